@@ -1,9 +1,12 @@
 """How fast the studio answers, measured end to end by a client of the page: from a move of the gizmo to skin, picture and numbers.
 
     python tests/bench/bench_studio.py --sensor mg400-331 --object sphere --seconds 30
+    python tests/bench/bench_studio.py --minutes 30
 
-Random drags go on for ``--seconds``; every move has a depth of its own, by which its answer is known. It is checked that pictures, scene
-and numbers come together, and that no answer comes twice or out of order. At the end: time to the path-traced picture, and memory.
+Random drags go on for ``--seconds`` or ``--minutes``, a second's rest after every fifteen; every move has a depth of its own, by which its
+answer is known. It is checked that pictures, scene and numbers come together, that no answer comes twice or out of order, that each shows
+a pose on the way between wishes of the last seconds, and that after each rest the pose that was wished last is shown, path-traced.
+Memory is measured in every rest. It ends with an error if anything of this was wrong.
 """
 
 import argparse
@@ -12,13 +15,21 @@ import re
 import subprocess
 import sys
 import time
+from bisect import bisect_right
 from pathlib import Path
 
 import numpy as np
 import psutil
-from studio_client import StudioClient
+from studio_client import StudioClient, Update
 
 from scenes import load_sensor
+
+# Random drags go on for DRAG_S, then nothing moves for REST_S; the pose that was wished last has to be shown within WAIT_S.
+DRAG_S, REST_S, WAIT_S = 15.0, 1.0, 30.0
+# An answer shows a pose on the way between wishes that are no older, s.
+LATE_S = 3.0
+# Depths that differ by less are the same, mm; those of two wishes differ by more.
+SAME_MM = 5e-6
 
 
 def start(sensor: str, touched: str, out: Path) -> tuple[subprocess.Popen, str, float]:
@@ -45,14 +56,34 @@ def cpu_s(process: subprocess.Popen) -> float:
     return times.user + times.system
 
 
+def rest(client: StudioClient, wish: tuple[float, float]) -> float | None:
+    """Wait until the last wish (its time and depth) is shown path-traced: for how long, s; None if it never was."""
+    since = max(0, len(client.updates) - 50)
+    try:
+        shown = client.wait(lambda u: "path-traced" in u.html and abs(u.depth_mm - wish[1]) < SAME_MM, WAIT_S, since=since)
+    except AssertionError:
+        return None
+    time.sleep(max(0.0, REST_S - (time.monotonic() - wish[0])))
+    return shown.time_s - wish[0]
+
+
+def shown_in_time(update: Update, sent: list[tuple[float, float]]) -> bool:
+    """Whether the depth that is shown lies between those wished in the seconds before, and the last one before these."""
+    first, end = (bisect_right(sent, (at, np.inf)) for at in (update.time_s - LATE_S, update.time_s))
+    late = [depth for _, depth in sent[max(0, first - 1) : end]]
+    return not late or min(late) - SAME_MM <= update.depth_mm <= max(late) + SAME_MM
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sensor", default="mg400-331")
     parser.add_argument("--object", default="sphere")
     parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--minutes", type=float, default=0.0, help="in place of --seconds")
     parser.add_argument("--rate", type=float, default=20.0, help="gizmo moves a second")
     parser.add_argument("--out", type=Path, default=Path("out/studio-bench"))
     args = parser.parse_args()
+    seconds = 60 * args.minutes or args.seconds
     radius = load_sensor(args.sensor).skin.outer_radius_mm
     rng = np.random.default_rng(0)
     process, url, begun = start(args.sensor, args.object, args.out)
@@ -67,19 +98,21 @@ def main() -> None:
                 np.array([0.0, 0.0, -1.0]),
                 rng.normal(0, 6, 3),
                 len(client.updates),
-                time.monotonic() + args.seconds,
+                time.monotonic() + seconds,
             )
-            memory, spent = [memory_mb(process)], cpu_s(process)
+            memory, spent, rests, rest_s = [memory_mb(process)], cpu_s(process), [], time.monotonic() + DRAG_S
             while time.monotonic() < ended:
                 speed += rng.normal(0, 4, 3) - 0.3 * speed - 0.8 * (place - [0, 0, 2.0])
                 place = np.clip(place + speed / args.rate, [-5, -5, -2], [5, 5, 4.5])
                 depth = round(float(place[2]), 2) + len(sent) % 1000 * 1e-5
                 sent.append((time.monotonic(), depth))
                 client.drag((float(place[0]), float(place[1]), radius - depth))
-                if len(sent) % 200 == 0:
-                    memory.append(memory_mb(process))
                 time.sleep(1 / args.rate)
-            stopped = sent[-1][0]
+                if time.monotonic() > rest_s:
+                    rests.append(rest(client, sent[-1]))
+                    memory.append(memory_mb(process))
+                    rest_s = time.monotonic() + DRAG_S
+            rests.append(rest(client, sent[-1]))
             answers = [u for u in client.updates[since:] if u.number > 0]
             times = dict((round(d, 6), t) for t, d in sent)
             late = [u.time_s - times[u.depth_mm] for u in answers if u.depth_mm in times]
@@ -87,24 +120,30 @@ def main() -> None:
             moved = [u for before, u in zip(answers, answers[1:], strict=False) if u.depth_mm != before.depth_mm]
             together = np.mean([u.pictures >= 2 and "/object" in u.nodes for u in moved])
             numbers = [u.number for u in answers]
-            traced = client.wait(lambda u: "path-traced" in u.html and u.number > numbers[-1], 60, since=len(client.updates) - 5)
+            stale = sum(not shown_in_time(u, sent) for u in answers)
             memory.append(memory_mb(process))
+            waited = [each for each in rests if each is not None]
             result = {
                 "sensor": args.sensor,
                 "object": args.object,
                 "moves": len(sent),
                 "answers": len(answers),
-                "answers_per_s": round(len(answers) / args.seconds, 1),
+                "answers_per_s": round(len(answers) / (seconds - REST_S * (len(rests) - 1)), 1),
                 "between_answers_ms": [round(1e3 * float(np.percentile(gaps, q))) for q in (50, 95)],
                 "move_to_page_ms": [round(1e3 * float(np.percentile(late, q))) for q in (50, 95)],
                 "together": float(together),
                 "in_order": bool((np.diff(numbers) > 0).all()),
-                "still_to_traced_s": round(traced.time_s - stopped, 2),
+                "stale": stale,
+                "rests": len(rests),
+                "rests_without_their_pose": rests.count(None),
+                "still_to_traced_s": [round(float(np.percentile(waited, q)), 2) for q in (50, 95)] if waited else None,
                 "cpu_ms_per_answer": round(1e3 * (cpu_s(process) - spent) / len(answers)),
                 "memory_mb": [round(m) for m in memory],
                 "load": psutil.getloadavg()[0],
             }
             print(json.dumps(result))
+            if stale or rests.count(None) or not result["in_order"]:
+                raise SystemExit("something stale was shown")
     finally:
         process.terminate()
         process.wait(20)

@@ -4,6 +4,7 @@ import json
 import re
 import time
 from pathlib import Path
+from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
@@ -141,6 +142,25 @@ def test_picture_and_state_are_saved_and_open_again(studio, client, tmp_path):
     studio.twin.open(state)
     since = len(client.updates)
     client.wait(lambda u: abs(u.depth_mm - 1.25) < 1e-4, WAIT_S, since=since)
+
+
+def test_a_link_shows_its_state_again_and_not_from_a_foreign_page(studio, client):
+    drag(client, 1.5, 0.75)
+    end = time.monotonic() + WAIT_S
+    while "depth_mm=1.5&" not in str(client.value("link")) and time.monotonic() < end:
+        time.sleep(0.02)
+    link = str(client.value("link"))
+    assert link.startswith(studio.page.url) and "x_mm=0.75" in link
+    drag(client, 2.0)
+    for site in ("cross-site", "none"):
+        since = len(client.updates)
+        with urlopen(Request(link.replace("depth_mm=1.5", f"depth_mm={len(site)}e-1"), headers={"Sec-Fetch-Site": site})) as page:
+            assert b"<html" in page.read()
+    update = client.wait(lambda u: u.number > 0 and u.depth_mm not in (2.0, 1.5), WAIT_S, since=since)
+    client.wait(lambda u: abs(u.depth_mm - 0.4) < 1e-4, WAIT_S, since=since)
+    assert update.depth_mm <= 0.4 + 1e-4
+    client.set("link", "?sensor=nothing&object=sphere")
+    assert "nothing" in wait_html(client, "class='stop'")
 
 
 def test_degrade_shows_the_same_contact_with_its_limits(client):

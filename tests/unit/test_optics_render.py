@@ -188,3 +188,13 @@ def test_pixels_that_show_a_pin_count_as_near_one():
     at = at[((at >= 0) & (at < 200)).all(axis=1)]
     assert len(at) > 1000 and near[at[:, 1], at[:, 0]].all()
     assert near.mean() < 0.8
+
+
+def test_passes_are_refined_to_the_mean_of_all(small):
+    """One pass is the picture itself; each further one takes noise away."""
+    renderer = Renderer(small, spp=4)
+    passes = list(renderer.refine(seed=3, samples=(4, 4, 8)))
+    np.testing.assert_array_equal(passes[0], renderer.render(seed=3))
+    calm = Renderer(small, spp=64).render(seed=9)
+    noise = [np.sqrt(np.mean((each - calm) ** 2)) for each in passes]
+    assert noise[2] < 0.8 * noise[0]

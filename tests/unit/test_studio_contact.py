@@ -126,9 +126,10 @@ def test_what_moves_is_near_the_fine_mesh():
 def test_an_old_picture_is_refused(contact):
     answer = pressed(contact, ObjectPose(depth_mm=1.0))
     light = np.asarray(answer.light)
-    traced = contact.traced(answer.number, light, 5.0)
+    traced = contact.traced(answer.solved, light, Light.TRACED, 5.0)
     assert traced is not None and traced.lit is Light.TRACED and traced.number > answer.number and traced.state is answer.state
-    assert contact.traced(answer.number, light, 5.0) is None
+    pressed(contact, ObjectPose(depth_mm=1.1))
+    assert contact.traced(answer.solved, light, Light.TRACED, 5.0) is None
 
 
 def test_the_solvers_failure_leaves_the_object_where_it_is(contact, monkeypatch):

@@ -27,6 +27,7 @@ class Stand:
 
     def __init__(self, number, pose, arrived, lit=Light.DRAWN, mesh=Mesh.USUAL):
         self.number, self.pose, self.arrived, self.lit, self.mesh, self.state = number, pose, arrived, lit, mesh, None
+        self.solved = number
 
 
 class SlowContact:
@@ -51,10 +52,12 @@ class SlowContact:
         self.left, self.refined = 2, False
         return self._made(arrived=self.depth == wished.depth_mm)
 
-    def traced(self, number, light, ms):
-        if self.newest is None or number != self.newest.number:
+    def traced(self, solved, light, lit, ms):
+        if self.newest is None or solved != self.newest.solved:
             return None
-        return self._made(arrived=True, lit=Light.TRACED, mesh=self.newest.mesh)
+        made = self._made(arrived=True, lit=lit, mesh=self.newest.mesh)
+        made.solved = solved
+        return made
 
     def refine(self):
         self.left -= 1
@@ -76,7 +79,8 @@ class StandTracer:
 
     def trace(self, number, state):
         self.asked.append(number)
-        self.jobs = [Failed("no path tracing here", tracing=True) if self.broken else Traced(number, np.zeros((2, 2)), 1.0)]
+        passes = [Traced(number, np.zeros((2, 2)), 1.0, rough) for rough in (True, False)]
+        self.jobs = [Failed("no path tracing here", tracing=True)] if self.broken else passes
 
     def outcomes(self):
         jobs, self.jobs = self.jobs, []
@@ -117,7 +121,9 @@ def test_what_stands_still_is_traced_then_refined_and_shown_with_its_own_picture
         worker.ask(ObjectPose(depth_mm=2.0))
         wait(lambda a: a.lit is Light.TRACED and a.mesh is Mesh.FINE)
     kinds = [(a.lit, a.mesh) for a in answers if a.arrived]
-    assert kinds == [(Light.DRAWN, Mesh.USUAL), (Light.TRACED, Mesh.USUAL), (Light.TRACED, Mesh.FINE)]
+    usual = [(lit, Mesh.USUAL) for lit in (Light.DRAWN, Light.ROUGH, Light.TRACED)]
+    assert kinds == [*usual, (Light.TRACED, Mesh.FINE)]  # the fine mesh's picture comes when it is as good as the one before
+    assert len(tracer.asked) == 2
     assert tracer.started >= 1
 
 
@@ -169,6 +175,24 @@ def test_a_state_opens_again(tmp_path):
 def test_what_is_no_state_is_refused_in_one_line(content):
     with pytest.raises(TwinError, match="some.json: .*open a file that 'Save state' wrote") as error:
         StudioState.read(content, "some.json")
+    assert "\n" not in str(error.value)
+
+
+def test_a_link_opens_the_whole_state_again():
+    state = StudioState(sensor="mg400-331", object="my part.toml", friction=0.3, pose={"x_mm": -1.25, "depth_mm": 2.0}, colour="pressure")
+    link = state.link("http://127.0.0.1:8090/")
+    assert StudioState.of_link(link) == state and StudioState.of_link(state.link()) == state
+    assert first_state("?sensor=mg400-331&object=edge", "ignored", "ignored").object_pose() == ObjectPose(depth_mm=2.0)
+
+
+@pytest.mark.parametrize(
+    "link", ["", "?", "nothing", "?sensor=a", "?sensor=a&object=b&more=1", "?sensor=a&object=b&x_mm=nan", "?sensor=a&object=b&friction=-1",
+             "?sensor=a&object=b&depth_mm=deep", "?sensor=a&object=b&form=odd", "?" + "a=1&" * 60,
+             "?sensor=a\n&form=odd&object=" + "b" * 99]
+)  # fmt: skip
+def test_what_is_no_link_to_a_state_is_refused_in_one_line(link):
+    with pytest.raises(TwinError, match="^link .*copy the link from the page") as error:
+        StudioState.of_link(link)
     assert "\n" not in str(error.value)
 
 

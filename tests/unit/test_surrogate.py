@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation, Slerp
 
 from scenes import ObjectSpec, load_object, load_sensor
 from scenes.object import CylinderShape, EdgeShape, MeshShape, PrismShape, SphereShape
 from training.surrogate.compliance import NODE_RINGS, compliance_of
 from training.surrogate.contact import LinearContacts
-from training.surrogate.contacts import SurrogateContacts
+from training.surrogate.contacts import SurrogateContacts, _way
 from training.surrogate.felt import Contact, FiniteElements
 from training.surrogate.fit import averaged, distil, require_dome
 from training.surrogate.model import SurrogateError, load_surrogate, representatives, rest_of, surrogate_of, unfolded
@@ -305,3 +306,16 @@ def test_drawn_paths_start_clear_and_stay_within_the_domain(sensor, surrogate):
 def test_the_lattice_of_a_sensor_has_its_rings(sensor):
     assert lattice_sensor(load_sensor("mg400-127")).pins.count == 331
     assert len(ring_directions(NODE_RINGS, 58.0, 0.0)) == 271
+
+
+def test_a_way_is_gone_straight_and_about_one_axis():
+    start, stop = np.eye(4), np.eye(4)
+    turns = Rotation.from_rotvec([[0.1, -0.2, 0.05], [-0.3, 0.4, 0.9]])
+    start[:3, :3], stop[:3, :3] = turns.as_matrix()
+    start[:3, 3], stop[:3, 3] = (1.0, 2.0, 3.0), (2.0, -1.0, 5.0)
+    between = Slerp([0, 1], turns)(np.arange(1, 6) / 5)
+    way = np.array(_way(start, stop, 5))
+    np.testing.assert_allclose(way[:, :3, :3], between.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(way[:, :3, 3], start[:3, 3] + np.arange(1, 6)[:, None] / 5 * (stop[:3, 3] - start[:3, 3]), atol=1e-12)
+    np.testing.assert_array_equal(way[-1], stop)
+    np.testing.assert_array_equal(_way(start, stop, 1), [stop])

@@ -1,9 +1,9 @@
 """The surrogate's contacts: many sensors at once, each with its object and all that friction remembers."""
 
 from functools import lru_cache
+from math import acos, atan2, ceil, sqrt
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from scenes.sensor import SensorSpec
 from training.surrogate.contact import LinearContacts
@@ -21,6 +21,8 @@ LARGEST_MOVE_MM = 30.0
 """Largest motion between two poses; beyond it the way between them is unknown, and the contact begins anew."""
 CLEAR_MM = 0.5
 """A contact begins this far in front of the object."""
+NO_TURN = 1e-9
+"""Sine of an angle that is none."""
 SETTLED_MM = 0.02
 """Most that the dome still has to move where an arm has given way."""
 MOST_SETTLING = 3
@@ -143,13 +145,14 @@ class SurrogateContacts:
             before[2, 3] += max(depth, 0.0) / max(self._surrogate.node_mm[deepest, 2] / self._radius, 0.5) + CLEAR_MM
             way = self._moved(before, T)
         law, force = contact.law, self._force(row)
-        for share in np.arange(1, int(np.ceil(way / STEP_MM)) + 1) / np.ceil(way / STEP_MM) if way > 0 else (1.0,):
-            here = _between(before, T, share)
+        for here in _way(before, T, max(ceil(way / STEP_MM), 1)):
+            settled = law.pose(here, force)
             for _ in range(MOST_SETTLING):
-                there = law.pose(here, force)
+                there = settled
                 self._linear.move(row, field, there, self._friction[row], self._compliance[row])
                 force = self._force(row)
-                if law.given_way is None or self._moved(there, law.pose(here, force)) <= SETTLED_MM:
+                settled = law.pose(here, force)
+                if law.given_way is None or self._moved(there, settled) <= SETTLED_MM:
                     break
         self._before[row] = T.copy()
         yielded = np.array([0.0, 0.0, law.compliance_mm_per_n * force[2]])
@@ -178,8 +181,9 @@ class SurrogateContacts:
     def _moved(self, start: FloatArray, stop: FloatArray) -> float:
         """How far the object moves at most over the dome."""
         turn = stop[:3, :3] @ start[:3, :3].T
-        angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0))
-        return float(np.linalg.norm(stop[:3, 3] - turn @ start[:3, 3]) + angle * self._radius)
+        cosine = (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1) / 2
+        off = stop[:3, 3] - turn @ start[:3, 3]
+        return sqrt(off @ off) + acos(min(max(cosine, -1.0), 1.0)) * self._radius
 
     def _answer(self, rows: IntArray) -> None:
         """What the sensors feel, from the linear skin and the network."""
@@ -198,12 +202,19 @@ class SurrogateContacts:
         felt.slip[rows] = slip
 
 
-def _between(start: FloatArray, stop: FloatArray, share: float) -> FloatArray:
-    """A pose (4, 4) on the way: the origin goes straight, the object turns about a fixed axis."""
-    if share == 1.0:
-        return stop
-    T = stop.copy()
-    turn = Rotation.from_matrix(stop[:3, :3] @ start[:3, :3].T).as_rotvec()
-    T[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ start[:3, :3]
-    T[:3, 3] = (1 - share) * start[:3, 3] + share * stop[:3, 3]
-    return T
+def _way(start: FloatArray, stop: FloatArray, steps: int) -> list[FloatArray]:
+    """Poses (4, 4) after each of some equal steps of a way: the origin goes straight, the object turns about a fixed axis."""
+    if steps == 1:
+        return [stop]
+    left = 1 - np.arange(1, steps + 1)[:, None] / steps
+    T = np.empty((steps, 4, 4))
+    T[:] = stop
+    T[:, :3, 3] += left * (start[:3, 3] - stop[:3, 3])
+    turn = start[:3, :3] @ stop[:3, :3].T
+    cross = (turn - turn.T) / 2  # with the axis, times the sine of the angle (less than a right one)
+    sine = sqrt(cross[2, 1] ** 2 + cross[0, 2] ** 2 + cross[1, 0] ** 2)
+    if sine > NO_TURN:
+        angle = (atan2(sine, (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1) / 2) * left)[..., None]
+        cross = cross / sine
+        T[:, :3, :3] += (np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)) @ stop[:3, :3]  # Rodrigues' formula
+    return list(T)

@@ -25,6 +25,8 @@ page says why.
 Other modes: Degrade (what the pipeline and the model bear on this contact), Recording (labels against estimates), Live (camera and arm),
 Your own sensor (a specification from a folder of frames, as 'twin new' makes it, with the layout drawn over them and corrected).
 
+The page's folder 'Save' shows a link that opens the whole state again, in a browser while the studio runs, or with --state.
+
 The page is served for this machine alone, loads nothing from elsewhere, and several browsers see the same state. Ctrl-C ends it.
 
 \b
@@ -32,6 +34,7 @@ Example:
   twin studio
   twin studio --sensor ur5-331 --object edge
   twin studio --state out/studio/state-1.json
+  twin studio --state '?sensor=mg400-331&object=edge&depth_mm=3&tilt_y_deg=10'
 """
 
 
@@ -41,7 +44,9 @@ def studio(
     object_name: Annotated[
         str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")
     ] = "sphere",
-    state: Annotated[Path | None, typer.Option("--state", metavar="FILE", help="a state that the page has saved, instead of both")] = None,
+    state: Annotated[
+        str | None, typer.Option("--state", metavar="FILE", help="a state that the page has saved, or a link to one, instead of both")
+    ] = None,
     model: Annotated[
         Path | None, typer.Option("--model", metavar="RUN", help="folder of a run for its sensor; shipped weights if not given")
     ] = None,

@@ -1,5 +1,6 @@
 """From a sensor's state to the linear light on its camera's film."""
 
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
@@ -32,6 +33,8 @@ SCALAR_SAMPLES = {"preview": 1, "standard": 4, "high": 16}
 """Samples per pixel of the scalar variant, which is several times slower."""
 BOUNCES = 2
 """Number of scatterings of a light path after the first. Because the skin is dark, a third one changes no gray level."""
+PASS_SEED = 0x10000
+"""Step of the seed from one pass of a picture to the next, larger than the numbers by which callers tell pictures apart."""
 MOST_SAMPLES_AT_ONCE = 6_000_000
 """Most samples of one pass. The number bounds the memory that a pass needs."""
 
@@ -108,6 +111,28 @@ class Renderer:
         (H, W, 3) or (H, W) float32
             RGB for a color camera, luminance for a mono one; H and W of the window.
         """
+        (image,) = self.refine(state, seed, samples=(self.spp,))
+        return image
+
+    def refine(self, state: PinState | None = None, seed: int = 0, *, samples: Sequence[int]) -> Iterator[FloatArray]:
+        """Linear light on the film, better from pass to pass: after each pass the mean of all samples so far.
+
+        Parameters
+        ----------
+        state, seed
+            As ``render`` takes them.
+        samples : sequence of int
+            For each pass, its samples of a pixel that shows a pin. A power of two is most uniform.
+
+        Notes
+        -----
+        No other state may be rendered before the last pass.
+
+        Yields
+        ------
+        (H, W, 3) or (H, W) float32
+            As ``render`` gives it.
+        """
         mi = use_variant(self.choice)
         state = self._rest if state is None else state
         surfaces = self.surfaces(state)
@@ -118,12 +143,16 @@ class Renderer:
             self._view.move(surfaces)
         light, through = self.static
         pixels = np.flatnonzero(through > 0)
-        gel = self._view.gel_light(pixels, self.spp, seed, state)
-        if light.ndim == 2 and gel.shape[1] == 3:
-            gel = luminance(gel)[:, None]
-        image = light.copy()
-        image.reshape(through.size, -1)[pixels] += (through.ravel()[pixels, None] * gel).astype(np.float32)
-        return np.maximum(image, 0)
+        total: FloatArray = np.zeros((1, 1))
+        count = 0
+        for k, spp in enumerate(samples):
+            gel = self._view.gel_light(pixels, spp, seed + k * PASS_SEED, state)
+            if light.ndim == 2 and gel.shape[1] == 3:
+                gel = luminance(gel)[:, None]
+            total, count = total + spp * gel, count + spp
+            image = light.copy()
+            image.reshape(through.size, -1)[pixels] += (through.ravel()[pixels, None] * (total / count)).astype(np.float32)
+            yield np.maximum(image, 0)
 
     def surfaces(self, state: PinState) -> dict[str, Surface]:
         """Skin, stems and caps of a state, by the names of the scene's meshes."""

@@ -15,6 +15,7 @@ Three things happen where an arm presses a sensor against an object with the for
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from math import cos, radians, sin
 
 import numpy as np
 
@@ -52,15 +53,17 @@ class ArmTurning:
     deg_per_n: float
 
     @cached_property
-    def _cross(self) -> np.ndarray:
-        """(3, 3) cross product with the axis, for Rodrigues' formula."""
+    def _cross(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For Rodrigues' formula the unit matrix (3, 3), the cross product with the axis, and its square."""
         x, y, z = self.axis
-        return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        return np.eye(3), cross, cross @ cross
 
     def __call__(self, T: np.ndarray, force_n: np.ndarray) -> np.ndarray:
         """The object's pose (4, 4) under a force (3,), N: seen from the sensor it turns the other way about the tool point."""
-        angle = -np.radians(self.deg_per_n * (self.across @ force_n))
-        turn = np.eye(3) + np.sin(angle) * self._cross + (1 - np.cos(angle)) * self._cross @ self._cross
+        angle = -radians(self.deg_per_n * float(self.across @ force_n))
+        one, cross, squared = self._cross
+        turn = one + sin(angle) * cross + (1 - cos(angle)) * squared
         there = T.copy()
         there[:3, :3] = turn @ T[:3, :3]
         there[:3, 3] = self.tool_mm + turn @ (T[:3, 3] - self.tool_mm)

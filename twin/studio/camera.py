@@ -7,8 +7,9 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.camera.capture import expose, record
 from twin.errors import FrameError
+from twin.geometry.mesh import build_mesh
 from twin.optics.preview import Preview, Shading, traced_shading
-from twin.optics.render import Quality, Renderer
+from twin.optics.render import Renderer
 from twin.optics.static_layer import static_layer
 from twin.optics.tracer import luminance
 from twin.store import cached_arrays
@@ -16,8 +17,8 @@ from twin.types import FloatArray, Form, Frame, ImageArray, PinState
 
 MARGIN_PX = 8
 """Width of the border around the pipeline's mask that is drawn as well. Blur and thresholds look that far."""
-QUALITY: Quality = "standard"
-"""Samples of a path-traced picture."""
+PARTS = (4, 2, 2)
+"""The passes of a path-traced picture: each takes the renderer's samples divided by this. The first is shown at once, then the mean."""
 
 
 def dome_window(spec: SensorSpec) -> tuple[int, int, int, int]:
@@ -63,8 +64,8 @@ def dome_shading(spec: SensorSpec) -> Shading:
 
 
 def dome_renderer(spec: SensorSpec) -> Renderer:
-    """A path tracer of the dome's part of the frame."""
-    return Renderer(spec, quality=QUALITY, window_px=dome_window(spec))
+    """A path tracer of the dome's part of the frame, for contacts on the usual mesh or a finer one."""
+    return Renderer(spec, mesh=build_mesh(spec.geometry), window_px=dome_window(spec))
 
 
 def in_window(planes: tuple[FloatArray, FloatArray], window_px: tuple[int, int, int, int]) -> tuple[FloatArray, FloatArray]:

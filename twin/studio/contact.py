@@ -57,6 +57,7 @@ class Light(StrEnum):
     """How a picture was made."""
 
     DRAWN = "drawn"
+    ROUGH = "path-traced, first pass"
     TRACED = "path-traced"
 
 
@@ -75,6 +76,8 @@ class Answer:
     ----------
     number : int
         Counts the answers.
+    solved : int
+        Counts the solved contacts: answers with the same number differ in light, form or model alone.
     pose : ObjectPose
         Where the object is.
     indent_mm : float
@@ -103,6 +106,7 @@ class Answer:
     """
 
     number: int
+    solved: int
     pose: ObjectPose
     indent_mm: float
     state: ContactState
@@ -174,7 +178,7 @@ class MovingContact:
         self._deep_mm = np.concatenate([shape.beneath(places, depth) for depth in depths_mm])  # where no object may reach
         self._experiment: ExperimentSpec | None = None
         self.model: SensorModel | None = None
-        self._count = 0
+        self._count, self._solved = 0, 0
         self.pose = ObjectPose()
         self._last: Answer | None = None
         self._take_up(setup)
@@ -305,25 +309,19 @@ class MovingContact:
             self._last = replace(self._last, number=self._count, arrived=True, stopped=self._why_blocked)
             return self._last
         self._remember(T)
+        self._solved += 1
         solved_ms = 1e3 * (time.perf_counter() - started)
         arrived = self._is_there(goal)
         stopped = (self._why_blocked if self._blocked is not None and np.array_equal(self._blocked, goal) else reason) if arrived else ""
-        return self._answer(T, state, None, Mesh.USUAL, arrived=arrived, stopped=stopped, ms={"contact": solved_ms})
+        return self._answer(T, state, Mesh.USUAL, arrived=arrived, stopped=stopped, ms={"contact": solved_ms})
 
-    def traced(self, number: int, light: FloatArray, traced_ms: float) -> Answer | None:
-        """The answer of a number with its path-traced light (h, w) or (h, w, 3); None if it is no longer the newest."""
+    def traced(self, solved: int, light: FloatArray, lit: Light, traced_ms: float) -> Answer | None:
+        """The newest answer with path-traced light (h, w) or (h, w, 3) of a contact; None if it is no longer the newest contact."""
         last = self._last
-        if last is None or last.number != number:
+        if last is None or last.solved != solved:
             return None
-        return self._answer(
-            self._T_of(last),
-            last.state,
-            light,
-            last.mesh,
-            arrived=last.arrived,
-            stopped=last.stopped,
-            ms={"contact": last.ms["contact"], "trace": traced_ms},
-        )
+        self._last = replace(last, light=light, lit=lit, ms={"contact": last.ms["contact"], "trace": traced_ms})
+        return self.again()
 
     def refine(self) -> Answer | None:
         """Go one piece of the contact's way on the fine mesh; at its end the fine answer, None before."""
@@ -351,8 +349,9 @@ class MovingContact:
         if self._way:
             return None
         self._refined = True
+        self._solved += 1
         last, ms = self._last, 1e3 * (time.perf_counter() - started)
-        return self._answer(self._T, state, None, Mesh.FINE, arrived=last.arrived, stopped=last.stopped, ms={"contact": ms})
+        return self._answer(self._T, state, Mesh.FINE, arrived=last.arrived, stopped=last.stopped, ms={"contact": ms})
 
     @property
     def refined(self) -> bool:
@@ -370,8 +369,9 @@ class MovingContact:
         last = self._last
         if last is None:
             return None
-        light = last.light if last.lit is Light.TRACED else None
-        return self._answer(self._T_of(last), last.state, light, last.mesh, arrived=last.arrived, stopped=last.stopped, ms=last.ms)
+        traced = None if last.lit is Light.DRAWN else (last.light, last.lit)
+        T = last.pose.matrix(self._apex_mm)
+        return self._answer(T, last.state, last.mesh, traced, arrived=last.arrived, stopped=last.stopped, ms=last.ms)
 
     def _remember(self, T: FloatArray) -> None:
         """Keep the way for the fine mesh. A contact's way begins at the last free pose, or where the contact was begun anew."""
@@ -386,17 +386,20 @@ class MovingContact:
             self._fine_lost = f"the way in contact is longer than {KEPT_WAY} poses; lift the object off, and the fine mesh follows again"
         self._T, self.pose = T, ObjectPose.of(T, self._apex_mm)
 
-    def _T_of(self, answer: Answer) -> FloatArray:
-        return answer.pose.matrix(self._apex_mm)
-
     def _answer(
-        self, T: FloatArray, state: ContactState, light: FloatArray | None, mesh: Mesh, *, arrived: bool, stopped: str, ms: dict[str, float]
+        self,
+        T: FloatArray,
+        state: ContactState,
+        mesh: Mesh,
+        traced: tuple[FloatArray, Light] | None = None,
+        *,
+        arrived: bool,
+        stopped: str,
+        ms: dict[str, float],
     ) -> Answer:
         self._count += 1
         started = time.perf_counter()
-        lit = Light.DRAWN if light is None else Light.TRACED
-        if light is None:
-            light = self.camera.draw(state)
+        light, lit = traced or (self.camera.draw(state), Light.DRAWN)
         raw = self.camera.raw(light, seed=self._count)
         now = time.perf_counter()
         needs_recorded = self.setup.form is Form.RECORDING or (self.model is not None and self.model.form is Form.RECORDING)
@@ -409,6 +412,7 @@ class MovingContact:
         times = {"picture": now - started, "estimate": estimated - now, "pins": time.perf_counter() - estimated}
         self._last = Answer(
             self._count,
+            self._solved,
             ObjectPose.of(T, self._apex_mm),
             -self._follower.gap_mm(T),
             state,

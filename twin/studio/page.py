@@ -4,17 +4,20 @@ import errno
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 import numpy as np
 import viser
+import websockets.asyncio.server
 from viser import uplot
 from viser.infra import WebsockClientConnection
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
 
 from scenes.base import SpecError
 from twin.errors import TwinError
@@ -94,6 +97,30 @@ def refuse_foreign_pages(server: viser.ViserServer, hosts: Sequence[str]) -> Non
     websocket_server.on_client_connect(check)
 
 
+@contextmanager
+def told_addresses(tell: Callable[[str], None]) -> Iterator[None]:
+    """A server of viser that is made here tells the address of each page that is loaded, if it has a query: viser itself reads none.
+
+    A page of another site is not heard: it could load this page with any query, unseen. A browser tells so in ``Sec-Fetch-Site``.
+    """
+    serve = websockets.asyncio.server.serve
+
+    def serving(*args: Any, process_request: Callable[[ServerConnection, Request], Response | None], **more: Any) -> Any:
+        def heard(connection: ServerConnection, request: Request) -> Response | None:
+            address = urlsplit(request.path)
+            if address.path == "/" and address.query and request.headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin"):
+                tell(request.path)
+            return process_request(connection, request)
+
+        return serve(*args, process_request=heard, **more)
+
+    websockets.asyncio.server.serve = serving  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
 def free_port(host: str, port: int) -> int:
     """The port, or the next one above it on which this machine can listen; 0 stays 0.
 
@@ -171,6 +198,11 @@ class Page:
     host, port : str, int
         Where to listen. If the port is taken, the next free one is used, see ``url``.
 
+    Attributes
+    ----------
+    on_address : callable
+        Called with path and query of the address of each page that is loaded with a query; in the server's event loop.
+
     Raises
     ------
     TwinError
@@ -178,9 +210,10 @@ class Page:
     """
 
     def __init__(self, title: str, *, host: str, port: int) -> None:
+        self.on_address: Callable[[str], None] = lambda address: None
         try:
             port = free_port(host, port)
-            with redirect_stdout(StringIO()):  # it prints its addresses
+            with redirect_stdout(StringIO()), told_addresses(lambda address: self.on_address(address)):  # it prints its own addresses
                 self.server = _Server(host=host, port=port, label=title, verbose=False)
         except (OSError, RuntimeError) as error:
             raise TwinError(f"--host {host} --port {port}: can't listen there ({error}); give another --host or --port") from error

@@ -5,6 +5,7 @@ import io
 import json
 from dataclasses import asdict
 from pathlib import Path
+from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from pydantic import ValidationError
 
@@ -20,6 +21,8 @@ from twin.types import Form
 
 MOST_BYTES = 4_000_000
 """A larger file is none of the studio's."""
+MOST_SHOWN = 80
+"""Most characters of a link that an error repeats."""
 MOST_ROWS = 20_000
 """Most poses of a way."""
 FIRST_DEPTH_MM = 2.0
@@ -59,7 +62,7 @@ class StudioState(Section):
         return ObjectPose(**self.pose)
 
     @classmethod
-    def read(cls, content: bytes, name: str) -> "StudioState":
+    def read(cls, content: bytes, name: str, remedy: str = "open a file that 'Save state' wrote") -> "StudioState":
         """Read a state.
 
         Raises
@@ -67,7 +70,6 @@ class StudioState(Section):
         TwinError
             It is no state of this version's studio.
         """
-        remedy = "open a file that 'Save state' wrote"
         if len(content) > MOST_BYTES:
             raise TwinError(f"{name}: {len(content)} bytes are no state of the studio; {remedy}")
         try:
@@ -90,20 +92,50 @@ class StudioState(Section):
         except OSError as error:
             raise TwinError(f"{path}: can't be read ({error.strerror}); give a file that 'Save state' wrote") from error
 
+    def link(self, page: str = "") -> str:
+        """The state as a link to a page of the studio, which then shows it; without a page the link's query alone."""
+        numbers = {name: f"{value:.4f}".rstrip("0").rstrip(".") for name, value in self.pose.items()}
+        friction = {} if self.friction is None else {"friction": f"{self.friction:g}"}
+        shown = {"form": self.form, "colour": self.colour, "drawn": self.drawn}
+        return f"{page}?" + urlencode({"sensor": self.sensor, "object": self.object, **numbers, **friction, **shown})
+
+    @classmethod
+    def of_link(cls, link: str) -> "StudioState":
+        """The state that ``link`` wrote. What a link leaves out is as at first.
+
+        Raises
+        ------
+        TwinError
+            It is no such link.
+        """
+        remedy = "copy the link from the page's folder 'Save'"
+        name = f"link {link[:MOST_SHOWN]}{'...' if len(link) > MOST_SHOWN else ''}".replace("\n", " ")
+        try:
+            given = dict(parse_qsl(urlsplit(link).query, keep_blank_values=True, strict_parsing=True, max_num_fields=50))
+            numbers = {key: float(given.pop(key)) for key in (*NAMES, "friction") if key in given}
+        except ValueError as error:
+            raise TwinError(f"{name}: no link to a state of the studio ({error}); {remedy}") from error
+        friction = {key: numbers.pop(key) for key in ("friction",) if key in numbers}
+        pose = numbers or {"depth_mm": FIRST_DEPTH_MM}
+        return cls.read(json.dumps({**given, **friction, "pose": pose}).encode(), name, remedy)
+
     def save(self, path: Path) -> Path:
         """Write the state."""
         return write_json(path, self.model_dump(mode="json"))
 
 
-def first_state(file: Path | None, sensor: str, touched: str) -> StudioState:
-    """The state of a file, else a sensor that is pressed a little.
+def first_state(saved: str | Path | None, sensor: str, touched: str) -> StudioState:
+    """The state of a file or link, else a sensor that is pressed a little.
 
     Raises
     ------
     TwinError, SpecError
-        The file holds no state, or there is no such sensor or object.
+        The file or link holds no state, or there is no such sensor or object.
     """
-    state = StudioState(sensor=sensor, object=touched, pose={"depth_mm": FIRST_DEPTH_MM}) if file is None else StudioState.load(file)
+    if saved is None:
+        state = StudioState(sensor=sensor, object=touched, pose={"depth_mm": FIRST_DEPTH_MM})
+    else:
+        state = StudioState.of_link(str(saved)) if "?" in str(saved) else StudioState.load(Path(saved))
     load_sensor(state.sensor), load_object(state.object)
     return state
 

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -17,12 +17,11 @@ from pathlib import Path
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.errors import RenderError, TwinError
-from twin.geometry.mesh import build_mesh
 from twin.one_contact import write_contact
 from twin.optics.preview import Shading
 from twin.optics.render import Renderer
 from twin.simulator import Simulator
-from twin.studio.camera import QUALITY, dome_shading, dome_window
+from twin.studio.camera import PARTS, dome_renderer, dome_shading
 from twin.studio.pose import PressedPose
 from twin.types import ContactState, FloatArray, Form
 
@@ -36,15 +35,19 @@ class Traced:
 
     Attributes
     ----------
-    number : int
-        The answer's.
+    solved : int
+        Number of the contact.
     light : (h, w) or (h, w, 3) float
     ms : float
+        Time since the job was begun.
+    rough : bool
+        Whether this is the first pass, which a better picture follows unless a newer contact comes.
     """
 
-    number: int
+    solved: int
     light: FloatArray
     ms: float
+    rough: bool
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ class Failed:
 
 @dataclass(frozen=True)
 class _Trace:
-    number: int
+    solved: int
     state: ContactState
 
 
@@ -83,7 +86,7 @@ Outcome = Shading | Traced | Saved | Failed
 class Tracer:
     """Path-traces contacts of one sensor. Of several asked at once only the newest is traced. A context manager.
 
-    The first outcome is the preview's shading.
+    The first outcome is the preview's shading. Of a contact there are two: the first pass, and the mean of all.
 
     Parameters
     ----------
@@ -110,14 +113,14 @@ class Tracer:
             self._here.send(self._spec)
             threading.Thread(target=self._receive, name="studio-tracer", daemon=True).start()
 
-    def trace(self, number: int, state: ContactState) -> None:
-        """Ask for an answer's light. One is traced at a time; of those that are asked for meanwhile only the newest is."""
+    def trace(self, solved: int, state: ContactState) -> None:
+        """Ask for a contact's light. One is traced at a time; of those that are asked for until its first pass only the newest is."""
         with self._one:
             if self._tracing:
-                self._next = _Trace(number, state)
+                self._next = _Trace(solved, state)
                 return
             self._tracing = True
-        self._send(_Trace(number, state))
+        self._send(_Trace(solved, state))
 
     def save(self, out: Path, touched: ObjectSpec, pose: PressedPose, state: ContactState, form: Form) -> None:
         """Ask for a contact's files in a folder that exists."""
@@ -136,7 +139,7 @@ class Tracer:
             while True:
                 outcome = self._here.recv()
                 self._found.append(outcome)
-                if isinstance(outcome, Traced):
+                if isinstance(outcome, Failed) or (isinstance(outcome, Traced) and outcome.rough):
                     with self._one:
                         job, self._next = self._next, None
                         self._tracing = job is not None
@@ -178,45 +181,58 @@ def serve(number: int) -> None:
     there = Connection(number)
     try:
         spec: SensorSpec = there.recv()
-        there.send(_tried(lambda: dome_shading(spec), tracing=True))
-        maker = _Maker(spec)
-        while (job := there.recv()) is not None:
-            there.send(_tried(partial(maker, job), tracing=isinstance(job, _Trace)))
+        for shading in _tried(lambda: iter([dome_shading(spec)]), tracing=True):
+            there.send(shading)
+        jobs: deque[_Trace | _Save | None] = deque()
+
+        def overtaken() -> bool:
+            while there.poll():
+                jobs.append(there.recv())
+            return any(job is None or isinstance(job, _Trace) for job in jobs)
+
+        maker = _Maker(spec, overtaken)
+        while (job := jobs.popleft() if jobs else there.recv()) is not None:
+            for outcome in _tried(partial(maker, job), tracing=isinstance(job, _Trace)):
+                there.send(outcome)
     except (EOFError, OSError):
         return
 
 
 class _Maker:
-    """Does the jobs; renderer and simulator are built when they are first needed."""
+    """Does the jobs; renderer and simulator are built when they are first needed. What is ``overtaken`` is not refined."""
 
-    def __init__(self, spec: SensorSpec) -> None:
-        self._spec = spec
+    def __init__(self, spec: SensorSpec, overtaken: Callable[[], bool]) -> None:
+        self._spec, self._overtaken = spec, overtaken
         self._renderer: Renderer | None = None
         self._simulator: Simulator | None = None
 
-    def __call__(self, job: _Trace | _Save) -> Outcome:
+    def __call__(self, job: _Trace | _Save) -> Iterator[Outcome]:
         return self._trace(job) if isinstance(job, _Trace) else self._save(job)
 
-    def _trace(self, job: _Trace) -> Traced:
+    def _trace(self, job: _Trace) -> Iterator[Traced]:
         if self._renderer is None:
-            self._renderer = Renderer(self._spec, quality=QUALITY, mesh=build_mesh(self._spec.geometry), window_px=dome_window(self._spec))
+            self._renderer = dome_renderer(self._spec)
         started = time.perf_counter()
-        light = self._renderer.render(job.state, seed=job.number)
-        return Traced(job.number, light, 1e3 * (time.perf_counter() - started))
+        samples = [max(1, self._renderer.spp // part) for part in PARTS]
+        for k, light in enumerate(self._renderer.refine(job.state, job.solved, samples=samples)):
+            if k == 0 or k == len(samples) - 1:
+                yield Traced(job.solved, light, 1e3 * (time.perf_counter() - started), rough=k == 0)
+            if self._overtaken():
+                return
 
-    def _save(self, job: _Save) -> Saved:
+    def _save(self, job: _Save) -> Iterator[Saved]:
         if self._simulator is None:
             self._simulator = Simulator(self._spec)
         shot = self._simulator.shoot(job.state, form=job.form)
-        return Saved(write_contact(job.out, self._simulator, job.touched, job.pose, job.state, shot))
+        yield Saved(write_contact(job.out, self._simulator, job.touched, job.pose, job.state, shot))
 
 
-def _tried(make: Callable[[], Outcome], *, tracing: bool = False) -> Outcome:
+def _tried(make: Callable[[], Iterator[Outcome]], *, tracing: bool = False) -> Iterator[Outcome]:
     try:
-        return make()
+        yield from make()
     except RenderError as error:
-        return Failed(str(error), tracing)
+        yield Failed(str(error), tracing)
     except TwinError as error:
-        return Failed(str(error))
+        yield Failed(str(error))
     except (RuntimeError, OSError, ValueError) as error:  # what Mitsuba, LLVM and a full disk raise
-        return Failed(f"{type(error).__name__}: {error}", tracing)
+        yield Failed(f"{type(error).__name__}: {error}", tracing)

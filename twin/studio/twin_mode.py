@@ -10,6 +10,7 @@ import numpy as np
 import viser
 
 from scenes import list_objects, list_sensors, load_object, load_sensor
+from scenes.base import SpecError
 from twin.errors import TwinError
 from twin.estimate import SensorModel
 from twin.frames.images import write_image
@@ -94,6 +95,8 @@ class TwinMode(PageMode):
         self._rebuilding = threading.Lock()
         self.contact, self.worker, self._tracer, self._scene = self._build(state)
         self._publisher = self.newest(self._publish, "page")
+        self._links = self.newest(self._open_link, "link")
+        page.on_address = self._links.give
         self._build_controls()
         with page.charts_tab:
             self._forces = Chart(page.gui, "force on the object, N", ("x", "y", "z"))
@@ -237,6 +240,8 @@ class TwinMode(PageMode):
                 for label, save in buttons.items():
                     gui.add_button(label).on_click(guarded(save))
                 opened = gui.add_upload_button("Open a state", mime_type=".json")
+                link = self.state.link(self._page.url)
+                self._link = gui.add_text("link", link, hint="opens this state again; paste another one to open it")
                 self._filming = gui.add_checkbox("record a video", False)
         self._form.on_update(guarded(self._change_form))
         self._drawing.on_update(guarded(self._change_look))
@@ -249,6 +254,7 @@ class TwinMode(PageMode):
         undo.on_click(guarded(self.undo))
         upload.on_upload(guarded(lambda: self.play(read_way(upload.value.content, upload.value.name))))
         opened.on_upload(guarded(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
+        self._link.on_update(guarded(lambda: self._links.give(self._link.value)))
         self._record_way.on_update(guarded(self._toggle_way))
         self._filming.on_update(guarded(self._toggle_film))
         for modifier, keys in (("shift", KEYS), ("cmd/ctrl+shift", TURN_KEYS)):
@@ -341,6 +347,15 @@ class TwinMode(PageMode):
             put(self._friction, self._own_friction())
             self._begin()
 
+    def _open_link(self, link: str) -> None:
+        """Show the state of a link, unless it is the one that is shown."""
+        if link.partition("?")[2] == self.state.link().partition("?")[2]:
+            return
+        try:
+            self.open(StudioState.of_link(link))
+        except SpecError as error:
+            raise TwinError(str(error)) from error
+
     # answers
 
     def _said(self, text: str) -> None:
@@ -370,6 +385,7 @@ class TwinMode(PageMode):
             if answer.arrived:
                 self._scene.place_gizmo(self._gizmo_pose(answer))
                 self._follow_sliders(answer)
+                put(self._link, self.state.link(self._page.url))
             if self._active:
                 self._page.show_pictures(camera, cells, f"camera, {answer.frame.form} frame, {answer.lit}")
                 self._page.show_numbers(*numbers)

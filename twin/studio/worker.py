@@ -13,7 +13,7 @@ from twin.studio.contact import Answer, Light, MovingContact
 from twin.studio.pose import ObjectPose
 from twin.studio.tracing import Failed, Outcome, Saved, Traced, Tracer
 
-STILL_S = 0.12
+STILL_S = 0.06
 """The object stands still once no wish has come for this time, in s."""
 REFINE_S = 1.0
 """Time in s without a wish after which the fine mesh follows. A step on it takes some 0.1 s, for which a new wish has to wait."""
@@ -173,7 +173,8 @@ class Worker(_OwnThread):
         elif self._busy():
             refined = self._contact.refine()
             if refined is not None and self._traces and self._tracer is not None:
-                self._tracer.trace(refined.number, refined.state)  # it is shown with its own picture
+                self._asked_trace = refined.solved
+                self._tracer.trace(refined.solved, refined.state)  # it is shown with its own picture
             elif refined is not None:
                 self._publish(refined)
         if wish is None:
@@ -185,14 +186,17 @@ class Worker(_OwnThread):
         if newest is None or not self._traces or self._tracer is None or self._way:
             return
         still = time.monotonic() - self._moved_s > STILL_S
-        if still and newest.lit is Light.DRAWN and newest.number != self._asked_trace:
-            self._asked_trace = newest.number
-            self._tracer.trace(newest.number, newest.state)
+        if still and newest.lit is Light.DRAWN and newest.solved != self._asked_trace:
+            self._asked_trace = newest.solved
+            self._tracer.trace(newest.solved, newest.state)
 
     def _take(self, outcome: Outcome) -> None:
         match outcome:
             case Traced():
-                answer = self._contact.traced(outcome.number, outcome.light, outcome.ms)
+                answer = None
+                if not (outcome.rough and self._newest is not None and self._newest.lit is Light.TRACED):  # no good picture gives way
+                    lit = Light.ROUGH if outcome.rough else Light.TRACED
+                    answer = self._contact.traced(outcome.solved, outcome.light, lit, outcome.ms)
                 if answer is not None:
                     self._publish(answer)
             case Shading():

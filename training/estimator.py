@@ -66,7 +66,7 @@ class PoseEstimate:
     notes : tuple of str
         Why the intervals of this frame are wider than those of others.
     seen : Observation or None
-        The pins that the estimate was made from; None if the model looks at the picture itself, or several kinds of contact are told apart.
+        The pins that the estimate was made from; None if the model looks at the picture itself.
     """
 
     names: tuple[str, ...]

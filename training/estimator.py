@@ -350,8 +350,9 @@ class PoseEstimator:
     ) -> PoseEstimate:
         if isinstance(made, Unseen):
             none = np.full(len(self.names), np.nan)
-            told = (False, made.reason, _ms(started), contact, made.touched, made.seen)
-            return PoseEstimate(self.names, self.units, none, none, none, np.nan, *told)
+            return PoseEstimate(
+                self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched, seen=made.seen
+            )
         value, half, executed = made.mean[0], made.half_width[0], float(made.executed[0])
         low, high, notes = self._widened(value, half, lost)
         value, low, high = (np.clip(each, *self._bounds) for each in (value, low, high))

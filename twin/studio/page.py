@@ -105,12 +105,12 @@ def told_addresses(tell: Callable[[str], None]) -> Iterator[None]:
     """
     serve = websockets.asyncio.server.serve
 
-    def serving(*args: Any, process_request: Callable[[ServerConnection, Request], Response | None], **more: Any) -> Any:
+    def serving(*args: Any, process_request: Callable[[ServerConnection, Request], Response | None] | None = None, **more: Any) -> Any:
         def heard(connection: ServerConnection, request: Request) -> Response | None:
             address = urlsplit(request.path)
             if address.path == "/" and address.query and request.headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin"):
                 tell(request.path)
-            return process_request(connection, request)
+            return None if process_request is None else process_request(connection, request)
 
         return serve(*args, process_request=heard, **more)
 

@@ -143,7 +143,12 @@ def test_commands_are_those_of_the_program(path):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_examples_of_the_help_are_commands_of_the_program(name):
     lines = re.sub(r"\\\n\s*", "", COMMANDS[name].example).splitlines()
-    wrong = {line: wrong_words(part.strip()) for line in lines for part in line.split("&") if "twin " in part and wrong_words(part.strip())}
+    wrong = {
+        line: wrong_words(part.strip())
+        for line in lines
+        for part in re.split(r"\s&(?:\s|$)", line)
+        if "twin " in part and wrong_words(part.strip())
+    }
     assert not wrong
 
 

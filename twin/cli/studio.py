@@ -34,7 +34,7 @@ Example:
   twin studio
   twin studio --sensor ur5-331 --object edge
   twin studio --state out/studio/state-1.json
-  twin studio --state '?sensor=mg400-331&object=edge&depth_mm=3&tilt_y_deg=10'
+  twin studio --state '?sensor=mg400-331&object=edge&depth_mm=3'
 """
 
 

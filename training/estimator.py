@@ -335,8 +335,8 @@ class PoseEstimator:
         """What makes contact maps; ``TrainingError`` if the run has none."""
         if self.maps is None:
             raise TrainingError(
-                f"the model of '{self.sensor.name}' makes no contact maps: recordings do not tell what acts on the skin; "
-                "train touch on simulated contacts ('twin dataset', 'twin train --model touch --target contact')"
+                f"the model of '{self.sensor.name}' makes no contact maps; train touch on simulated contacts, which tell "
+                "what acts on the skin ('twin dataset', 'twin train --model touch --target contact')"
             )
         return self.maps
 

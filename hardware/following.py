@@ -9,15 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from hardware.arms.open_arm import kind_of
 from hardware.errors import DeviceError
 from hardware.last_axis import LastAxis, turns_back_mm
 from hardware.loop import ServoLoop
 from hardware.policy_law import policy_law
-from hardware.rig import Rig, build_rig, counting_from_first, given_frame, servo_loop, steps_round
+from hardware.rig import TWIN, Rig, build_rig, counting_from_first, given_frame, servo_loop, steps_round
 from hardware.step import LoopSettings, StepRecord
 from hardware.timing import Timing
 from hardware.trajectory import Measures, Trajectory, measure, trajectory_figure, trajectory_of, write_csv
 from scenes import ObjectSpec, ServoSpec, load_experiment
+from scenes.files import shown
 from twin.errors import OptionError, TwinError
 from twin.estimate import Estimate, SensorModel
 from twin.policy import PolicyModel
@@ -53,7 +55,8 @@ class FollowPlan:
     servo : ServoSpec
         Gains, speeds and where the object stands.
     camera, arm : str
-        As for ``build_rig``.
+        As for ``build_rig``. Without a camera the twin's frames are drawn, for a simulated arm alone: a real one would move by what it
+        does not touch.
     steps : int or None
         Number of steps. None: once around the object.
     stream_hz : float or None
@@ -78,7 +81,7 @@ class FollowPlan:
 
     stimulus: ObjectSpec
     servo: ServoSpec
-    camera: str = "twin"
+    camera: str = ""
     arm: str = "simulated"
     steps: int | None = None
     stream_hz: float | None = None
@@ -97,6 +100,13 @@ class FollowPlan:
             raise DeviceError(f"--rate {self.stream_hz:g}: expected {SLOWEST_HZ:g} to {FASTEST_HZ:g} decisions a second")
         if self.steps is not None and not 1 <= self.steps <= MOST_STEPS:
             raise DeviceError(f"--steps {self.steps}: expected 1 to {MOST_STEPS}")
+        if not self.camera:
+            if kind_of(self.arm) != "simulated":
+                raise OptionError(
+                    f"--arm {shown(self.arm)} moves by what a camera sees: give the sensor's with --camera; '--camera twin' draws the "
+                    "frames for the pose that the arm reports, and such a loop does not feel what it touches"
+                )
+            object.__setattr__(self, "camera", TWIN)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from scenes.body import MOST_POISSON
 from scenes.load import SHIPPED
 from training.estimator import PoseEstimator
 from training.recipes import TrainingError
-from twin.errors import ContactError, FrameError, TwinError
+from twin.errors import ContactError, FrameError, OptionError, TwinError
 from twin.frames import open_recording
 from twin.frames.forms import form_of, known_frames
 from twin.geometry.solid import Resolution
@@ -48,6 +48,14 @@ def test_rates_that_are_none_are_refused_with_their_range(number):
         emulate_magician(time_scale=number)
     with pytest.raises(DeviceError, match="--rate .*: expected 0.1 to 1000 decisions a second"):
         FollowPlan(load_object("can"), load_servo("surface"), stream_hz=number)
+
+
+@pytest.mark.parametrize("arm", ["mg400", "mg400:127.0.0.1", "mg400-lenient:127.0.0.1", "magician:/dev/ttyUSB0"])
+def test_a_real_arm_is_not_moved_by_drawn_frames_unless_that_is_said(arm):
+    thing, servo = load_object("can"), load_servo("surface")
+    with pytest.raises(OptionError, match="give the sensor's with --camera"):
+        FollowPlan(thing, servo, arm=arm)
+    assert FollowPlan(thing, servo, arm=arm, camera="twin").camera == FollowPlan(thing, servo, arm="simulated:4").camera == "twin"
 
 
 @pytest.mark.parametrize("count", [0, -1, 2_000_000_000])

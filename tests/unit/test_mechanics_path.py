@@ -17,6 +17,7 @@ from twin.mechanics.path import plan_path
 from twin.objects import build_field
 
 SOLVER_MM = 1e-4  # what the residual's tolerance leaves open in a position
+SIDE_SHARE = 0.02  # of a side force before slip, whatever the load step
 STEP_SHARE = 0.03  # of the largest motion: load steps half as large, with friction
 WORK_SHARE = 0.05  # of the work: trapezoids over load steps of 0.15 mm, and what sticking points creep
 
@@ -261,6 +262,18 @@ def test_an_edge_s_shear_does_not_depend_on_the_load_step(solver):
     edge, pose_ = load_object("edge"), ContactPose(2.0, shear_mm=(1.5, 0.0))
     forces = np.array([last(solver.path(edge, pose_, friction=0.5, step_mm=mm)).force_n for mm in (0.2, 0.3, 0.6)])
     assert np.linalg.norm(np.ptp(forces, axis=0)) < 0.01 * np.linalg.norm(forces[0])
+
+
+@pytest.mark.parametrize(("name", "tilt_deg"), [("plane", 15.0), ("edge", 7.5)])
+def test_the_side_force_before_slip_hardly_depends_on_the_load_step(solver, name, tilt_deg):
+    """A front of contact that passes several points in one step slips over them all the same."""
+    short, usual, long = (
+        last(solver.path(load_object(name), ContactPose(1.2, tilt_deg=(0.0, tilt_deg)), friction=0.5, step_mm=mm)).force_n
+        for mm in (0.1, 0.4, 0.6)
+    )
+    assert abs(short[0]) > 0.05 * short[2]
+    assert abs(usual[0] - short[0]) < SIDE_SHARE * abs(short[0]) and abs(long[0] - short[0]) < SIDE_SHARE * abs(short[0])
+    assert np.linalg.norm(long - short) < 0.004 * np.linalg.norm(short)
 
 
 @pytest.mark.parametrize("friction", [Friction(0.3, 0.3), Friction(0.5, 0.2)])

@@ -1,5 +1,6 @@
 """The equations of one load step: elastic forces against contact and friction."""
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,6 +64,10 @@ class Friction:
     def __post_init__(self) -> None:
         if not (0 <= self.kinetic <= self.static < np.inf and self.weakening_mm > 0 and self.shear_strength_mpa > 0):
             raise ContactError(f"friction needs 0 <= kinetic <= static, weakening_mm > 0 and shear_strength_mpa > 0, got {self}")
+
+    def after(self, slid_mm: FloatArray) -> FloatArray:
+        """Coefficients (q,) of points that have slid so far since they last stuck."""
+        return self.kinetic + (self.static - self.kinetic) * np.exp(-slid_mm / self.weakening_mm)
 
 
 @dataclass(frozen=True)
@@ -194,8 +199,15 @@ class Problem:
         self.anchor_mm = anchor_mm[looked]
         self.stiff = penalty * points.area_mm2[looked]
         self.bound_n = friction.shear_strength_mpa * points.area_mm2[looked]
-        weakened = np.exp(-state.slid_mm[looked] / friction.weakening_mm)
-        self.friction = friction.kinetic + (friction.static - friction.kinetic) * weakened
+        self._law = friction
+        self.slid_mm = state.slid_mm[looked]
+        self.friction = friction.after(self.slid_mm)
+
+    def moved(self, T: FloatArray, anchor_mm: FloatArray, slid_mm: FloatArray) -> "Problem":
+        """The same equations with the object at ``T`` (4, 4); anchors (q, 3) and slip (q,) are those of the points looked at."""
+        other = copy(self)
+        other.T, other.anchor_mm, other.slid_mm, other.friction = T, anchor_mm, slid_mm, self._law.after(slid_mm)
+        return other
 
     def contact(self, at: FloatArray, soften: float = 1.0) -> ContactForces:
         """Contact with the points looked at in places (q, 3) of the object's frame."""

@@ -147,6 +147,18 @@ class SmallContact:
             out[near.far] = -lapack.strtrs(near.factor, right, lower=1, trans=1)[0]
         return out, y[-2:]
 
+    def newton(self, y: FloatArray, wanted: float, most: int) -> tuple[FloatArray, bool]:
+        """Solve from a start (n + 2,): moves of the near controls and the border. Also whether the residual (N) came below ``wanted``."""
+        return self._newton(y, 1.0, wanted, most)
+
+    def contact(self, y: FloatArray) -> ContactForces:
+        """Contact after moves ``y`` (n + 2,)."""
+        return self._problem.contact(self.places(y))
+
+    def places(self, y: FloatArray) -> FloatArray:
+        """The points looked at after moves ``y`` (n + 2,), in the object's frame, (q, 3)."""
+        return _moved(self._near.local, self._problem.weights, self._at, y, self._problem.T, self._border[0] + y[-2])
+
     def _newton(self, y: FloatArray, soften: float, wanted: float, most: int) -> tuple[FloatArray, bool]:
         residual, contact = self._equations(y, soften)
         norm = float(np.linalg.norm(residual))

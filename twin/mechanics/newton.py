@@ -6,6 +6,8 @@ down to the controls of the outer skin that the object may touch, and is kept as
 exactly on the small dense problem that remains: which points touch, stick or slip changes often, and is cheap to find there.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, in_object
@@ -14,6 +16,7 @@ from twin.mechanics.contact import touching_mm2
 from twin.mechanics.elements import KeptStiffness
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
+from twin.mechanics.rubbing import met, rub, rubbed, substeps
 from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -21,6 +24,8 @@ GAP_BOUND_MM = 0.01
 """No contact point ends deeper inside the object than this."""
 RESIDUAL_TOLERANCE = 1e-5
 """A step is solved when the norm of the residual is at most this share of the sum of the contact forces."""
+_ROUGH_TOLERANCE = 1e-2
+"""The same where friction within the step is still to be followed: anchors then change the solution by more."""
 _PENALTY_GROWTH = 4.0
 """Factor on the penalty when a point ends too deep."""
 _PENALTY_RAISES = 5
@@ -124,25 +129,37 @@ class LoadStepper:
         gap_before, gap = self._field.distance(before), self._field.distance(after)
         looked = np.flatnonzero((gap < _REACH_MM) | state.held)
         self._provide(looked, gap)
-        # a point that is driven into the object is anchored where it meets the surface on the way
-        driven = (gap_before > 0) & (gap < 0)
-        share = np.where(driven, gap_before / np.where(driven, gap_before - gap, 1.0), 0.0)[:, None]
-        anchors = np.where(state.held[:, None], state.anchor_mm, (1 - share) * before + share * after)
+        anchors = met(self._field, state.held, state.anchor_mm, before, after)
+        memory = replace(state, dissipated_nmm=0.0)
         penalty = state.penalty_mpa_mm
-        for _ in range(_PENALTY_RAISES):
-            problem = Problem(
+
+        def problem_now() -> Problem:
+            return Problem(
                 self._body,
                 self._field,
                 self._friction,
                 self._compliance,
-                state,
+                memory,
                 anchor_mm=anchors,
                 looked=looked,
                 penalty=penalty,
                 T=T,
                 given=given,
             )
-            control, border, balance = self._solve(problem, control, border, control is not state.control_mm)
+
+        known = control is not state.control_mm
+        touched = state.held | ((gap_before > 0) & (gap < 0))
+        count = substeps(self._moved_mm(state, T, touched)) if self._friction.static and (touched & ~state.held).any() else 1
+        if count > 1:
+            problem = problem_now()
+            control, border, balance = self._solve(problem, control, border, known, tolerance=_ROUGH_TOLERANCE)
+            known = True
+            found = self._rubbed(problem, state, anchors, control, border, balance, count)
+            if found is not None:
+                memory, anchors = found, found.anchor_mm
+        for _ in range(_PENALTY_RAISES):
+            problem = problem_now()
+            control, border, balance = self._solve(problem, control, border, known)
             left_out = np.setdiff1d(np.arange(len(gap)), looked, assume_unique=True)
             missed = left_out[self._field.distance(self._seen(control, border, T)[left_out]) < 0]
             if len(missed):
@@ -151,7 +168,8 @@ class LoadStepper:
             elif balance.contact.penetration_mm.max(initial=0.0) > GAP_BOUND_MM:
                 penalty *= _PENALTY_GROWTH
             else:
-                return self._accepted(state, problem, control, border, balance), balance, looked
+                self._last = state
+                return self._accepted(memory, problem, control, border, balance), balance, looked
         raise NoConvergence(balance.relative)
 
     def touching_mm2(self, state: LoadState) -> float:
@@ -192,22 +210,46 @@ class LoadStepper:
 
     def _accepted(self, state: LoadState, problem: Problem, control: FloatArray, border: FloatArray, balance: Balance) -> LoadState:
         contact, looked, count = balance.contact, problem.looked, len(state.held)
-        self._last = state
         held, anchor, slid, limit = np.zeros(count, bool), np.zeros((count, 3)), np.zeros(count), np.zeros(count)
-        held[looked], anchor[looked] = contact.penetration_mm > 0, contact.anchor_mm
-        limit[looked] = np.minimum(problem.friction * contact.normal_n, problem.bound_n)
-        moved = np.linalg.norm(contact.anchor_mm - problem.anchor_mm, axis=1)
-        slid[looked] = np.where(contact.slipping, state.slid_mm[looked] + moved, 0.0)
-        # a point that slips bears the limit of friction, which changes in the step with its normal force and its slip
-        lost = float(((state.limit_n + limit)[looked] / 2 * moved)[contact.slipping].sum())
-        return LoadState(control, border, anchor, held, slid, limit, problem.penalty, problem.T, balance.elastic_nmm, lost)
+        held[looked] = contact.penetration_mm > 0
+        anchor[looked], slid[looked], limit[looked], lost = rub(problem, contact, state.limit_n[looked])
+        return LoadState(
+            control, border, anchor, held, slid, limit, problem.penalty, problem.T, balance.elastic_nmm, state.dissipated_nmm + lost
+        )
+
+    def _moved_mm(self, state: LoadState, T: FloatArray, which: BoolArray) -> float:
+        """How far the object moves in a step to ``T`` (4, 4), seen from those of all points (p,)."""
+        at = self._body.points.positions(state.control_mm)[which]
+        return float(np.linalg.norm(carried(at, state.T, T), axis=1).max(initial=0.0))
+
+    def _rubbed(
+        self,
+        problem: Problem,
+        state: LoadState,
+        anchors: FloatArray,
+        control: FloatArray,
+        border: FloatArray,
+        balance: Balance,
+        count: int,
+    ) -> LoadState | None:
+        """What friction did within the step (see ``rubbing.rubbed``)."""
+        if self._tangent is None:
+            self._tangent = self._linearise(problem, control, border, 0.0)
+        near, local = self._nearest(problem, self._tangent), self._local[problem.looked]
+        return rubbed(problem, state, anchors, self._field, near, self._tangent, local, control, border, balance, count=count)
+
+    def _nearest(self, problem: Problem, tangent: Tangent) -> Near:
+        """The tangent eliminated down to the points looked at; the last one is kept."""
+        if self._near is None or self._near[0] is not tangent or not np.array_equal(self._near[1], problem.looked):
+            self._near = tangent, problem.looked, Near.of(tangent, self._local[problem.looked])
+        return self._near[2]
 
     def _seen(self, control: FloatArray, border: FloatArray, T: FloatArray) -> FloatArray:
         """All contact points in the object's frame, (p, 3)."""
         return in_object(self._body.points.positions(control), T, border)
 
     def _solve(
-        self, problem: Problem, control: FloatArray, border: FloatArray, extrapolated: bool
+        self, problem: Problem, control: FloatArray, border: FloatArray, extrapolated: bool, *, tolerance: float = RESIDUAL_TOLERANCE
     ) -> tuple[FloatArray, FloatArray, Balance]:
         balance = problem.balance(control, border)
         if balance is None:
@@ -217,7 +259,7 @@ class LoadStepper:
         secants: _Secants | None = None
         most_inner = self.inner_iterations + _INNER_ITERATIONS
         for _ in range(_ITERATIONS):
-            if balance.relative <= RESIDUAL_TOLERANCE:
+            if balance.relative <= tolerance:
                 return control, border, balance
             if self.inner_iterations > most_inner:
                 break
@@ -248,7 +290,7 @@ class LoadStepper:
             shift, astray = 0.0, False
             last, accepted = balance.absolute, accepted + 1
             control, border, balance = new, new_border, trial
-        if balance.relative <= RESIDUAL_TOLERANCE:
+        if balance.relative <= tolerance:
             return control, border, balance
         raise NoConvergence(balance.relative)
 
@@ -291,14 +333,12 @@ class LoadStepper:
         eliminated = tangent.eliminated
         kept = eliminated.kept
         forward = eliminated.forward(elastic)
-        volume_residual = balance.border_residual[1]
+        volume_residual, near = balance.border_residual[1], self._nearest(problem, tangent)
         if tangent.volume_column is not None:
             inner = np.ones(len(forward), bool)
             inner[kept] = False
             volume_residual = volume_residual - tangent.volume_column[inner] @ forward[inner]
-        if self._near is None or self._near[0] is not tangent or not np.array_equal(self._near[1], problem.looked):
-            self._near = tangent, problem.looked, Near.of(tangent, self._local[problem.looked])
-        small = SmallContact(problem, self._near[2], tangent.volume_pivot, forward[kept], volume_residual, control, border)
+        small = SmallContact(problem, near, tangent.volume_pivot, forward[kept], volume_residual, control, border)
         kept_move, border_move = small.solve(balance, soften=soften, least=0.1 * RESIDUAL_TOLERANCE)
         self.inner_iterations += small.iterations
         if tangent.volume_column is not None:

@@ -97,6 +97,12 @@ def test_a_layout_whose_end_is_cut_off_is_never_sure(pins, part):
         assert found.candidates[1].pins.rings == found.best.pins.rings + 1, "the next larger layout is shown"
 
 
+def test_a_pin_that_the_rim_lacks_may_be_dark_and_is_not_sure():
+    whole = PinsSpec(rings=4)
+    found = identify(frames_of(np.delete(rest_of(whole), 50, axis=0), contact_px=3.0, ring=False))
+    assert found.best.pins.missing and not found.sure and any("too dark to be seen" in doubt for doubt in found.doubts)
+
+
 def test_frames_turned_and_filled_show_the_layout():
     """A turned frame's corners are filled, and its cut pins are not in view: they count neither for the layout nor against it."""
     pins = PinsSpec(rings=6)

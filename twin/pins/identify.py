@@ -575,6 +575,12 @@ def _doubts(found: list[Candidate]) -> list[str]:
         )
     if best.agreeing < SURE_AGREEING:
         doubts.append(f"only {100 * best.agreeing:.0f} % of the frames show {best.pins.in_words()}; give frames with less contact")
+    complete = best.pins.model_copy(update={"missing": ()})
+    if at_rim := sorted(set(best.pins.missing) & set(pin_lattice(complete).outmost.tolist())):
+        doubts.append(
+            f"pin {', '.join(map(str, at_rim[:5]))} at the rim is in no frame: missing, or too dark to be seen; look there in the "
+            "overlay, and give the layout"
+        )
     for other in found[1:]:
         if other.explained > best.explained - SURE_AHEAD and (other.misfit == np.inf or best.misfit > SAME_SHAPE * other.misfit):
             doubts.append(f"{other.pins.in_words()} explain nearly as much; count the pins of one ring or row, and give the layout")

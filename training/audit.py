@@ -85,7 +85,7 @@ def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
     moved = (pins.nodes_px - pins.reference.pins_px).reshape(len(pins), -1)
     size = np.linalg.norm(moved, axis=1)
     no_contact = size < STILL * np.median(size)
-    labels = _Labels.of(pose, move)
+    labels = LabelColumns.of(pose, move)
     degree, untold = labels.degree(int((~no_contact).sum()))
     if untold:
         nowhere = np.zeros(len(pins), bool)
@@ -101,7 +101,7 @@ def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
     still = np.abs(move[:, labels.moved]).max(axis=1, initial=0.0) == 0
     done, tilt, used = np.ones(len(pins), bool), 0.0, ~no_contact
     for _ in range(ROUNDS):
-        terms = np.stack([_polynomials(story, degree) for story in stories])
+        terms = np.stack([polynomials(story, degree) for story in stories])
         chosen = terms[np.where(done, 0, 1), np.arange(len(pins))]
         weight = np.linalg.lstsq(chosen[used], modes[used], rcond=None)[0]
         residual = modes[used] - chosen[used] @ weight
@@ -133,7 +133,7 @@ def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
 
 
 @dataclass(frozen=True)
-class _Labels:
+class LabelColumns:
     """Which labels of a recording vary.
 
     Attributes
@@ -149,7 +149,7 @@ class _Labels:
     direction: int | None
 
     @classmethod
-    def of(cls, pose: np.ndarray, move: np.ndarray) -> "_Labels":
+    def of(cls, pose: np.ndarray, move: np.ndarray) -> "LabelColumns":
         turning = [k for k in range(3, 6) if np.ptp(pose[:, k]) > HALF_CIRCLE_DEG]
         direction = turning[-1] if turning else None
         posed = np.array([k for k in range(6) if np.ptp(pose[:, k]) > 0 and k != direction], int)
@@ -176,7 +176,7 @@ class _Labels:
         some = np.zeros((1, 6))
         count = max(self.columns(some, some).shape[1], FEW)
         lowest = DEGREE if count <= FEW else LOWEST
-        needed = {degree: FRAMES_A_TERM * _polynomials(np.zeros((1, count)), degree).shape[1] for degree in range(lowest, DEGREE + 1)}
+        needed = {degree: FRAMES_A_TERM * polynomials(np.zeros((1, count)), degree).shape[1] for degree in range(lowest, DEGREE + 1)}
         fitting = [degree for degree, frames in needed.items() if frames <= touching]
         if fitting:
             return fitting[-1], ""
@@ -192,7 +192,8 @@ def _modes(moved: np.ndarray, used: np.ndarray) -> np.ndarray:
     return (moved - mean) @ directions[: min(MODES, len(directions))].T
 
 
-def _polynomials(story: np.ndarray, highest: int) -> np.ndarray:
+def polynomials(story: np.ndarray, highest: int) -> np.ndarray:
+    """All products (M, P) of up to ``highest`` columns of labels (M, C), the constant one first."""
     columns = [np.ones(len(story))]
     for degree in range(1, highest + 1):
         columns += [story[:, list(which)].prod(axis=1) for which in combinations_with_replacement(range(story.shape[1]), degree)]
@@ -245,7 +246,7 @@ def _depth_per_move(
     step = 1e-3
     nudged = story.copy()
     nudged[:, depth] += step
-    along = (_polynomials(nudged, degree) - terms) @ weight / step
+    along = (polynomials(nudged, degree) - terms) @ weight / step
     residual = modes - terms @ weight
     steep = np.einsum("mi,ij,mj->m", along, precision, along, optimize=True)
     beyond = depth_scale * np.einsum("mi,ij,mj->m", along, precision, residual, optimize=True) / np.maximum(steep, 1e-12)

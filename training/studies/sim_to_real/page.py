@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from scenes.randomisation import FrictionSpread
+from training.studies.sim_to_real.inverted import BACKWARDS
 from training.targets import unit_of
 from twin.report.charts import muted, plain_log, sized_figure, write_chart
 from twin.report.numbers import number
@@ -94,6 +95,8 @@ def write_page(
             _pins_said(error_px, friction),
             _missing_said(modes, bare=bool(_of(rows, BARE))),
             _beside_said(names, left_out),
+            "Twin backwards: the labels whose simulated pins are most like the frame's. What the twin misses is a quadratic of the label, "
+            "fitted to the labelled frames.",
             "Pins are counted from the no-contact frame of the recording, or of each simulated sensor.",
         ]
     )
@@ -167,8 +170,12 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
             ax.plot([row["labelled_frames"] for row in mine], [row[key] for row in mine], line, color=color, label=f"real frames, {model}")
         for row in _of(rows, SIMULATED):
             ax.axhline(row[key], color=BLUE, ls=(0, (5, 2)), label="twin alone")
-        for row in _of(rows, "simulated and real"):
-            ax.plot(row["labelled_frames"], row[key], "*", color=PURPLE, ms=13, label="twin and labelled frames")
+        both = _of(rows, "simulated and real")
+        for row in both:
+            if row["model"] != BACKWARDS:
+                ax.plot(row["labelled_frames"], row[key], "*", color=PURPLE, ms=13, label="twin and labelled frames")
+        if back := [row for row in both if row["model"] == BACKWARDS]:
+            ax.plot([row["labelled_frames"] for row in back], [row[key] for row in back], "^-", color=PURPLE, label="twin read backwards")
         ax.set(
             title=f"{name} error", xlabel="labelled real frames", ylabel=f"mean absolute error, {unit_of(name)}", xscale="log", yscale="log"
         )

@@ -34,6 +34,8 @@ from twin.store import output, overwriting, write_text, writes
 TWIN_EPOCHS = 60
 # Number of labelled frames that can be recorded with the rig in a morning.
 MANY = 500
+# Numbers of labelled frames that models are compared with, beside the study's own number and ``MANY``.
+COUNTS = (5, 10, 20, 100)
 # Share of the labelled frames' range of a label by which simulated states may lie outside of it.
 RANGE_MARGIN = 0.1
 # Number of modes of the displacements that are inputs of the quadratic regression.
@@ -54,11 +56,14 @@ class Frames:
         The labelled frames, drawn at random from the others.
     trained : dict of str to (m,) int
         Frames to train on without the twin: ``few``, more of them, and all that are not judged on. Each set contains those before it.
+    nested : list of (m,) int
+        Sets of ``COUNTS`` frames, with ``few`` among them, for models that learn at once. Each contains those before it.
     """
 
     test: np.ndarray
     few: np.ndarray
     trained: dict[str, np.ndarray]
+    nested: list[np.ndarray]
 
 
 def choose_frames(count: int, labels: int, seed: int) -> Frames:
@@ -74,7 +79,8 @@ def choose_frames(count: int, labels: int, seed: int) -> Frames:
         raise TrainingError(f"--labels {labels}: the recording has {len(rest)} frames beside those that are judged on")
     order = np.random.default_rng([seed, labels]).permutation(rest)
     trained = {str(n): np.sort(order[:n]) for n in (labels, MANY) if n < len(rest)}
-    return Frames(test, np.sort(order[:labels]), trained | {"all": rest})
+    nested = [np.sort(order[:n]) for n in sorted({*COUNTS, labels, MANY}) if n < len(rest)]
+    return Frames(test, np.sort(order[:labels]), trained | {"all": rest}, nested)
 
 
 def arm_labels(data: Dataset) -> list[ArmLabel]:

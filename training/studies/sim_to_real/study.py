@@ -12,6 +12,7 @@ from training.generation import generate, require_count
 from training.recipes import TrainingError
 from training.simulated import is_simulated
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
+from training.studies.sim_to_real.inverted import TwinBackwards, inverted_row
 from training.studies.sim_to_real.page import write_page
 from training.studies.sim_to_real.steps import (
     Beside,
@@ -211,6 +212,7 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
         if twin is ground.full:
             rows.append(judged("simulated and real", plan.labels, out / BESIDE, ground.real, ground.chosen.test))
     rows += _without_the_twin(ground)
+    rows += _backwards(ground, sets[ground.full.contacts])
     page = _write_page(ground, rows, beside, known[_tried(ground.full)], full_learnt)
     return Result(rows, beside.left_out, ground.residuals.error_px, [write_table(out / "study.csv", rows), page])
 
@@ -310,6 +312,17 @@ def _beside(ground: _Ground, folder: Path, sets: list[Dataset]) -> Beside:
     return made
 
 
+def _backwards(ground: _Ground, sets: list[Dataset]) -> list[dict[str, Any]]:
+    """Rows of the table for the twin read backwards, with growing numbers of labelled frames."""
+    bare = states_touching(sets, ground.plan.touched)
+    by_folder = {each.folder: each for each in sets}
+    told = [label for folder in bare.folders for label in arm_labels(by_folder[folder])]
+    like = states_like(bare, ground.few)
+    twin = TwinBackwards((bare.pins.nodes_px - bare.pins.reference.pins_px)[like], [told[row] for row in like])
+    labels = arm_labels(ground.real)
+    return [inverted_row("simulated and real", twin, ground.real, labels, rows, ground.chosen.test) for rows in ground.chosen.nested]
+
+
 def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
     """Rows of the table for the models that are trained on real frames alone."""
     rows = []
@@ -319,7 +332,9 @@ def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
             train_on_real(ground.real.rows(index), folder, seed=ground.plan.seed, epochs=ground.plan.epochs, progress=step)
         rows.append(judged("real", len(index), folder, ground.real, ground.chosen.test))
         rows.append(quadratic_row("real", ground.real, index, ground.chosen.test))
-    return rows
+    counts = {len(index) for index in ground.chosen.trained.values()}
+    others = [index for index in ground.chosen.nested if len(index) not in counts]
+    return rows + [quadratic_row("real", ground.real, index, ground.chosen.test) for index in others]
 
 
 def _write_page(ground: _Ground, rows: list[dict[str, Any]], beside: Beside, missing: Discrepancy, learnt: Dataset) -> Path:

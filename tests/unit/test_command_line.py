@@ -91,12 +91,16 @@ def test_a_function_of_the_packages_is_behind_every_command(command):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_that_writes_overwrites_nothing_foreign_unless_it_is_forced(command):
-    """Every command with ``--out`` has ``--force``, and what it calls opens its output by the store before it works."""
+    """Every command with ``--out`` has ``--force``, and what it calls opens its output by the store before it works.
+
+    The folder of ``--maps`` is opened by what writes each frame's maps (``Predictions``).
+    """
     names = {argument.arg for argument in command.args.args}
-    assert ("force" in names) == ("out" in names)
-    if "out" in names:
+    assert ("force" in names) == bool(names & {"out", "maps"})
+    if "force" in names:
         entered = [ast.unparse(item.context_expr) for part in ast.walk(command) if isinstance(part, ast.With) for item in part.items]
         assert entered[0] == "overwriting(force)"
+    if "out" in names:
         behind = [_behind(source, name) for source, name in imported(command) if _is_ours(source)]
         opens = ("@writes", " generate(", " new_sensor(")  # the second and third open what they write themselves
         assert [each for each in behind if inspect.isfunction(each) and any(word in inspect.getsource(each) for word in opens)]

@@ -12,7 +12,8 @@ from training.models.part import OneFrame
 from training.models.touch.model import TOUCH
 from training.packed import pack
 from training.recipes import TrainingError
-from training.studies.evaluation import write_frame_maps
+from training.studies.evaluation import Predictions, write_frame_maps
+from twin.errors import StoreError
 from twin.geometry.mesh import build_mesh
 from twin.mechanics.skin_map import SIDE, ContactMaps, between_nodes, skin_grid
 from twin.types import Form, Frame
@@ -102,6 +103,15 @@ def test_maps_are_written_as_arrays_and_as_a_picture(contacts, tmp_path):
         np.testing.assert_allclose(file["force_n"].sum(axis=0), file["resultant_n"])
         assert file["nodes_px"].shape == (SIDE * SIDE, 2) and file["patch"].any()
     assert picture.name == "frame_7.png" and picture.stat().st_size > 10_000
+
+
+def test_maps_overwrite_nothing_foreign(contacts, tmp_path):
+    _, run, _ = contacts
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "mine.png").write_bytes(b"mine")
+    made = Predictions(PoseEstimator.load(run), [], tmp_path / "maps")
+    with pytest.raises(StoreError, match="mine.png"):
+        list(made)
 
 
 def test_a_model_of_recordings_says_that_it_makes_no_maps(trained):

@@ -66,6 +66,8 @@ class LiveSession:
     on_estimate: Callable[[Frame, Estimate], None] | None = None
     newest: tuple[Frame, Estimate] | None = None
     count: int = 0
+    valid: int = 0
+    invalid: str = ""
     _ages: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
     _late: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
     _spent: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
@@ -102,6 +104,8 @@ class LiveSession:
             self._spent.append(now_s - taken_s)
             self._done.append(now_s)
             self.count += 1
+            self.valid += estimate.valid
+            self.invalid = self.invalid if estimate.valid else estimate.reason
             self.newest = (frame, estimate)
             if self.record is not None:
                 self.record.append(frame, estimate_line(estimate) | {"time_s": now_s})
@@ -285,6 +289,10 @@ class Watched:
         Number of frames.
     notes : list of str
         What was odd in the recording or session.
+    valid : int
+        Number of frames with a valid estimate.
+    invalid : str
+        Why the last frame without one had none.
     """
 
     timing: Timing
@@ -293,12 +301,17 @@ class Watched:
     record: Path | None
     frames: int
     notes: list[str] = field(default_factory=list)
+    valid: int = 0
+    invalid: str = ""
 
     def lines(self) -> list[str]:
         """The result in words."""
         lines = ["ended"] if self.interrupted else []
         lines += [f"note: {note}" for note in self.notes]
         lines += self.timing.lines()
+        if self.frames:
+            why = "" if self.valid == self.frames or not self.invalid else f"; the last that was not: {self.invalid}"
+            lines.append(f"{self.valid} of {self.frames} frames valid{why}")
         if self.same is not None:
             lines.append(f"{self.same[0]} of {self.same[1]} estimates are those that were recorded")
         if self.record is not None:
@@ -369,7 +382,7 @@ def watch(
             interrupted = True
         same = (same_estimates(source.steps, found), len(found)) if isinstance(source, SessionSource) else None
         notes = source.notes() if isinstance(source, SequentialSource) else []
-        return Watched(session.timing(), interrupted, same, plan.record, session.count, notes)
+        return Watched(session.timing(), interrupted, same, plan.record, session.count, notes, session.valid, session.invalid)
 
 
 def _catch_up(session: LiveSession, kept: KeptAlso) -> None:

@@ -152,6 +152,10 @@ def layout_from(text: str) -> PinsSpec:
         It is none of these, or impossible.
     """
     kind, _, size = text.partition(":")
+    if kind in ("rings", "hexagon") and not size.strip().isdecimal():
+        raise SpecError(f"layout {text}: the number of rings is missing or no number; give for example {kind}:10")
+    if kind == "grid" and not all(part.strip().isdecimal() for part in size.partition("x")[::2]):
+        raise SpecError(f"layout {text}: the numbers of columns and rows are missing or no numbers; give for example grid:9x7")
     try:
         if kind in ("rings", "hexagon"):
             return PinsSpec(layout="rings" if kind == "rings" else "hexagon", rings=int(size))

@@ -413,6 +413,8 @@ class BlobSpec(Section):
         compared with its surroundings. It takes caps with a pattern, of uneven light, and near reflections.
     rest_px : (N, 2) float
         Where the pins were measured without contact, in this form's frames; empty: where the camera sees them by the specification.
+    rest_origin : {"measured", "contacts"}
+        Whether ``rest_px`` was measured in a frame without contact, or made from contacts, which is less exact.
     """
 
     threshold: float
@@ -423,6 +425,25 @@ class BlobSpec(Section):
     min_area_px2: NonNegative = 1.0
     spot_sigma_px: Annotated[float, Field(ge=0, le=200)] = 0.0
     rest_px: tuple[tuple[float, float], ...] = ()
+    rest_origin: Literal["measured", "contacts"] = "measured"
+
+
+class UsualCapsSpec(Section):
+    """Light and focus of a unit, as its raw frames showed them when its specification was made; 'twin check' compares with them.
+
+    Attributes
+    ----------
+    contrast : float
+        Gray levels of the caps above the skin around them, median.
+    edge_px : float
+        Width of the caps' edges, median: the distance in which the level falls from 90 to 10 % of the contrast.
+    unevenness : float
+        Gray levels by which the brightest part of the skin is brighter than most of it.
+    """
+
+    contrast: Positive
+    edge_px: Positive
+    unevenness: NonNegative = 0.0
 
 
 class PipelineSpec(Section):
@@ -434,10 +455,13 @@ class PipelineSpec(Section):
         For the camera's own frames.
     recording : BlobSpec, optional
         For the recordings' cropped and thresholded form.
+    usual_caps : UsualCapsSpec, optional
+        What the unit's raw frames showed; without it 'twin check' expects what the twin draws.
     """
 
     raw: BlobSpec
     recording: BlobSpec | None = None
+    usual_caps: UsualCapsSpec | None = None
 
 
 class GeometrySpec(Section):

@@ -84,7 +84,9 @@ def test_measured_places_at_rest_take_the_place_of_projected_ones():
     [
         ("rings:0", "greater than or equal to 1"),
         ("rings:x", "rings:10"),
+        ("rings", "the number of rings is missing"),
         ("grid:9", "grid:9x7"),
+        ("grid:9xb", "columns and rows are missing or no numbers"),
         ("cubes:3", "not known"),
         ("positions:nowhere.csv", "nowhere.csv"),
     ],

@@ -14,6 +14,7 @@ from PIL import Image
 
 from scenes import load_sensor
 from training.targets import choose_targets
+from twin.cli.frames import lines_of
 from twin.errors import FrameError, StoreError
 from twin.frames import evenly_read, natural_key, open_recording, read_image
 from twin.frames.images import write_image
@@ -383,6 +384,9 @@ def test_batch_writes_what_it_promises(tmp_path, spec, pictures):
     assert (np.isnan(arrays["pins_px"]) ^ np.isnan(arrays["predicted_px"])).all()
     written = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert written == summary and written["frames"] == 3 and written["exact_fraction"] == pytest.approx(2 / 3)
+    assert written["in_view"] == n
+    assert next(lines_of(written, n)).startswith(f"3 frames, all {n} pins found in 66.67 %")
+    assert f"all pins in view ({n - 20} of {n};" in next(lines_of(written | {"in_view": n - 20.0}, n))
     assert written["parameters"]["reference"] == "init_0.png" and set(written["ms"]["total"]) == {"p50", "p95", "p99"}
     assert sorted(p.name for p in (tmp_path / "out" / "overlay").iterdir()) == sorted(names)
     assert seen[-1] == (3, 3)

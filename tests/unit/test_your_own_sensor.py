@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from drawn_frames import drawn_frame
+from scipy.spatial import cKDTree
 from test_identify import frames_of, rest_of
 
 from scenes import load_sensor
@@ -14,10 +15,14 @@ from scenes.pins import PinsSpec
 from training.estimator import PoseEstimator
 from training.studies.evaluation import predict_frames
 from twin.errors import FrameError, TwinError
-from twin.fit.new_sensor import new_sensor
+from twin.fit.camera_pose import CameraReport
+from twin.fit.new_sensor import _at_rest, _doubtful, _given, _health, new_sensor
+from twin.fit.rest import Rest
 from twin.fit.rest import rest_of as rest_found
 from twin.frames import frames_at, open_recording
-from twin.pins import Pipeline, tune, with_detector
+from twin.pins import Grade, Pipeline, examine, nominal_reference, tune, with_detector
+from twin.pins.batch import recording_reference
+from twin.pins.detector_spec import shipped_detector
 from twin.pins.identify import Candidate, Seen
 from twin.types import Form, Frame
 
@@ -42,6 +47,26 @@ def made(tmp_path_factory):
     folder = folder_of(tmp_path, images, [*(f"frame_{k}.png" for k in range(4)), "no_contact.png"])
     (folder / "frame_4.png").write_bytes((folder / "frame_3.png").read_bytes()[:5000])
     return new_sensor(folder, tmp_path / "mine.toml"), rest, folder
+
+
+def test_frames_that_a_specification_was_made_from_are_well(made):
+    """Also where the picture's border cuts pins off: they are not lost."""
+    found, rest, folder = made
+    spec = load_sensor(found.written[0])
+    frames = list(open_recording(folder, spec))
+    findings = {f.name: f for f in examine(frames, spec)}
+    assert {findings[name].verdict for name in ("brightness", "focus", "stray light", "pins")} == {Grade.GOOD}, findings
+    assert spec.pipeline.usual_caps is not None and f"({spec.pipeline.usual_caps.contrast:.0f} expected)" in findings["brightness"].text
+    cut = int(rest[:, 0].max()) - 15  # before the outermost pins on the right
+    camera = spec.camera.model_copy(update={"width_px": cut})
+    cropped = spec.model_copy(update={"camera": camera})
+    frames = [Frame(np.ascontiguousarray(frame.image[:, :cut]), Form.RAW, frame.name) for frame in frames]
+    pipeline = Pipeline(cropped, Form.RAW)
+    assert all(pipeline(frame).expected < 61 for frame in frames)
+    pins = next(f for f in examine(frames, cropped) if f.name == "pins")
+    assert pins.verdict is Grade.GOOD and "lie outside the picture" in pins.text, pins
+    health, _ = _health(cropped, Form.RAW, frames, folder)
+    assert health.all_pins == 1.0 and not health.steadily_lost
 
 
 def test_a_folder_of_frames_becomes_a_sensor(made):
@@ -93,6 +118,40 @@ def test_without_a_no_contact_frame_a_rest_layout_is_made_and_said():
     median = np.sqrt(np.mean(np.sum((layout.rest_px - rest) ** 2, axis=1)))
     assert found.source == "made" and "--no-contact" in found.line()
     assert error < 0.6 * median
+
+
+def test_places_at_rest_that_were_made_from_contacts_are_said_to_be(tmp_path):
+    spec = load_sensor("mg400-127")
+    rest_px = tuple(map(tuple, nominal_reference(spec, Form.RAW).pins_px.tolist()))
+    cv2.imwrite(str(tmp_path / "f_0.png"), drawn_frame(spec, Form.RAW, np.array(rest_px)).image)
+    told = {}
+    for origin in ("measured", "contacts"):
+        blob = spec.pipeline.raw.model_copy(update={"rest_px": rest_px, "rest_origin": origin})
+        own = spec.model_copy(update={"pipeline": spec.pipeline.model_copy(update={"raw": blob})})
+        told[origin] = []
+        recording_reference(own, open_recording(tmp_path, own), told[origin])
+    assert "tenth of a spacing" in told["contacts"][0] and "measured before" in told["measured"][0]
+    layout = Candidate(PINS, 1.0, 1.0, 0, 0, 0.0, rest_of(PINS), np.ones(61), ())
+    detector = shipped_detector(spec, Form.RAW)
+    for source, origin in (("made", "contacts"), ("found", "measured")):
+        assert _at_rest(detector, spec.model_copy(update={"pins": PINS}), Rest(rest_of(PINS), source), layout).blob.rest_origin == origin
+
+
+def test_a_layout_that_was_given_and_is_wrong_is_told_which_one_is_right():
+    images = frames_of(rest_of(PINS), 2)
+    found = _given(PinsSpec(rings=3), images)
+    assert not found.sure and "61 pins in 4 rings explain 100.0 %" in found.doubts[0], found.doubts
+    with pytest.raises(FrameError, match="they show 61 pins in 4 rings; leave --layout out"):
+        _given(PinsSpec(rings=2), images)
+    assert _given(PINS, images).sure
+
+
+def test_stretched_and_few_frames_are_told():
+    rest = Rest(rest_of(PINS), "given")
+    spacing = float(np.median(cKDTree(rest.pins_px).query(rest.pins_px, k=2)[0][:, 1]))
+    assert not _doubtful(CameraReport(0.1 * spacing, 61, {}, {}), rest, 40)
+    assert "stretched" in _doubtful(CameraReport(0.3 * spacing, 61, {}, {}), rest, 40)[0]
+    assert "3 frames are few" in _doubtful(CameraReport(0.1 * spacing, 61, {}, {}), rest, 3)[0]
 
 
 def test_frames_of_another_size_are_tuned_and_then_observed():

@@ -42,7 +42,8 @@ init_0.png or --no-contact, in a frame that shows no contact, or made from many 
 camera fitted. Where the layout is unsure, the two likeliest are named with what would decide; then give --layout.
 
 With --labels TABLE it goes on to the contact, as 'twin calibrate contact' does; with --optics to light and colours, as 'twin calibrate
-optics' does (raw frames). With --camera a live camera takes the place of the folder: it says when to press.
+optics' does (raw frames). --table TABLE only names the frames and their order, and fits nothing. With --camera a live camera takes the
+place of the folder: it says when to press.
 
 \b
 Writes:
@@ -60,7 +61,8 @@ Writes:
 \b
 Example:
   twin new recordings/mine --out mine.toml
-  twin new recordings/mine --labels targets.csv --out mine.toml
+  twin new recordings/mine --labels recordings/mine/targets.csv \\
+      --out mine.toml
   twin new --camera /dev/video0 --out mine.toml
 """
 

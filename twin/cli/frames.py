@@ -32,7 +32,9 @@ Writes pins.npz:
                      are NaN in pins_px, NaN for all others
   area_px2 (M, N)    Voronoi cell areas
   found (M,), valid (M,)
-and summary.json (frames, exact_fraction, ms.<stage>.p50|p95|p99, parameters,
+and summary.json (frames, in_view: median number of pins that the picture's
+border does not cut off, exact_fraction: share of frames in which all these
+are found, ms.<stage>.p50|p95|p99, parameters,
 failed).
 
 \b
@@ -63,14 +65,16 @@ def preprocess(
     with overwriting(force), shown() as progress, stage(progress, "frames") as step:
         at = frames_at(path, table, no_contact)
         summary = preprocess_recording(at, spec, out, form=form, overlay=overlay, progress=step)
-    say(_lines(summary, spec.pins.count))
+    say(lines_of(summary, spec.pins.count))
     say(f"wrote {out / name}" for name in ("pins.npz", "summary.json") + (("overlay",) if overlay else ()))
 
 
-def _lines(summary: dict[str, Any], pins: int) -> Iterator[str]:
-    """What ``summary.json`` says, in words."""
+def lines_of(summary: dict[str, Any], pins: int) -> Iterator[str]:
+    """What ``summary.json`` says of a sensor of so many pins, in words."""
+    in_view = summary["in_view"]
+    which = f"all {pins} pins" if in_view == pins else f"all pins in view ({in_view:g} of {pins}; the picture's border cuts the others off)"
     yield (
-        f"{summary['frames']} frames, all {pins} pins found in {100 * summary['exact_fraction']:.2f} %, "
+        f"{summary['frames']} frames, {which} found in {100 * summary['exact_fraction']:.2f} %, "
         f"{summary['ms']['total']['p50']:.2f} ms per frame (median)"
     )
     yield from (f"not valid {invalid['image_name']}: {invalid['reason']}" for invalid in summary["invalid"])

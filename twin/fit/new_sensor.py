@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scenes.pins import PinsSpec
 from scenes.sensor import BlobSpec, CameraSpec, PipelineSpec, RecordingSpec, SensorSpec
@@ -15,8 +16,10 @@ from twin.frames import evenly_read, frames_at, open_recording
 from twin.frames.forms import gray_levels
 from twin.frames.images import write_image
 from twin.pins.batch import draw_overlay
+from twin.pins.caps import measure_caps
+from twin.pins.check import CAPS_MEASURED, lost_in_view, usual_caps
 from twin.pins.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, with_detector
-from twin.pins.identify import STEADY, Candidate, Identified, identify, judge_layout
+from twin.pins.identify import STEADY, Candidate, Identified, identify, judge_layout, spread
 from twin.pins.pipeline import Pipeline
 from twin.pins.tune import Tuned, tune, turned_as
 from twin.progress import Progress, silent, stage
@@ -43,6 +46,16 @@ BETTER = 0.85
 GOOD_SHARE = 0.99
 """From this share of frames with all pins on, a sensor is well seen."""
 FAIR_SHARE = 0.9
+STEADILY_LOST = 0.5
+"""Share of the frames from which on a pin that should be in view counts as steadily lost."""
+GIVEN_SHOWN = 0.9
+"""A layout that is given is doubted if it explains less than this share of what the frames show."""
+LEAST_SHOWN = 0.6
+"""A layout that is given must explain at least this share of what the frames show."""
+FEW_FRAMES = 20
+"""With fewer frames the camera's model and the pins' places at rest are less sure."""
+MOST_AWAY = 0.2
+"""A camera that meets the pins at rest only within more than this, in spacings, does not suit them: no lens squeezes one direction."""
 
 
 @dataclass(frozen=True)
@@ -186,9 +199,9 @@ def new_sensor(
         with stage(progress, "pins") as step:
             tuned = tune(looked, fitted, known=best, progress=step)
         detector = _at_rest(tuned.detector, fitted, rest, best)
-        sensor = _with_pipeline(fitted, detector)
+        sensor = _with_usual_caps(_with_pipeline(fitted, detector), looked)
         judged = looked if limit >= min(JUDGED, len(recording)) else evenly_read(recording, JUDGED)
-        odd = list(dict.fromkeys([*odd, *recording.notes()]))
+        odd = list(dict.fromkeys([*odd, *recording.notes(), *_doubtful(camera, rest, len(looked))]))
         health, pictures = _health(sensor, looked[0].form, judged, folder)
         known, assumed, steps = _told(sensor, found, rest, camera, tuned, health, recording.labels)
         write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
@@ -199,12 +212,20 @@ def new_sensor(
 def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
     """A layout that the user gives, as the frames show it."""
     shown = judge_layout(layout, images)
-    if shown is None:
-        raise FrameError(f"none of {len(images)} frames shows {layout.in_words()}; leave the layout out to have it identified")
-    doubts: tuple[str, ...] = ()
-    if shown.explained < 0.9:
-        doubts = (f"{layout.in_words()} were given, but {shown.line()}",)
-    return Identified((shown,), not doubts, doubts, 0.0)
+    if shown is not None and shown.explained >= GIVEN_SHOWN:
+        return Identified((shown,), True, (), 0.0)
+    try:
+        other = identify(images).best
+    except FrameError:
+        other = None
+    if shown is None or shown.explained < LEAST_SHOWN:
+        instead = f"; they show {other.pins.in_words()}" if other is not None else ""
+        raise FrameError(f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave --layout out to have it identified")
+    doubt = f"{layout.in_words()} were given, and explain only {100 * shown.explained:.1f} % of what is there"
+    if other is None or other.explained <= shown.explained:
+        return Identified((shown,), False, (f"{doubt}; look at the overlay: are these all pins?",), 0.0)
+    doubt += f"; {other.pins.in_words()} explain {100 * other.explained:.1f} %: leave --layout out, or correct it"
+    return Identified((shown, other), False, (doubt,), 0.0)
 
 
 def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str) -> SensorSpec:
@@ -278,7 +299,8 @@ def _at_rest(detector: DetectorSpec, sensor: SensorSpec, rest: Rest, best: Candi
     unseen = ~np.isfinite(rest.pins_px[:, 0])
     guess = turned_as(sensor.pins, best.rest_px)
     places = np.where(unseen[:, None], guess, rest.pins_px)
-    return detector.model_copy(update={"pins_px": tuple(map(tuple, places.round(2).tolist()))})
+    blob = detector.blob.model_copy(update={"rest_origin": "contacts" if rest.source == "made" else "measured"})
+    return detector.model_copy(update={"pins_px": tuple(map(tuple, places.round(2).tolist())), "blob": blob})
 
 
 def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
@@ -287,18 +309,27 @@ def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
     if detector.form == Form.RAW:
         return tuned
     usual = detector.blob.model_copy(
-        update={"threshold": -12.0, "threshold_block_px": UNKNOWN_BLOCK_PX, "rest_px": (), "spot_sigma_px": 0.0}
+        update={"threshold": -12.0, "threshold_block_px": UNKNOWN_BLOCK_PX, "rest_px": (), "rest_origin": "measured", "spot_sigma_px": 0.0}
     )
     return tuned.model_copy(update={"pipeline": tuned.pipeline.model_copy(update={"raw": usual})})
+
+
+def _with_usual_caps(sensor: SensorSpec, frames: list[Frame]) -> SensorSpec:
+    """The specification with light and focus of its caps as raw frames show them."""
+    form = frames[0].form
+    if form != Form.RAW:
+        return sensor
+    pipeline = Pipeline(sensor, form)
+    seen = [(frame, pipeline(frame)) for frame in (frames[k] for k in spread(len(frames), CAPS_MEASURED))]
+    usual = usual_caps([measure_caps(gray_levels(frame.image), o.pins_px) for frame, o in seen if o.valid])
+    return sensor.model_copy(update={"pipeline": sensor.pipeline.model_copy(update={"usual_caps": usual})})
 
 
 def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -> tuple[Health, list[Path]]:
     """How a specification does on frames, and overlay pictures of some of them."""
     pipeline = Pipeline(sensor, form)
     seen = [pipeline(frame) for frame in frames]
-    lost = np.mean([np.isfinite(o.predicted_px[:, 0]) for o in seen], axis=0)
-    inside = [(o.predicted_px > 0).all(axis=1) & (o.predicted_px < np.array(pipeline.size_px) - 1).all(axis=1) for o in seen]
-    steadily = np.flatnonzero((lost >= 0.5) & (np.mean(inside, axis=0) >= 0.5))
+    steadily = np.flatnonzero(lost_in_view(seen, pipeline)[0].mean(axis=0) >= STEADILY_LOST)
     reasons = list(dict.fromkeys(o.reason.split(":")[0] for o in seen if not o.valid))
     first = [next(f"{f.name}: {o.reason}" for f, o in zip(frames, seen, strict=True) if o.reason.startswith(r)) for r in reasons]
     health = Health(
@@ -325,6 +356,21 @@ def _enlarged(size_px: tuple[int, int]) -> int:
     return int(np.clip(round(900 / max(size_px)), 1, 6))
 
 
+def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
+    """What speaks against a camera that was fitted to the pins at rest, and what to do."""
+    notes = []
+    seen = rest.pins_px[np.isfinite(rest.pins_px[:, 0])]
+    away = camera.rms_px / float(np.median(cKDTree(seen).query(seen, k=2)[0][:, 1]))
+    if away > MOST_AWAY:
+        notes.append(
+            f"no camera sees this layout as the frames show it: the best one misses the pins at rest by {camera.rms_px:.1f} px (rms), "
+            f"{away:.2f} of their spacing; were the frames stretched? Give them as the camera wrote them"
+        )
+    if frames < FEW_FRAMES:
+        notes.append(f"{frames} frames are few: kind and focal length of the camera are unsure; give about {LIMIT}, of different contacts")
+    return notes
+
+
 def _told(
     sensor: SensorSpec, found: Identified, rest: Rest, camera: CameraReport, tuned: Tuned, health: Health, labels: dict[str, np.ndarray]
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
@@ -340,7 +386,8 @@ def _told(
         + (
             f"spots of {sensor_blob(sensor, tuned).spot_sigma_px:g} px"
             if sensor_blob(sensor, tuned).spot_sigma_px
-            else f"threshold {sensor_blob(sensor, tuned).threshold:g}, slack {evidence.threshold_slack if evidence else 0:g} gray levels"
+            else f"threshold {sensor_blob(sensor, tuned).threshold:g}, which may change by "
+            f"{evidence.threshold_slack if evidence else 0:g} gray levels"
         ),
     )
     assumed = [
@@ -443,7 +490,7 @@ def _page(
             for candidate in found.candidates
         ],
         ["layout", "explained", "agreeing", "not_seen", "left_over", "misfit"],
-        caption="Explained: share of pins in view and pin-like spots that are one another's (median). Misfit: distance of the pins at "
-        "rest from a smooth view of the layout, in spacings.",
+        caption="Explained: of the pins in view and the pin-like spots, the share that belong together (median). Misfit: distance of the "
+        "pins at rest from a smooth view of the layout, in spacings.",
     )
     return page.write(folder / "index.html")

@@ -311,7 +311,7 @@ def open_recording(
     table, no_contact = (path.table, path.no_contact) if isinstance(path, FramesAt) else (None, None)
     path = Path(path)
     if table is not None and not table.is_file() and not is_lerobot(table):
-        raise FrameError(f"{shown(table, LONGEST_PATH)}: no such table; give the path of a CSV file with --table")
+        raise FrameError(f"{shown(table, LONGEST_PATH)}: no such table; give the path of a CSV file (--table or --labels)")
     recording = _opened(path, None if spec is None else known_frames(spec), form, table)
     if no_contact is not None:
         recording.must_take_reference(no_contact)

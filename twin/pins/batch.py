@@ -40,6 +40,11 @@ NO_OWN_REFERENCE = (
     "since, record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
 )
 """What is said where the specification holds the pins' measured places at rest."""
+MADE_FROM_CONTACTS = (
+    "no no-contact frame was used, and none when the specification was made: the pins' rest places were made from contacts; expect errors "
+    "of a tenth of a spacing or so; record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+)
+"""What is said where the specification's places at rest come from contacts."""
 MEASURED_BEFORE = "measured before"
 """Stands in place of a no-contact frame's name where the pins' measured places of the specification are the reference."""
 FARTHEST_PX = 1e4
@@ -101,6 +106,7 @@ def preprocess_recording(
         "sensor": spec.name,
         "frames": len(observations),
         "exact_fraction": float(all_found.sum() / max(len(names), 1)),
+        "in_view": float(np.median([o.expected for o in observations])) if observations else 0.0,
         "valid_fraction": float(arrays["valid"].sum() / max(len(names), 1)),
         "ms": _timing(observations),
         "parameters": {
@@ -157,8 +163,9 @@ def recording_reference(spec: SensorSpec, recording: Recording, problems: list[s
             return measure_reference(spec, recording.form, recording.reference), recording.reference.name
         except FrameError as error:
             problems.append(str(error))
-    if blob_spec(spec.pipeline, recording.form).rest_px:
-        problems.append(NO_OWN_REFERENCE)
+    blob = blob_spec(spec.pipeline, recording.form)
+    if blob.rest_px:
+        problems.append(MADE_FROM_CONTACTS if blob.rest_origin == "contacts" else NO_OWN_REFERENCE)
         return nominal_reference(spec, recording.form), MEASURED_BEFORE
     problems.append(NO_REFERENCE)
     return nominal_reference(spec, recording.form), UNMEASURED
@@ -186,7 +193,9 @@ def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> n
     for px in place(observation.extra_px):
         cv2.circle(canvas, px, 6, EXTRA_RGB, 1, cv2.LINE_AA)
     name = frame.name.encode("ascii", "replace").decode()  # OpenCV's font has no other letters, and some end the process
-    text = f"{name}  {observation.found}/{len(observation.pins_px)}  {observation.reason}"
+    outside = len(observation.pins_px) - observation.expected
+    pins = f"{observation.found}/{observation.expected}" + (f" in view, {outside} outside" if outside else "")
+    text = f"{name}  {pins}  {observation.reason}"
     cv2.putText(canvas, text, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
     return canvas
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import SensorSpec, UsualCapsSpec
 from twin.camera.capture import expose
 from twin.frames.forms import gray_levels
 from twin.optics.preview import Preview
@@ -112,8 +112,12 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
         seen.append(pipeline(frame))
         if progress:
             progress(k + 1, len(frames))
-    findings = [_layout(frames, spec), _pins(seen), _spots(seen, pipeline), *_place(seen, nominal_reference(spec, form))]
-    return findings if form == Form.RECORDING else [*_light(frames, seen, promised_caps(spec), pipeline.mask), *findings]
+    findings = [_layout(frames, spec), _pins(seen, pipeline), _spots(seen, pipeline), *_place(seen, nominal_reference(spec, form))]
+    return (
+        findings
+        if form == Form.RECORDING
+        else [*_light(frames, seen, spec.pipeline.usual_caps or drawn_caps(spec), pipeline.mask), *findings]
+    )
 
 
 @dataclass(frozen=True)
@@ -180,26 +184,36 @@ def _layout(frames: list[Frame], spec: SensorSpec) -> Finding:
     layout = judge_layout(spec.pins, images)
     share = 0.0 if layout is None else layout.explained
     doubts = [f"the frames do not show {spec.pins.in_words()}"] if layout is None else other_layout(layout, images)
-    text = f"{100 * share:.1f} % of pins in view and pin-like spots are one another's" + (f"; {doubts[0]}" if doubts else "")
+    text = f"of the pins in view and the pin-like spots, {100 * share:.1f} % belong together" + (f"; {doubts[0]}" if doubts else "")
     wrong = bool(doubts) and "rather than" in doubts[0]
     remedy = "give the --sensor that these frames are of, or make one with 'twin new'; look for stray light"
     return _finding("layout", 0.0 if wrong else share, (0.9, 0.75), text, remedy)
 
 
-def _pins(seen: list[Observation]) -> Finding:
-    """Finding about lost pins, and pins that are lost in most frames."""
-    lost = np.isnan(np.stack([o.pins_px[:, 0] for o in seen]))
+def lost_in_view(seen: list[Observation], pipeline: Pipeline) -> tuple[np.ndarray, np.ndarray]:
+    """Pins (M, N) bool that are lost in M frames though the frame's border does not cut them off, and those that it does not cut off."""
+    in_view = ~np.stack([pipeline.out_of_view(o) for o in seen])
+    return np.isnan(np.stack([o.pins_px[:, 0] for o in seen])) & in_view, in_view
+
+
+def _pins(seen: list[Observation], pipeline: Pipeline) -> Finding:
+    """Finding about lost pins, and pins that are lost in most frames; those that the frame's border cuts off are not lost."""
+    lost, in_view = lost_in_view(seen, pipeline)
+    share = float(lost.sum() / max(in_view.sum(), 1))
     steady = np.flatnonzero(lost.mean(axis=0) >= STEADY)
-    text = f"{100 * lost.mean():.2f} % of the pins lost; {sum(o.valid for o in seen)} of {len(seen)} frames can be used"
+    outside = int(np.median((~in_view).sum(axis=1)))
+    text = f"{100 * share:.2f} % of the pins in view lost; {sum(o.valid for o in seen)} of {len(seen)} frames can be used"
     if 0 < len(steady) < lost.shape[1] / 2:
         text += f"; steadily lost: pin {', '.join(map(str, steady[:LISTED]))}{', ...' if len(steady) > LISTED else ''}"
+    if outside:
+        text += f"; {outside} of {lost.shape[1]} pins lie outside the picture"
     unusable = next((o.reason for o in seen if not o.valid), "")
     remedy = (
         "look at these places: caps may be off, dirty or hidden by glare"
         if not unusable
         else f"{unusable}; run 'twin tune' on these frames"
     )
-    return _finding("pins", float(lost.mean()), (0.002, 0.05), text, remedy)
+    return _finding("pins", share, (0.002, 0.05), text, remedy)
 
 
 def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
@@ -236,7 +250,7 @@ def _place(seen: list[Observation], nominal: Reference) -> list[Finding]:
     ]
 
 
-def _light(frames: list[Frame], seen: list[Observation], expected: Caps, mask: Mask) -> list[Finding]:
+def _light(frames: list[Frame], seen: list[Observation], expected: UsualCapsSpec | None, mask: Mask) -> list[Finding]:
     """Findings about brightness, saturation, focus and glare of raw frames inside the mask, compared with the ``expected`` caps."""
     looked = list(zip(frames, seen, strict=True))[:: -(-len(frames) // CAPS_MEASURED)]
     caps = [measure_caps(gray_levels(f.image), o.pins_px) for f, o in looked if np.isfinite(o.pins_px).any()]
@@ -246,10 +260,10 @@ def _light(frames: list[Frame], seen: list[Observation], expected: Caps, mask: M
         float(np.nanmedian([np.nanmedian(getattr(c, name)) for c in caps])) if caps else np.nan
         for name in ("level", "contrast", "edge_px", "diameter_px")
     )
-    promised, sharp = float(np.nanmedian(expected.contrast)), float(np.nanmedian(expected.edge_px))
+    promised, sharp, uneven = (expected.contrast, expected.edge_px, expected.unevenness) if expected else (np.nan, np.nan, 0.0)
     cap_px2 = np.pi / 4 * (diameter if np.isfinite(diameter) else USUAL_CAP_PX) ** 2
     stray, where = _stray(caps, [o for _, o in looked if np.isfinite(o.pins_px).any()], contrast)
-    usual = _unevenness(expected) / promised
+    usual = uneven / promised
     glare = float(np.median([_glare(w, mask.disc, cap_px2) for w in windows]))
     dark = (
         f"caps {level:.0f} gray levels, {contrast:.0f} above the skin ({promised:.0f} expected)"
@@ -283,11 +297,21 @@ def _light(frames: list[Frame], seen: list[Observation], expected: Caps, mask: M
     ]
 
 
+def usual_caps(caps: list[Caps]) -> UsualCapsSpec | None:
+    """Light and focus that the caps of some frames show, medians over the frames; None where no cap can be measured."""
+    measured = [c for c in caps if np.isfinite(c.contrast).any() and np.isfinite(c.edge_px).any()]
+    contrast = float(np.median([np.nanmedian(c.contrast) for c in measured])) if measured else 0.0
+    edge_px = float(np.median([np.nanmedian(c.edge_px) for c in measured])) if measured else 0.0
+    if contrast <= 0 or edge_px <= 0:
+        return None
+    return UsualCapsSpec(contrast=contrast, edge_px=edge_px, unevenness=max(float(np.median([_unevenness(c) for c in measured])), 0.0))
+
+
 @lru_cache(maxsize=2)
-def promised_caps(spec: SensorSpec) -> Caps:
-    """The caps measured in the twin's frame at rest."""
+def drawn_caps(spec: SensorSpec) -> UsualCapsSpec | None:
+    """The caps measured in the twin's frame at rest; None where it shows none."""
     twin = expose(Preview(spec).render(), spec.capture)
-    return measure_caps(gray_levels(twin), Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px)
+    return usual_caps([measure_caps(gray_levels(twin), Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px)])
 
 
 def _white(caps: list[Caps]) -> float:

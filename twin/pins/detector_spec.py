@@ -42,7 +42,7 @@ class Evidence(Section):
     frames : int
         Number of frames that were looked at.
     exact_rate : float
-        Share of the frames in which all pins were found.
+        Share of the frames in which all pins in view were found.
     low_rate : float
         Lower end of the 90 % interval of that share.
     threshold_slack : float
@@ -136,6 +136,7 @@ def with_detector(spec: SensorSpec, detector: DetectorSpec) -> SensorSpec:
     if size is not None and size != known_frames(spec).size_px.get(detector.form):
         width, height = size
         if detector.form == Form.RAW:
+            changed["pipeline"] = pipeline.model_copy(update={"usual_caps": None})  # the caps' edges have another width in these frames
             seen_px = np.array(detector.pins_px).reshape(-1, 2)
             changed["camera"] = camera_seeing(spec, seen_px, np.arange(len(seen_px))).model_copy(
                 update={"width_px": width, "height_px": height}

@@ -82,7 +82,7 @@ class Seen:
 
     @property
     def explained(self) -> float:
-        """Share of pins in view and pin-like spots that are one another's."""
+        """Of the pins in view and the pin-like spots, the share that belong together."""
         pins = int(np.isfinite(self.pins_px[:, 0]).sum())
         return pins / max(pins + self.not_seen + len(self.left_over_px), 1)
 
@@ -124,8 +124,8 @@ class Candidate:
     def line(self) -> str:
         """The candidate in words."""
         return (
-            f"{self.pins.in_words()}: explains {100 * self.explained:.1f} % of what is there; a frame has {self.not_seen:g} of its pins "
-            f"unseen and {self.left_over:g} pin-like spots besides (medians)"
+            f"{self.pins.in_words()}: explains {100 * self.explained:.1f} % of what is there; in a typical frame "
+            f"{self.not_seen:g} of its pins are not seen, and {self.left_over:g} pin-like spots are none of them"
         )
 
 

@@ -251,6 +251,12 @@ class Pipeline:
         """Which pins (N,) the frame's border cuts off: they are near it at rest, and not whole in this frame."""
         return self._at_border & (self._inside_px(nodes_px) < CUT * self.reference.spacing_px)
 
+    def out_of_view(self, seen: Observation) -> np.ndarray:
+        """Which pins (N,) the frame's border cuts off, of what was seen in a frame: lost, and no fault of the sensor."""
+        with np.errstate(invalid="ignore"):
+            cut: np.ndarray = self._cut_off(seen.predicted_px)  # NaN where a pin was found
+        return cut
+
     def _between_caps(self, frame: Frame, pins_px: np.ndarray) -> float:
         """Share of the found pins (N, 2), NaN where lost, that are no brighter than the places between them and their neighbours."""
         found = np.flatnonzero(np.isfinite(pins_px[:, 0]))

@@ -146,7 +146,7 @@ def tune(
         for d, (exact, share) in zip(tried, rates, strict=True)
     ]
     seen = sum(one.explained >= SHOWN for one in layout.seen)
-    return Tuned(tried[best].model_copy(update={"evidence": evidence}), table, doubts + _notes(evidence, seen, len(frames)))
+    return Tuned(tried[best].model_copy(update={"evidence": evidence}), table, doubts + _notes(tried[best], evidence, seen, len(frames)))
 
 
 def _shown_instead(images: list[np.ndarray]) -> str:
@@ -352,7 +352,7 @@ def _evidence(
     slack = min(abs(_threshold(tried[best]) - end) for end in ends)
     reach = np.linalg.norm(reference.pins_px - start.blob.mask_center_px, axis=1).max()
     sure: Literal["sure", "fairly sure", "unsure"] = "fairly sure" if exact >= FAIR_RATE else "unsure"
-    if low >= SURE_LOW_RATE and slack >= SURE_SLACK:
+    if low >= SURE_LOW_RATE and (slack >= SURE_SLACK or tried[best].blob.spot_sigma_px):
         sure = "sure"
     return Evidence(
         frames=n,
@@ -364,14 +364,16 @@ def _evidence(
     )
 
 
-def _notes(evidence: Evidence, seen: int, frames: int) -> list[str]:
+def _notes(best: DetectorSpec, evidence: Evidence, seen: int, frames: int) -> list[str]:
     """Reasons to doubt a tuning, and what to do."""
     notes = []
     if seen < frames:
         notes.append(f"{frames - seen} of {frames} frames don't show the whole layout clearly; they took no part in finding the mask")
     if evidence.low_rate < SURE_LOW_RATE:
         rate = 100 * evidence.exact_rate
-        notes.append(f"all pins in {rate:.0f} % of {evidence.frames} frames: too few frames, or too poor ones, to be sure; give more")
-    if evidence.threshold_slack < SURE_SLACK:
-        notes.append("the threshold has hardly any slack: better light or focus would help")
+        notes.append(
+            f"all pins in view found in {rate:.0f} % of {evidence.frames} frames: too few frames, or too poor ones, to be sure; give more"
+        )
+    if evidence.threshold_slack < SURE_SLACK and not best.blob.spot_sigma_px:
+        notes.append("the threshold may hardly change without losing pins: better light or focus would help")
     return notes

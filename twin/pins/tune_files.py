@@ -26,8 +26,6 @@ class TunedOnFrames:
     tuned : Tuned
     evidence : Evidence
         How sure it is.
-    pins : int
-        Of the sensor.
     written : list of Path
         The file, where one was wanted.
     odd : list of str
@@ -36,7 +34,6 @@ class TunedOnFrames:
 
     tuned: Tuned
     evidence: Evidence
-    pins: int
     written: list[Path]
     odd: list[str]
 
@@ -46,15 +43,18 @@ class TunedOnFrames:
         blob, exact, low = detector.blob, 100 * evidence.exact_rate, 100 * evidence.low_rate
         (x, y), radius, slack = blob.mask_center_px, blob.mask_radius_px, evidence.mask_slack_px
         lines = [
-            f"{evidence.sure}: all {self.pins} pins in {exact:.0f} % of {evidence.frames} frames (90 % sure: at least {low:.0f} %)",
+            f"{evidence.sure}: all pins in view found in {exact:.0f} % of {evidence.frames} frames (90 % sure: at least {low:.0f} %)",
             f"mask centre ({x:g}, {y:g}) px, radius {radius:g} px, {slack:g} px beyond the outermost pins",
         ]
         if recorder := detector.recording:
             lines.append(f"crop {recorder.crop_px}, adaptive threshold {recorder.threshold_offset:g} over {recorder.threshold_block_px} px")
+        elif blob.spot_sigma_px:
+            lines.append(f"bright spots of {blob.spot_sigma_px:g} px (sd); no threshold is used")
         else:
             over = f" over {blob.threshold_block_px} px, erosion {blob.erosion_px} px" if blob.threshold_block_px else ""
             lines.append(
-                f"threshold {blob.threshold:g}{over}, slack {evidence.threshold_slack:g} gray levels; least area {blob.min_area_px2:g} px2"
+                f"threshold {blob.threshold:g}{over}, may change by {evidence.threshold_slack:g} gray levels; least area "
+                f"{blob.min_area_px2:g} px2"
             )
         return [*lines, *(f"note: {note}" for note in [*self.tuned.notes, *self.odd])]
 
@@ -95,7 +95,7 @@ def tune_on_frames(
     assert evidence is not None  # ``tune`` always gives evidence
     if out is not None:
         write_detector(out, found.detector, f"Found by 'twin tune' from {len(frames)} frames of {path.name}; {evidence.sure}.")
-    return TunedOnFrames(found, evidence, sensor.pins.count, [] if out is None else [out], odd)
+    return TunedOnFrames(found, evidence, [] if out is None else [out], odd)
 
 
 def _of_another_size(recording: Recording, sensor: SensorSpec) -> list[str]:

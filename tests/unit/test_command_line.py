@@ -270,3 +270,8 @@ def test_a_missing_device_is_one_line_though_it_is_also_an_error_of_the_system(m
         main()
     said = capsys.readouterr().err
     assert end.value.code == 1 and said == "twin: error: MG400 at 127.0.0.1: no connection; check that the arm is on\n"
+
+
+def test_an_option_of_two_numbers_says_so_where_one_is_missing():
+    told = CliRunner().invoke(command_line(), ["render", "--sensor", "ur5-331", "--object", "edge", "--tilt-deg", "5", "--indent-mm", "3"])
+    assert told.exit_code == 2 and "it needs 2 numbers" in " ".join(told.output.split()), told.output

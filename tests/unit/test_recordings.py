@@ -14,13 +14,12 @@ from PIL import Image
 
 from scenes import load_sensor
 from training.targets import choose_targets
-from twin.cli.frames import lines_of
 from twin.errors import FrameError, StoreError
 from twin.frames import evenly_read, natural_key, open_recording, read_image
 from twin.frames.images import write_image
 from twin.frames.videos import is_cut
 from twin.pins import Pipeline, nominal_reference
-from twin.pins.batch import overlay_name, preprocess_recording
+from twin.pins.batch import overlay_name, preprocess_recording, summary_lines
 from twin.rig.labels import read_arm_labels
 from twin.store import write_text
 from twin.types import Form
@@ -385,8 +384,8 @@ def test_batch_writes_what_it_promises(tmp_path, spec, pictures):
     written = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert written == summary and written["frames"] == 3 and written["exact_fraction"] == pytest.approx(2 / 3)
     assert written["in_view"] == n
-    assert next(lines_of(written, n)).startswith(f"3 frames, all {n} pins found in 66.67 %")
-    assert f"all pins in view ({n - 20} of {n};" in next(lines_of(written | {"in_view": n - 20.0}, n))
+    assert next(summary_lines(written, n)).startswith(f"3 frames, all {n} pins found in 66.67 %")
+    assert f"all pins in view ({n - 20} of {n};" in next(summary_lines(written | {"in_view": n - 20.0}, n))
     assert written["parameters"]["reference"] == "init_0.png" and set(written["ms"]["total"]) == {"p50", "p95", "p99"}
     assert sorted(p.name for p in (tmp_path / "out" / "overlay").iterdir()) == sorted(names)
     assert seen[-1] == (3, 3)

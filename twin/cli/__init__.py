@@ -65,6 +65,11 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
         except KeyboardInterrupt as interrupt:
             _end_interrupted(interrupt)
+        except typer.BadParameter as error:
+            numbers = error.param.nargs if error.param is not None else 1
+            if numbers > 1:
+                error.message += f"; it needs {numbers} numbers, with a space between"
+            raise
 
 
 app = typer.Typer(name="twin", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)

@@ -6,10 +6,9 @@
 - ``twin check``: whether the sensor is well.
 """
 
-from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -57,7 +56,7 @@ def preprocess(
 ) -> None:
     from twin.cli.progress import shown
     from twin.frames import frames_at
-    from twin.pins.batch import preprocess_recording
+    from twin.pins.batch import preprocess_recording, summary_lines
     from twin.progress import stage
     from twin.store import overwriting
 
@@ -65,21 +64,8 @@ def preprocess(
     with overwriting(force), shown() as progress, stage(progress, "frames") as step:
         at = frames_at(path, table, no_contact)
         summary = preprocess_recording(at, spec, out, form=form, overlay=overlay, progress=step)
-    say(lines_of(summary, spec.pins.count))
+    say(summary_lines(summary, spec.pins.count))
     say(f"wrote {out / name}" for name in ("pins.npz", "summary.json") + (("overlay",) if overlay else ()))
-
-
-def lines_of(summary: dict[str, Any], pins: int) -> Iterator[str]:
-    """What ``summary.json`` says of a sensor of so many pins, in words."""
-    in_view = summary["in_view"]
-    which = f"all {pins} pins" if in_view == pins else f"all pins in view ({in_view:g} of {pins}; the picture's border cuts the others off)"
-    yield (
-        f"{summary['frames']} frames, {which} found in {100 * summary['exact_fraction']:.2f} %, "
-        f"{summary['ms']['total']['p50']:.2f} ms per frame (median)"
-    )
-    yield from (f"not valid {invalid['image_name']}: {invalid['reason']}" for invalid in summary["invalid"])
-    yield from (f"note: {problem}" for problem in summary["problems"])
-    yield from (f"skipped {failed['image_name']}: {failed['reason']}" for failed in summary["failed"])
 
 
 HELP_GRAPH = """Build the graphs of frames or of found pins.

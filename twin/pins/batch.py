@@ -1,8 +1,9 @@
 """The pipeline applied to a whole recording. The results are files in a folder: pins, a summary, and pictures of the found pins."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import chain, count
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -126,6 +127,19 @@ def preprocess_recording(
     if not arrays["valid"].any():
         raise FrameError(_nothing_found(path, summary, out_dir / "summary.json"))
     return summary
+
+
+def summary_lines(summary: dict[str, Any], pins: int) -> Iterator[str]:
+    """What ``summary.json`` says of a sensor of so many ``pins``, in words."""
+    in_view = summary["in_view"]
+    which = f"all {pins} pins" if in_view == pins else f"all pins in view ({in_view:g} of {pins}; the picture's border cuts the others off)"
+    yield (
+        f"{summary['frames']} frames, {which} found in {100 * summary['exact_fraction']:.2f} %, "
+        f"{summary['ms']['total']['p50']:.2f} ms per frame (median)"
+    )
+    yield from (f"not valid {invalid['image_name']}: {invalid['reason']}" for invalid in summary["invalid"])
+    yield from (f"note: {problem}" for problem in summary["problems"])
+    yield from (f"skipped {failed['image_name']}: {failed['reason']}" for failed in summary["failed"])
 
 
 def _observed(

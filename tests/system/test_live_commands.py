@@ -57,6 +57,9 @@ class StandIn:
     def check(self, sensor, form) -> None:
         assert form == self.form
 
+    def remembering(self) -> "StandIn":
+        return self
+
     def __call__(self, frame):
         if self.true is not None:
             return self.true(frame)
@@ -200,7 +203,7 @@ def test_live_records_and_replays_the_same(stand_in, tmp_path):
     for k in range(5):
         write_image(folder / f"frame_{k}.png", (rng.random((360, 360)) > 0.7).astype(np.uint8) * 255)
     told = run("live", "--camera", folder, "--model", "any", "--headless", "--record", tmp_path / "s", "--also", "lerobot")
-    assert "5 steps" in told
+    assert "5 steps" in told and "5 of 5 frames valid" in told
     assert [episode.length for episode in open_records(tmp_path / "s" / "lerobot").episodes] == [5]
     with pytest.raises(OptionError, match="--also goes with --record"):
         run("live", "--camera", folder, "--model", "any", "--headless", "--also", "lerobot")

@@ -82,8 +82,9 @@ def test_a_folder_of_frames_becomes_a_sensor(made):
     assert found.camera.rms_px < 1.5 and found.health.all_pins == 1.0
     page = found.written[1].read_text()
     assert "What is assumed" in page and "overlay-1.png" in page
-    (note,) = [line for line in found.lines() if line.startswith("note: ")]
+    note, few = [line for line in found.lines() if line.startswith("note: ")]
     assert "skipped frame_4.png: truncated PNG" in note and "skipped frame_4.png" in page, "what was left out is told"
+    assert "4 frames are few" in few, few
 
 
 def test_the_specification_is_short_and_commented(made):

@@ -31,6 +31,16 @@ def _no_truth(value: object) -> object:
     return value
 
 
+def _data_uri(text: str) -> str:
+    head, _, content = text.partition(",")
+    if not (head.startswith(PICTURE) and head.endswith(";base64") and content):
+        raise ValueError("expected a picture: { picture = 'file name' } of a PNG, JPEG or WebP file, or of a text file with its data URI")
+    return text
+
+
+PICTURE = "data:image/"
+"""Beginning of a picture as text: a data URI (RFC 2397) with base64 content."""
+Picture = Annotated[str, AfterValidator(_data_uri)]
 Name = Annotated[str, AfterValidator(_plain_name)]
 # For a choice of numbers: refuses true and false, which Python (and therefore ``Literal``) takes for 1 and 0.
 NotTruth = BeforeValidator(_no_truth)

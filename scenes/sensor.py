@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from scenes.base import Fraction, Index, Name, NearOne, NonNegative, NotTruth, Positive, Rgb, Section
+from scenes.base import Fraction, Index, Name, NearOne, NonNegative, NotTruth, Picture, Positive, Rgb, Section
 from scenes.body import GelSpec, SkinSpec
 from scenes.pins import PinsSpec
 from scenes.rig import RigSpec
@@ -182,6 +182,23 @@ class RimSpec(Section):
         return self
 
 
+class BackgroundSpec(Section):
+    """Measured light of everything that contacts do not change, on top of the formulas: housing, flare, glints, bubbles.
+
+    The default of ``span`` is that of 'twin calibrate optics'.
+
+    Attributes
+    ----------
+    light : picture of the camera's whole frame, red, green and blue; of another size it is scaled to the frame
+        Added linear light, which may be negative. A level v stands for ``sign(v - 128) span (|v - 128| / 127)^2.2``.
+    span : float
+        Light of the levels 255 and (negative) 1, as a share of saturation.
+    """
+
+    light: Picture
+    span: Positive = 2.0
+
+
 class HousingSpec(Section):
     """The bright ring and wall around the disc that the camera sees: a flat annulus in the air.
 
@@ -212,6 +229,8 @@ class HousingSpec(Section):
         Radiance with which the innermost ``fill_width_mm`` of the ring light the gel.
     rim : RimSpec, optional
         Light measured on top of all that.
+    background : BackgroundSpec, optional
+        Light measured on top of the rim's, at each pixel of the frame.
     """
 
     aperture_radius_mm: Positive = 16.6
@@ -231,6 +250,7 @@ class HousingSpec(Section):
     fill: NonNegative = 0.0
     fill_width_mm: Positive = 4.0
     rim: RimSpec | None = None
+    background: BackgroundSpec | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -261,6 +281,44 @@ class SpeckSpec(Section):
     light: NonNegative = 0.0
 
 
+class ReliefSpec(Section):
+    """What was measured of caps and of the skin around them: a reflectance added to the smooth model's, at places fixed to each cap.
+
+    Each pin has a square tile of cells in the plane of its cap. The tile moves and turns with the cap, and the lights that light
+    the cap light it: the added light is the tile's value times the cap's irradiance divided by pi. A place belongs to the nearest cap.
+    The defaults are a tile of both caps and skin as it was measured.
+
+    Attributes
+    ----------
+    tiles : picture
+        Red, green and blue of all tiles, row by row, as many in a row as fit the picture's width. A level v stands for the
+        reflectance ``sign(v - 128) span (|v - 128| / 127)^1.5``, which may be negative.
+    count : int
+        Number of tiles.
+    span : float
+        Reflectance of the levels 255 and (negative) 1.
+    cells : int
+        Cells along a tile's side; between their centres the value is bilinear.
+    reach : float
+        Distance of a tile's outermost cell centres from its middle along the sides, cap radii. One side is along the projection of the
+        sensor's x.
+    caps, skin : bool
+        Whether the tiles are used on the caps with their edges (up to ``SKIN_FROM`` cap radii), and on the skin around.
+    pattern : int
+        0: each pin has its own tile. Another number is another print of the sensor: each pin's tile is drawn at random, with the mean
+        and the covariance of all measured tiles.
+    """
+
+    tiles: Picture
+    count: Annotated[int, Field(ge=1)]
+    span: Positive = 0.5
+    cells: Annotated[int, Field(ge=3)]
+    reach: Positive
+    caps: bool = True
+    skin: bool = True
+    pattern: Annotated[int, Field(ge=0)] = 0
+
+
 class AppearanceSpec(Section):
     """Reflectances (linear RGB, 0 to 1) of what the camera sees in the gel.
 
@@ -288,6 +346,8 @@ class AppearanceSpec(Section):
         a_1 and b_1: how far the outline's middle lies beside the pin's, in cap radii.
     specks : tuple of SpeckSpec
         Bubbles and grains on the window.
+    relief : ReliefSpec, optional
+        What was measured of each cap and of the skin around it.
     """
 
     skin_albedo: Rgb = (0.0006, 0.00048, 0.0055)
@@ -304,6 +364,7 @@ class AppearanceSpec(Section):
     cap_shapes: tuple[tuple[float, ...], ...] = ()
     cap_offsets: tuple[tuple[float, float], ...] = ()
     specks: tuple[SpeckSpec, ...] = ()
+    relief: ReliefSpec | None = None
 
 
 class ResponseSpec(Section):
@@ -602,6 +663,11 @@ class SensorSpec(Section):
             raise ValueError(f"appearance.cap_levels needs one number for each of the {pins.count} pins; {ELSEWHERE}")
         if self.appearance.cap_offsets and len(self.appearance.cap_offsets) != pins.count:
             raise ValueError(f"appearance.cap_offsets needs one pair for each of the {pins.count} pins; {ELSEWHERE}")
+        relief = self.appearance.relief
+        if relief is not None and not relief.pattern and relief.count != pins.count:
+            raise ValueError(
+                f"appearance.relief needs one tile for each of the {pins.count} pins; give it a pattern above 0 to draw tiles at random"
+            )
         for form, blob in (("raw", self.pipeline.raw), ("recording", self.pipeline.recording)):
             if blob is not None and blob.rest_px and len(blob.rest_px) != pins.count:
                 raise ValueError(f"pipeline.{form}.rest_px needs one place for each of the {pins.count} pins, or none at all")

@@ -1,4 +1,4 @@
-"""Measured arrays of a specification, stored as CSV files beside its TOML file.
+"""Measured arrays and pictures of a specification, stored as files beside its TOML file.
 
 The TOML file has a reference in the place of the array::
 
@@ -7,13 +7,22 @@ The TOML file has a reference in the place of the array::
 The CSV file has one line for each index of the first dimension. Within a line the numbers are in C order (the last dimension varies
 fastest). Lines that begin with ``#`` are comments. Whole numbers stay whole numbers. A loaded specification holds the numbers, not the
 reference, so they are part of its dump and of its digest.
+
+A picture is stored in the same way::
+
+    light = { picture = "ur5-331.housing.background.light.uri" }
+
+The file is a picture (PNG, JPEG or WebP), or a text file with its data URI, which a browser shows. The loaded specification holds the
+data URI.
 """
 
+import base64
 from collections.abc import Mapping, Sequence
 from math import isfinite, prod
 from pathlib import Path
 from typing import TypeAlias
 
+from scenes.base import PICTURE
 from scenes.files import INT64, LARGEST_BYTES, read_regular, shown
 
 Nested: TypeAlias = "int | float | list[Nested] | tuple[Nested, ...]"
@@ -25,7 +34,14 @@ MOST_INLINE = 120
 DIGITS = 6
 """Significant digits of a written number: no length or light of a sensor is known more precisely."""
 
+URI = ".uri"
+"""Suffix of a text file with a data URI."""
+
+KINDS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
+"""Kind of picture (the subtype of its media type) by the suffix of its file."""
+
 _REFERENCE = {"csv", "shape"}
+_PICTURE = {"picture"}
 
 
 def fill_in_tables(section: Mapping[str, object], folder: Path, key: str = "") -> dict[str, object]:
@@ -49,14 +65,15 @@ def fill_in_tables(section: Mapping[str, object], folder: Path, key: str = "") -
     for name, value in section.items():
         here = f"{key}.{name}" if key else name
         if isinstance(value, dict):
-            filled[name] = _read_table(value, folder, here) if set(value) == _REFERENCE else fill_in_tables(value, folder, here)
+            read = {frozenset(_REFERENCE): _read_table, frozenset(_PICTURE): _read_picture}.get(frozenset(value), fill_in_tables)
+            filled[name] = read(value, folder, here)
         else:
             filled[name] = value
     return filled
 
 
 def take_out_tables(section: Mapping[str, object], stem: str, key: str = "") -> tuple[dict[str, object], dict[str, str]]:
-    """Replace every long list of numbers by a reference. Returns the section, and the texts of the tables by file name.
+    """Replace every long list of numbers and every picture by a reference. Returns the section, and the texts of the files by name.
 
     Parameters
     ----------
@@ -75,6 +92,9 @@ def take_out_tables(section: Mapping[str, object], stem: str, key: str = "") -> 
         if isinstance(value, dict):
             kept[name], more = take_out_tables(value, stem, here)
             texts |= more
+        elif isinstance(value, str) and value.startswith(PICTURE):
+            kept[name] = {"picture": f"{stem}.{here}{URI}"}
+            texts[f"{stem}.{here}{URI}"] = f"{value}\n"
         elif isinstance(value, list | tuple) and shape is not None and prod(shape) > MOST_INLINE:
             file = f"{stem}.{here}.csv"
             kept[name] = {"csv": file, "shape": list(shape)}
@@ -94,14 +114,8 @@ def _read_table(reference: Mapping[str, object], folder: Path, key: str) -> list
     file, shape = reference["csv"], reference["shape"]
     if not isinstance(file, str) or not isinstance(shape, list) or not shape or not all(isinstance(n, int) and n > 0 for n in shape):
         raise ValueError(f"{key}: expected {{ csv = 'file name', shape = [numbers above 0] }}, got {dict(reference)}")
-    if Path(file).name != file or not file.endswith(".csv"):
-        raise ValueError(f"{key}: csv = '{file}' must be the name of a .csv file in the folder of the specification, without a folder")
     try:
-        lines = read_regular(folder / file, LARGEST_BYTES).decode("utf-8-sig").splitlines()
-    except FileNotFoundError:
-        raise ValueError(f"{key}: the table {folder / file} is missing; copy it together with the specification") from None
-    except OSError as error:
-        raise ValueError(f"{key}: the table {folder / file} can't be read ({error.strerror}); copy it anew") from error
+        lines = _content(file, folder, key, "csv", (".csv",)).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(f"{key}: the table {folder / file} is no UTF-8 text (byte {error.start}); save it as UTF-8") from error
     rows = [(number, line.split(",")) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
@@ -118,6 +132,31 @@ def _read_table(reference: Mapping[str, object], folder: Path, key: str) -> list
             raise ValueError(f"{key}: {file}, line {number}: {shown(error)}; give numbers with commas between them") from None
         table.append(_folded(values, shape[1:]))
     return table
+
+
+def _read_picture(reference: Mapping[str, object], folder: Path, key: str) -> str:
+    file = reference["picture"]
+    if not isinstance(file, str):
+        raise ValueError(f"{key}: expected {{ picture = 'file name' }}, got {dict(reference)}")
+    content = _content(file, folder, key, "picture", (URI, *KINDS))
+    suffix = Path(file).suffix
+    if suffix == URI:
+        return content.decode("ascii", "replace").strip()
+    return f"{PICTURE}{KINDS[suffix]};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def _content(file: str, folder: Path, key: str, word: str, suffixes: tuple[str, ...]) -> bytes:
+    """Content of a file that a reference names."""
+    if Path(file).name != file or not file.endswith(suffixes):
+        kind = f"a {suffixes[0]} file" if len(suffixes) == 1 else f"a {', '.join(suffixes[:-1])} or {suffixes[-1]} file"
+        raise ValueError(f"{key}: {word} = '{file}' must be the name of {kind} in the folder of the specification, without a folder")
+    what = "table" if word == "csv" else word
+    try:
+        return read_regular(folder / file, LARGEST_BYTES)
+    except FileNotFoundError:
+        raise ValueError(f"{key}: the {what} {folder / file} is missing; copy it together with the specification") from None
+    except OSError as error:
+        raise ValueError(f"{key}: the {what} {folder / file} can't be read ({error.strerror}); copy it anew") from error
 
 
 def _number(word: str) -> int | float:

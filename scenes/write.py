@@ -49,7 +49,7 @@ def sensor_files(spec: SensorSpec, stem: str, comment: str = "", notes: Mapping[
 
 def _item(value: object) -> object:
     """A value in the form that tomlkit writes: sections as tables, references and lists of sections inline, lists in lines."""
-    if isinstance(value, dict) and set(value) == {"csv", "shape"}:
+    if isinstance(value, dict) and set(value) in ({"csv", "shape"}, {"picture"}):
         reference = tomlkit.inline_table()
         reference.update(value)
         return reference

@@ -10,26 +10,28 @@ from figures.jobs import Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
 from twin.frames import open_recording
 from twin.judge.pictures.images import compare_images
+from twin.optics.relief import DETAILS
 from twin.simulator import Simulator
 from twin.types import Form
 
 RECORDED = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
-RENDERED = {"psnr_db": "dB", "psnr_gray_db": "dB", "ssim": "", "flip": ""}
+RENDERED = {"psnr_db": "dB", "psnr_gray_db": "dB", "ssim": "", "flip": "", "psnr_whole_db": "dB"}
 REPEATS = 5
+FITTED = 6
+"""Frames of the folder to which the shipped specification was fitted."""
 
 
 @job(
     "render.realism.ur5-331",
-    "twin realism DIR --sensor ur5-331 --out OUT",
+    "twin realism DIR --sensor ur5-331 --fitted 6 --out OUT",
     sensors=("ur5-331",),
     code=("scenes", "twin", "training"),
     recordings=("ur5-331-raw",),
     minutes=10,
 )
 def realism(work: Path) -> Measured:
-    """30 frames with caps where they stand in the real ones: likeness, and the worst bin of radius of what caps look like."""
-    run_twin(work, "realism", real_folder("ur5-331-raw"), "--sensor", "ur5-331", "--out", work / "realism")
-    metrics = json.loads((work / "realism" / "metrics.json").read_text())
+    """Unfitted frames, caps where they stand in the real ones: likeness, and the worst bin of radius of what caps look like."""
+    metrics = judged(work, work / "realism")
     images, seen = metrics["pin_aligned"], metrics["statistics"]
     found = {name: Value(part["mean"], RENDERED.get(name, "px")) for name, part in images.items() if isinstance(part, dict)}
     found |= {"frames": Value(metrics["frames"]), "exact": Value(images["exact_fraction"])}
@@ -37,6 +39,29 @@ def realism(work: Path) -> Measured:
     noise = seen["scalars"]["noise_sd"]
     found |= {"noise_real": Value(noise["real"], "gray levels"), "noise_rendered": Value(noise["rendered"], "gray levels")}
     return found | ({"told_apart": Value(metrics["two_sample"]["accuracy"])} if metrics["two_sample"] else {})
+
+
+def judged(work: Path, out: Path, *options: str) -> dict:
+    """The figures of ``twin realism`` with further options, on the frames to which the UR5's sensor was not fitted."""
+    run_twin(work, "realism", real_folder("ur5-331-raw"), "--sensor", "ur5-331", "--fitted", str(FITTED), "--out", out, *options)
+    return json.loads((out / "metrics.json").read_text())
+
+
+@job(
+    "render.details",
+    "twin realism DIR --sensor ur5-331 --fitted 6 --no-two-sample --without DETAIL --out OUT",
+    sensors=("ur5-331",),
+    code=("scenes", "twin"),
+    recordings=("ur5-331-raw",),
+    minutes=10,
+)
+def details(work: Path) -> Measured:
+    """What each measured detail is worth: likeness with all, and without each."""
+    found: Measured = {}
+    for name in ("all", *DETAILS):
+        images = judged(work, work / name, "--no-two-sample", *([] if name == "all" else ["--without", name]))["pin_aligned"]
+        found |= {f"{name}_{key}": Value(images[key]["mean"], unit) for key, unit in RENDERED.items()}
+    return found
 
 
 @job("render.speed", "tests/bench/bench_render.py", sensors=("mg400-331", "ur5-331"), minutes=8)

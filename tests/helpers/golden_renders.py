@@ -14,6 +14,7 @@ from scipy import stats
 from scenes import load_sensor
 from scenes.sensor import SensorSpec
 from twin.geometry.pins import PinRest, rest_pins
+from twin.optics.relief import DETAILS, without
 from twin.optics.render import Renderer
 
 BLOCK_PX = 4
@@ -34,8 +35,8 @@ class Case:
     dent_mm: float
 
     def spec(self) -> SensorSpec:
-        """The shipped specification with the case's film."""
-        return scaled(load_sensor(self.sensor), self.scale)
+        """The shipped specification's smooth model, which does not change with what was measured on top of it, with the case's film."""
+        return scaled(without(load_sensor(self.sensor), DETAILS), self.scale)
 
 
 CASES = {

@@ -1,5 +1,7 @@
 """Arrays beside a specification: what is written is read back, and a table that does not fit is refused with its remedy."""
 
+import base64
+
 import pytest
 
 from scenes import SpecError, load_sensor
@@ -116,3 +118,31 @@ def test_a_shipped_table_has_a_reference():
         if 'csv = "' in line
     }
     assert referred == {path.name for path in (SHIPPED / "sensors").glob("*.csv")}
+
+
+PICTURE = f"{NAME}.housing.background.light.uri"
+
+
+def test_a_picture_file_takes_the_place_of_a_data_uri(copied):
+    """A background is replaced by putting the name of a picture file into the specification."""
+    content = base64.b64decode((copied.parent / PICTURE).read_text().partition(",")[2])
+    (copied.parent / "mine.jpg").write_bytes(content)
+    copied.write_text(copied.read_text().replace(PICTURE, "mine.jpg"))
+    assert load_sensor(copied) == load_sensor(NAME)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("gone.uri", None, "housing.background.light: the picture .*gone.uri is missing; copy it together with the specification"),
+        ("mine.bmp", b"BM", r"must be the name of a \.uri, \.png, \.jpg, \.jpeg or \.webp file in the folder"),
+        ("../mine.png", None, "must be the name of .* without a folder"),
+        ("mine.uri", b"a text", r"housing.background.light: expected a picture: \{ picture = 'file name' \}"),
+    ],
+)
+def test_a_file_that_is_no_picture_is_refused_with_its_remedy(copied, file, content, message):
+    if content is not None:
+        (copied.parent / file).write_bytes(content)
+    copied.write_text(copied.read_text().replace(PICTURE, file))
+    with pytest.raises(SpecError, match=message):
+        load_sensor(copied)

@@ -20,7 +20,7 @@ def test_a_sensor_round_trips(sensor, tmp_path):
     write_sensor(path, sensor, "first line\nsecond line")
     assert path.read_text().startswith("# first line\n# second line\n")
     assert rounded(load_sensor(path).model_dump()) == rounded(sensor.model_dump())
-    assert all(file.name.startswith(f"{sensor.name}.") and file.suffix in (".toml", ".csv") for file in tmp_path.iterdir())
+    assert all(file.name.startswith(f"{sensor.name}.") and file.suffix in (".toml", ".csv", ".uri") for file in tmp_path.iterdir())
 
 
 def test_what_was_measured_of_each_cap_round_trips(tmp_path):

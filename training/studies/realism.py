@@ -1,5 +1,6 @@
 """Study: how close are the renders of a sensor to its real frames? It includes the two-sample test."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from twin.optics.render import Quality
 from twin.progress import Progress, Step, silent
 from twin.store import writes
 
-IMAGES = ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip")
+IMAGES = ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip", "psnr_whole_db")
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,8 @@ def compare_with_renders(
     *,
     pose_aligned: bool = False,
     limit: int | None = None,
+    fitted: int = 0,
+    without: Collection[str] = (),
     quality: Quality = "standard",
     test: bool = True,
     progress: Progress = silent,
@@ -69,6 +72,8 @@ def compare_with_renders(
         Also render from the labels alone.
     limit : int, optional
         Most frames that are used; they are spread evenly over the folder.
+    fitted, without
+        As in ``run_realism``.
     quality : {"preview", "standard", "high"}
     test : bool
         Train the two-sample test (minutes).
@@ -81,7 +86,19 @@ def compare_with_renders(
         Nothing can be rendered here.
     """
     asked = _two_sample if test else None
-    return Realism(*run_realism(frames, sensor, out, with_poses=pose_aligned, limit=limit, quality=quality, test=asked, progress=progress))
+    found = run_realism(
+        frames,
+        sensor,
+        out,
+        with_poses=pose_aligned,
+        limit=limit,
+        fitted=fitted,
+        without=without,
+        quality=quality,
+        test=asked,
+        progress=progress,
+    )
+    return Realism(*found)
 
 
 def _two_sample(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> TwoSample:
@@ -92,5 +109,5 @@ def _image_line(title: str, count: int, images: dict[str, Any]) -> str:
     mean = {name: images[name]["mean"] for name in IMAGES}
     return (
         f"{title}, {count} frames: PSNR {mean['psnr_db']:.2f} dB (gray {mean['psnr_gray_db']:.2f}), "
-        f"SSIM {mean['ssim']:.3f} (gray {mean['ssim_gray']:.3f}), FLIP {mean['flip']:.3f}"
+        f"SSIM {mean['ssim']:.3f} (gray {mean['ssim_gray']:.3f}), FLIP {mean['flip']:.3f}; whole frame {mean['psnr_whole_db']:.2f} dB"
     )

@@ -128,13 +128,14 @@ HELP_CALIBRATE_OPTICS = """Fit light, colours, sharpness and noise to raw frames
 Start from the shipped specification that is most like your sensor. The frames may show any contact: their pins are found,
 the skin is fitted to them, the twin renders the same state, and its parameters are moved until both agree, by
 differentiating the path tracer (LEDs, reflectances, haze) and by least squares (ring, reflections, specks, each cap's own
-reflectance and outline, blur, aperture, sharpening, colour fringes, compression, noise). With --no-contact one frame without
-contact fits the camera first.
+reflectance and outline, blur, aperture, sharpening, colour fringes, compression, noise). What is left then is measured: a
+tile of light and colour that moves with each cap and the skin around it, and a background that stays in place. With
+--no-contact one frame without contact fits the camera first.
 
 \b
-Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it
-SPEC-calibration/ with index.html (before, after, what is left, what changed)
-and the stages' results. An interrupted run continues where it ended.
+Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it its measured
+tables and pictures (SPEC.*.csv, SPEC.*.uri), and SPEC-calibration/ with
+index.html (before, after, what is left, what changed) and the stages' results. An interrupted run continues where it ended.
 
 What frames cannot tell is kept at the starting values, and named: the response curve (gamma) and the product of LED power and
 exposure in any case; distance and focal length if all frames are without contact.
@@ -331,7 +332,8 @@ Writes:
 How to read it: no render can do better than PSNR and SSIM of two real frames
 with the same contact. Two-sample accuracy is the share of patches of unseen
 frames that a small network puts into the right set: at 100 % it always tells
-real from rendered, at 50 % never.
+real from rendered, at 50 % never. --without shows what a measured detail is
+worth: the caps' relief, the skin's grain, the background.
 
 \b
 Example:
@@ -347,6 +349,12 @@ def realism(
     out: Out,
     pose_aligned: Annotated[bool, typer.Option("--pose-aligned", help="also render from the labels alone")] = False,
     limit: Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = None,
+    fitted: Annotated[
+        int, typer.Option("--fitted", min=0, metavar="N", help="leave out the frames that 'calibrate optics --limit N' fits")
+    ] = 0,
+    without: Annotated[
+        list[str] | None, typer.Option("--without", metavar="DETAIL", help="relief, grain or background; may be repeated")
+    ] = None,
     quality: Annotated[Quality, typer.Option(help="samples per pixel")] = "standard",
     two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
     table: Table = None,
@@ -365,6 +373,8 @@ def realism(
             out,
             pose_aligned=pose_aligned,
             limit=limit,
+            fitted=fitted,
+            without=without or (),
             quality=quality,
             test=two_sample,
             progress=progress,

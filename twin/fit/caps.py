@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scenes.sensor import ResponseSpec, SensorSpec
-from twin.camera.projection import project
 from twin.frames.forms import gray_levels
 from twin.judge.pictures.aligned import SATURATED, Aligned, revised, to_light
+from twin.optics.relief import cap_planes
 
 # Highest order of an outline's harmonics.
 ORDERS = 6
@@ -91,12 +91,7 @@ def _changes(spec: SensorSpec, frame: Aligned, image: np.ndarray) -> Iterator[tu
     """For each found cap: index; derivatives (n, 2 ORDERS + 3) of its n pixels' levels by the unknowns; real minus rendered levels (n,)."""
     state, real, ours = frame.state, gray_levels(frame.image).astype(np.float32), gray_levels(image).astype(np.float32)
     slope = np.stack([cv2.Sobel(ours, cv2.CV_32F, *way, ksize=3) / 8 for way in ((1, 0), (0, 1))], axis=-1)
-    u = np.array([1.0, 0.0, 0.0]) - state.axis[:, :1] * state.axis
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    face, radius = state.caps_mm + 0.5 * spec.pins.cap_height_mm * state.axis, 0.5 * spec.pins.cap_diameter_mm
-    middle = project(spec.view, face)
-    ways = u, np.cross(u, state.axis)
-    plane = np.stack([project(spec.view, face + radius * way) - middle for way in ways], axis=-1)  # px per cap radius
+    middle, plane = cap_planes(spec.view, spec.pins, state)  # px per cap radius
     others = cKDTree(middle)
     height, width = real.shape
     for cap in np.flatnonzero(np.isfinite(frame.pins_px).all(axis=1)):

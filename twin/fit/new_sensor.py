@@ -142,7 +142,7 @@ class NewSensor:
         return lines + [f"next: {step}" for step in self.next_steps] + [f"note: {note}" for note in self.odd]
 
 
-@writes_file(".*.csv")
+@writes_file(".*.csv", ".*.uri")
 def new_sensor(
     frames: Path,
     out: Path,

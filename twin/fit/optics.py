@@ -17,6 +17,7 @@ from twin.camera.projection import lens_disc
 from twin.errors import FrameError
 from twin.fit.camera_pose import fit_camera
 from twin.fit.caps import fit_caps
+from twin.fit.details import fit_details, undetermined_tiles
 from twin.fit.photometry import fit_photometry
 from twin.fit.response import fit_blur, fit_focus, fit_noise, fit_response, sharpness
 from twin.fit.rim import fit_rim
@@ -29,6 +30,7 @@ from twin.judge.pictures.aligned import Aligned, read_frames, revised
 from twin.judge.pictures.images import compare_images, difference_picture
 from twin.judge.pictures.report import image_columns
 from twin.mechanics.skin_fit import FittedPins, SkinFit
+from twin.optics.relief import DETAILS, without
 from twin.optics.render import Renderer
 from twin.pins.pipeline import Pipeline
 from twin.progress import Bar, Progress, Step, silent, stage
@@ -43,6 +45,8 @@ SAMPLES = 16
 """Samples per pixel of the renders."""
 CAP_ROUNDS = 2
 """Rounds of fitting caps and response alternately."""
+DETAIL_ROUNDS = 3
+"""Rounds of fitting the response to renders with details, and the details anew."""
 HAZE_SIGMA_PX = 40.0
 """Width of the haze, px, at the start of the fit if the specification has no haze."""
 LONGEST = 12
@@ -55,6 +59,8 @@ ALWAYS = (
     "the response curve (gamma, black level): held; photograph a gray card at several exposures to know it",
     "LED power, exposure and reflectance: only their product is seen; the caps' brightest channel is taken as white resin",
     "the window's thickness and index, and the skin's thickness: held",
+    "caps' height and reflectance: only their product with the light is seen, which the relief's tiles hold; under lights from other "
+    "directions a crest would look different",
 )
 """Parameters that no set of frames determines."""
 RING_HELD = "ring, LEDs' places and reflections: held; the frames show no bright ring around the disc (a crop, or a sensor without one)"
@@ -136,7 +142,7 @@ class _Studio:
         return [expose(light, spec.capture) for light in self.light(spec, frames, title)]
 
 
-@writes_file(".*.csv")
+@writes_file(".*.csv", ".*.uri")
 def calibrate_optics(
     frames: Path, sensor: SensorSpec, out: Path, *, limit: int = FRAMES, no_contact: Path | None = None, progress: Progress = silent
 ) -> OpticsCalibration:
@@ -211,7 +217,10 @@ def fit_optics(
     with bar("fit the skin to the pins") as step:
         frames = log.aligned(spec, raw, step)
     inside, studio = lens_disc(spec.view, spec.housing).inside, _Studio(bar)
+    if unseen := undetermined_tiles(spec, frames):
+        notes.append(f"the relief of {unseen} of {spec.pins.count} caps: fewer than two frames show them; use more frames")
     first = studio.shots(spec, frames, "render the start")
+    spec = without(spec, DETAILS)
     held = spec.housing
     for number, fit in enumerate(_stages(frames, inside, studio, bar)):
         spec = log.stage(f"{number:02d}-{fit.__name__}", fit, spec)
@@ -251,10 +260,17 @@ def _stages(frames: list[Aligned], inside: np.ndarray, studio: _Studio, bar: Bar
     def rim(spec: SensorSpec) -> SensorSpec:
         return fit_rim(spec, frames, studio.light(spec, frames, "render for the rim"))
 
+    def details(spec: SensorSpec) -> SensorSpec:
+        return fit_details(spec, frames, studio.light(without(spec, DETAILS), frames, "render for relief and background"))
+
+    def detailed_response(spec: SensorSpec) -> SensorSpec:
+        return fit_response(spec, frames, studio.light(spec, frames, "render for the response to details"), inside)
+
     def noise(spec: SensorSpec) -> SensorSpec:
         return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"))
 
-    return [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), rim, noise]
+    smooth = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), rim]
+    return [*smooth, details, *[detailed_response, details] * DETAIL_ROUNDS, noise]
 
 
 def _mean_figures(frames: list[Aligned], shots: list[np.ndarray], inside: np.ndarray) -> dict[str, float]:

@@ -14,6 +14,7 @@ from twin.geometry.mesh import SensorMesh
 from twin.geometry.pins import rest_pins
 from twin.optics.arrays import with_room
 from twin.optics.lens import CameraRays
+from twin.optics.relief import Relief
 from twin.optics.sampling import SKIN_SAVING, PixelSamples, near_pins
 from twin.optics.scalar import ScalarView
 from twin.optics.scene import build_scene, move_meshes
@@ -89,6 +90,10 @@ class Renderer:
         self._view: GelView | ScalarView | None = None
 
     @cached_property
+    def _relief(self) -> Relief | None:
+        return None if self.spec.appearance.relief is None else Relief(self.spec, self.window_px)
+
+    @cached_property
     def static(self) -> tuple[FloatArray, FloatArray]:
         """Light (H, W, 3) or (H, W) of the static layer, and its transmittance (H, W) for the gel's light."""
         light, cover = static_layer(self.spec, self.window_px)
@@ -143,6 +148,11 @@ class Renderer:
             self._view.move(surfaces)
         light, through = self.static
         pixels = np.flatnonzero(through > 0)
+        known = light.copy()
+        if self._relief is not None:
+            raised, more = self._relief.light(state)
+            more = luminance(more)[:, None] if light.ndim == 2 else more
+            known.reshape(through.size, -1)[raised] += through.ravel()[raised, None] * more
         total: FloatArray = np.zeros((1, 1))
         count = 0
         for k, spp in enumerate(samples):
@@ -150,7 +160,7 @@ class Renderer:
             if light.ndim == 2 and gel.shape[1] == 3:
                 gel = luminance(gel)[:, None]
             total, count = total + spp * gel, count + spp
-            image = light.copy()
+            image = known.copy()
             image.reshape(through.size, -1)[pixels] += (through.ravel()[pixels, None] * (total / count)).astype(np.float32)
             yield np.maximum(image, 0)
 

@@ -14,6 +14,7 @@ from scenes.sensor import HousingSpec, LedRingSpec, SensorSpec, SpeckSpec, ViewS
 from twin.camera.projection import sensor_to_camera
 from twin.optics.lens import ray_table, subpixel_rays
 from twin.optics.lights import Patch, led_patches, lights
+from twin.optics.measured import values_of
 from twin.optics.window import fresnel
 from twin.types import FloatArray
 
@@ -23,6 +24,8 @@ EVEN = 0.02
 """Relative difference of a pixel's corners up to which their mean is the pixel's value."""
 RIM_UNIT = 1000.0
 """Value in ``RimSpec.light`` that stands for the light 1: its numbers are thousandths."""
+BACKGROUND_POWER = 2.2
+"""Power of a background's levels (see ``BackgroundSpec.light``)."""
 SMALL = 1e-3
 """Least light or cover to which a difference within a pixel is compared. Smaller values need no relative precision."""
 
@@ -47,7 +50,25 @@ def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tupl
     corners = np.stack([[table[rows + j, columns + i] for i in (0, 1)] for j in (0, 1)])
     light, hidden = seen(subpixel_rays(corners, ACROSS))
     both[rows, columns] = np.concatenate([light, hidden[..., None]], axis=2).mean(axis=1)
-    return both[..., :3].astype(np.float32), both[..., 3].astype(np.float32)
+    return (both[..., :3] + background_light(spec, window_px)).astype(np.float32), both[..., 3].astype(np.float32)
+
+
+def background_light(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> FloatArray:
+    """Light (H, W, 3) of a window of the raw frame that was measured in addition to everything else (`BackgroundSpec`); may be negative.
+
+    Raises
+    ------
+    FrameError
+        The picture can't be read.
+    """
+    x0, y0, x1, y1 = window_px
+    background, camera = spec.housing.background, spec.camera
+    if background is None:
+        return np.zeros((y1 - y0, x1 - x0, 3), np.float32)
+    values = values_of(background.light, background.span, BACKGROUND_POWER, "housing.background.light")
+    if values.shape[:2] != (camera.height_px, camera.width_px):
+        values = cv2.resize(values, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA).astype(np.float32, copy=False)
+    return values[y0:y1, x0:x1]
 
 
 def _seen(

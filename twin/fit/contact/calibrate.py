@@ -133,7 +133,7 @@ class ContactCalibration:
         return lines
 
 
-@writes_file(".*.csv")
+@writes_file(".*.csv", ".*.uri")
 def calibrate_to_file(
     frames: Path,
     sensor: SensorSpec,

@@ -52,8 +52,16 @@ class RealFrames:
     refused: list[BadFrame] = field(default_factory=list)
 
 
-def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = None, progress: Step | None = None) -> RealFrames:
+def read_real(
+    path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = None, fitted: int = 0, progress: Step | None = None
+) -> RealFrames:
     """Read raw frames. If there are more than ``limit``, those that are read are spread evenly over the recording.
+
+    Parameters
+    ----------
+    limit : int, optional
+    fitted : int
+        Leave out the frames that are read with this number as the limit, because a specification was fitted to them.
 
     Raises
     ------
@@ -65,8 +73,11 @@ def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = N
         raise FrameError(
             f"{path}: these are thresholded recordings; light, colours and pictures show in raw camera frames only, give a folder of those"
         )
-    pipeline, count = Pipeline(spec, Form.RAW), len(recording)
-    chosen = np.unique(np.linspace(0, count - 1, min(limit or count, count)).round().astype(int)).tolist()
+    pipeline = Pipeline(spec, Form.RAW)
+    left = np.setdiff1d(np.arange(len(recording)), _spread(len(recording), fitted))
+    if not len(left):
+        raise FrameError(f"{path}: no frame is left without the {fitted} fitted ones; give a folder with more frames")
+    chosen = left[_spread(len(left), len(left) if limit is None else limit)].tolist()
     frames: list[RealFrame] = []
     refused: list[BadFrame] = []
     for done, index in enumerate(chosen):
@@ -85,6 +96,11 @@ def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = N
         first = refused[0]
         raise FrameError(f"{path}: none of {len(chosen)} frames can be used; the first, {first['image_name']}: {first['reason']}")
     return RealFrames(frames, refused)
+
+
+def _spread(count: int, number: int) -> np.ndarray:
+    """Indices of at most ``number`` of ``count`` things, spread evenly."""
+    return np.unique(np.linspace(0, count - 1, min(number, count)).round().astype(int))
 
 
 def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc) -> Observation:

@@ -22,13 +22,14 @@ CHANGE_GAIN = 2
 
 @dataclass(frozen=True)
 class ImageFigures:
-    """Similarity of one pair: PSNR in dB (inf: identical), SSIM (1: identical), FLIP (0: identical)."""
+    """Similarity of one pair: PSNR in dB (inf: identical), SSIM (1: identical), FLIP (0: identical); ``psnr_whole_db``: of whole frames."""
 
     psnr_db: float
     psnr_gray_db: float
     ssim: float
     ssim_gray: float
     flip: float
+    psnr_whole_db: float
 
     def as_dict(self) -> dict[str, float]:
         """Figures by name."""
@@ -55,6 +56,7 @@ def compare_images(real: np.ndarray, rendered: np.ndarray, inside: np.ndarray) -
         ssim=_ssim(real, masked, inside),
         ssim_gray=_ssim(gray, masked_gray, inside),
         flip=float(flip_map(real, masked)[inside].mean()),
+        psnr_whole_db=_psnr_db(real, rendered),
     )
 
 

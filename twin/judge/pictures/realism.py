@@ -1,6 +1,6 @@
 """The complete comparison of a folder of real frames with their renders, with its results in one folder."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,6 +21,7 @@ from twin.judge.pictures.report import (
     write_plots,
     write_tables,
 )
+from twin.optics.relief import without as plain_of
 from twin.progress import Progress, Step, silent, stage
 
 
@@ -51,6 +52,8 @@ def run_realism(
     *,
     with_poses: bool = False,
     limit: int | None = None,
+    fitted: int = 0,
+    without: Collection[str] = (),
     quality: Quality = "standard",
     test: Test | None = None,
     progress: Progress = silent,
@@ -67,6 +70,10 @@ def run_realism(
         Also render from the labels alone.
     limit : int, optional
         Most frames that are used; they are spread evenly over the folder.
+    fitted : int
+        Leave out the frames to which ``calibrate_optics`` with this limit fits.
+    without : collection of str
+        Details that are not rendered (`twin.optics.relief.without`).
     quality : {"preview", "standard", "high"}
     test : callable, optional
         The two-sample test.
@@ -86,9 +93,10 @@ def run_realism(
     RenderError
         The renderer does not work on this machine.
     """
+    spec = plain_of(spec, without)
     disc, bar = lens_disc(spec.view, spec.housing), partial(stage, progress)
     with bar("read the real frames, find their pins") as step:
-        real = read_real(folder, spec, disc, limit=limit, progress=step)
+        real = read_real(folder, spec, disc, limit=limit, fitted=fitted, progress=step)
     with bar("fit the skin to the pins, render") as step:
         pairs = pin_aligned(spec, real.frames, disc, quality=quality, progress=step)
     poses = pose_aligned(spec, real.frames, disc, quality=quality, bar=bar) if with_poses else None
@@ -102,6 +110,8 @@ def run_realism(
         "sensor": spec.name,
         "quality": quality,
         "frames": len(pairs),
+        "fitted": fitted,
+        "without": sorted(without),
         "refused": real.refused,
         "disc": {"center_px": disc.center_px.tolist(), "radius_px": disc.radius_px},
         "pin_aligned": image_summary(pairs),

@@ -159,6 +159,7 @@ def image_columns(*, mark_best: bool = False) -> list[Column]:
         Column("ssim", "SSIM, colour", decimals=3, best="most" if mark_best else ""),
         Column("ssim_gray", "SSIM, gray", decimals=3, best="most" if mark_best else ""),
         Column("flip", "FLIP", "0: none", decimals=3, best="least" if mark_best else ""),
+        Column("psnr_whole_db", "PSNR, whole frame", "dB", decimals=2, best="most" if mark_best else ""),
     ]
 
 

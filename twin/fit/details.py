@@ -1,0 +1,167 @@
+"""Fit of what smooth models leave: a background that contacts do not change, and a tile of reflectance fixed to each cap.
+
+Both are linear in light. They are found by simultaneous iterative reconstruction (SIRT; Gilbert 1972): the missing gray levels of the
+captured render, divided by the slope of the response curve, are spread over the values that each pixel sees. The camera's blur makes
+fine structure converge last, so that few rounds also keep noise out.
+
+A pixel shows the background and tiles. Where the same pixel lacks the same light in most frames, it is background; what moves with the
+caps is relief.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import sparse
+
+from scenes.sensor import BackgroundSpec, ReliefSpec, SensorSpec
+from twin.camera.capture import expose
+from twin.judge.pictures.aligned import SATURATED, Aligned, levels_slope, revised
+from twin.optics.measured import picture_of
+from twin.optics.relief import POWER, CapLamp, cap_places, tiles_picture
+from twin.optics.static_layer import BACKGROUND_POWER
+from twin.types import BoolArray, FloatArray, IntArray
+
+CELLS, REACH = 19, 1.8
+"""Cells along a tile's side, and the tile's reach, cap radii: cells are about a pixel apart, and neighbours' tiles meet."""
+PRIOR_LEVELS, PRIOR_REFLECTANCE = 9.0, 0.1
+"""Prior of a tile's values: their standard deviation, and the gray levels of a pixel that tiles do not explain."""
+BACKGROUND_ROUNDS, TILE_ROUNDS = 4, 8
+"""Rounds of the reconstructions."""
+BACKGROUND_GAIN, TILE_GAIN = 0.7, 1.2
+"""Share of the missing light that a round adds."""
+EDGE = (0.6, 1.5)
+"""Distances from a cap's middle, cap radii, between which a pixel tells nothing of the background before tiles are fitted."""
+SURE_SDS, SURE_LEVELS = 3.0, 3.0
+"""Where caps pass, a background is believed from so many standard errors, plus so many gray levels, on."""
+GLINT_LIGHT, GLINT_PX = 0.004, 5
+"""Added light from which on a pixel where caps pass tells nothing of tiles; width of the surroundings that are left out, too."""
+DARKEST = 2e-4
+"""Least light at which the slope of the response curve is taken, because the slope of a dark pixel has no bound."""
+BRIGHTEST = 2.0
+"""Largest light of a background: it is saturated, so that more would not show."""
+LEAST_FRAMES = 2
+"""Number of frames from which on a tile counts as determined."""
+
+
+@dataclass(frozen=True)
+class _View:
+    """A frame with its render, and where its pixels lie on tiles."""
+
+    image: FloatArray
+    light: FloatArray
+    pixels: IntArray
+    distance: FloatArray
+    weights: sparse.csr_array
+    lamp: FloatArray
+
+
+def fit_details(spec: SensorSpec, frames: list[Aligned], light: list[FloatArray]) -> SensorSpec:
+    """The specification with ``housing.background`` and ``appearance.relief``.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+        A specification in which everything else was fitted.
+    frames : list of Aligned
+    light : list of (H, W, 3) or (H, W) float
+        Rendered light of each frame's state without background and relief.
+    """
+    views = list(_views(spec, frames, light))
+    fit = _Fit(spec, views)
+    fit.improve_background(None)
+    tiles = fit.tiles()
+    fit.improve_background(tiles)
+    each, frame = (spec.pins.count, CELLS, CELLS), (spec.camera.height_px, spec.camera.width_px)
+    whole = np.broadcast_to(tiles.reshape(*each, -1), (*each, 3))
+    background = np.broadcast_to(fit.background.reshape(*frame, -1), (*frame, 3))
+    span = float(np.ceil(10 * max(np.percentile(np.abs(whole), 99.98), 0.1)) / 10)
+    relief = ReliefSpec(tiles=picture_of(tiles_picture(whole), span, POWER), count=spec.pins.count, span=span, cells=CELLS, reach=REACH)
+    found = BackgroundSpec(light=picture_of(background, BRIGHTEST, BACKGROUND_POWER), span=BRIGHTEST)
+    return revised(spec, housing={"background": found.model_dump()}, appearance={"relief": relief.model_dump()})
+
+
+def undetermined_tiles(spec: SensorSpec, frames: list[Aligned]) -> int:
+    """Number of pins that fewer than ``LEAST_FRAMES`` of the frames show, so that their tiles hold the noise of one frame or nothing."""
+    return int((sum(np.isfinite(frame.pins_px).all(axis=1).astype(int) for frame in frames) < LEAST_FRAMES).sum())
+
+
+def _views(spec: SensorSpec, frames: list[Aligned], light: list[FloatArray]) -> Iterator[_View]:
+    window, lamp = (0, 0, spec.camera.width_px, spec.camera.height_px), CapLamp(spec)
+    for frame, lit in zip(frames, light, strict=True):
+        places = cap_places(spec.view, spec.pins, frame.state, window, REACH)
+        shines = lamp(frame.state)[places.cap].astype(np.float32)
+        yield _View(
+            np.atleast_3d(frame.image).astype(np.float32),
+            np.atleast_3d(lit),
+            places.pixels,
+            np.linalg.norm(places.place, axis=1),
+            places.weights(CELLS, REACH, spec.pins.count),
+            shines if lit.ndim == 3 else shines.mean(axis=1, keepdims=True),
+        )
+
+
+class _Fit:
+    """The values that are being fitted; ``background`` (H W, channels) is the added light."""
+
+    def __init__(self, spec: SensorSpec, views: list[_View]) -> None:
+        self._spec, self._views = spec, views
+        height, width, channels = views[0].image.shape
+        self._mean = np.mean([v.light for v in views], axis=0).reshape(-1, channels)
+        self.background = np.zeros_like(self._mean)
+        passed = np.zeros(height * width, bool)
+        for view in views:
+            passed[view.pixels] = True
+        self._passed: BoolArray = passed
+
+    def _lit(self, view: _View, tiles: FloatArray | None) -> FloatArray:
+        """Light (H W, channels) of a frame's render with background and tiles (N cells^2, channels)."""
+        light = view.light.reshape(self.background.shape) + self.background
+        if tiles is not None:
+            light[view.pixels] += (view.weights @ tiles) * view.lamp
+        return np.maximum(light, 0)
+
+    def _missing(self, view: _View, light: FloatArray) -> FloatArray:
+        """Gray levels (H W, channels) of the frame minus those of light; 0 where both are saturated."""
+        film = light.reshape(view.image.shape)
+        shown = np.atleast_3d(expose(film if film.shape[2] == 3 else film[..., 0], self._spec.capture)).astype(np.float32)
+        lacking = np.where((view.image >= SATURATED) & (shown >= SATURATED), 0.0, view.image - shown)
+        return lacking.reshape(light.shape).astype(np.float32)
+
+    def _slope(self, light: FloatArray) -> FloatArray:
+        return levels_slope(np.maximum(light, DARKEST), self._spec.response).astype(np.float32)
+
+    def improve_background(self, tiles: FloatArray | None) -> None:
+        """Add what a pixel lacks in most frames. Without tiles, the pixels near a cap's edge tell nothing."""
+        for _ in range(BACKGROUND_ROUNDS):
+            stack = np.stack([self._missing(view, self._lit(view, tiles)) for view in self._views])
+            known = np.ones(stack.shape[:2], bool)
+            if tiles is None:
+                for row, view in zip(known, self._views, strict=True):
+                    row[view.pixels[(view.distance > EDGE[0]) & (view.distance < EDGE[1])]] = False
+            some = known.sum(axis=0) >= min(LEAST_FRAMES, len(self._views))
+            masked = np.ma.masked_array(stack, np.broadcast_to(~known[..., None], stack.shape))
+            typical = np.where(some[:, None], np.ma.median(masked, axis=0).filled(0), 0.0)
+            spread = masked.std(axis=0).filled(0) / np.sqrt(np.maximum(known.sum(axis=0), 1))[:, None]
+            doubt = np.where(self._passed[:, None], SURE_SDS * spread + SURE_LEVELS, 0.0)
+            sure = np.sign(typical) * np.maximum(np.abs(typical) - doubt, 0)
+            more = BACKGROUND_GAIN * sure / self._slope(self._mean + self.background)
+            self.background = np.clip(self.background + more, -self._mean, BRIGHTEST).astype(np.float32)
+
+    def tiles(self) -> FloatArray:
+        """The tiles (N cells^2, channels) that explain what is left."""
+        height, width, channels = self._views[0].image.shape
+        bright = (self.background.max(axis=1) > GLINT_LIGHT) & self._passed
+        glint = cv2.dilate(bright.reshape(height, width).astype(np.uint8), np.ones((GLINT_PX, GLINT_PX))).ravel() > 0
+        tiles = np.zeros((self._views[0].weights.shape[1], channels), np.float32)
+        prior = (PRIOR_LEVELS / PRIOR_REFLECTANCE) ** 2
+        for _ in range(TILE_ROUNDS):
+            found, weight = np.zeros_like(tiles), np.full_like(tiles, prior)
+            for view in self._views:
+                light = self._lit(view, tiles)
+                slope = self._slope(light[view.pixels]) * view.lamp * ~glint[view.pixels, None]
+                found += view.weights.T @ (slope * self._missing(view, light)[view.pixels])
+                weight += view.weights.T @ slope**2
+            tiles += TILE_GAIN * found / weight
+        return tiles

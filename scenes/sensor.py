@@ -389,7 +389,7 @@ class ResponseSpec(Section):
     gamma, black_level : float
         The curve is ``black + (255 - black) light^(1 / gamma)``.
     chroma_sigma_px : float
-        Further blur of the light that the colour differences are made of.
+        Blur of the colour differences, in gray levels.
     chroma_columns : {1, 2}
         This many neighbouring columns share the colour differences of the first one (2: a 4:2:2 stream).
     stream : {"rgb", "bt601", "bt709"}

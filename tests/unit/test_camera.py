@@ -240,8 +240,8 @@ def test_lost_chroma_leaves_the_luma_as_it_is():
     assert np.abs(luma(lost) - luma(255 * light)).max() < 5e-5 and np.abs(lost - 255 * light).max() > 58
 
 
-def test_soft_colour_of_a_bright_spot_reaches_further_out():
-    """Blurred before the curve, light spreads into the dark, where the curve shows it: half of the colour lies outside half of the luma."""
+def test_soft_colour_of_an_edge_stays_at_the_edge():
+    """Colour differences are softened in gray levels: half of their step lies at the edge, and 16 to 84 % is two blurs wide."""
     light = np.full((40, 80, 3), 0.01, np.float32)
     light[:, 40:] = (0.2, 0.3, 0.6)
     soft = changed(CURVED, response={"chroma_sigma_px": 2.0}).response
@@ -249,7 +249,9 @@ def test_soft_colour_of_a_bright_spot_reaches_further_out():
     row = (gray[20, :, 2] - luma(gray[20]))[30:50]
     half = np.interp((row[0] + row[-1]) / 2, row, np.arange(30.0, 50.0))
     edge = 39.5
-    assert half < edge - 1.26
+    assert half == pytest.approx(edge, abs=0.01)
+    width = np.interp(row[0] + np.array([0.16, 0.84]) * (row[-1] - row[0]), row, np.arange(30.0, 50.0))
+    assert np.diff(width)[0] == pytest.approx(2 * 2.0, rel=0.1)
 
 
 def test_neighbouring_columns_share_the_first_ones_chroma():

@@ -166,21 +166,17 @@ def sharpened(light: FloatArray, response: ResponseSpec) -> FloatArray:
 
 
 def developed(light: FloatArray, grainy: FloatArray, response: ResponseSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
-    """Gray levels of ``light``, with the noise of ``grainy``: the luma is sharpened, and colour is taken from softer light.
+    """Gray levels of ``light``, with the noise of ``grainy``: all colours are sharpened by their luma, and colour differences are softened.
 
-    A camera measures one colour at each pixel of its sensor and takes the other two from neighbouring pixels, in linear light.
-    Therefore colour is softer than luma, and the response curve moves its edges outwards. The camera does not sharpen the noise.
-    Neighbouring columns of the full frame have the same colour differences.
+    The camera does not sharpen the noise. Neighbouring columns of the full frame have the same colour differences.
     """
     gray = curve(sharpened(light, response), response)
     if grainy is not light:
         gray = gray + blurred(curve(grainy, response) - curve(light, response), response.noise_sigma_px)
-    if gray.ndim == 2 or (response.sharpening == 0 and response.chroma_sigma_px == 0 and response.chroma_columns == 1):
+    if gray.ndim == 2 or (response.chroma_sigma_px == 0 and response.chroma_columns == 1):
         return gray
-    weights = luma_weights(response.stream)
-    soft = curve(blurred(grainy, response.chroma_sigma_px), response)
-    chroma = shared(soft - (soft @ weights)[..., None], response.chroma_columns, origin_px[0])
-    return chroma + (gray @ weights)[..., None]
+    luma = (gray @ luma_weights(response.stream))[..., None]
+    return shared(blurred(gray - luma, response.chroma_sigma_px), response.chroma_columns, origin_px[0]) + luma
 
 
 def shared(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:

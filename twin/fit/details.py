@@ -108,7 +108,7 @@ class _Fit:
     def __init__(self, spec: SensorSpec, views: list[_View]) -> None:
         self._spec, self._views = spec, views
         height, width, channels = views[0].image.shape
-        self._mean = np.mean([v.light for v in views], axis=0).reshape(-1, channels)
+        self._mean: FloatArray = np.mean(np.stack([v.light for v in views]), axis=0).reshape(-1, channels)
         self.background = np.zeros_like(self._mean)
         passed = np.zeros(height * width, bool)
         for view in views:
@@ -125,7 +125,7 @@ class _Fit:
     def _missing(self, view: _View, light: FloatArray) -> FloatArray:
         """Gray levels (H W, channels) of the frame minus those of light; 0 where both are saturated."""
         film = light.reshape(view.image.shape)
-        shown = np.atleast_3d(expose(film if film.shape[2] == 3 else film[..., 0], self._spec.capture)).astype(np.float32)
+        shown = np.atleast_3d(expose(film if light.shape[-1] == 3 else film[..., 0], self._spec.capture)).astype(np.float32)
         lacking = np.where((view.image >= SATURATED) & (shown >= SATURATED), 0.0, view.image - shown)
         return lacking.reshape(light.shape).astype(np.float32)
 

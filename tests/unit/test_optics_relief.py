@@ -26,7 +26,9 @@ def spec() -> SensorSpec:
     """A sensor of 19 pins with a small frame."""
     half = {"width_px": 320, "height_px": 240, "fx_px": 245.0, "fy_px": 245.0, "cx_px": 152.0, "cy_px": 124.0}
     pins = PinsSpec(layout="hexagon", rings=2, max_polar_deg=35.0, length_mm=1.1, diameter_mm=0.8, cap_diameter_mm=3.0, cap_height_mm=0.1)
-    return changed(plain(), camera=half).model_copy(update={"pins": pins})
+    whole = plain()
+    pipeline = whole.pipeline.model_copy(update={"recording": None})
+    return changed(whole, camera=half).model_copy(update={"pins": pins, "recording": None, "pipeline": pipeline})
 
 
 @pytest.fixture(scope="module")

@@ -282,21 +282,22 @@ class SpeckSpec(Section):
 
 
 class ReliefSpec(Section):
-    """What was measured of caps and of the skin around them: a reflectance added to the smooth model's, at places fixed to each cap.
+    """What was measured of caps and of the skin around them: light added to the smooth model's, at places fixed to each cap.
 
     Each pin has a square tile of cells in the plane of its cap. The tile moves and turns with the cap, and the lights that light
-    the cap light it: the added light is the tile's value times the cap's irradiance divided by pi. A place belongs to the nearest cap.
+    the cap light it: the added light is the tile's value times the light of the smooth cap, so that a darker cap or lamp makes it darker.
+    A place belongs to the nearest cap.
     The defaults are a tile of both caps and skin as it was measured.
 
     Attributes
     ----------
     tiles : picture
         Red, green and blue of all tiles, row by row, as many in a row as fit the picture's width. A level v stands for the
-        reflectance ``sign(v - 128) span (|v - 128| / 127)^1.5``, which may be negative.
+        share ``sign(v - 128) span (|v - 128| / 127)^1.5`` of the smooth cap's light, which may be negative.
     count : int
         Number of tiles.
     span : float
-        Reflectance of the levels 255 and (negative) 1.
+        Share of the levels 255 and (negative) 1.
     cells : int
         Cells along a tile's side; between their centres the value is bilinear.
     reach : float

@@ -71,12 +71,23 @@ def test_a_pixel_lies_on_the_nearest_cap_at_its_place_in_the_caps_plane(spec):
     np.testing.assert_allclose(apart[np.arange(len(at)), places.cap], apart.min(axis=1))
 
 
-def test_an_even_tile_adds_its_reflectance_of_the_caps_own_light(spec):
+def test_an_even_tile_adds_its_share_of_the_caps_own_light(spec):
     state, even = rest_pins(spec.geometry), np.full((spec.pins.count, CELLS, CELLS, 3), 0.25)
     for shown in (state, FittedPins(state.base_mm, state.axis[::-1], state.caps_mm, np.zeros(len(even)), np.zeros(3))):
         light, lamp = added(with_tiles(spec, even), shown), CapLamp(spec)(shown)
         places = cap_places(spec.view, spec.pins, shown, WINDOW, REACH)
         np.testing.assert_allclose(light.reshape(-1, 3)[places.pixels], 0.25 * lamp[places.cap], rtol=0.05)
+
+
+def test_a_faded_cap_has_a_faded_relief(spec, tiles):
+    state, whole = rest_pins(spec.geometry), with_tiles(spec, tiles)
+    levels = np.ones(19)
+    levels[3] = 0.001
+    faded = added(changed(whole, appearance={"cap_levels": tuple(levels)}), state).reshape(-1, 3)
+    places = cap_places(spec.view, spec.pins, state, WINDOW, REACH)
+    lost, before = places.pixels[places.cap == 3], added(whole, state).reshape(-1, 3)
+    np.testing.assert_allclose(faded[lost], 0.001 * before[lost], rtol=1e-5, atol=1e-9)
+    np.testing.assert_array_equal(np.delete(faded, lost, axis=0), np.delete(before, lost, axis=0))
 
 
 def test_relief_and_grain_share_the_tile_and_are_switched_off_alone(spec, tiles):

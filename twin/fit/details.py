@@ -1,4 +1,4 @@
-"""Fit of what smooth models leave: a background that contacts do not change, and a tile of reflectance fixed to each cap.
+"""Fit of what smooth models leave: a background that contacts do not change, and a tile of light fixed to each cap.
 
 Both are linear in light. They are found by simultaneous iterative reconstruction (SIRT; Gilbert 1972): the missing gray levels of the
 captured render, divided by the slope of the response curve, are spread over the values that each pixel sees. The camera's blur makes
@@ -25,8 +25,8 @@ from twin.types import BoolArray, FloatArray, IntArray
 
 CELLS, REACH = 19, 1.8
 """Cells along a tile's side, and the tile's reach, cap radii: cells are about a pixel apart, and neighbours' tiles meet."""
-PRIOR_LEVELS, PRIOR_REFLECTANCE = 9.0, 0.1
-"""Prior of a tile's values: their standard deviation, and the gray levels of a pixel that tiles do not explain."""
+PRIOR_LEVELS, PRIOR_SHARE = 9.0, 0.2
+"""Prior of a tile: the gray levels of a pixel that tiles do not explain, and the standard deviation of a tile's values."""
 BACKGROUND_ROUNDS, TILE_ROUNDS = 4, 8
 """Rounds of the reconstructions."""
 BACKGROUND_GAIN, TILE_GAIN = 0.7, 1.2
@@ -155,7 +155,7 @@ class _Fit:
         bright = (self.background.max(axis=1) > GLINT_LIGHT) & self._passed
         glint = cv2.dilate(bright.reshape(height, width).astype(np.uint8), np.ones((GLINT_PX, GLINT_PX))).ravel() > 0
         tiles = np.zeros((self._views[0].weights.shape[1], channels), np.float32)
-        prior = (PRIOR_LEVELS / PRIOR_REFLECTANCE) ** 2
+        prior = (PRIOR_LEVELS / PRIOR_SHARE) ** 2
         for _ in range(TILE_ROUNDS):
             found, weight = np.zeros_like(tiles), np.full_like(tiles, prior)
             for view in self._views:

@@ -17,6 +17,7 @@ from twin.errors import FrameError, RenderError
 from twin.optics.direct_light import DirectLight
 from twin.optics.lights import lights
 from twin.optics.measured import values_of
+from twin.optics.surfaces import cap_albedo
 from twin.types import BoolArray, FloatArray, IntArray, PinState
 
 POWER = 1.5
@@ -118,13 +119,14 @@ class Relief:
 
 
 class CapLamp:
-    """Radiance (N, 3) that a flat white cap of each pin sends to the camera, in the renderer's unit, without shadows."""
+    """Radiance (N, 3) that each smooth cap sends to the camera, in the renderer's unit, without shadows: tiles are relative to it."""
 
     def __init__(self, spec: SensorSpec) -> None:
         self._lamp, self._bump = DirectLight(spec.lens, spec.gel, lights(spec.leds, spec.housing)), spec.appearance.cap_bump
+        self._albedo = cap_albedo(spec.appearance, spec.pins.count)
 
     def __call__(self, state: PinState) -> FloatArray:
-        return self._lamp(state.caps_mm, state.axis, self._bump) / np.pi
+        return self._lamp(state.caps_mm, state.axis, self._bump) * self._albedo / np.pi
 
 
 def _used(relief: ReliefSpec, place: FloatArray) -> BoolArray:

@@ -135,7 +135,7 @@ tile of light and colour that moves with each cap and the skin around it, and a 
 \b
 Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it its measured
 tables and pictures (SPEC.*.csv, SPEC.*.uri), and SPEC-calibration/ with
-index.html (before, after, what is left, what changed) and the stages' results.
+index.html (before, after, what is left, changes) and the stages' results.
 
 An interrupted run continues where it ended.
 

@@ -161,6 +161,7 @@ def contact_calibration(out: Path) -> Path:
         ],
         "independent_numbers_a_frame": 20,
         "problems": [HOSTILE],
+        "newtons": {"said": HOSTILE},
     }
     return write_calibration(out, measured, moved, fit, summary)
 

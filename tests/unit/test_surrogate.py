@@ -31,7 +31,7 @@ COARSE = Resolution(across=8)
 ROW = np.zeros(1, int)
 PINS_BOUND_PX = 1.0  # largest mean error of the contacts below; the stated mean over all is half of it
 FORCE_BOUND = 0.25  # of the force after a reversal of the shear, the hardest; the stated mean over all contacts is a quarter of it
-SLIP_BOUND = 0.2  # of the share that slides, on average over these five poses; over all contacts it is a third of it
+SLIP_BOUND = 0.28  # of the share that slides, on average over these five poses: most is of presses, in which the linear skin slides more
 ANSWER_TOLERANCE = 2e-3  # relative: half precision in the file
 
 

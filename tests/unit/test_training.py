@@ -23,7 +23,7 @@ from training.recipes import TrainingError
 from training.run import fold_rows, is_finished, train_run, training_rows
 from training.run_files import read_tensors
 from training.studies.evaluation import Predictions
-from twin.errors import FrameError
+from twin.errors import FrameError, warn_once
 from twin.pins import Pipeline, nominal_reference
 from twin.store import contents
 from twin.types import Form, Frame
@@ -228,6 +228,7 @@ def test_no_share_above_one_and_no_area_below_zero_is_judged_or_written(data, tm
 
 
 def test_intervals_from_too_few_frames_are_said_to_be_too_narrow(data, tmp_path):
+    warn_once.cache_clear()  # another test may have been told
     with pytest.warns(RuntimeWarning, match="frames that training did not see are too narrow; 9 or more"):
         train_run(config_of("vgnn", epochs=1, members=1, kernel=False), data.rows(np.arange(8)), tmp_path)
 
@@ -320,9 +321,13 @@ def test_the_time_of_an_estimate_is_without_that_of_compiling():
     """The first estimate of a process loads or compiles code, so it is made twice."""
     seen = []
 
-    def estimator(frame):
-        seen.append(frame.name)
-        return len(seen)
+    class Counting:
+        def remembering(self):
+            return self
+
+        def __call__(self, frame):
+            seen.append(frame.name)
+            return len(seen)
 
     frames = [SimpleNamespace(name=name) for name in "ab"]
-    assert list(Predictions(estimator, frames)) == [("a", 2), ("b", 3)] and seen == ["a", "a", "b"]
+    assert list(Predictions(Counting(), frames)) == [("a", 2), ("b", 3)] and seen == ["a", "a", "b"]

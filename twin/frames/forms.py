@@ -174,7 +174,7 @@ def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form 
         raise FrameError(f"{name}: sensor {known.sensor} has no {form} form (no [{form}] section); give frames of its {told} form as such")
     if expected != _size_px(image):
         wanted, got = f"{times(expected)} ({form} form)", f"{times(_size_px(image))} ({told} form)"
-        remedy = "give frames of this form, or the --form, sensor or weights that suit these frames"
+        remedy = "give frames of this form, or the form, sensor or weights that suit these frames"
         raise FrameError(f"{name}: expected {wanted} of {known.sensor}, got {got}; {remedy}")
     return form
 

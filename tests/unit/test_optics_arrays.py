@@ -7,7 +7,7 @@ from twin.optics.arrays import ROOM_BYTES, with_room
 
 
 @pytest.mark.parametrize("dtype", [np.uint32, np.float32])
-@pytest.mark.parametrize("shape", [(0,), (1,), (1021,), (7, 3, 3)])
+@pytest.mark.parametrize("shape", [(0,), (1,), (1021,), (7, 3, 3), (211, 97)])
 def test_values_shape_and_room(shape, dtype):
     values = np.arange(np.prod(shape)).reshape(shape)
     made = with_room(values, dtype)
@@ -17,6 +17,7 @@ def test_values_shape_and_room(shape, dtype):
         whole = whole.base
     end = made.__array_interface__["data"][0] + made.nbytes
     assert whole.__array_interface__["data"][0] + whole.nbytes - end >= ROOM_BYTES
+    assert not values.size or made.__array_interface__["data"][0] % ROOM_BYTES == 0, "else kernels are compiled twice"
 
 
 def test_a_copy_shares_no_memory_with_its_original():

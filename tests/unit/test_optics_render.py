@@ -1,5 +1,7 @@
 """Laws of the renderer, on small films: projection, symmetry, light, noise, updates."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from plain_sensor import changed, plain
@@ -152,6 +154,23 @@ def test_moving_the_vertices_equals_building_anew(small):
     assert (np.abs(after - built) > accumulation).mean() < edge_samples
     assert (np.abs(back - at_rest) > accumulation).mean() < edge_samples
     assert np.abs(after - at_rest).max() > 0.1
+
+
+def test_all_states_are_rendered_by_the_same_kernels(small):
+    """Nothing of a state, not even its number of samples, is part of a kernel: only the first picture waits for the compiler."""
+    import drjit as dr
+
+    bright = changed(small, appearance={"pin_albedo": (0.9, 0.9, 0.9), "skin_albedo": (0.8, 0.8, 0.8)})  # many paths go on
+    renderer, rest = Renderer(bright, variant="llvm", spp=4), rest_pins(bright.geometry)
+    moved = [replace(rest, caps_mm=rest.caps_mm + [0.3 * k, 0.2 * k, 0.0]) for k in range(4)]
+    used = []
+    for k, state in enumerate(moved):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            renderer.render(state, seed=k)
+            used.append({each["hash"] for each in dr.kernel_history() if each["type"] == dr.KernelType.JIT})
+    samples = {near_pins(bright.view, bright.pins, bright.appearance, state, renderer.window_px).sum() for state in moved}
+    assert len(samples) == len(moved) and len(used[1]) > 10
+    assert used[1] == used[2] == used[3]
 
 
 def test_a_color_camera_sees_three_channels_and_a_mono_one_their_luminance(small):

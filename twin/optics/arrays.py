@@ -3,6 +3,8 @@
 Dr.Jit's vectorised variants use the memory of a NumPy array without a copy, and their kernels read it in whole packets: up to one packet
 beyond the last element. If that is beyond the end of a mapped page, the process is killed (drjit 1.5, `arr + 1` on such an array).
 Embree also reads beyond the last vertex. Therefore every array that is handed over has unused memory behind its end.
+
+A kernel is compiled anew for arrays that do not begin at a multiple of a packet's size. Therefore they all do.
 """
 
 from typing import TypeVar
@@ -17,9 +19,14 @@ ROOM_BYTES = 64
 
 
 def with_room(values: ArrayLike, dtype: type[Number]) -> NDArray[Number]:
-    """A contiguous copy of ``values`` with the same shape, whose memory extends at least ``ROOM_BYTES`` beyond its end."""
+    """A contiguous copy of ``values`` with the same shape.
+
+    Its memory begins at a multiple of ``ROOM_BYTES`` and extends at least ``ROOM_BYTES`` beyond its end.
+    """
     values = np.asarray(values)
-    room = np.zeros(values.size + -(-ROOM_BYTES // np.dtype(dtype).itemsize), dtype)
-    out = room[: values.size].reshape(values.shape)
+    each = np.dtype(dtype).itemsize
+    room = np.zeros(values.size + 2 * (ROOM_BYTES // each), dtype)
+    first = -room.ctypes.data % ROOM_BYTES // each
+    out = room[first : first + values.size].reshape(values.shape)
     out[...] = values
     return out

@@ -97,7 +97,7 @@ class GelTracer:
             if sample is None:
                 result += light
             else:
-                dr.scatter_add(result, light, sample, active)
+                dr.scatter_add(result, light, sample, active, mode=dr.ReduceMode.NoConflicts)  # else kernels hold the array's size
             if bounce == self.bounces:
                 break
             out, value = bsdf.sample(mi.BSDFContext(), hit, random.next_1d(), random.next_2d(), active)

@@ -137,6 +137,11 @@ def test_nothing_takes_the_command_line_for_a_library():
                 assert taken <= ENTRY, f"{path.relative_to(ROOT)} imports {taken - ENTRY} from twin.cli"
 
 
+def test_a_command_that_a_group_does_not_have_is_told_with_those_it_has():
+    told = CliRunner().invoke(command_line(), ["emulate", "ur5"])
+    assert told.exit_code == 2 and "There are mg400, magician, camera." in told.output
+
+
 def test_what_could_not_be_let_go_of_is_printed_after_ctrl_c(monkeypatch, tmp_path):
     def interrupted(*_: object, **__: object) -> None:
         interrupt = KeyboardInterrupt()

@@ -67,7 +67,7 @@ def test_every_method_tunes_itself_and_finds_the_pins(spec, foreign, method):
 
 
 def test_a_tuning_tells_what_it_left_out_and_frames_of_another_size(spec, tuned, tmp_path, monkeypatch):
-    monkeypatch.setattr("twin.pins.tune_files.tune", lambda frames, sensor, method, progress: tuned)
+    monkeypatch.setattr("twin.pins.tune_files.tune", lambda *_, **__: tuned)
     for k in range(3):
         cv2.imwrite(str(tmp_path / f"f_{k}.png"), np.full((240, 320), 40 * k, np.uint8))
     (tmp_path / "f_1.png").write_bytes(b"no picture")
@@ -78,6 +78,18 @@ def test_a_tuning_tells_what_it_left_out_and_frames_of_another_size(spec, tuned,
     for k in range(3):
         cv2.imwrite(str(tmp_path / f"f_{k}.png"), np.full((height, width), 40 * k, np.uint8))
     assert not tune_on_frames(tmp_path, spec, limit=3).odd
+
+
+def test_a_tuning_says_whether_its_pins_at_rest_were_made_from_contacts(spec, foreign):
+    uneven = foreign[1][0] + np.random.default_rng(0).normal(0, 1.5, foreign[1][0].shape)  # as no frame without contact is
+    contact, given = (
+        Frame(draw_discs((640, 480), px, 6.0, level=(20, 120), blur_px=0.8), Form.RAW, name)
+        for px, name in ((uneven, "f_0.png"), (foreign[1][1], "init_0.png"))
+    )
+    made, measured = tune([contact], spec), tune([contact], spec, given=given)
+    assert made.detector.blob.rest_origin == "contacts" and "--no-contact" in made.rest.line()
+    assert measured.detector.blob.rest_origin == "measured" and "init_0.png" in measured.rest.line()
+    assert np.linalg.norm(np.array(measured.detector.pins_px) - foreign[1][1], axis=1).max() < 0.5
 
 
 def test_names_are_those_of_the_layout(spec, foreign, tuned):

@@ -11,7 +11,7 @@ from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
 from twin.pins import tune
 from twin.pins.bumps import find_bumps
-from twin.pins.identify import identify, judge_layout, symmetries
+from twin.pins.identify import _matched, identify, judge_layout, symmetries
 from twin.types import Form, Frame
 
 LAYOUTS = [
@@ -95,6 +95,16 @@ def test_a_layout_whose_end_is_cut_off_is_never_sure(pins, part):
     assert any("may be cut off" in doubt for doubt in found.doubts)
     if pins.rings:
         assert found.candidates[1].pins.rings == found.best.pins.rings + 1, "the next larger layout is shown"
+
+
+def test_a_layout_whose_pins_fall_together_explains_nothing():
+    """Labels of a grid that are put on rings can bring two of its pins to one place."""
+    pins = PinsSpec(rings=3)
+    rest = rest_of(pins)
+    spots = find_bumps(frames_of(rest, 1)[0], 10.0)
+    assert _matched(pins, rest, spots).explained > 0.9
+    rest[5] = rest[6]
+    assert _matched(pins, rest, spots).explained == 0.0
 
 
 def test_a_pin_that_the_rim_lacks_may_be_dark_and_is_not_sure():
@@ -183,3 +193,15 @@ def test_frames_of_inverted_contrast_are_refused_as_such():
     images = [255 - image for image in frames_of(rest_of(PinsSpec(rings=4)), 3)]
     with pytest.raises(FrameError, match="contrast is inverted"):
         identify(images)
+
+
+def test_thresholded_frames_of_fading_light_are_not_sure():
+    """A fixed threshold makes caps in dark corners black, and those before them small; a local one leaves them alike."""
+    pins = PinsSpec(rings=6)
+    images = frames_of(rest_of(pins, radius=150.0), 3, ring=False, contact_px=3.0)
+    y, x = np.mgrid[: images[0].shape[0], : images[0].shape[1]]
+    light = np.clip(1.0 - 0.8 * np.hypot(x - 259, y - 204) / 150, 0, 1)
+    even = identify([np.where(image > 70, 255, 0).astype(np.uint8) for image in images])
+    faded = identify([np.where(cv2.GaussianBlur(image, (0, 0), 3) * light > 32, 255, 0).astype(np.uint8) for image in images])
+    assert even.sure and even.best.pins.rings == 6, even.doubts
+    assert not faded.sure and any("light fades" in doubt for doubt in faded.doubts), faded.best.line()

@@ -16,6 +16,7 @@ from scenes import load_sensor
 from training.targets import choose_targets
 from twin.errors import FrameError, StoreError
 from twin.frames import evenly_read, natural_key, open_recording, read_image
+from twin.frames.forms import is_two_level
 from twin.frames.images import write_image
 from twin.frames.videos import is_cut
 from twin.pins import Pipeline, nominal_reference
@@ -156,6 +157,16 @@ def test_form_is_told_by_size_and_can_be_given(tmp_path, spec):
     cv2.imwrite(str(tmp_path / "odd.png"), np.zeros((50, 60), np.uint8))
     with pytest.raises(FrameError, match="expected 640x480.*got 60x50"):
         open_recording(tmp_path / "odd.png", spec)
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.7, 1.9])
+def test_thresholded_frames_that_were_resized_are_still_such(scale):
+    """Small caps are edges for the most part then; as raw frames they would be called saturated."""
+    spec = load_sensor("mg400-331")
+    for form in (Form.RECORDING, Form.RAW):
+        image = drawn_frame(spec, form, nominal_reference(spec, form).pins_px).image
+        resized = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+        assert is_two_level(resized) == (form == Form.RECORDING)
 
 
 def test_nothing_usable_is_one_error_line(tmp_path, spec):

@@ -16,14 +16,15 @@ from training.estimator import PoseEstimator
 from training.studies.evaluation import predict_frames
 from twin.errors import FrameError, TwinError
 from twin.fit.camera_pose import CameraReport
-from twin.fit.new_sensor import _at_rest, _doubtful, _given, _health, new_sensor
-from twin.fit.rest import Rest
-from twin.fit.rest import rest_of as rest_found
+from twin.fit.new_sensor import _doubtful, _given, _health, new_sensor
 from twin.frames import frames_at, open_recording
 from twin.pins import Grade, Pipeline, examine, nominal_reference, tune, with_detector
 from twin.pins.batch import recording_reference
 from twin.pins.detector_spec import shipped_detector
 from twin.pins.identify import Candidate, Seen
+from twin.pins.rest import Rest
+from twin.pins.rest import rest_of as rest_found
+from twin.pins.tune import _at_rest
 from twin.types import Form, Frame
 
 DOCS = Path(__file__).parents[2] / "docs" / "your-own-sensor.md"
@@ -130,12 +131,13 @@ def test_places_at_rest_that_were_made_from_contacts_are_said_to_be(tmp_path):
         blob = spec.pipeline.raw.model_copy(update={"rest_px": rest_px, "rest_origin": origin})
         own = spec.model_copy(update={"pipeline": spec.pipeline.model_copy(update={"raw": blob})})
         told[origin] = []
-        recording_reference(own, open_recording(tmp_path, own), told[origin])
+        told[origin].append(recording_reference(own, open_recording(tmp_path, own), told[origin])[1])
     assert "tenth of a spacing" in told["contacts"][0] and "measured before" in told["measured"][0]
+    assert (told["contacts"][1], told["measured"][1]) == ("made from contacts", "measured before"), "summary.json has it so"
     layout = Candidate(PINS, 1.0, 1.0, 0, 0, 0.0, rest_of(PINS), np.ones(61), ())
     detector = shipped_detector(spec, Form.RAW)
     for source, origin in (("made", "contacts"), ("found", "measured")):
-        assert _at_rest(detector, spec.model_copy(update={"pins": PINS}), Rest(rest_of(PINS), source), layout).blob.rest_origin == origin
+        assert _at_rest(detector, PINS, Rest(rest_of(PINS), source), layout).blob.rest_origin == origin
 
 
 def test_a_layout_that_was_given_and_is_wrong_is_told_which_one_is_right():

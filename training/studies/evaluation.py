@@ -22,7 +22,7 @@ from twin.errors import FrameError
 from twin.frames import Recording, open_recording
 from twin.frames.forms import from_raw
 from twin.mechanics.skin_map import ContactMaps
-from twin.pins.batch import MEASURED_BEFORE, recording_reference
+from twin.pins.batch import UNMEASURED, recording_reference
 from twin.progress import Progress, silent, stage
 from twin.report.contact_maps import SkinPicture, draw_contact_maps
 from twin.report.table import write_table
@@ -177,7 +177,7 @@ def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = N
             estimator = estimator.at_rest(recording.reference)
         else:
             _, named = recording_reference(estimator.recorded_sensor, recording, recording.problems)
-            estimator = estimator.at_known_rest() if named == MEASURED_BEFORE else estimator
+            estimator = estimator if named == UNMEASURED else estimator.at_known_rest()
     if maps is not None:
         if not isinstance(estimator, PoseEstimator):
             raise TrainingError(f"{run}: models of several kinds of contact have no contact maps; leave --maps out")

@@ -72,6 +72,15 @@ class _Commands(TyperGroup):
             raise
 
 
+class FewCommands(TyperGroup):
+    """A group of commands of one kind. Where a name is none of them, the error says which there are."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args[0] not in self.list_commands(ctx) and not args[0].startswith("-") and not ctx.resilient_parsing:
+            ctx.fail(f"No such command '{args[0]}'. There are {', '.join(self.list_commands(ctx))}.")
+        return super().resolve_command(ctx, args)
+
+
 app = typer.Typer(name="twin", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from twin.cli import app
+from twin.cli import FewCommands, app
 from twin.cli.options import (
     CORES,
     Across,
@@ -120,7 +120,9 @@ def new(
     tell(made)
 
 
-calibrate_app = typer.Typer(help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None)
+calibrate_app = typer.Typer(
+    cls=FewCommands, help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None
+)
 app.add_typer(calibrate_app, name="calibrate")
 
 HELP_CALIBRATE_OPTICS = """Fit light, colours, sharpness and noise to raw frames.

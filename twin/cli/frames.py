@@ -135,8 +135,9 @@ round or hexagon). Give some frames, with or without contact, as they come from 
 (then there is no crop, and the threshold hardly matters).
 
 It prints how reliable the result is: in how many frames all pins are found, by how many gray levels the threshold may change, and
-what speaks against the result. It writes a file for 'twin robustness --pipeline' and 'twin check --pipeline'. The section [blob] of
-this file can be copied to [pipeline.raw] or [pipeline.recording] of a sensor's specification.
+what speaks against the result. It writes a file that --pipeline of the other commands takes. The section [blob] of this file can be
+copied to [pipeline.raw] or [pipeline.recording] of a sensor's specification. The file also holds the pins' places at rest: of a frame
+without contact (init_*, --no-contact, or one among the frames), else made from the contacts, which it says.
 
 \b
 Example:
@@ -154,15 +155,19 @@ def tune_command(
     ] = "twin",
     form: FormOrAuto = None,
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = 12,
+    table: Table = None,
+    no_contact: NoContact = None,
     force: Force = False,
 ) -> None:
     from scenes import load_sensor
     from twin.cli.progress import shown
+    from twin.frames import frames_at
     from twin.pins.tune_files import tune_on_frames
     from twin.store import overwriting
 
     with overwriting(force), shown() as progress:
-        found = tune_on_frames(frames, load_sensor(sensor), out=out, method=method, form=form, limit=limit, progress=progress)
+        at = frames_at(frames, table, no_contact)
+        found = tune_on_frames(at, load_sensor(sensor), out=out, method=method, form=form, limit=limit, progress=progress)
     tell(found)
 
 

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from twin.cli import app
+from twin.cli import FewCommands, app
 from twin.cli.options import (
     SHIPPED_MODEL,
     Also,
@@ -319,6 +319,7 @@ def policy_command(
 
 
 emulate = typer.Typer(
+    cls=FewCommands,
     help="Emulate a device on this machine.\n\nIt prints 'ready ...' when it listens, and runs until SIGTERM or Ctrl-C.",
     no_args_is_help=True,
 )

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from twin.cli import app
+from twin.cli import FewCommands, app
 from twin.cli.options import (
     CORES,
     MOST_SEED,
@@ -35,7 +35,7 @@ from twin.cli.options import (
 )
 from twin.types import FINE
 
-study = typer.Typer(help="Experiments that compare models.", no_args_is_help=True, rich_markup_mode=None)
+study = typer.Typer(cls=FewCommands, help="Experiments that compare models.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(study, name="study")
 
 # The objects of the Tac-VGNN paper.

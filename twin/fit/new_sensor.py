@@ -10,7 +10,6 @@ from scenes.pins import PinsSpec
 from scenes.sensor import BlobSpec, CameraSpec, PipelineSpec, RecordingSpec, SensorSpec
 from twin.errors import FrameError
 from twin.fit.camera_pose import CameraReport, fit_camera
-from twin.fit.rest import Rest, rest_of, turn_of
 from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.frames import evenly_read, frames_at, open_recording
 from twin.frames.forms import gray_levels
@@ -19,9 +18,10 @@ from twin.pins.batch import draw_overlay
 from twin.pins.caps import measure_caps
 from twin.pins.check import CAPS_MEASURED, lost_in_view, usual_caps
 from twin.pins.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, with_detector
-from twin.pins.identify import STEADY, Candidate, Identified, identify, judge_layout, spread
+from twin.pins.identify import STEADY, Identified, identify, judge_layout, spread
 from twin.pins.pipeline import Pipeline
-from twin.pins.tune import Tuned, tune, turned_as
+from twin.pins.rest import Rest, rest_of, turn_of
+from twin.pins.tune import Tuned, tune
 from twin.progress import Progress, silent, stage
 from twin.report.numbers import number
 from twin.report.page import Page, Picture
@@ -197,9 +197,8 @@ def new_sensor(
         with stage(progress, "camera"):
             fitted, camera = _camera(start, np.where((best.there >= STEADY)[:, None], rest.pins_px, np.nan))
         with stage(progress, "pins") as step:
-            tuned = tune(looked, fitted, known=best, progress=step)
-        detector = _at_rest(tuned.detector, fitted, rest, best)
-        sensor = _with_usual_caps(_with_pipeline(fitted, detector), looked)
+            tuned = tune(looked, fitted, known=best, rest=rest, progress=step)
+        sensor = _with_usual_caps(_with_pipeline(fitted, tuned.detector), looked)
         judged = looked if limit >= min(JUDGED, len(recording)) else evenly_read(recording, JUDGED)
         odd = list(dict.fromkeys([*odd, *recording.notes(), *_doubtful(camera, rest, len(looked))]))
         health, pictures = _health(sensor, looked[0].form, judged, folder)
@@ -292,15 +291,6 @@ def _scaled(sensor: SensorSpec, pins_px: np.ndarray) -> SensorSpec:
     """The sensor with a camera whose view of the pins has the size and place of pins (N, 2), NaN where unknown."""
     known = np.flatnonzero(np.isfinite(pins_px[:, 0]))
     return sensor.model_copy(update={"camera": camera_seeing(sensor, pins_px, known)})
-
-
-def _at_rest(detector: DetectorSpec, sensor: SensorSpec, rest: Rest, best: Candidate) -> DetectorSpec:
-    """The detector with the pins' places at rest; pins out of view stand where the camera has them."""
-    unseen = ~np.isfinite(rest.pins_px[:, 0])
-    guess = turned_as(sensor.pins, best.rest_px)
-    places = np.where(unseen[:, None], guess, rest.pins_px)
-    blob = detector.blob.model_copy(update={"rest_origin": "contacts" if rest.source == "made" else "measured"})
-    return detector.model_copy(update={"pins_px": tuple(map(tuple, places.round(2).tolist())), "blob": blob})
 
 
 def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:

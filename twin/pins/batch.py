@@ -48,6 +48,8 @@ MADE_FROM_CONTACTS = (
 """What is said where the specification's places at rest come from contacts."""
 MEASURED_BEFORE = "measured before"
 """Stands in place of a no-contact frame's name where the pins' measured places of the specification are the reference."""
+MADE_OF_CONTACTS = "made from contacts"
+"""Stands there where the specification's places at rest come from contacts."""
 FARTHEST_PX = 1e4
 """What is drawn is at most this far from the frame's origin, px. Farther off, OpenCV's integers would overflow."""
 HALF, BRIGHTEST, DARKEST = 127.0, 98.0, 24.0
@@ -179,8 +181,9 @@ def recording_reference(spec: SensorSpec, recording: Recording, problems: list[s
             problems.append(str(error))
     blob = blob_spec(spec.pipeline, recording.form)
     if blob.rest_px:
-        problems.append(MADE_FROM_CONTACTS if blob.rest_origin == "contacts" else NO_OWN_REFERENCE)
-        return nominal_reference(spec, recording.form), MEASURED_BEFORE
+        made = blob.rest_origin == "contacts"
+        problems.append(MADE_FROM_CONTACTS if made else NO_OWN_REFERENCE)
+        return nominal_reference(spec, recording.form), MADE_OF_CONTACTS if made else MEASURED_BEFORE
     problems.append(NO_REFERENCE)
     return nominal_reference(spec, recording.form), UNMEASURED
 

@@ -16,6 +16,7 @@ from twin.pins.detector_spec import DetectorSpec, Evidence, Method, with_detecto
 from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, identify, judge_layout, spread, symmetries
 from twin.pins.legacy import legacy_parameters
 from twin.pins.reference import Reference, make_reference
+from twin.pins.rest import Rest, rest_of
 from twin.progress import Step
 from twin.types import Form, Frame
 
@@ -81,15 +82,25 @@ class Tuned:
         All settings that were tried.
     notes : list of str
         Reasons to doubt the result, and what to do.
+    rest : Rest
+        Where the detector's pins at rest come from.
     """
 
     detector: DetectorSpec
     rates: list[RateRow]
     notes: list[str]
+    rest: Rest
 
 
 def tune(
-    frames: list[Frame], sensor: SensorSpec, method: Method = "twin", *, known: Candidate | None = None, progress: Step | None = None
+    frames: list[Frame],
+    sensor: SensorSpec,
+    method: Method = "twin",
+    *,
+    known: Candidate | None = None,
+    rest: Rest | None = None,
+    given: Frame | None = None,
+    progress: Step | None = None,
 ) -> Tuned:
     """Find mask, threshold and blob parameters from frames of one size and form.
 
@@ -100,11 +111,15 @@ def tune(
     known : Candidate, optional
         What the very same frames show of this layout, where the layout was identified in them. Without it the frames are also looked
         through for other layouts, and the tuning is unsure where another one explains more.
+    rest : Rest, optional
+        Where the pins of ``known`` are without contact, where that was found already.
+    given : Frame, optional
+        A frame without contact. Otherwise one of the frames that shows none, or a rest layout made of contacts.
 
     Raises
     ------
     FrameError
-        No frame shows the layout.
+        No frame shows the layout, or the given frame without contact does not.
     """
     chosen = spread(len(frames), TUNED_ON)
     frames = [frames[k] for k in chosen]
@@ -121,8 +136,9 @@ def tune(
         doubts = other_layout(layout, images)
     shape = frames[0].image.shape
     size_px = (shape[1], shape[0])
-    rest_px = turned_as(sensor.pins, layout.rest_px)
-    reference = make_reference(rest_px, sensor.pins)
+    if rest is None:
+        rest = rest_of(layout, [f.name for f in frames], None if given is None else gray_levels(given.image), given.name if given else "")
+    reference = make_reference(turned_as(sensor.pins, layout.rest_px), sensor.pins)
     caps = [caps_in(image, seen.pins_px, reference.spacing_px) for image, seen in zip(images, layout.seen, strict=True)]
     area, contrast = (float(np.nanmedian(values)) for values in zip(*caps, strict=True))
     start = _start(size_px, reference, layout, area, method, form, sensor.pins.layout)
@@ -146,7 +162,16 @@ def tune(
         for d, (exact, share) in zip(tried, rates, strict=True)
     ]
     seen = sum(one.explained >= SHOWN for one in layout.seen)
-    return Tuned(tried[best].model_copy(update={"evidence": evidence}), table, doubts + _notes(tried[best], evidence, seen, len(frames)))
+    found = _at_rest(tried[best].model_copy(update={"evidence": evidence}), sensor.pins, rest, layout)
+    return Tuned(found, table, doubts + _notes(tried[best], evidence, seen, len(frames)), rest)
+
+
+def _at_rest(detector: DetectorSpec, pins: PinsSpec, rest: Rest, layout: Candidate) -> DetectorSpec:
+    """The detector with the pins' places at rest; pins out of view stand where most frames let expect them."""
+    unseen = ~np.isfinite(rest.pins_px[:, 0])
+    places = turned_as(pins, np.where(unseen[:, None], layout.rest_px, rest.pins_px))
+    blob = detector.blob.model_copy(update={"rest_origin": "contacts" if rest.source == "made" else "measured"})
+    return detector.model_copy(update={"pins_px": tuple(map(tuple, places.round(2).tolist())), "blob": blob})
 
 
 def _shown_instead(images: list[np.ndarray]) -> str:

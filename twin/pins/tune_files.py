@@ -56,6 +56,7 @@ class TunedOnFrames:
                 f"threshold {blob.threshold:g}{over}, may change by {evidence.threshold_slack:g} gray levels; least area "
                 f"{blob.min_area_px2:g} px2"
             )
+        lines.append(self.tuned.rest.line())
         return [*lines, *(f"note: {note}" for note in [*self.tuned.notes, *self.odd])]
 
 
@@ -74,6 +75,8 @@ def tune_on_frames(
 
     Parameters
     ----------
+    path : Path
+        As ``open_recording`` takes it. Its frame without contact, if there is one, tells the pins' places at rest.
     sensor : SensorSpec
         Only the layout of its pins is used.
     out : Path, optional
@@ -82,7 +85,7 @@ def tune_on_frames(
     Raises
     ------
     FrameError
-        No frame shows the layout, or ``out`` is not the name of a ``.toml`` file.
+        No frame shows the layout, or the frame without contact does not, or ``out`` is not the name of a ``.toml`` file.
     """
     if out is not None and out.suffix != ".toml":
         raise OptionError(f"--out {out}: give the name of a .toml file")
@@ -90,11 +93,15 @@ def tune_on_frames(
     frames = evenly_read(recording, limit)
     odd = recording.notes() + _of_another_size(recording, sensor)
     with stage(progress, "tuning") as step:
-        found = tune(frames, sensor, method, progress=step)
+        found = tune(frames, sensor, method, given=recording.reference, progress=step)
     evidence = found.detector.evidence
     assert evidence is not None  # ``tune`` always gives evidence
     if out is not None:
-        write_detector(out, found.detector, f"Found by 'twin tune' from {len(frames)} frames of {path.name}; {evidence.sure}.")
+        write_detector(
+            out,
+            found.detector,
+            f"Found by 'twin tune' from {len(frames)} frames of {recording.path.name}; {evidence.sure}. {found.rest.line()}.",
+        )
     return TunedOnFrames(found, evidence, [] if out is None else [out], odd)
 
 

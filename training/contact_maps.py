@@ -12,19 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 from torch import nn
 
 from scenes.sensor import GeometrySpec
 from training.dataset import Dataset, told_apart
-from training.run_files import damaged
+from training.recipes import TrainingError
 from twin.frames.truth import arrays_of, open_truth, row_of
 from twin.mechanics.skin_map import SIDE, ContactMaps, between_nodes, skin_grid
-from twin.store import write_bytes
+from twin.store import ArrayFile, Layers, layers_from, layers_to
 
 MAPS = "maps.safetensors"
 """File of a run that holds its maps."""
+FILE = ArrayFile("file of contact maps", "twin train", version=1, error=TrainingError)
 DETAIL_MM = 1.0
 """Standard deviation of the Gaussian over which forces are averaged."""
 FORCE_DIRECTIONS, SKIN_DIRECTIONS = 120, 40
@@ -80,7 +79,7 @@ class MapModel:
     geometry : GeometrySpec
     gain, limit : (1,), (D,) float
         Factor on the modes, and their largest size.
-    layers : list of (weight, bias)
+    layers : tuple of (weights, offset)
         The network.
     force, skin : Directions
         Of the forces (3 G values, N, divided by the root of each node's area) and of the places of the skin's nodes (3 c values, mm).
@@ -89,7 +88,7 @@ class MapModel:
     geometry: GeometrySpec
     gain: np.ndarray
     limit: np.ndarray
-    layers: list[tuple[np.ndarray, np.ndarray]] = field(repr=False)
+    layers: Layers = field(repr=False)
     force: Directions = field(repr=False)
     skin: Directions = field(repr=False)
 
@@ -163,7 +162,7 @@ def learn_maps(modes: np.ndarray, data: Dataset, rows: np.ndarray, *, seed: int 
     return MapModel(geometry, gain, limit, _layers(gain * x, y, seed), force, skin)
 
 
-def _layers(x: np.ndarray, y: np.ndarray, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def _layers(x: np.ndarray, y: np.ndarray, seed: int) -> Layers:
     """Layers of a network that goes from x (M, D) to y (M, k)."""
     generator = torch.Generator().manual_seed(seed)
     sizes = [x.shape[1], UNITS, UNITS, y.shape[1]]
@@ -183,18 +182,15 @@ def _layers(x: np.ndarray, y: np.ndarray, seed: int) -> list[tuple[np.ndarray, n
             loss.backward()
             optimiser.step()
             schedule.step()
-    return [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in layers]
+    return tuple((layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in layers)
 
 
 def write_maps(path: Path, model: MapModel) -> None:
     """Write what ``read_maps`` reads: large arrays in half precision."""
-    arrays = {"gain": model.gain, "limit": model.limit}
-    for k, (weight, bias) in enumerate(model.layers):
-        arrays |= {f"layers.{k}.weight": weight, f"layers.{k}.bias": bias}
+    arrays = {"gain": model.gain, "limit": model.limit, **layers_to(model.layers)}
     for name, directions in (("force", model.force), ("skin", model.skin)):
         arrays |= {f"{name}.mean": directions.mean, f"{name}.rows": directions.rows}
-    half = {key: array.astype(np.float16 if array.ndim == 2 else np.float32) for key, array in arrays.items()}
-    write_bytes(path, save({key: np.ascontiguousarray(array) for key, array in half.items()}))
+    FILE.write(path, {key: array.astype(np.float16 if array.ndim == 2 else np.float32) for key, array in arrays.items()}, {})
 
 
 def read_maps(path: Path, geometry: GeometrySpec) -> MapModel:
@@ -205,16 +201,13 @@ def read_maps(path: Path, geometry: GeometrySpec) -> MapModel:
     TrainingError
         The file can't be read, or is damaged.
     """
-    try:
-        found = {key: array.astype(np.float32) for key, array in load(path.read_bytes()).items()}
-        layers = [(found[f"layers.{k}.weight"], found[f"layers.{k}.bias"]) for k in range(3)]
+    with FILE.opened(path) as (_, found):
+        layers = layers_from(found)
         force, skin = (Directions(found[f"{name}.mean"], found[f"{name}.rows"]) for name in ("force", "skin"))
-        fits = len(force.mean) == 3 * SIDE * SIDE and len(layers[2][1]) == len(force.rows) + len(skin.rows)
+        fits = len(force.mean) == 3 * SIDE * SIDE and len(layers[-1][1]) == len(force.rows) + len(skin.rows)
         if not (fits and layers[0][0].shape[1] == len(found["limit"])):
             raise ValueError("its arrays do not fit together")
         return MapModel(geometry, found["gain"], found["limit"], layers, force, skin)
-    except (OSError, SafetensorError, ValueError, KeyError, IndexError) as error:
-        raise damaged(path, getattr(error, "strerror", None) or "no contact maps") from error
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 from torch import nn
 
 from training.dataset import Dataset, split_rows
 from training.pins import PinTable
 from training.recipes import TrainingError
-from twin.store import write_bytes
+from twin.store import ArrayFile, Layers, layers_from, layers_to
 
 CONTACTS = "contacts.safetensors"
+FILE = ArrayFile("file of kinds of contact", "training.contact_estimator.put_together", version=1, error=TrainingError)
 # Modes of the displacements of all kinds together, by which kinds are told apart.
 COMMON_MODES = 60
 # First modes of a kind, and all modes of it that are looked at.
@@ -150,13 +149,13 @@ class Contacts:
     kinds : dict of str to Kind
     modes : Modes
         Of all kinds together.
-    layers : list of (weight, bias)
+    layers : tuple of (weights, offset)
         The network that tells kinds apart.
     """
 
     kinds: dict[str, Kind]
     modes: Modes
-    layers: list[tuple[np.ndarray, np.ndarray]] = field(repr=False)
+    layers: Layers = field(repr=False)
 
     def likeliest(self, pins: PinTable, among: Sequence[str]) -> np.ndarray:
         """(M,) str: which of some kinds each valid frame of a table shows rather than the others."""
@@ -218,7 +217,7 @@ def groups_of(parts: Sequence[Dataset]) -> np.ndarray | None:
     return np.concatenate(found)
 
 
-def _layers(seen: np.ndarray, right: np.ndarray, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def _layers(seen: np.ndarray, right: np.ndarray, seed: int) -> Layers:
     """Layers of a network that tells the number (M,) of each row's kind from its modes (M, K)."""
     generator = torch.Generator().manual_seed(seed)
     sizes = [seen.shape[1], UNITS, UNITS, int(right.max()) + 1]
@@ -238,21 +237,18 @@ def _layers(seen: np.ndarray, right: np.ndarray, seed: int) -> list[tuple[np.nda
             loss.backward()
             optimiser.step()
             schedule.step()
-    return [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in layers]
+    return tuple((layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in layers)
 
 
 def write_contacts(path: Path, contacts: Contacts) -> None:
     """Write what ``read_contacts`` reads: arrays in half precision, except the few that need more."""
-    arrays = {"modes.mean": contacts.modes.mean, "modes.components": contacts.modes.components}
-    for k, (weight, bias) in enumerate(contacts.layers):
-        arrays |= {f"layers.{k}.weight": weight, f"layers.{k}.bias": bias}
+    arrays = {"modes.mean": contacts.modes.mean, "modes.components": contacts.modes.components, **layers_to(contacts.layers)}
     for name, kind in contacts.kinds.items():
         parts = {"mean": kind.modes.mean, "components": kind.modes.components}
         parts |= {key: getattr(kind, key) for key in ("weight", "usual", "known", "limits")}
         arrays |= {f"kinds.{name}.{key}": array for key, array in parts.items()}
-    whole = ("usual", "limits", "mean", "weight", "bias")
-    small = {key: array.astype(np.float32 if key.rsplit(".", 1)[1] in whole else np.float16) for key, array in arrays.items()}
-    write_bytes(path, save({key: np.ascontiguousarray(array) for key, array in small.items()}, {"kinds": ",".join(contacts.kinds)}))
+    large = ("components", "known")
+    FILE.write(path, {key: array.astype(np.float16 if key.rsplit(".", 1)[1] in large else np.float32) for key, array in arrays.items()}, {})
 
 
 def read_contacts(path: Path) -> Contacts:
@@ -263,14 +259,11 @@ def read_contacts(path: Path) -> Contacts:
     TrainingError
         The file can't be read, or is damaged.
     """
-    try:
-        found = {key: array.astype(float) for key, array in load(path.read_bytes()).items()}
+    with FILE.opened(path) as (_, single):
+        found = {key: array.astype(float) for key, array in single.items()}
         names = sorted({key.split(".")[1] for key in found if key.startswith("kinds.")})
         kinds = {}
         for name in names:
             part = {key.rsplit(".", 1)[1]: array for key, array in found.items() if key.startswith(f"kinds.{name}.")}
             kinds[name] = Kind(Modes(part["mean"], part["components"]), part["weight"], part["usual"], part["known"], part["limits"])
-        layers = [(found[f"layers.{k}.weight"], found[f"layers.{k}.bias"]) for k in range(3)]
-        return Contacts(kinds, Modes(found["modes.mean"], found["modes.components"]), layers)
-    except (OSError, SafetensorError, ValueError, KeyError, IndexError) as error:
-        raise TrainingError(f"{path}: no file of kinds of contact, or damaged; copy the model's folder anew") from error
+        return Contacts(kinds, Modes(found["modes.mean"], found["modes.components"]), layers_from(found))

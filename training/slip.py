@@ -18,8 +18,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load, save
 from torch import nn
 
 from scenes.sensor import SensorSpec
@@ -27,7 +25,7 @@ from training.assemble import COVERAGE, conformal_quantile
 from training.contact_maps import HEADROOM
 from training.dataset import Dataset
 from training.pins import PinTable
-from training.run_files import damaged
+from training.recipes import TrainingError
 from training.surrogate.symmetry import Symmetry, symmetries
 from twin.camera.projection import project
 from twin.frames.forms import from_raw
@@ -35,10 +33,11 @@ from twin.frames.truth import arrays_of, open_truth
 from twin.geometry.pins import rest_pins
 from twin.mechanics.path import carried
 from twin.mechanics.skin_map import skin_grid
-from twin.store import write_bytes
+from twin.store import ArrayFile
 
 SLIP = "slip.safetensors"
 """File of a run that holds its network for slip."""
+FILE = ArrayFile("network for slip", "twin train", version=1, error=TrainingError)
 BEGINS, WHOLE = 0.1, 0.95
 """Share of the pressed skin that slides when slip begins, and when the whole contact slides."""
 FEWEST_DRAGS = 30
@@ -430,10 +429,9 @@ def _calibrated(model: SlipModel, ways: list[Way]) -> SlipModel:
 
 def write_slip(path: Path, model: SlipModel) -> None:
     """Write what ``read_slip`` reads."""
-    numbers = {"gain": model.gain, "alarm_at": model.alarm_at, "quantile": model.quantile}
-    arrays = {key: torch.tensor([value]) for key, value in numbers.items()} | {"limit": torch.from_numpy(np.array(model.limit, np.float32))}
-    weights = {f"network.{key}": value.contiguous() for key, value in model.network.state_dict().items()}
-    write_bytes(path, save(arrays | weights))
+    about = {"gain": model.gain, "alarm_at": model.alarm_at, "quantile": model.quantile}
+    weights = {key: value.numpy() for key, value in model.network.state_dict().items()}
+    FILE.write(path, weights | {"limit": model.limit.astype(np.float32)}, about)
 
 
 def read_slip(path: Path) -> SlipModel:
@@ -444,15 +442,14 @@ def read_slip(path: Path) -> SlipModel:
     TrainingError
         The file can't be read, or is damaged.
     """
-    try:
-        found = load(path.read_bytes())
-        gain, alarm_at, quantile = (float(found.pop(key)[0]) for key in ("gain", "alarm_at", "quantile"))
-        limit = found.pop("limit").numpy().astype(float)
+    with FILE.opened(path) as (about, found):
+        limit = found.pop("limit").astype(float)
         network = SlipNetwork(2 * len(limit))
-        network.load_state_dict({key.removeprefix("network."): value for key, value in found.items()})
-        return SlipModel(network.eval(), gain, limit, alarm_at, quantile)
-    except (OSError, SafetensorError, ValueError, KeyError, IndexError, RuntimeError, TypeError) as error:
-        raise damaged(path, getattr(error, "strerror", None) or "no network for slip") from error
+        try:
+            network.load_state_dict({key: torch.from_numpy(value) for key, value in found.items()})
+        except RuntimeError as error:
+            raise ValueError("its arrays do not fit together") from error
+        return SlipModel(network.eval(), about["gain"], limit, about["alarm_at"], about["quantile"])
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from twin.mechanics.solver import SkinSolver
 from twin.optics import probes
 from twin.optics.probes import Verdict
 from twin.store import (
+    ArrayFile,
     Item,
     atomic,
     code_of,
@@ -332,3 +333,42 @@ def test_frames_of_the_same_stem_do_not_share_a_fitted_skin(tmp_path, monkeypatc
     raw = [("frame.png", image, np.zeros((3, 2))), ("frame.jpg", image, np.ones((3, 2)))]
     frames = _Log(tmp_path, sensor, raw).aligned(sensor, raw, lambda *_: None)
     assert [float(frame.state.base_mm.mean()) for frame in frames] == [0.0, 1.0]
+
+
+KIND = ArrayFile("model of dreams", "twin dream", version=3, error=StoreError)
+
+
+def test_arrays_and_what_is_said_of_them_are_read_again(tmp_path):
+    arrays = {"one": np.arange(6.0).reshape(2, 3), "half": np.ones(4, np.float16)}
+    assert KIND.write(tmp_path / "a", arrays, {"of": "a night"}) == (tmp_path / "a").stat().st_size
+    with KIND.opened(tmp_path / "a") as (about, found):
+        assert about == {"of": "a night"} == KIND.about(tmp_path / "a")
+        assert all(np.array_equal(found[key], array) and found[key].dtype == np.float32 for key, array in arrays.items())
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda whole: b"", "damaged, or no model of dreams"),
+        (lambda whole: b"no arrays at all" * 50, "damaged, or no model of dreams"),
+        (lambda whole: whole[:-5], "damaged, or no model of dreams"),
+        (lambda whole: whole[:-7] + bytes([whole[-7] ^ 0x10]) + whole[-6:], "changed since it was written"),
+        (lambda whole: whole.replace(b'version\\": 3', b'version\\": 7'), "another version"),
+        (None, "no such file"),
+    ],
+)
+def test_a_file_of_arrays_that_is_not_whole_is_refused_with_the_remedy(damage, says, tmp_path):
+    path = tmp_path / "a"
+    if damage is not None:
+        KIND.write(path, {"one": np.arange(6.0)}, {})
+        whole, changed = path.read_bytes(), damage(path.read_bytes())
+        assert changed != whole
+        path.write_bytes(changed)
+    with pytest.raises(StoreError, match=f"{path}: .*{says}.*'twin dream'"), KIND.opened(path):
+        pass
+
+
+def test_what_a_reader_misses_in_a_file_of_arrays_is_told_as_damage(tmp_path):
+    KIND.write(tmp_path / "a", {"one": np.arange(6.0)}, {})
+    with pytest.raises(StoreError, match="damaged, or no model of dreams .*two"), KIND.opened(tmp_path / "a") as (_, found):
+        found["two"]

@@ -26,13 +26,10 @@ def show(jobs: list[Job]) -> None:
         if lacking := missing_recordings(job):
             state += f", needs recordings {', '.join(lacking)} (TACTIP_REAL)"
         print(f"{job.name:34s} about {job.minutes:5g} min  {state}")
-    known = values()
-    for title, names in (
-        ("documents", {name for path in documents() for name in used_in(path.read_text())}),
-        ("tables", named_in_templates()),
-    ):
-        absent = sorted(names - set(known))
-        print(f"{len(absent)} of {len(names)} figures that {title} name are missing" + (f": {', '.join(absent)}" if absent else ""))
+    named = named_in_templates() | {name for path in documents() for name in used_in(path.read_text())}
+    absent = named - set(values())
+    of = sorted({max((job for job in JOBS if name.startswith(f"{job}.")), key=len, default=name) for name in absent})
+    print(f"{len(absent)} of {len(named)} figures that documents and tables name are missing" + (f", of {', '.join(of)}" if of else ""))
 
 
 def main() -> None:

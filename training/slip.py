@@ -6,6 +6,7 @@ part of the skin slides, and with it
 
 - the beginning of slip: at least a tenth of the pressed skin slides under a drag;
 - slip of the whole contact: nineteen twentieths of it slide;
+- the sliding share: which part of the pressed skin slides under the drag;
 - the way that is left to it: how far the object must still be dragged.
 
 A press alone is no drag, though skin that spreads over a smooth object slides on it. The states of a contact are gone through at random
@@ -60,15 +61,18 @@ UNITS, EPOCHS, BATCH, RATE, DECAY = 64, 12, 24, 5e-3, 0.02
 """Training: units of both layers, epochs, sequences of a step, highest learning rate, weight decay."""
 LEAST_LEFT_MM = 0.1
 """Added to the way that is left before its logarithm is taken."""
-LEFT_WEIGHT = 0.3
-"""Weight in the loss of the way that is left, and of the direction."""
+LEFT_WEIGHT, SHARE_WEIGHT = 0.3, 0.1
+"""Weights in the loss: of the way that is left and of the direction, and of the sliding share."""
+LEFT_SCALES, SHARE_SCALES = (-4.0, 2.0), (-3.5, 0.0)
+"""Bounds of the logarithm of an error that the network states: of the way that is left, and of the sliding share (0.03 to 1)."""
 SEEN_DRAG_MM = 0.3
 """Drag from which on its direction is learnt."""
 FALSE_ALARMS = 0.01
 """Share of the kept-out frames without slip of which an alarm may speak: it sets the alarm's threshold."""
-NAMES = ("slip_begins", "slip_whole", "slip_left", "slip_direction")
-"""Labels of an estimate that remembers: probabilities of slip's beginning and of slip of the whole contact, way left, direction."""
-SLIP_UNITS = ("", "", "mm", "deg")
+NAMES = ("slip_begins", "slip_whole", "slip_sliding", "slip_left", "slip_direction")
+"""Labels of an estimate that remembers: probabilities of slip's beginning and of slip of the whole contact, sliding share, way left,
+direction."""
+SLIP_UNITS = ("", "", "", "mm", "deg")
 
 
 @dataclass(frozen=True)
@@ -124,6 +128,8 @@ class Way:
         What the model sees of the pins.
     begins, whole : (T,) bool
         Whether slip has begun, and whether the whole contact slides.
+    share : (T,) float
+        Share of the pressed skin that slides; 0 before the drag.
     left_mm : (T,) float
         Drag that is left until the whole contact slides; NaN where it never does.
     drag_mm : (T,) float
@@ -133,6 +139,7 @@ class Way:
     modes: np.ndarray
     begins: np.ndarray
     whole: np.ndarray
+    share: np.ndarray
     left_mm: np.ndarray
     drag_mm: np.ndarray
     direction: np.ndarray
@@ -146,6 +153,8 @@ class Slip:
     ----------
     begins, whole : float
         Probability that slip has begun, and that the whole contact slides.
+    share, share_low, share_high : float
+        Share of the pressed skin that slides under a drag, and the ends of its 90 % interval.
     left_mm, left_low_mm, left_high_mm : float
         Drag that is left until the whole contact slides, and the ends of its 90 % interval.
     direction_deg : float
@@ -156,6 +165,9 @@ class Slip:
 
     begins: float
     whole: float
+    share: float
+    share_low: float
+    share_high: float
     left_mm: float
     left_low_mm: float
     left_high_mm: float
@@ -164,24 +176,28 @@ class Slip:
 
     @property
     def values(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values, and low and high ends of the 90 % intervals (4,), of the labels ``NAMES``; a probability has no interval."""
-        value = np.array([self.begins, self.whole, self.left_mm, self.direction_deg])
+        """Values, and low and high ends of the 90 % intervals (5,), of the labels ``NAMES``; probability and direction have no interval."""
+        value = np.array([self.begins, self.whole, self.share, self.left_mm, self.direction_deg])
         low, high = value.copy(), value.copy()
-        low[2], high[2] = self.left_low_mm, self.left_high_mm
+        low[2:4], high[2:4] = (self.share_low, self.left_low_mm), (self.share_high, self.left_high_mm)
         return value, low, high
 
 
 class SlipNetwork(nn.Module):
-    """Six numbers of every frame of sequences (B, T, D): two logits, log of the way left and of its error, direction (2)."""
+    """Eight numbers of every frame of sequences (B, T, D).
+
+    They are the logits of slip's beginning and of slip of the whole contact, the logarithms of the way left and of its error, the
+    direction (2), the logit of the sliding share and the logarithm of its error.
+    """
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
         self.enter = nn.Linear(inputs, UNITS)
         self.memory = nn.GRU(UNITS, UNITS, batch_first=True)
-        self.head = nn.Linear(2 * UNITS, 6)
+        self.head = nn.Linear(2 * UNITS, 8)
 
     def forward(self, x: torch.Tensor, before: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """The numbers (B, T, 6), and the memory (1, B, units) after the last frame."""
+        """The numbers (B, T, 8), and the memory (1, B, units) after the last frame."""
         h = nn.functional.silu(self.enter(x))
         remembered, after = self.memory(h, before)
         return self.head(torch.cat([h, remembered], dim=2)), after
@@ -189,13 +205,26 @@ class SlipNetwork(nn.Module):
 
 @dataclass(frozen=True)
 class SlipModel:
-    """A trained network, the gain on its modes, the alarm's threshold, and the factor (1,) on the error of the way left."""
+    """A trained network, the gain and bounds of its modes, the alarm's threshold, and factors on the errors that the network states.
+
+    Attributes
+    ----------
+    network : SlipNetwork
+    gain : float
+    limit : (D,) float
+        A mode counts up to this size.
+    alarm_at : float
+        Probability of slip's beginning from which on an alarm is given.
+    left_factor, share_factor : float
+        With these, 90 % of the ways left, and of the sliding shares, lie within the stated errors.
+    """
 
     network: SlipNetwork = field(repr=False)
     gain: float
     limit: np.ndarray
     alarm_at: float
-    quantile: float
+    left_factor: float
+    share_factor: float
 
     def inputs(self, modes: np.ndarray, before: np.ndarray) -> np.ndarray:
         """Inputs of the network from modes (..., D) and those of the frame before."""
@@ -203,11 +232,13 @@ class SlipModel:
         return np.concatenate([now, CHANGE * (now - last)], axis=-1).astype(np.float32)
 
     def told(self, out: np.ndarray) -> Slip:
-        """What the network's numbers (6,) say."""
-        begins, whole = (1 / (1 + np.exp(-np.clip(out[:2].astype(float), -50, 50)))).tolist()
-        middle, wide = float(out[2]), self.quantile * float(np.exp(np.clip(out[3], -4, 2)))
+        """What the network's numbers (8,) say."""
+        begins, whole, share = (1 / (1 + np.exp(-np.clip(out[[0, 1, 6]].astype(float), -50, 50)))).tolist()
+        middle, wide = float(out[2]), self.left_factor * float(np.exp(np.clip(out[3], *LEFT_SCALES)))
         left, low, high = (max(float(np.exp(np.clip(at, -9, 5))) - LEAST_LEFT_MM, 0.0) for at in (middle, middle - wide, middle + wide))
-        return Slip(begins, whole, left, low, high, float(np.degrees(np.arctan2(out[5], out[4]))), begins > self.alarm_at)
+        apart = self.share_factor * float(np.exp(np.clip(out[7], *SHARE_SCALES)))
+        sliding = (share, max(share - apart, 0.0), min(share + apart, 1.0))
+        return Slip(begins, whole, *sliding, left, low, high, float(np.degrees(np.arctan2(out[5], out[4]))), begins > self.alarm_at)
 
 
 class SlipTracker:
@@ -327,7 +358,7 @@ def gone_through(drag: Drag, at: np.ndarray, eyes: Eyes, rng: np.random.Generato
     drag_mm, share, limit = between(drag.drag_mm), between(drag.share), drag.whole_mm
     whole = drag_mm >= limit if np.isfinite(limit) else np.zeros(len(at), bool)
     modes = eyes(between(drag.caps_mm), drag.lost[low], rng)
-    return Way(modes, (share >= BEGINS) | whole, whole, np.maximum(limit - drag_mm, 0.0), drag_mm, drag.direction)
+    return Way(modes, (share >= BEGINS) | whole, whole, share, np.maximum(limit - drag_mm, 0.0), drag_mm, drag.direction)
 
 
 def random_places(states: int, rng: np.random.Generator) -> np.ndarray:
@@ -355,7 +386,7 @@ def learn_slip(drags: Sequence[Drag], eyes: Eyes, sensor: SensorSpec, *, seed: i
     known = np.concatenate([way.modes for way in ways[0]])
     gain = GAIN / max(float(known.std(axis=0).max()), 1e-12)
     torch.manual_seed(seed)
-    model = SlipModel(SlipNetwork(2 * known.shape[1]), gain, HEADROOM * np.abs(known).max(axis=0), 0.5, 1.0)
+    model = SlipModel(SlipNetwork(2 * known.shape[1]), gain, HEADROOM * np.abs(known).max(axis=0), 0.5, 1.0, 1.0)
     _fit(model, ways[0], seed)
     return _calibrated(model, ways[1])
 
@@ -381,11 +412,11 @@ def _fit(model: SlipModel, ways: list[Way], seed: int) -> None:
 
 
 def _padded(model: SlipModel, ways: list[Way]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Inputs (B, T, 2 D), which frames there are (B, T), and what is wanted of them (B, T, 7), of ways one of which has T frames."""
+    """Inputs (B, T, 2 D), which frames there are (B, T), and what is wanted of them (B, T, 8), of ways one of which has T frames."""
     longest = max(len(way.modes) for way in ways)
     x = np.zeros((len(ways), longest, 2 * ways[0].modes.shape[1]), np.float32)
     there = np.zeros((len(ways), longest), bool)
-    wanted = np.zeros((len(ways), longest, 7), np.float32)
+    wanted = np.zeros((len(ways), longest, 8), np.float32)
     for k, way in enumerate(ways):
         count = len(way.modes)
         x[k, :count] = model.inputs(way.modes, np.concatenate([way.modes[:1], way.modes[:-1]]))
@@ -393,21 +424,27 @@ def _padded(model: SlipModel, ways: list[Way]) -> tuple[torch.Tensor, torch.Tens
         known = np.isfinite(way.left_mm) & ~way.whole
         way_left = np.log(np.where(known, way.left_mm, 1.0) + LEAST_LEFT_MM)
         shown = way.drag_mm > SEEN_DRAG_MM
-        wanted[k, :count] = np.column_stack([way.begins, way.whole, known, way_left, shown, np.tile(way.direction, (count, 1))])
+        direction = np.tile(way.direction, (count, 1))
+        wanted[k, :count] = np.column_stack([way.begins, way.whole, known, way_left, shown, direction, way.share])
     return torch.from_numpy(x), torch.from_numpy(there), torch.from_numpy(wanted)
 
 
 def _loss(out: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
-    """Mean loss of frames: numbers (M, 6) against what is wanted (M, 7)."""
+    """Mean loss of frames: numbers (M, 8) against what is wanted (M, 8)."""
     loss = nn.functional.binary_cross_entropy_with_logits(out[:, :2], wanted[:, :2], reduction="none").sum(dim=1).mean()
     known, shown = wanted[:, 2] > 0, wanted[:, 4] > 0
-    scale = out[:, 3].clamp(-4, 2)
-    left = ((out[:, 2] - wanted[:, 3]) / scale.exp()) ** 2 / 2 + scale
-    apart = ((out[:, 4:] - wanted[:, 5:]) ** 2).sum(dim=1)
+    left = _likelihood(out[:, 2] - wanted[:, 3], out[:, 3].clamp(*LEFT_SCALES))
+    apart = ((out[:, 4:6] - wanted[:, 5:7]) ** 2).sum(dim=1)
+    loss = loss + SHARE_WEIGHT * _likelihood(out[:, 6].sigmoid() - wanted[:, 7], out[:, 7].clamp(*SHARE_SCALES)).mean()
     for part, chosen in ((left, known), (apart, shown)):
         if chosen.any():
             loss = loss + LEFT_WEIGHT * part[chosen].mean()
     return loss
+
+
+def _likelihood(off: torch.Tensor, log_error: torch.Tensor) -> torch.Tensor:
+    """Negative logarithm of the density of errors (M,) that are normally distributed, without its constant."""
+    return (off / log_error.exp()) ** 2 / 2 + log_error
 
 
 def _calibrated(model: SlipModel, ways: list[Way]) -> SlipModel:
@@ -417,19 +454,25 @@ def _calibrated(model: SlipModel, ways: list[Way]) -> SlipModel:
         out, _ = model.network(x)
     said, true = out[there].numpy(), wanted[there].numpy()
     known, none = true[:, 2] > 0, true[:, 0] < 0.5
-    quantile, alarm_at = model.quantile, model.alarm_at
+    left_factor, alarm_at = model.left_factor, model.alarm_at
     if known.any():
-        scores = np.abs(said[known, 2] - true[known, 3]) / np.exp(np.clip(said[known, 3], -4, 2))
-        quantile = float(conformal_quantile(scores[:, None], COVERAGE)[0])
+        left_factor = _factor(said[known, 2] - true[known, 3], said[known, 3], LEFT_SCALES)
+    share_factor = _factor(1 / (1 + np.exp(-said[:, 6])) - true[:, 7], said[:, 7], SHARE_SCALES)
     if none.any():
         logits = np.quantile(said[none, 0].astype(float), 1 - FALSE_ALARMS)
         alarm_at = max(0.5, float(1 / (1 + np.exp(-np.clip(logits, -50, 50)))))
-    return SlipModel(model.network, model.gain, model.limit, min(alarm_at, 0.99), quantile)
+    return replace(model, alarm_at=min(alarm_at, 0.99), left_factor=left_factor, share_factor=share_factor)
+
+
+def _factor(off: np.ndarray, log_error: np.ndarray, bounds: tuple[float, float]) -> float:
+    """By how much stated errors must be multiplied so that 90 % of the errors (M,) lie within them."""
+    scores = np.abs(off) / np.exp(np.clip(log_error, *bounds))
+    return float(conformal_quantile(scores[:, None], COVERAGE)[0])
 
 
 def write_slip(path: Path, model: SlipModel) -> None:
     """Write what ``read_slip`` reads."""
-    about = {"gain": model.gain, "alarm_at": model.alarm_at, "quantile": model.quantile}
+    about = {key: getattr(model, key) for key in ("gain", "alarm_at", "left_factor", "share_factor")}
     weights = {key: value.numpy() for key, value in model.network.state_dict().items()}
     FILE.write(path, weights | {"limit": model.limit.astype(np.float32)}, about)
 
@@ -449,7 +492,7 @@ def read_slip(path: Path) -> SlipModel:
             network.load_state_dict({key: torch.from_numpy(value) for key, value in found.items()})
         except RuntimeError as error:
             raise ValueError("its arrays do not fit together") from error
-        return SlipModel(network.eval(), about["gain"], limit, about["alarm_at"], about["quantile"])
+        return SlipModel(network.eval(), limit=limit, **about)
 
 
 @dataclass(frozen=True)
@@ -468,6 +511,8 @@ class SlipErrors:
         missing one as the drag's end.
     late : float
         Share of the contacts whose alarm came after the whole contact slid.
+    share, share_covered : float
+        Mean absolute error of the sliding share, and the part of the true shares inside the 90 % intervals.
     left_mm, left_covered : float
         Mean absolute error of the way left, and the share inside the 90 % intervals.
     direction_deg : float
@@ -480,6 +525,8 @@ class SlipErrors:
     false_alarms: float
     lead_mm: float
     late: float
+    share: float
+    share_covered: float
     left_mm: float
     left_covered: float
     direction_deg: float
@@ -492,11 +539,15 @@ def judge_slip(model: SlipModel, ways: Sequence[Way]) -> SlipErrors:
     inside: list[bool] = []
     leads: list[float] = []
     left: list[float] = []
+    shares: list[float] = []
+    shares_inside: list[bool] = []
     turned: list[float] = []
     for way in ways:
         tracker = SlipTracker(model)
         told = [tracker(modes) for modes in way.modes]
         right += [(slip.whole > 0.5) == whole for slip, whole in zip(told, way.whole.tolist(), strict=True)]
+        shares += [abs(slip.share - share) for slip, share in zip(told, way.share.tolist(), strict=True)]
+        shares_inside += [slip.share_low <= share <= slip.share_high for slip, share in zip(told, way.share.tolist(), strict=True)]
         alarms += [slip.alarm for slip, begins in zip(told, way.begins.tolist(), strict=True) if not begins]
         if way.whole.any():
             at = next((k for k, slip in enumerate(told) if slip.alarm and way.drag_mm[k] > 0), len(told) - 1)
@@ -507,7 +558,7 @@ def judge_slip(model: SlipModel, ways: Sequence[Way]) -> SlipErrors:
             inside.append(told[k].left_low_mm <= way.left_mm[k] <= told[k].left_high_mm)
         true_deg = float(np.degrees(np.arctan2(way.direction[1], way.direction[0])))
         turned += [abs((told[k].direction_deg - true_deg + 180) % 360 - 180) for k in np.flatnonzero(way.drag_mm > SEEN_DRAG_MM).tolist()]
-    numbers = (_mean(right), _mean(alarms), _mean(leads), _mean([lead < 0 for lead in leads]))
+    numbers = (_mean(right), _mean(alarms), _mean(leads), _mean([lead < 0 for lead in leads]), _mean(shares), _mean(shares_inside))
     more = (_mean(left), _mean(inside), np.median(turned) if turned else np.nan)
     return SlipErrors(len(ways), len(right), *(float(value) for value in (*numbers, *more)))
 

@@ -18,7 +18,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_html_math_renderer("mathml", (_inline_formula, None), (_displayed_formula, None))
     app.connect("builder-inited", _write_references)
     app.connect("source-read", _name_notebook)
-    app.connect("source-read", _list_subjects)
     app.connect("build-finished", _write_notebooks)
     return {"parallel_read_safe": True}
 
@@ -52,14 +51,6 @@ def _name_notebook(app: Sphinx, name: str, source: list[str]) -> None:
         title, _, rest = source[0].partition("\n")
         stem = name.rpartition("/")[2]
         source[0] = f"{title}\n\n<p><a class='notebook' href='{stem}.ipynb' download>This page as a notebook</a></p>\n{rest}"
-
-
-def _list_subjects(app: Sphinx, name: str, source: list[str]) -> None:
-    """List the pages beside the first one that it does not name itself: a new page there needs no entry."""
-    if name == "index":
-        pages = sorted(path.stem for path in Path(app.srcdir).glob("*.md"))
-        named = set(source[0].split()) | {name}
-        source[0] = source[0].replace("SUBJECTS", "\n".join(page for page in pages if page not in named))
 
 
 def _write_notebooks(app: Sphinx, error: Exception | None) -> None:

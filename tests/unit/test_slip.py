@@ -62,6 +62,7 @@ def test_slip_is_told_before_the_whole_contact_slides(learnt):
     found = judge_slip(learnt, unseen_ways())
     assert found.contacts == 20 and found.whole_accuracy > 0.95
     assert found.lead_mm > 0.5 and found.late < 0.1 and found.false_alarms < 0.05
+    assert found.share < 0.08 and 0.75 < found.share_covered <= 1.0
     assert found.left_mm < 0.3 and 0.75 < found.left_covered <= 1.0 and found.direction_deg < 5
 
 
@@ -115,7 +116,7 @@ def test_a_model_that_remembers_tells_slip_besides_and_forgets_a_contact_that_en
     data = load_dataset(folder, sensor, estimator.names)
     modes = estimator.modes_of(data.pins)
     network = slip.SlipNetwork(2 * modes.shape[1]).eval()
-    estimator.slip = slip.SlipModel(network, 1.0, np.abs(modes).max(axis=0), 0.5, 1.0)
+    estimator.slip = slip.SlipModel(network, 1.0, np.abs(modes).max(axis=0), 0.5, 1.0, 1.0)
     remembering = estimator.remembering()
     assert remembering.names == (*estimator.names, *NAMES) and remembering.remembering().names == remembering.names
     frames = iter([data.pins.rows(np.array([k])) for k in (0, 1)] + [None] + [data.pins.rows(np.array([0]))])
@@ -169,7 +170,7 @@ def test_slip_of_simulated_drags_is_judged_and_said(contacts, tmp_path):
     data = load_dataset(folder, sensor, estimator.names)
     network = slip.SlipNetwork(2 * estimator.modes_of(data.pins).shape[1]).eval()
     shutil.copytree(run, tmp_path / "run")
-    write_slip(tmp_path / "run" / slip.SLIP, slip.SlipModel(network, 1.0, np.ones(network.enter.in_features // 2), 0.5, 1.0))
+    write_slip(tmp_path / "run" / slip.SLIP, slip.SlipModel(network, 1.0, np.ones(network.enter.in_features // 2), 0.5, 1.0, 1.0))
     found = evaluate_run(tmp_path / "run", [folder], tmp_path / "out", rows="all")
     assert found.metrics["slip"]["contacts"] == 10 and found.metrics["maps"]["states"] > 20
     assert sum("slip of 10 contacts" in line or "contact maps of" in line for line in found.lines()) == 2

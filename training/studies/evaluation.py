@@ -252,7 +252,7 @@ class Evaluation:
             lines.append(
                 f"slip of {slip['contacts']} contacts: slip of all of it told in {100 * slip['whole_accuracy']:.1f} % of the frames, "
                 f"alarm {slip['lead_mm']:.2f} mm of drag before it, in {100 * slip['false_alarms']:.1f} % of the frames without slip; "
-                f"way left wrong by {slip['left_mm']:.2f} mm"
+                f"sliding share wrong by {slip['share']:.2f}, way left by {slip['left_mm']:.2f} mm"
             )
         if self.metrics["leak_slope"] is not None:
             lines.append(f"slope of the angle's error on move_6 where it was not executed: {self.metrics['leak_slope']:+.3f}")

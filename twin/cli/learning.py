@@ -314,8 +314,8 @@ With --maps DIR it also writes, for each frame, the pressure and the shear over 
 (NAME.npz) and a picture (NAME.png). The model must be touch and have learnt from simulated contacts.
 
 With --sequence the frames follow each other in time, as those of a video, and a model that learnt from simulated drags also tells slip:
-slip_begins and slip_whole (probabilities that a tenth of the contact, and that all of it, slides), slip_left (drag in mm until all slides)
-and slip_direction (deg, sensor frame, of the object over the skin).
+slip_begins and slip_whole (probabilities that a tenth of the contact, and that all of it, slides), slip_sliding (share of the contact that
+slides under the drag, 0 to 1), slip_left (drag in mm until all slides) and slip_direction (deg, sensor frame, of the object over the skin).
 
 \b
 Examples:

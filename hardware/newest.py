@@ -79,7 +79,11 @@ class NewestTarget:
                 raise error
             target = self._kinematics.nearest_pose(target)
             self._target = self._arm.clipped(target) if isinstance(self._arm, SafeArm) else target
-            self._step()
+            try:
+                self._step()
+            except BaseException:
+                self._target = None  # after Ctrl-C, too, the thread sends nothing more
+                raise
             self._wake.set()
             return self._arm.state().pose if self._sent is None else self._sent
 

@@ -161,8 +161,16 @@ class SafeArm:
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         return self.arm.state(max_age_s=max_age_s)
 
-    def wait_settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0) -> ArmState:
-        return self.arm.wait_settled(pose, tolerance_mm=tolerance_mm, tolerance_deg=tolerance_deg, timeout_s=timeout_s)
+    def wait_settled(
+        self,
+        pose: np.ndarray,
+        *,
+        tolerance_mm: float = 0.1,
+        tolerance_deg: float = 0.1,
+        timeout_s: float = 10.0,
+        at_rest: bool = True,
+    ) -> ArmState:
+        return self.arm.wait_settled(pose, tolerance_mm=tolerance_mm, tolerance_deg=tolerance_deg, timeout_s=timeout_s, at_rest=at_rest)
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
         """Set the speed; a speed above the limits is reduced to them."""

@@ -115,14 +115,30 @@ class Arm(Protocol):
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         """Go to joints (J,), deg; otherwise as `move_linear`. Returns the pose that was commanded."""
 
-    def wait_settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0) -> ArmState:
-        """Wait for feedback of the arm at rest at ``pose``: the state that confirms it.
+    def wait_settled(
+        self,
+        pose: np.ndarray,
+        *,
+        tolerance_mm: float = 0.1,
+        tolerance_deg: float = 0.1,
+        timeout_s: float = 10.0,
+        at_rest: bool = True,
+    ) -> ArmState:
+        """Wait for feedback of the arm at rest at ``pose``: the state that confirms it. Without ``at_rest`` the arm may still move there.
 
         Raises
         ------
         DeviceError
             It did not get there in time, or reports an error.
         """
+
+
+def stop_after(arm: "Arm | BaseArm", error: BaseException) -> None:
+    """Stop an arm after an error. If that fails, the error says so, too."""
+    try:
+        arm.stop()
+    except DeviceError as failed:
+        also(error, str(failed))
 
 
 class BaseArm(Connection):
@@ -151,12 +167,22 @@ class BaseArm(Connection):
     @abstractmethod
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState: ...
 
-    def wait_settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0) -> ArmState:
+    def wait_settled(
+        self,
+        pose: np.ndarray,
+        *,
+        tolerance_mm: float = 0.1,
+        tolerance_deg: float = 0.1,
+        timeout_s: float = 10.0,
+        at_rest: bool = True,
+    ) -> ArmState:
         """Wait for feedback of the arm at rest at ``pose``; see ``Arm``."""
         with self._watched():
-            return self._settled(pose, tolerance_mm=tolerance_mm, tolerance_deg=tolerance_deg, timeout_s=timeout_s)
+            return self._settled(pose, tolerance_mm=tolerance_mm, tolerance_deg=tolerance_deg, timeout_s=timeout_s, at_rest=at_rest)
 
-    def _settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float) -> ArmState:
+    def _settled(
+        self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float, at_rest: bool = True
+    ) -> ArmState:
         """As ``wait_settled``, for callers that stop the arm after an error themselves."""
         deadline = time.monotonic() + timeout_s
         asked_s, rest_since = time.monotonic(), None
@@ -166,12 +192,10 @@ class BaseArm(Connection):
                 raise DeviceError(f"{self.name}: {state.error}")
             off_mm = float(np.linalg.norm(state.pose[:3] - np.asarray(pose)[:3]))
             off_deg = turn_between_deg(state.pose, np.asarray(pose, float))
-            if state.moving or state.time_s < asked_s:
-                rest_since = None
-            elif off_mm <= tolerance_mm and off_deg <= tolerance_deg:
+            known, near = state.time_s >= asked_s, off_mm <= tolerance_mm and off_deg <= tolerance_deg
+            if known and near and not (at_rest and state.moving):
                 return state
-            else:
-                rest_since = rest_since or state.time_s
+            rest_since = (rest_since or state.time_s) if known and not state.moving else None
             if rest_since is not None and state.time_s - rest_since > min(max(BELIEVE_REST_S, 0.1 * timeout_s), MOST_REST_S):
                 raise DeviceError(
                     f"{self.name}: at rest {off_mm:.2f} mm and {off_deg:.2f} deg from where it was sent; the move was not executed. "
@@ -191,10 +215,7 @@ class BaseArm(Connection):
             yield
         except BaseException as error:
             if self._may_move():
-                try:
-                    self.stop()
-                except DeviceError as failed:
-                    also(error, str(failed))
+                stop_after(self, error)
             raise
 
     def _may_move(self) -> bool:

@@ -1,5 +1,6 @@
 """Scripts written for cri and LeRobot drive our arms."""
 
+import signal
 import time
 
 import numpy as np
@@ -286,3 +287,32 @@ def test_a_gray_camera_gives_pictures_of_three_channels():
     robot = LeRobotArm(SimulatedArm(), cameras={"front": LeRobotCamera(NoisyCamera())})
     with pytest.raises(DeviceError, match="width and height"):
         dict(robot.observation_features)
+
+
+@pytest.mark.parametrize("way", ["tolerance", "servo"])
+def test_a_move_that_is_interrupted_leaves_no_arm_moving(mg400_robot, way):
+    """As with Ctrl-C: a signal's handler raises in the main thread."""
+    robot, emulator = mg400_robot
+    robot.controller.linear_speed = robot.controller.angular_speed = 5
+    robot.controller.tolerance, robot.controller.servo_delay = (1.0, None) if way == "tolerance" else (None, 1.0)
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.15)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            robot.move_linear((0, 60, 0, 0, 0, 0))
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    stands = emulator.pose()
+    time.sleep(0.3)
+    assert np.allclose(emulator.pose(), stands) and not emulator.arm.busy()
+
+
+@pytest.mark.parametrize(("fault", "said"), [("collision", "collision"), ("stall", "at rest")])
+def test_a_move_that_ends_within_a_tolerance_tells_a_fault_at_once(mg400_robot, fault, said):
+    robot, emulator = mg400_robot
+    robot.controller.tolerance = 1.0
+    emulator.faults.add(fault)
+    begun_s = time.monotonic()
+    with pytest.raises(DeviceError, match=said):
+        robot.move_linear((0, 60, 0, 0, 0, 0))
+    assert time.monotonic() - begun_s < 5.0

@@ -12,7 +12,7 @@ from typing import Self
 
 import numpy as np
 
-from hardware.arms.arm import POLL_S, Arm
+from hardware.arms.arm import Arm, stop_after
 from hardware.arms.cri.transforms import Numbers, euler2mat, mat2euler, mat2quat, quat2mat
 from hardware.arms.mg400 import MG400
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, MAX_JOINT_DEG_S, MAX_LINEAR_MM_S
@@ -181,11 +181,7 @@ class RobotController(Closing):
         """Move the tool straight to a pose (7,). Arms of four and six axes have no elbow."""
         flange = self._flange(pose)
         if self._servo_delay is not None:
-            if self._newest is None:
-                self._newest = NewestTarget(self.arm, *self._speeds())
-                self._newest.start()
-            self._newest.go(flange)
-            time.sleep(self._servo_delay[0])
+            self._follow(flange, self._servo_delay[0])
         else:
             self._go([flange])
         self.commanded_pose, self._tilt_deg = np.asarray(pose, float), flange[3:5]
@@ -220,11 +216,21 @@ class RobotController(Closing):
         if self.tolerance is None:
             self.arm.move_linear(poses[-1], timeout_s=timeout_s)
             return
-        sent, deadline = self.arm.move_linear(poses[-1], wait=False, timeout_s=timeout_s), time.monotonic() + timeout_s
-        while not _near(self.arm.state().pose, sent, self.tolerance):
-            if time.monotonic() > deadline:
-                self.arm.wait_settled(sent, timeout_s=0.0)  # says what is wrong, after a stop
-            time.sleep(POLL_S)
+        sent = self.arm.move_linear(poses[-1], wait=False, timeout_s=timeout_s)
+        self.arm.wait_settled(sent, tolerance_mm=self.tolerance, tolerance_deg=self.tolerance, timeout_s=timeout_s, at_rest=False)
+
+    def _follow(self, flange: np.ndarray, delay_s: float) -> None:
+        """Send the arm towards the flange's newest pose (6,), and return after the delay."""
+        if self._newest is None:
+            self._newest = NewestTarget(self.arm, *self._speeds())
+            self._newest.start()
+        try:
+            self._newest.go(flange)
+            time.sleep(delay_s)
+        except BaseException as error:
+            self._end_servo()
+            stop_after(self.arm, error)
+            raise
 
     def _end_servo(self) -> None:
         if self._newest is not None:
@@ -292,10 +298,6 @@ class _Controllers(Mapping[str, type[RobotController]]):
 
 
 Controller = _Controllers()
-
-
-def _near(pose: np.ndarray, target: np.ndarray, tolerance: float) -> bool:
-    return float(np.linalg.norm(pose[:3] - target[:3])) <= tolerance and turn_between_deg(pose, target) <= tolerance
 
 
 def _percent(name: str, speed: float) -> float:

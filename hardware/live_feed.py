@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.arms.open_arm import open_arm
+from hardware.arms.open_arm import kind_of, open_arm
 from hardware.cameras.choose import open_camera
 from hardware.errors import DeviceError
 from hardware.live import LiveSession, estimate_line
@@ -44,7 +44,7 @@ class WatchedArm:
     """
 
     def __init__(self, text: str) -> None:
-        kind = text.partition(":")[0]
+        kind = kind_of(text)
         if not (SHIPPED_LIMITS / f"{kind}.toml").is_file():
             raise DeviceError(
                 f"--arm {shown(text)}: no limits are known for '{shown(kind)}', so the page may not move it; write {shown(kind)}.toml"
@@ -197,19 +197,22 @@ class CameraFeed:
                 self._session.run(going=lambda: not self._end.is_set())
                 if not self._end.is_set():
                     on_end(f"{self.name}: at its end")
-            except TwinError as error:
-                on_end(str(error))
+            except Exception as error:  # whatever it is, a picture that stands still must be told
+                on_end(str(error) if isinstance(error, TwinError) else f"{self.name}: ended by a fault of this program ({error!r})")
 
         self._thread = threading.Thread(target=run, name="studio-camera", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """End; the arm is let go of even if the camera fails."""
+        """End. The arm is let go of first, and the rest is done even if one part fails.
+
+        Raises
+        ------
+        DeviceError
+            A part failed.
+        """
         self._end.set()
-        if self._thread is not None:
-            self._thread.join(END_S)
-        self.end_record()
-        failed = try_each(arm=self._close_arm, camera=self._source.disconnect)
+        failed = try_each(arm=self._close_arm, frames=self._join, recording=self.end_record, camera=self._source.disconnect)
         if failed:
             raise DeviceError(f"{self.name}: {'; '.join(failed)}")
 
@@ -233,6 +236,10 @@ class CameraFeed:
             return "nothing was recorded"
         writer.__exit__(None, None, None)
         return f"wrote {writer.folder} ({writer.count} frames)"
+
+    def _join(self) -> None:
+        if self._thread is not None:
+            self._thread.join(END_S)
 
     def _close_arm(self) -> None:
         if self.robot is not None:

@@ -8,14 +8,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from arms import mg400_of
+from free_ports import free_offset
 from noisy_camera import NoisyCamera
-from true_estimator import TrueEstimator
+from true_estimator import TrueEstimate, TrueEstimator
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.collect import Collection, collect
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError, DeviceNotConnectedError
 from hardware.lerobot import LeRobotArm
+from hardware.live_feed import CameraFeed
 from hardware.loop import ServoLoop
 from hardware.rig import Rig, servo_loop, signals_as_ctrl_c
 from hardware.rig_geometry import PlacedObject
@@ -214,3 +216,47 @@ class TestMg400:
         moving.arm.disconnect()
         with pytest.raises(DeviceNotConnectedError, match="connect"):
             moving.arm.disable()
+
+
+@pytest.fixture
+def feed(monkeypatch):
+    """The studio's camera with an armed arm, an emulator of it, and the texts that it ended with."""
+    monkeypatch.setattr("hardware.live_feed.open_camera", lambda *_: NoisyCamera())
+    value = np.zeros(1)
+    model = SimpleNamespace(sensor=load_sensor("mg400-331"), form=Form.RAW, check=lambda *_: None)
+    offset = free_offset()
+
+    class Model(SimpleNamespace):
+        def __call__(self, frame):
+            return TrueEstimate(("pose_2",), value, value, value)
+
+    with Mg400Emulator(port_offset=offset) as emulator:
+        made = CameraFeed("any", f"mg400:127.0.0.1:{29999 + offset}", Model(**vars(model)))
+        ends, shots = [], []
+        made.start(shots.append, ends.append)
+        made.robot.arm()
+        yield made, emulator, ends
+        made.stop()
+
+
+def test_an_armed_arm_is_let_go_of_though_the_recording_can_not_be_ended(feed, tmp_path):
+    made, emulator, _ = feed
+    made.record(tmp_path / "session")
+    with made._writing:  # no frame is written meanwhile
+        made._writer._lines.close()
+        made._writer._lines = open("/dev/full", "w")  # noqa: SIM115  (closed by the writer)
+        made._writer._lines.write("a line that waits to be written")
+        made._end.set()
+    with pytest.raises(DeviceError, match="free some space"):
+        made.stop()
+    assert not emulator.arm.enabled and not made.robot.armed
+
+
+def test_a_camera_whose_frames_break_the_program_is_told(feed):
+    made, _, ends = feed
+    made._session.estimator = lambda frame: 1 / 0
+    deadline = time.monotonic() + 5.0
+    while not ends:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert "division by zero" in ends[0]

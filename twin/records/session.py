@@ -90,8 +90,17 @@ class SessionWriter:
         write_image(self.folder / REST, frame.image)
 
     def close(self) -> None:
-        """End the session; its lines are on disk already."""
-        self._lines.close()
+        """End the session; the lines of whole steps are on disk already.
+
+        Raises
+        ------
+        StoreError
+            A line that could not be written before can't be written now.
+        """
+        try:
+            self._lines.close()
+        except OSError as error:
+            raise unwritten(self.folder / STEPS, error) from error
 
     def __enter__(self) -> Self:
         return self

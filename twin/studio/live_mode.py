@@ -161,13 +161,15 @@ class LiveMode(PageMode):
     def disconnect(self) -> None:
         """Let go of camera and arm."""
         feed, self._feed, self._last = self._feed, None, None
-        if feed is not None:
-            if self._record.value:
+        try:
+            if feed is not None and self._record.value:
                 self._page.say(feed.end_record())
-            feed.stop()
-        for control in (self._record, self._armed):
-            put(control, False)
-        self._nudges.visible = False
+        finally:  # a recording that can't be ended leaves no arm armed
+            for control in (self._record, self._armed):
+                put(control, False)
+            self._nudges.visible = False
+            if feed is not None:
+                feed.stop()
 
     def emergency_stop(self) -> None:
         """Stop the arm. It is never refused."""

@@ -2,6 +2,7 @@
 
 import json
 import re
+import threading
 import time
 from pathlib import Path
 from urllib.request import Request, urlopen
@@ -18,6 +19,7 @@ from training.estimator import models_by_sensor
 from twin.errors import TwinError
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
+from twin.studio.scene import Scene
 from twin.studio.state import StudioState, first_state
 from twin.studio.studio import Studio, StudioPlan
 from twin.types import Form
@@ -161,6 +163,35 @@ def test_a_link_shows_its_state_again_and_not_from_a_foreign_page(studio, client
     assert update.depth_mm <= 0.4 + 1e-4
     client.set("link", "?sensor=nothing&object=sphere")
     assert "nothing" in wait_html(client, "class='stop'")
+
+
+def test_an_answer_of_the_sensor_that_is_being_replaced_does_no_harm(studio, client, monkeypatch):
+    """While the new sensor's scene is made, the scene of the old one is gone; an answer of the old one may come just then."""
+    drag(client, 1.5)
+    old, failed, threads = studio.twin.worker.newest, [], []
+
+    def publish():
+        try:
+            studio.twin._publish(old)
+        except BaseException as error:
+            failed.append(error)
+
+    def scene(*arguments):
+        made = Scene(*arguments)
+        threads.append(threading.Thread(target=publish))
+        threads[0].start()
+        threads[0].join(0.3)
+        return made
+
+    monkeypatch.setattr("twin.studio.twin_mode.Scene", scene)
+    studio.twin.open(StudioState(sensor="mg400-331", object="sphere", pose={"depth_mm": 1.0}))
+    threads[0].join(WAIT_S)
+    assert not failed
+    client.wait(lambda u: "of 331" in u.html, WAIT_S)
+    monkeypatch.undo()
+    since = len(client.updates)
+    studio.twin.open(StudioState(sensor=SENSOR, object="sphere", pose={"depth_mm": 1.0}))
+    client.wait(lambda u: "of 127" in u.html, WAIT_S, since=since)
 
 
 def test_degrade_shows_the_same_contact_with_its_limits(client):

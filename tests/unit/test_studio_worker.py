@@ -17,7 +17,7 @@ from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.state import MOST_BYTES, StudioState, first_state, read_way, save_way, tap_and_shear
 from twin.studio.tracing import Failed, Traced
 from twin.studio.video import RATE_HZ, FilmWriter
-from twin.studio.worker import Worker
+from twin.studio.worker import Newest, Worker
 
 WAIT_S = 20.0
 
@@ -146,6 +146,31 @@ def test_an_error_is_told_and_the_next_wish_is_served():
         worker.ask(ObjectPose(depth_mm=1.0))
         wait(lambda a: a.arrived)
     assert said == ["too deep for this test"]
+
+
+def test_a_fault_of_the_program_is_told_and_ends_no_thread(caplog):
+    contact = SlowContact()
+    step, contact.step = contact.step, lambda wished: 1 / 0
+    worker, _, said, wait = run(contact)
+    with worker:
+        worker.ask(ObjectPose(depth_mm=2.0))
+        end = time.monotonic() + WAIT_S
+        while not said and time.monotonic() < end:
+            time.sleep(0.005)
+        contact.step = step
+        worker.ask(ObjectPose(depth_mm=1.0))
+        wait(lambda a: a.arrived)
+    assert "division by zero" in said[0] and "ZeroDivisionError" in caplog.text
+    taken, failed = [], threading.Event()
+    newest = Newest(lambda divisor: taken.append(1 / divisor), "test", lambda text: failed.set())
+    newest.start()
+    newest.give(0)
+    assert failed.wait(WAIT_S)
+    newest.give(1)
+    while not taken and time.monotonic() < end + WAIT_S:
+        time.sleep(0.005)
+    newest.stop()
+    assert taken == [1.0]
 
 
 def test_a_way_is_gone_pose_by_pose_and_a_wish_ends_it():

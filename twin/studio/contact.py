@@ -74,6 +74,8 @@ class Answer:
 
     Attributes
     ----------
+    setup : Setup
+        What was moved against what.
     number : int
         Counts the answers.
     solved : int
@@ -105,6 +107,7 @@ class Answer:
         Time of each stage.
     """
 
+    setup: "Setup"
     number: int
     solved: int
     pose: ObjectPose
@@ -411,6 +414,7 @@ class MovingContact:
         seen = seen_in(frame, estimate if of_frame else None, self._pipeline)
         times = {"picture": now - started, "estimate": estimated - now, "pins": time.perf_counter() - estimated}
         self._last = Answer(
+            self.setup,
             self._count,
             self._solved,
             ObjectPose.of(T, self._apex_mm),

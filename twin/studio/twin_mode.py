@@ -93,7 +93,8 @@ class TwinMode(PageMode):
         self._film: FilmWriter | None = None
         self.followers: list[Callable[[Answer], None]] = []
         self._rebuilding = threading.Lock()
-        self.contact, self.worker, self._tracer, self._scene = self._build(state)
+        self._showing = threading.Lock()  # held while the scene is changed or made anew
+        self._take_up(*self._prepare(state))
         self._publisher = self.newest(self._publish, "page")
         self._links = self.newest(self._open_link, "link")
         page.on_address = self._links.give
@@ -105,16 +106,22 @@ class TwinMode(PageMode):
 
     # life
 
-    def _build(self, state: StudioState) -> tuple[MovingContact, Worker, Tracer | None, Scene]:
-        """Everything that belongs to one sensor."""
+    def _prepare(self, state: StudioState) -> tuple[MovingContact, Tracer | None]:
+        """The contact of a state and its tracer. The page stays as it is."""
         sensor = load_sensor(state.sensor)
         contact = MovingContact(Setup(sensor, load_object(state.object), state.friction, Form(state.form)))
-        tracer = Tracer(sensor) if self._traces else None
-        self._rest = nominal_reference(sensor, contact.setup.form)
-        scene = Scene(self._page.server, sensor, contact.solver.mesh, contact.solver.rest())
-        scene.put_object(contact.setup.touched)
-        scene.on_drag(self._dragged)
-        return contact, Worker(contact, tracer, self._answered, self._said), tracer, scene
+        return contact, Tracer(sensor) if self._traces else None
+
+    def _take_up(self, contact: MovingContact, tracer: Tracer | None) -> None:
+        """Show another contact from now on: its scene is made. No worker may be at work."""
+        setup = contact.setup
+        with self._showing:
+            self.contact, self._tracer = contact, tracer
+            self.worker = Worker(contact, tracer, self._answered, self._said)
+            self._rest = nominal_reference(setup.sensor, setup.form)
+            self._scene = Scene(self._page.server, setup.sensor, contact.solver.mesh, contact.solver.rest())
+            self._scene.put_object(setup.touched)
+            self._scene.on_drag(self._dragged)
 
     def start(self) -> None:
         """Begin to answer. The first wish is the state's pose; the model is loaded beside it."""
@@ -310,7 +317,8 @@ class TwinMode(PageMode):
 
         def change() -> None:
             self.contact.change(touched=touched)
-            self._scene.put_object(touched)
+            with self._showing:
+                self._scene.put_object(touched)
             put(self._friction, self._own_friction())
 
         self.worker.do(change)
@@ -329,14 +337,14 @@ class TwinMode(PageMode):
         """
         with self._rebuilding:
             self._page.say(f"opening {state.sensor} against {state.object} ...")
-            built = self._build(state)
+            prepared = self._prepare(state)
             self.worker.__exit__(None, None, None)
             if self._tracer is not None:
                 self._tracer.__exit__(None, None, None)
             self._state, self._wish = state, state.object_pose()
             self._shown, self._drawn = Shown(state.colour), Drawn(state.drawn)
             self._model_note = "the model is being loaded"
-            self.contact, self.worker, self._tracer, self._scene = built
+            self._take_up(*prepared)
             setup = self.contact.setup
             self._form.options = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
             self._sensor.options = tuple(sorted({*self._sensor.options, state.sensor}))
@@ -371,6 +379,14 @@ class TwinMode(PageMode):
 
     def _publish(self, answer: Answer) -> None:
         """Show an answer: scene, pictures and numbers belong to one pose, and browsers get them together."""
+        with self._showing:
+            if answer.setup.sensor is not self.contact.setup.sensor:  # the page shows another sensor since
+                return
+            self._show_answer(answer)
+        for follow in self.followers:
+            follow(answer)
+
+    def _show_answer(self, answer: Answer) -> None:
         contact = self.contact
         if self._active:
             camera = camera_picture(answer.frame, answer.seen, self._rest.pins_px, self._drawn)
@@ -392,8 +408,6 @@ class TwinMode(PageMode):
             self._draw_charts(answer)
 
         self._page.together(change)
-        for follow in self.followers:
-            follow(answer)
 
     def _gizmo_pose(self, answer: Answer) -> np.ndarray:
         return answer.pose.matrix(self.contact.setup.sensor.skin.apex_mm)

@@ -1,5 +1,6 @@
 """One thread that owns the contact: it always goes towards the newest wish, and refines the answer when there is nothing to go to."""
 
+import logging
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -13,12 +14,22 @@ from twin.studio.contact import Answer, Light, MovingContact
 from twin.studio.pose import ObjectPose
 from twin.studio.tracing import Failed, Outcome, Saved, Traced, Tracer
 
+LOG = logging.getLogger(__name__)
 STILL_S = 0.06
 """The object stands still once no wish has come for this time, in s."""
 REFINE_S = 1.0
 """Time in s without a wish after which the fine mesh follows. A step on it takes some 0.1 s, for which a new wish has to wait."""
 LOOK_S = 0.02
 """Interval in s at which it is looked for the tracer's outcomes and for what is due."""
+
+
+def told(error: Exception) -> str:
+    """An error in words for the page. A fault of this program is also logged with its traceback: the thread goes on."""
+    if isinstance(error, TwinError):
+        return str(error)
+    LOG.error("a fault of this program", exc_info=error)
+    return f"a fault of this program ({error!r}); what is shown may be an earlier state"
+
 
 Wish = tuple[ObjectPose, float]
 """A pose, and the time (``time.monotonic``) at which it was wished."""
@@ -112,7 +123,7 @@ class Worker(_OwnThread):
             self._news.notify()
 
     def do(self, job: Callable[[], None]) -> None:
-        """Call a function in the worker's thread, between two steps. Its ``TwinError`` becomes a message."""
+        """Call a function in the worker's thread, between two steps. Its error becomes a message."""
         with self._news:
             self._jobs.append(job)
             self._news.notify()
@@ -141,11 +152,12 @@ class Worker(_OwnThread):
                 wish = self._due()
             try:
                 self._turn(job, wish)
-            except TwinError as error:
+            except Exception as error:
                 with self._news:
                     if self._wish is wish:
                         self._wish = None
-                self._on_message(str(error))
+                self._moved_s = time.monotonic()  # so that what fails on the fine mesh is not tried without a pause
+                self._on_message(told(error))
 
     def _due(self) -> Wish | None:
         """The wish to go to now. A pose of a way that is played waits for its time, and for the one before."""
@@ -229,7 +241,7 @@ class Newest(_OwnThread, Generic[T]):
     name : str
         Of the thread.
     failed : callable, optional
-        Called with the text of a ``TwinError`` of ``take``.
+        Called with the text of an error of ``take``. The thread goes on.
     """
 
     def __init__(self, take: Callable[[T], None], name: str, failed: Callable[[str], None] = lambda text: None) -> None:
@@ -257,5 +269,5 @@ class Newest(_OwnThread, Generic[T]):
                 thing = self._waiting.pop()
             try:
                 self._take(thing)
-            except TwinError as error:
-                self._failed(str(error))
+            except Exception as error:
+                self._failed(told(error))

@@ -168,6 +168,46 @@ def test_a_damaged_file_is_one_line(tmp_path, to, file, keep):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("to", "file"),
+    [
+        ("recording", "targets.csv"),
+        ("recording", "pins.npz"),
+        ("huggingface", "episodes/000001.json"),
+        ("mcap", "episode_000001.mcap"),
+    ],
+)
+def test_a_missing_file_is_told(tmp_path, to, file):
+    folder = written(tmp_path / "r", to, at_once=True)
+    (folder / file).unlink()
+    with pytest.raises(TwinError, match="is missing"):
+        for episode in open_records(folder).episodes:
+            list(episode.steps())
+
+
+def test_an_mcap_file_with_changed_bytes_is_told_or_read_as_it_was(tmp_path):
+    """In a compressed chunk, whose numbers would change without a word, in a message's definition, or in the index."""
+    path = written(tmp_path / "r", "mcap", EPISODES[:1]) / "episode_000000.mcap"
+    data, told = path.read_bytes(), 0
+    for place in range(300, len(data), 150):
+        for changed in (bytes([data[place] ^ 4]), bytes(64)):
+            path.write_bytes(data[:place] + changed + data[place + len(changed) :])
+            try:
+                (found,) = open_records(path.parent).episodes
+                assert_same(EPISODES[0], found)
+            except RecordError as error:
+                assert "damaged" in str(error)
+                told += 1
+    assert told > 50
+
+
+def test_a_model_with_a_single_label_is_kept_in_every_format(tmp_path):
+    about = replace(ABOUT, numbers={"pose": 6, "estimate": 1, "low": 1, "high": 1}, estimates=("pose_2",))
+    episode = made_episode(1, 3, about)
+    for to in FORMATS:
+        assert_same(episode, open_records(written(tmp_path / to, to, [episode], about)).episodes[0])
+
+
 def test_a_missing_library_names_its_remedy(tmp_path):
     def missing(name):
         raise ImportError(name)

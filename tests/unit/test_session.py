@@ -13,6 +13,7 @@ import pytest
 from hardware.session import SessionSource
 from twin.errors import FrameError, StoreError
 from twin.frames.images import write_image
+from twin.records import open_records
 from twin.records.session import FRAMES, REST, STEPS, SessionWriter, is_session, read_steps
 from twin.types import Form, Frame
 
@@ -179,6 +180,14 @@ def test_a_damaged_session_is_refused_in_one_line(tmp_path, name, content, says)
     with pytest.raises(FrameError, match=says) as caught:
         SessionSource(folder)
     assert str(folder) in str(caught.value) and len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("clock", [{}, {"unix_s": "noon", "monotonic_s": 1.0}, {"unix_s": 1.0}, [], {"unix_s": None, "monotonic_s": 3.0}])
+def test_a_session_whose_clock_is_damaged_has_no_start(tmp_path, clock):
+    folder = recorded(tmp_path / "s")
+    about = json.loads((folder / "session.json").read_text())
+    (folder / "session.json").write_text(json.dumps(about | {"clock": clock}))
+    assert open_records(folder).episodes[0].started_s == 0.0
 
 
 def test_what_follows_a_damaged_line_is_left_out_and_told(tmp_path):

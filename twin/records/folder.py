@@ -184,6 +184,13 @@ def read_json(path: Path) -> dict[str, Any]:
     return found
 
 
+def require_numbered(files: Sequence[Path], name: Callable[[int], str]) -> None:
+    """Raise ``RecordError`` if files, in order, do not have the names of 0, 1, 2 and so on."""
+    for number, path in enumerate(files):
+        if path.name != name(number):
+            raise RecordError(f"{path.parent}: {name(number)} is missing; {AGAIN}")
+
+
 def episode_of(folder: Path, facts: dict[str, Any], steps: Any) -> Episode:
     """An episode by what is kept of it.
 

@@ -16,7 +16,7 @@ import numpy as np
 from twin.errors import FrameError
 from twin.frames.images import read_image, write_image
 from twin.frames.tables import base_name
-from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, read_json, records_in
+from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, read_json, records_in, require_numbered
 from twin.records.record import CHANNELS, TIME, About, Episode, RecordError, Records, Step, library
 from twin.store import remove_parts, replace_folder, write_json, write_text, write_with
 from twin.store.atomic import PART
@@ -140,8 +140,16 @@ def _steps_of(folder: Path, about: About, index: int) -> Iterator[Step]:
 
 
 def _listed(folder: Path) -> list[Path]:
-    """Files that say which episodes are there, in their order."""
-    return sorted((folder / EPISODES).glob("*.json"))
+    """Files that say which episodes are there, in their order.
+
+    Raises
+    ------
+    RecordError
+        One of them is missing.
+    """
+    files = sorted((folder / EPISODES).glob("*.json"))
+    require_numbered(files, "{:06d}.json".format)
+    return files
 
 
 def _facts_in(folder: Path) -> list[tuple[str, dict[str, Any]]]:

@@ -165,7 +165,9 @@ class LeRobotWriter(FolderWriter):
 
     def _row(self, step: Step, number: int, episode: int, index: int, task: int) -> dict[str, Any]:
         row: dict[str, Any] = {} if self.video else {IMAGE: {"bytes": png(_colour(step.image)), "path": f"frame-{number:06d}.png"}}
-        row |= {CHANNELS[name].column: np.asarray(step.values[name], np.float32).tolist() for name in self.about.numbers}
+        for name, count in self.about.numbers.items():  # a single number is no list
+            values = np.asarray(step.values[name], np.float32)
+            row[CHANNELS[name].column] = values.tolist() if count > 1 else values.item()
         counted = dict(zip(COUNTERS, (number, episode, index, task), strict=True))
         return row | {TIME: float(step.time_s), "timestamp": number / self.rate_hz} | counted
 

@@ -77,7 +77,10 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
         estimates=estimates,
         robot=str(said.get("arm", "")),
     )
-    about = read_sidecar(path)[0] if own else about
+    if own:
+        about = read_sidecar(path)[0]
+        if missing := set(about.numbers) - set(values):
+            raise RecordError(f"{path}: {PINS if missing == {'pins'} else TABLE} is missing, or lacks columns; {AGAIN}")
     carried = {column for name in values for column in columns_of(CHANNELS[name], about.axes(name))} | NOT_CARRIED
     left = [name for name, cells in recording.labels.items() if name not in carried and cells.dtype.kind == "f"]
     notes = [*recording.problems, *([f"columns {', '.join(left)} are not taken over"] if left else [])]

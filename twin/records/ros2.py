@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from twin.records.folder import AGAIN, VERSION, FolderWriter, image_of, png, read_sidecar, whole_steps
+from twin.records.folder import AGAIN, VERSION, FolderWriter, image_of, png, read_sidecar, require_numbered, whole_steps
 from twin.records.record import CHANNELS, About, Episode, RecordError, Records, Step, float32, library
 from twin.store import write_with
 
@@ -26,6 +26,8 @@ METADATA, REST = "tactip", "rest.png"
 """Name of a file's own metadata, and of the attached picture without contact."""
 MM_PER_M = 1000.0
 NS_PER_S = 1_000_000_000
+MOST_SAID = 200
+"""Most characters of a library's error that a message repeats."""
 TOUCHES_N = 1e-6
 """Force in N from which on ``/tactip/contact`` is 1."""
 
@@ -60,12 +62,7 @@ class Ros2Writer(FolderWriter):
     LIBRARIES = ("mcap_ros2.writer",)
 
     def _find(self) -> list[dict[str, Any]]:
-        found = []
-        for number, path in enumerate(_files(self.folder)):
-            if path.name != _name(number):
-                raise RecordError(f"{self.folder}: {_name(number)} is missing; {AGAIN}")
-            found.append(_said(path)[1])
-        return found
+        return [_said(path)[1] for path in _files(self.folder)]
 
     def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
         for episode in episodes:
@@ -181,8 +178,8 @@ def _said(path: Path) -> tuple[About, dict[str, Any], bytes | None]:
         raise RecordError(f"{path}: can't be read ({error.strerror}); {AGAIN}") from error
     except StopIteration as error:
         raise RecordError(f"{path}: was not written by this program; give one that it wrote") from error
-    except (KeyError, TypeError, ValueError, RecursionError, library("mcap.exceptions").McapError) as error:
-        raise RecordError(f"{path}: damaged or cut ({error}); {AGAIN}") from error
+    except Exception as error:  # the libraries raise exceptions of any type for damaged files
+        raise RecordError(f"{path}: damaged or cut ({' '.join(str(error).split())[:MOST_SAID]}); {AGAIN}") from error
 
 
 def _steps_of(path: Path, about: About) -> Iterator[Step]:
@@ -194,7 +191,7 @@ def _steps_of(path: Path, about: About) -> Iterator[Step]:
     values: dict[str, np.ndarray] = {}
     try:
         with path.open("rb") as file:
-            bag = reader.make_reader(file, decoder_factories=[decoder])
+            bag = reader.make_reader(file, validate_crcs=True, decoder_factories=[decoder])
             for _, channel, message, ros in bag.iter_decoded_messages(topics, log_time_order=False):
                 if message.sequence != count:
                     if image is not None:
@@ -207,8 +204,10 @@ def _steps_of(path: Path, about: About) -> Iterator[Step]:
                     values[named[channel.topic]] = _numbers(named[channel.topic], ros, about)
             if image is not None:
                 yield Step(image, (at_ns - start_ns) / NS_PER_S, {name: values[name] for name in about.numbers})
-    except (OSError, KeyError, TypeError, ValueError, AttributeError, library("mcap.exceptions").McapError) as error:
-        raise RecordError(f"{path}: damaged ({error}); {AGAIN}") from error
+    except RecordError:
+        raise
+    except Exception as error:  # the libraries raise exceptions of any type for damaged files
+        raise RecordError(f"{path}: damaged ({' '.join(str(error).split())[:MOST_SAID]}); {AGAIN}") from error
 
 
 def _numbers(name: str, ros: Any, about: About) -> np.ndarray:
@@ -251,7 +250,16 @@ def _array(values: np.ndarray, label: str) -> dict[str, Any]:
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted(folder.glob("episode_*.mcap"))
+    """A folder's files in the order of their numbers.
+
+    Raises
+    ------
+    RecordError
+        One of them is missing.
+    """
+    files = sorted(folder.glob("episode_*.mcap"))
+    require_numbered(files, _name)
+    return files
 
 
 def _name(number: int) -> str:

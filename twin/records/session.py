@@ -261,7 +261,7 @@ def session_records(folder: Path) -> Records:
         As of ``Session``, or its first picture can't be read.
     """
     session = Session(folder)
-    first, image = session.steps[0], session.frame(0).image
+    first, first_s, image = session.steps[0], session.frame(0).time_s, session.frame(0).image
     estimates = tuple(map(str, first.get("names", [])))
     numbers = {name: 6 for name, key in _POSES.items() if key in first} | {name: len(estimates) for name in _ESTIMATES if estimates}
     size_px = image.shape[1], image.shape[0]
@@ -275,8 +275,6 @@ def session_records(folder: Path) -> Records:
         frame="base",
         robot=str(session.about.get("arm", "")),
     )
-    clock, first_s = session.about.get("clock"), session.frame(0).time_s
-    started_s = clock["unix_s"] + first_s - clock["monotonic_s"] if isinstance(clock, dict) else 0.0
     touched = session.about.get("object")
     rest = session.rest
     episode = Episode(
@@ -285,7 +283,7 @@ def session_records(folder: Path) -> Records:
         steps=partial(_steps_of, session, about, first_s),
         length=len(session.steps),
         rest=None if rest is None else rest.image,
-        started_s=float(started_s),
+        started_s=_started_s(session),
         T_tool_sensor=_sensor_on_tool(session.about),
     )
     return Records(about, [episode], list(session.notes))
@@ -307,6 +305,16 @@ def _steps_of(session: Session, about: About, first_s: float) -> Iterator[Step]:
             )
         values = {name: float32(line.get(key, []), about.numbers[name]) for name, key in keys.items()}
         yield Step(frame.image, seconds(frame.time_s - first_s), values)
+
+
+def _started_s(session: Session) -> float:
+    """Unix time of the session's first frame; 0 if it says no clock or a damaged one."""
+    try:
+        clock = session.about["clock"]
+        started_s = float(clock["unix_s"]) + session.frame(0).time_s - float(clock["monotonic_s"])
+    except (KeyError, TypeError, ValueError):
+        return 0.0
+    return started_s if math.isfinite(started_s) else 0.0
 
 
 def _sensor_on_tool(about: dict[str, Any]) -> np.ndarray | None:

@@ -188,6 +188,11 @@ class Sensed:
     slip_share: float = float("nan")
     slip_begins: float = float("nan")
 
+    @property
+    def turning_nmm(self) -> float:
+        """Size of the torque about the sensor's axis."""
+        return abs(self.torque_nmm)
+
     @classmethod
     def of(cls, depth_mm: float, frame_time_s: float, names: Sequence[str], value: np.ndarray) -> "Sensed":
         """From the labels (K,) of an estimate.
@@ -201,6 +206,38 @@ class Sensed:
         return cls(
             depth_mm, frame_time_s, float(np.linalg.norm(force)), torque, told.get("slip_share", missing), told.get("slip_begins", missing)
         )
+
+
+@dataclass(frozen=True)
+class _FeltRule:
+    """What the arm does when what the sensor feels exceeds a limit; both are named by their attributes. NaN exceeds nothing."""
+
+    felt: str
+    limit: str
+    action: Action
+    code: Code
+    said: str
+
+    def broken(self, sensed: Sensed, limits: SafetyLimits) -> Decision | None:
+        """The decision if the limit is exceeded."""
+        felt, limit = getattr(sensed, self.felt), getattr(limits, self.limit)
+        return None if limit is None or not felt > limit else Decision(self.action, self.code, self.said.format(felt=felt, limit=limit))
+
+
+_TURNED, _STILL = "the sensor feels {felt:.0f} N mm about its axis", "the arm holds still beyond {limit:g}"
+_SLIDES = "the contact begins to slide (probability {felt:.0%}, allowed {limit:.0%}); press harder"
+# In the order in which they count.
+_FELT = (
+    _FeltRule("depth_mm", "contact_mm", Action.RETRACT, Code.TOO_DEEP, "{felt:.1f} mm deep in contact (allowed {limit:g} mm)"),
+    _FeltRule("force_n", "force_n", Action.RETRACT, Code.TOO_STRONG, "the sensor feels {felt:.1f} N (allowed {limit:g} N)"),
+    _FeltRule("turning_nmm", "torque_nmm", Action.RETRACT, Code.TOO_TWISTED, f"{_TURNED} (allowed {{limit:g}} N mm)"),
+    _FeltRule("force_n", "hold_force_n", Action.HOLD, Code.HELD_FORCE, f"the sensor feels {{felt:.1f}} N ({_STILL} N)"),
+    _FeltRule("turning_nmm", "hold_torque_nmm", Action.HOLD, Code.HELD_FORCE, f"{_TURNED} ({_STILL} N mm)"),
+    _FeltRule("slip_begins", "slip_begins", Action.HOLD, Code.SLIPPING, _SLIDES),
+    _FeltRule(
+        "slip_share", "slip_share", Action.HOLD, Code.SLIPPING, "{felt:.0%} of the contact slides (allowed {limit:.0%}); press harder"
+    ),
+)
 
 
 def decide(
@@ -318,27 +355,7 @@ def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed
         return None
     if not (age_s := now_s - sensed.frame_time_s) <= limits.frame_age_s:
         return Decision(Action.HOLD, Code.STALE_FRAME, f"the sensor's frame is {age_s:.2f} s old (allowed {limits.frame_age_s:g} s)")
-    if sensed.depth_mm > limits.contact_mm:
-        return Decision(Action.RETRACT, Code.TOO_DEEP, f"{sensed.depth_mm:.1f} mm deep in contact (allowed {limits.contact_mm:g} mm)")
-    if limits.force_n is not None and sensed.force_n > limits.force_n:
-        return Decision(Action.RETRACT, Code.TOO_STRONG, f"the sensor feels {sensed.force_n:.1f} N (allowed {limits.force_n:g} N)")
-    if limits.torque_nmm is not None and abs(sensed.torque_nmm) > limits.torque_nmm:
-        felt = f"{abs(sensed.torque_nmm):.0f} N mm about its axis"
-        return Decision(Action.RETRACT, Code.TOO_TWISTED, f"the sensor feels {felt} (allowed {limits.torque_nmm:g} N mm)")
-    if limits.hold_force_n is not None and sensed.force_n > limits.hold_force_n:
-        felt = f"the sensor feels {sensed.force_n:.1f} N (the arm holds still beyond {limits.hold_force_n:g} N)"
-        return Decision(Action.HOLD, Code.HELD_FORCE, felt)
-    if limits.hold_torque_nmm is not None and abs(sensed.torque_nmm) > limits.hold_torque_nmm:
-        felt = f"the sensor feels {abs(sensed.torque_nmm):.0f} N mm about its axis"
-        return Decision(Action.HOLD, Code.HELD_FORCE, f"{felt} (the arm holds still beyond {limits.hold_torque_nmm:g} N mm)")
-    if limits.slip_begins is not None and sensed.slip_begins > limits.slip_begins:
-        said = f"the contact begins to slide (probability {sensed.slip_begins:.0%}, allowed {limits.slip_begins:.0%}); press harder"
-        return Decision(Action.HOLD, Code.SLIPPING, said)
-    if limits.slip_share is not None and sensed.slip_share > limits.slip_share:
-        return Decision(
-            Action.HOLD, Code.SLIPPING, f"{sensed.slip_share:.0%} of the contact slides (allowed {limits.slip_share:.0%}); press harder"
-        )
-    return None
+    return next(filter(None, (rule.broken(sensed, limits) for rule in _FELT)), None)
 
 
 def _place(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits) -> Decision | None:

@@ -15,6 +15,7 @@ import pytest
 from made_records import ABOUT, COLOUR, assert_same, made_episode
 
 from twin.errors import StoreError, TwinError
+from twin.frames import open_recording
 from twin.records import FORMATS, RecordError, convert, open_records, open_writer, record
 from twin.records.folder import SIDECAR
 
@@ -198,6 +199,23 @@ def test_an_mcap_file_with_changed_bytes_is_told_or_read_as_it_was(tmp_path):
             except RecordError as error:
                 assert "damaged" in str(error)
                 told += 1
+    assert told > 50
+
+
+@pytest.mark.parametrize(("to", "file"), [("lerobot", "data/chunk-000/file-000.parquet"), ("huggingface", "data/000000/metadata.parquet")])
+def test_a_table_with_a_changed_byte_is_told_or_read_as_it_was(tmp_path, to, file):
+    folder = written(tmp_path / "r", to, EPISODES[:1])
+    labels = open_recording(folder).labels if to == "lerobot" else {}
+    data, told = (folder / file).read_bytes(), 0
+    for place in range(4, len(data), len(data) // 150):
+        (folder / file).write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
+        try:
+            (found,) = open_records(folder).episodes
+            assert_same(EPISODES[0], found)
+            for name, column in (open_recording(folder).labels if to == "lerobot" else {}).items():
+                np.testing.assert_array_equal(column, labels[name])
+        except TwinError:
+            told += 1
     assert told > 50
 
 

@@ -89,8 +89,11 @@ class LeRobotFrames:
     def _stored(self, path: Path, group: int, row: int) -> bytes:
         """A picture's file from a table."""
         if self._group != (path, group):
-            cells = _read(path, lambda parquet: parquet.ParquetFile(path).read_row_group(group, columns=[self._feature]))
-            self._group, self._cells = (path, group), cells.column(self._feature).to_pylist()
+            columns = [self._feature]
+            table = _read(path, lambda parquet: parquet.ParquetFile(path, page_checksum_verification=True).read_row_group(group, columns))
+            if self._feature not in table.column_names:
+                raise FrameError(f"{path}: has no column {self._feature}, though {INFO} names it; {DAMAGED}")
+            self._group, self._cells = (path, group), table.column(self._feature).to_pylist()
         cell = self._cells[row]
         data = cell.get("bytes") if isinstance(cell, dict) else cell
         if isinstance(data, bytes):
@@ -176,7 +179,12 @@ def _rows(path: Path, info: dict[str, Any], numbered: list[str]) -> tuple[dict[s
     for file in sorted(path.glob(DATA)):
         groups = _read(file, lambda parquet, file=file: parquet.ParquetFile(file).num_row_groups)
         for group in range(groups):
-            table = _read(file, lambda parquet, file=file, group=group: parquet.ParquetFile(file).read_row_group(group, columns=columns))
+            table = _read(
+                file,
+                lambda parquet, file=file, group=group: parquet.ParquetFile(file, page_checksum_verification=True).read_row_group(
+                    group, columns=columns
+                ),
+            )
             if missing := [name for name in columns if name not in table.column_names]:
                 raise FrameError(f"{file}: has no column {', '.join(missing[:3])}, though {INFO} names it; {DAMAGED}")
             cells = {name: table.column(name).to_pylist() for name in columns}
@@ -195,7 +203,9 @@ def _in_videos(path: Path, info: dict[str, Any], feature: str, rows: dict[str, l
     at = f"videos/{feature}"
     keys = [f"{at}/chunk_index", f"{at}/file_index", f"{at}/from_timestamp"]
     for file in sorted(path.glob(EPISODES)):
-        table = _read(file, lambda parquet, file=file: parquet.read_table(file, columns=["episode_index", *keys]))
+        table = _read(
+            file, lambda parquet, file=file: parquet.read_table(file, columns=["episode_index", *keys], page_checksum_verification=True)
+        )
         episodes |= {row["episode_index"]: row for row in table.to_pylist()}
     try:
         files = {

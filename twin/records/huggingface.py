@@ -105,7 +105,7 @@ class HuggingFaceWriter(FolderWriter):
         kinds = {name: pa.list_(pa.float32()) for name in self.about.numbers}
         named = [(CHANNELS[name].column, pa.list_(kind) if len(self.about.shape(name)) == 2 else kind) for name, kind in kinds.items()]
         table = pa.Table.from_pylist(lines, pa.schema([*counted, (TIME, pa.float64()), *named]))
-        write_with(part / METADATA, lambda file: parquet.write_table(table, file))
+        write_with(part / METADATA, lambda file: parquet.write_table(table, file, write_page_checksum=True))
         replace_folder(part, self.folder / DATA / f"{self._next:06d}")
         write_json(self.folder / EPISODES / f"{self._next:06d}.json", {"episodes": group})
         self._next += 1
@@ -130,7 +130,9 @@ def _reader(folder: Path, found: list[tuple[str, dict[str, Any]]], about: About,
 
 def _steps_of(folder: Path, about: About, index: int) -> Iterator[Step]:
     try:
-        for line in library("pyarrow.parquet").read_table(folder / METADATA, partitioning=None).to_pylist():
+        for line in (
+            library("pyarrow.parquet").read_table(folder / METADATA, partitioning=None, page_checksum_verification=True).to_pylist()
+        ):
             if line["episode_index"] != index:
                 continue
             values = {name: np.array(line[CHANNELS[name].column], np.float32).reshape(about.shape(name)) for name in about.numbers}

@@ -129,7 +129,7 @@ class LeRobotWriter(FolderWriter):
         schema = pa.schema(self._schema(pa), metadata={"huggingface": json.dumps({"info": {"features": self._hf_features()}})})
         frames, written = self._frames, 0
         film = _Film(video, self.rate_hz, self.about.size_px) if self.video else None
-        with parquet.ParquetWriter(file, schema, compression="snappy") as table:
+        with parquet.ParquetWriter(file, schema, compression="snappy", write_page_checksum=True) as table:
             while (not group or written < self.held_bytes) and waiting.has_next:
                 episode = next(waiting)
                 number, rows, length = len(self.facts) + len(group), [], 0
@@ -234,12 +234,15 @@ class LeRobotWriter(FolderWriter):
         pandas = {"index_columns": ["__index_level_0__"], "column_indexes": [], "columns": [column, index], "pandas_version": "2.2.0"}
         tasks = pa.table({"task_index": pa.array(range(len(self._tasks)), pa.int64()), "__index_level_0__": self._tasks})
         tasks = tasks.replace_schema_metadata({"pandas": json.dumps(pandas)})
-        write_with(_made(self.folder / TASKS), lambda file: parquet.write_table(tasks, file))
+        write_with(_made(self.folder / TASKS), lambda file: parquet.write_table(tasks, file, write_page_checksum=True))
         rows = [
             row | {f"stats/{key}/{k}": v.tolist() for key, each in found.items() for k, v in each.items()} | {FACTS: json.dumps(facts)}
             for row, facts, found in group
         ]
-        write_with(_made(self.folder / EPISODES_PATH.format(**at)), lambda file: parquet.write_table(pa.Table.from_pylist(rows), file))
+        write_with(
+            _made(self.folder / EPISODES_PATH.format(**at)),
+            lambda file: parquet.write_table(pa.Table.from_pylist(rows), file, write_page_checksum=True),
+        )
         write_json(self.folder / STATS, {key: {k: v.tolist() for k, v in each.items()} for key, each in stats.items()})
         last = group[-1][0]
         write_json(
@@ -394,7 +397,7 @@ def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Step]
     if video:
         pictures = _film_pictures(folder, row, about)
     try:
-        file = parquet.ParquetFile(path)
+        file = parquet.ParquetFile(path, page_checksum_verification=True)
         leaf = next(k for k in range(len(file.schema)) if file.schema.column(k).path == "episode_index")
         for group in range(file.num_row_groups):
             told = file.metadata.row_group(group).column(leaf).statistics
@@ -432,7 +435,7 @@ def _episode_rows(folder: Path) -> list[dict[str, Any]]:
     try:
         for path in sorted(folder.glob("meta/episodes/chunk-*/file-*.parquet")):
             names = [name for name in parquet.read_schema(path).names if not name.startswith("stats/")]
-            rows += parquet.read_table(path, columns=names).to_pylist()
+            rows += parquet.read_table(path, columns=names, page_checksum_verification=True).to_pylist()
     except (OSError, library("pyarrow").ArrowException) as error:
         raise RecordError(f"{folder / 'meta/episodes'}: damaged ({error}); {AGAIN}") from error
     if not isinstance(total, int) or len(rows) < total:

@@ -347,6 +347,8 @@ def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwr
 def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed | None) -> Decision | None:
     if (age_s := now_s - state.time_s) > limits.feedback_age_s:
         return Decision(Action.HOLD, Code.STALE_FEEDBACK, f"feedback is {age_s:.2f} s old (allowed {limits.feedback_age_s:g} s)")
+    if not (np.isfinite(state.pose).all() and np.isfinite(state.joints_deg).all()):
+        return Decision(Action.HOLD, Code.NOT_A_NUMBER, f"the arm says that it is at {state.pose}; restart it")
     if state.error:
         return Decision(Action.HOLD, Code.ARM_ERROR, state.error)
     if not state.enabled:

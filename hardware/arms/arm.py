@@ -14,12 +14,14 @@ from typing import Protocol, Self
 import numpy as np
 
 from hardware.arms.motion import turn_between_deg
-from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, also
+from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError, also
 
 # Interval in s at which feedback is read. It is shorter than the 8 ms period of the fastest feedback.
 POLL_S = 0.005
 # Feedback older than this (s) is not used. So an arm that is lost or frozen is stopped, and that is said, within a second.
 FEEDBACK_AGE_S = 0.8
+# An arm that says that a number of its pose is larger than this (mm, deg) says nothing.
+FARTHEST = 1e5
 # A commanded move shows in feedback sooner than this (s). An arm that rests elsewhere for longer does not execute the move.
 BELIEVE_REST_S = 0.15
 # With a long time limit an arm may rest for a tenth of it, but not longer than this (s), before that is an error.
@@ -217,6 +219,11 @@ class BaseArm(Connection):
             if self._may_move():
                 stop_after(self, error)
             raise
+
+    def _require_possible(self, pose: np.ndarray) -> None:
+        """Raise ``StaleDataError`` if no arm can be at a pose (6,) that this one tells: where it is, is not known."""
+        if not (np.abs(pose) < FARTHEST).all():  # NaN is not smaller
+            raise StaleDataError(f"{self.name}: says that it is at {pose}, a place that no arm reaches; stop it, then restart it")
 
     def _may_move(self) -> bool:
         """Whether a move that was sent may not have ended."""

@@ -134,6 +134,7 @@ class Magician(BaseArm):
                 f"{self.name}: the arm took {time.monotonic() - begun_s:.2f} s to tell its state (allowed {max_age_s:g} s)"
             )
         pose = np.array([*values[:3], 0.0, 0.0, values[3]])
+        self._require_possible(pose)
         return ArmState(pose, values[4:], begun_s, self._enabled, moving, explain(alarms) if alarms else "")
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:

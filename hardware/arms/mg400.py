@@ -201,11 +201,13 @@ class MG400(BaseArm):
         self._require_connected()
         packet, time_s = self._feedback.newest(max_age_s)
         x, y, z, turn = packet["tool_actual"][:4]
+        pose = np.array([x, y, z, 0.0, 0.0, turn])
+        self._require_possible(pose)
         mode = int(packet["mode"])
         if mode != Mode.ERROR:
             self._alarm_text = None
         return ArmState(
-            np.array([x, y, z, 0.0, 0.0, turn]),
+            pose,
             packet["q_actual"][:4].copy(),
             time_s,
             mode in ENABLED_MODES,

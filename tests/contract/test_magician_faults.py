@@ -243,3 +243,11 @@ def test_a_link_that_leads_nowhere_is_replaced_and_one_in_use_is_not(tmp_path):
         with pytest.raises(TwinError, match="--link"):
             MagicianEmulator(link=link).start()
         assert arm.state().joints_deg.shape == (4,)
+
+
+def test_a_pose_that_can_not_be_is_no_pose(monkeypatch):
+    with MagicianEmulator() as emulator, Magician(emulator.device) as arm:
+        arm.enable()
+        monkeypatch.setattr(emulator.arm.track, "pose", lambda time_s: np.full(6, np.nan))
+        with pytest.raises(StaleDataError, match="a place that no arm reaches"):
+            arm.state()

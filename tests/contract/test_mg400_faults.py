@@ -14,7 +14,7 @@ from hardware.arms import kinematics as arms
 from hardware.arms.mg400 import Mg400Ports
 from hardware.arms.mg400_link import CommandPort, Feedback
 from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, newest_packet, take_reply
-from hardware.emulators.mg400 import FAULTS, Mg400Emulator
+from hardware.emulators.mg400 import FAULTS, Mg400Emulator, feedback_packet
 from hardware.emulators.mg400_grammar import RefusedError
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from hardware.safe_arm import SafeArm
@@ -455,3 +455,30 @@ def test_two_clients_that_disable_each_other_are_told(caplog):
 
 def test_the_default_ports_are_the_arms():
     assert Mg400Ports() == Mg400Ports(29999, 30003, (30004, 30005))
+
+
+@pytest.mark.parametrize("told", [np.nan, np.inf, 1e300])
+def test_a_pose_that_can_not_be_is_no_pose(monkeypatch, told):
+    """It is told as feedback that does not come, and the arm is stopped."""
+
+    def packet(arm):
+        made = feedback_packet(arm)
+        if broken.is_set():
+            made["tool_actual"] = told
+        return made
+
+    broken = threading.Event()
+    monkeypatch.setattr("hardware.emulators.mg400.feedback_packet", packet)
+    with emulated() as emulator, SafeArm(mg400_of(emulator), load_limits("mg400")) as arm:
+        arm.enable()
+        arm.set_speed(20.0, 20.0)
+        arm.move_linear(AWAY, wait=False)
+        broken.set()
+        time.sleep(0.1)
+        begun_s = time.monotonic()
+        with pytest.raises(DeviceError, match="a place that no arm reaches"):
+            arm.move_linear(HOME)
+        assert time.monotonic() - begun_s < 1.0
+        stands = emulator.pose()
+        time.sleep(0.1)
+        assert np.allclose(emulator.pose(), stands)

@@ -28,6 +28,10 @@ def state(pose=HOME, *, age_s=0.0, enabled=True, error=""):
     return ArmState(pose, MG400.inverse(pose), NOW_S - age_s, enabled, False, error)
 
 
+def lost_state():
+    return ArmState(HOME * np.nan, np.full(4, np.nan), NOW_S, True, False)
+
+
 def decided(target, limits=FREE, *, at=HOME, sensed=None, **told):
     return decide(target, state(at, **told), limits, now_s=NOW_S, kinematics=MG400, sensed=sensed)
 
@@ -41,6 +45,7 @@ def decided(target, limits=FREE, *, at=HOME, sensed=None, **told):
         (decided(HOME, enabled=False), Action.REFUSE, Code.NOT_ENABLED),
         (decided(HOME, error="alarm 17"), Action.HOLD, Code.ARM_ERROR),
         (decided(HOME, age_s=1.1), Action.HOLD, Code.STALE_FEEDBACK),
+        (decide(HOME, lost_state(), FREE, now_s=NOW_S, kinematics=MG400), Action.HOLD, Code.NOT_A_NUMBER),
         (decided(HOME, sensed=Sensed(1.0, NOW_S - 0.6)), Action.HOLD, Code.STALE_FRAME),
         (decided(HOME, sensed=Sensed(1.0, np.nan)), Action.HOLD, Code.STALE_FRAME),
         (decided(HOME, sensed=Sensed(6.1, NOW_S)), Action.RETRACT, Code.TOO_DEEP),

@@ -1,5 +1,6 @@
 """JPEG pictures over HTTP (multipart/x-mixed-replace): what a server of such a stream writes, and a camera that reads it."""
 
+import contextlib
 import http.client
 import socket
 import time
@@ -94,9 +95,11 @@ class MjpegCamera(LiveSource):
         self._parts = parts
         self._connection: http.client.HTTPConnection | None = None
         self._stream: http.client.HTTPResponse | None = None
+        self._socket: socket.socket | None = None
         self._last: int | None = None
 
     def _open(self) -> None:
+        self._last = None
         try:
             self._request()
         except OSError as error:
@@ -108,6 +111,7 @@ class MjpegCamera(LiveSource):
         connection = protocol(self._parts.hostname or "", self._parts.port, timeout=SILENT_S)
         try:
             connection.request("GET", (self._parts.path or "/") + (f"?{self._parts.query}" if self._parts.query else ""))
+            self._socket = connection.sock  # the answer may take it over
             answer = connection.getresponse()
         except (OSError, http.client.HTTPException) as error:
             connection.close()
@@ -122,7 +126,12 @@ class MjpegCamera(LiveSource):
         for opened in (self._stream, self._connection):
             if opened is not None:
                 opened.close()
-        self._connection = self._stream = None
+        self._connection = self._stream = self._socket = None
+
+    def _interrupt(self) -> None:
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.shutdown(socket.SHUT_RDWR)
 
     def _grab(self) -> Picture:
         if self._stream is None:
@@ -147,7 +156,7 @@ class MjpegCamera(LiveSource):
         return Picture(image, stamped_s(headers), lost)
 
     def _finish(self, image: np.ndarray) -> np.ndarray:
-        return capture(image, self._spec, self.form, self.name)
+        return capture(image, self._spec, self.form)
 
 
 def next_part(stream: Readable) -> tuple[dict[str, str], bytes]:

@@ -24,6 +24,8 @@ MOST_FAILED_READS = 10
 FAILED_PAUSE_S = 0.2
 # The stream is frozen if a picture stays the same for this time (s) and this number of times. A live sensor's pictures differ by noise.
 FROZEN_S, FROZEN_N = 0.5, 5
+# A picture that says that it is older than this (s) when it comes has the time of another clock, or is of no use.
+LATE_S = 5.0
 # Gray level (0 to 255). A picture without a pixel of this level is black: the lamps are off.
 BLACK_LEVEL = 16
 # The first picture of a real camera may take this time (s) after opening, and in addition FIRST_PERIODS periods of its frames.
@@ -93,6 +95,9 @@ class LiveSource(Connection):
     def _close(self) -> None:
         """Let go of the device; without effect when closed."""
 
+    def _interrupt(self) -> None:
+        """End a read that waits, if the device can. It is called from another thread than ``_grab``."""
+
     @abstractmethod
     def _grab(self) -> Picture:
         """The next picture; ``ReadFailed``."""
@@ -122,7 +127,7 @@ class LiveSource(Connection):
 
     @property
     def fault(self) -> str:
-        """What is wrong with the pictures ("" if nothing): frozen or black."""
+        """What is wrong with the pictures ("" if nothing): frozen, black or late."""
         return self._fault
 
     def connect(self) -> None:
@@ -138,6 +143,7 @@ class LiveSource(Connection):
         if self._thread is None:
             return
         self._end.set()
+        self._interrupt()
         self._thread.join(timeout=15.0)
         self._thread = None
         self._close()
@@ -222,6 +228,11 @@ class LiveSource(Connection):
     def _look_at(self, picture: Picture) -> str:
         if picture.image.max(initial=0) < BLACK_LEVEL:
             return "the picture is black; check the sensor's lamps and the camera's exposure"
+        if (age_s := time.monotonic() - picture.time_s) > LATE_S:
+            return (
+                f"the picture says that it is {age_s:.0f} s old; set the clock of the camera's computer to that of this one, "
+                "or look for what delays the pictures"
+            )
         if not self.notices_still:
             return ""
         if self._still is None or not np.array_equal(self._still[0], picture.image):
@@ -234,7 +245,7 @@ class LiveSource(Connection):
         return ""
 
 
-def capture(image: np.ndarray, spec: SensorSpec | None, form: Form, name: str) -> np.ndarray:
+def capture(image: np.ndarray, spec: SensorSpec | None, form: Form) -> np.ndarray:
     """A picture (H, W) or (H, W, 3) uint8 RGB as the sensor's frame of a form. Without a sensor the picture is returned unchanged.
 
     Raises
@@ -248,9 +259,7 @@ def capture(image: np.ndarray, spec: SensorSpec | None, form: Form, name: str) -
     if image.shape[1::-1] != size:
         if form is Form.RECORDING and image.shape[1::-1] == frame_size(spec, form):
             return gray_levels(image)  # thresholded by the sender
-        raise DeviceError(
-            f"{name}: delivers {image.shape[1]}x{image.shape[0]}, {spec.name} has {size[0]}x{size[1]}; give the matching sensor"
-        )
+        raise DeviceError(f"delivers {image.shape[1]}x{image.shape[0]}, {spec.name} has {size[0]}x{size[1]}; give the matching sensor")
     if spec.camera.channels == "mono":
         image = gray_levels(image)
     return record(image, spec.recording) if form is Form.RECORDING and spec.recording is not None else image

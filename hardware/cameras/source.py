@@ -12,7 +12,7 @@ class FrameSource(Protocol):
 
     A background reader keeps the newest frame. ``Frame.time_s`` is when the frame was exposed as well as can be known (the
     kernel's buffer time, else the arrival), ``Frame.sequence`` counts frames of the device, lost ones included where
-    the device tells. A live source whose pictures are frozen or black, or whose reader has ended after too many failed
+    the device tells. A live source whose pictures are frozen, black or late, or whose reader has ended after too many failed
     reads, raises ``DeviceError`` from every read.
     """
 

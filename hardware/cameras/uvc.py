@@ -95,7 +95,7 @@ class UvcCamera(LiveSource):
         return Picture(image if image.ndim == 2 else image[..., ::-1].copy(), exposed_s(device.get(cv2.CAP_PROP_POS_MSEC)))
 
     def _finish(self, image: np.ndarray) -> np.ndarray:
-        return capture(image, self._spec, self.form, self.name)
+        return capture(image, self._spec, self.form)
 
 
 def exposed_s(position_ms: float) -> float:

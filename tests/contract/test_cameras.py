@@ -1,8 +1,11 @@
 """One suite over every frame source: the twin, a folder, a video, a session, a stream over a real socket, a USB camera."""
 
 import socket
+import threading
 import time
 import urllib.request
+from contextlib import contextmanager, suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -14,7 +17,7 @@ from noisy_camera import NoisyCamera, number_of
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras import reader
 from hardware.cameras.choose import open_camera
-from hardware.cameras.mjpeg import MjpegCamera, next_part
+from hardware.cameras.mjpeg import CONTENT_TYPE, MjpegCamera, jpeg_of, next_part, write_part
 from hardware.cameras.reader import FIRST_PERIODS, MOST_FAILED_READS, ReadFailed
 from hardware.cameras.source import FrameSource
 from hardware.cameras.twin import TwinCamera
@@ -289,6 +292,79 @@ class TestStream:
         while not condition():
             assert time.monotonic() < deadline, "it did not happen in time"
             time.sleep(0.01)
+
+
+@contextmanager
+def served(script):
+    """The address of a foreign stream, which ``script`` writes to the connection's file."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", CONTENT_TYPE)
+            self.end_headers()
+            with suppress(OSError):
+                script(self.wfile)
+
+        def log_message(self, *_):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/"
+    server.shutdown()
+    server.server_close()
+
+
+def write_pictures(out, *, count=10**6, headers=lambda: {}):
+    for k in range(count):
+        write_part(out, jpeg_of(pictures()[k % COUNT]), headers())
+        time.sleep(0.01)
+
+
+def test_a_stream_that_drips_is_left_at_once():
+    def drip(out):
+        write_pictures(out, count=2)
+        out.write(b"--frame\r\nContent-Length: 90000\r\n\r\n")
+        while True:
+            out.write(b"\xff")
+            time.sleep(0.05)
+
+    with served(drip) as url:
+        camera = MjpegCamera(url)
+        camera.connect()
+        camera.read(timeout_s=5.0)
+        time.sleep(0.1)
+        begun_s = time.monotonic()
+        camera.disconnect()
+        assert time.monotonic() - begun_s < 1.0
+
+
+def test_frames_of_another_clock_are_told():
+    """A camera's computer whose clock jumps: all frames seem old, and would be waited out one by one."""
+    jumped = threading.Event()
+
+    def stamped():
+        return {"X-Timestamp": f"{time.time() - 40.0 * jumped.is_set():.6f}"}
+
+    with served(lambda out: write_pictures(out, headers=stamped)) as url, MjpegCamera(url) as camera:
+        camera.read(timeout_s=5.0)
+        jumped.set()
+        begun_s = time.monotonic()
+        with pytest.raises(DeviceError, match="40 s old.*clock"):
+            camera.read_after(begun_s, timeout_s=5.0)
+        assert time.monotonic() - begun_s < 1.0
+        jumped.clear()
+        time.sleep(0.1)
+        assert camera.read(timeout_s=2.0).image.size
+
+
+def test_pictures_of_another_size_name_the_camera_once():
+    with served(write_pictures) as url, MjpegCamera(url, load_sensor("mg400-331")) as camera:
+        with pytest.raises(DeviceError, match="delivers 64x48") as refused:
+            camera.read(timeout_s=5.0)
+        assert str(refused.value).count(url) == 1
 
 
 class TestUvcSettings:

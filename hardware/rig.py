@@ -31,7 +31,8 @@ from scenes.experiment import ExperimentSpec
 from twin.errors import FrameError, RenderError
 from twin.estimate import Estimate, Estimator, SensorModel
 from twin.frames import open_recording
-from twin.optics.preview import Preview, traced_shading
+from twin.optics.preview import Preview
+from twin.optics.render import traced_shading
 from twin.pins import require_untouched
 from twin.rig.mounting import Mounting
 from twin.types import FIRST, NONE, Form, Frame

@@ -72,7 +72,7 @@ def render_contact(
         The folder to write to; made if missing.
     form : Form
         The camera's frame, or the form of the sensor's recordings.
-    quality : {"preview", "standard", "high"}
+    quality : {"drawn", "preview", "standard", "high"}
         Samples per pixel.
     seed : int
         Seed of the renderer and of the camera's noise.

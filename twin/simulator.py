@@ -15,6 +15,7 @@ from twin.frames.forms import frame_size
 from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
+from twin.optics.preview import Shading
 from twin.optics.render import Quality, Renderer
 from twin.types import ContactState, FloatArray, Form, Frame
 
@@ -46,17 +47,21 @@ class Simulator:
     Parameters
     ----------
     spec : SensorSpec
-    quality : {"preview", "standard", "high"}
-        Samples per pixel of the renderer.
+    quality : {"drawn", "preview", "standard", "high"}
+        Of the renderer.
     solver : SkinSolver, optional
         A solver of the same sensor. By default one with the usual resolution is made.
+    shading : Shading, optional
+        Of drawn pictures, as a `Renderer` takes it.
     """
 
-    def __init__(self, spec: SensorSpec, *, quality: Quality = "standard", solver: SkinSolver | None = None) -> None:
+    def __init__(
+        self, spec: SensorSpec, *, quality: Quality = "standard", solver: SkinSolver | None = None, shading: Shading | None = None
+    ) -> None:
         self.spec = spec
         self.solver = solver or SkinSolver(spec)
         self.rest = self.solver.rest()
-        self._quality = quality
+        self._quality, self._shading = quality, shading
         self._renderer: Renderer | None = None
         self._rest_shots: dict[Form, Shot] = {}
 
@@ -64,7 +69,7 @@ class Simulator:
     def renderer(self) -> Renderer:
         """The renderer. It is built when it is first needed, because a simulation without rendering needs no Mitsuba."""
         if self._renderer is None:
-            self._renderer = Renderer(self.spec, quality=self._quality, mesh=self.solver.mesh)
+            self._renderer = Renderer(self.spec, quality=self._quality, mesh=self.solver.mesh, shading=self._shading)
         return self._renderer
 
     def press(self, touched: ObjectSpec, pose: ContactPose, *, progress: Callable[[float], object] | None = None) -> ContactState:
@@ -110,7 +115,7 @@ class Simulator:
         return replace(raw, frame=frame, truth=cap_truth(self.spec, self.rest, state, Form.RECORDING))
 
     def describe(self) -> dict[str, dict[str, object]]:
-        """Everything besides sensor and object that a result depends on: variant, samples, mesh and tolerances."""
+        """Everything besides sensor and object that a result depends on: variant, samples (0: drawn), mesh and tolerances."""
         return {
             "renderer": {"variant": self.renderer.choice.variant, "samples_per_pixel": self.renderer.spp},
             "solver": {

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-from bench_render import CHOSEN, Bench
+from bench_render import CHOSEN, DRAWN, Bench
 
 from figures.jobs import Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
@@ -71,14 +71,20 @@ def speed(work: Path) -> Measured:
     truth, rows = bench.samples()
     ratios = bench.plain(rows)
     _, wall_ms, _, _, centroid_px = next(row for row in rows if row[0] == CHOSEN)
+    _, drawn_ms, _, drawn_gray, drawn_px = next(row for row in rows if row[0] == DRAWN)
     half_px = next(row for row in rows if row[0] == CHOSEN // 2)[4]
     preview_ms, preview_px = bench.preview(truth)
     return {
         "frame_s": Value(wall_ms / 1e3, "s"),
         "centroid_px": Value(centroid_px, "px"),
         "centroid_half_px": Value(half_px, "px"),
-        "plain_ratio_centroids": Value(ratios["centroids"]),
-        "plain_ratio_grays": Value(ratios["gray levels"]),
+        "plain_ratio_centroids": Value(ratios[CHOSEN, "centroids"]),
+        "plain_ratio_grays": Value(ratios[CHOSEN, "gray levels"]),
+        "drawn_s": Value(drawn_ms / 1e3, "s"),
+        "drawn_gray": Value(drawn_gray, "gray levels"),
+        "drawn_px": Value(drawn_px, "px"),
+        "plain_ratio_drawn_centroids": Value(ratios[DRAWN, "centroids"]),
+        "plain_ratio_drawn_grays": Value(ratios[DRAWN, "gray levels"]),
         "photo_s": Value(bench.photo(), "s"),
         "preview_s": Value(preview_ms / 1e3, "s"),
         "preview_px": Value(preview_px, "px"),

@@ -113,7 +113,7 @@ def test_the_centroid_of_a_cap_is_that_of_its_projected_disc(small):
         _, centroid = area_and_centroid(disc)
         weight = np.where(np.hypot(x - centroid[0], y - centroid[1]) < 7.5, image, 0.0)
         errors.append([(weight * x).sum() / weight.sum() - centroid[0], (weight * y).sum() / weight.sum() - centroid[1]])
-    tolerance_px = 0.0036  # measured: 0.0033; an outline is a polygon
+    tolerance_px = 0.0047  # measured: 0.0043; an outline is a polygon, and caps overlap
     assert np.sqrt(np.square(errors).sum(axis=1).mean()) < tolerance_px
 
 

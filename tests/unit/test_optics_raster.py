@@ -1,9 +1,9 @@
-"""Laws of drawn polygons and triangles: exact cover, cut-offs, nesting, linear fields."""
+"""Laws of drawn pins and triangles: exact cover, cut-offs, nesting, linear fields."""
 
 import numpy as np
 import pytest
 
-from twin.optics.raster import draw_polygons, draw_triangles
+from twin.optics.raster import draw_pins, draw_triangles
 
 
 def area_of(polygon: np.ndarray) -> float:
@@ -12,12 +12,15 @@ def area_of(polygon: np.ndarray) -> float:
     return abs(np.sum(polygon[:, 0] * after[:, 1] - after[:, 0] * polygon[:, 1])) / 2
 
 
-def drawn(shape, polygons, light=None, inner=None) -> np.ndarray:
-    """Polygons on black, of light 1 by default."""
+def drawn(shape, polygons, light=None, side=None) -> np.ndarray:
+    """Caps with these faces on black, of light 1 by default; with ``side`` each has a bevel and a wall around a smaller face."""
     count, image = len(polygons), np.zeros(shape)
-    draw_polygons(
-        image, polygons, np.ones((count, shape[2])) if light is None else light, np.zeros(count, bool) if inner is None else inner
-    )
+    light = np.ones((count, shape[2])) if light is None else light
+    middle = polygons.mean(axis=1, keepdims=True)
+    face, edge = (polygons, polygons) if side is None else (middle + share * (polygons - middle) for share in (0.6, 0.8))
+    outlines = np.stack([np.repeat(middle, polygons.shape[1], axis=1), polygons, edge, face], axis=1)
+    sides = np.zeros((count, 2 * polygons.shape[1], shape[2])) + (0.0 if side is None else side)
+    draw_pins(image, outlines, light, sides, light, np.ones(count, bool), np.arange(count))
     return image
 
 
@@ -32,7 +35,7 @@ def test_polygons_cover_exactly_their_area():
     for _ in range(50):
         polygon = ring_of(7, rng)
         image = drawn((30, 40, 1), polygon[None])
-        assert image.sum() == pytest.approx(area_of(polygon), abs=rounding) and image.max() <= 1
+        assert image.sum() == pytest.approx(area_of(polygon), abs=rounding) and image.max() <= 1 + rounding
         np.testing.assert_allclose(drawn((30, 40, 1), polygon[None, ::-1]), image, atol=rounding, err_msg="the sense of turning matters")
 
 
@@ -55,13 +58,21 @@ def test_polygons_are_clipped_at_the_border():
     np.testing.assert_allclose(drawn((11, 15, 2), polygons - [13, 9], light), drawn((30, 40, 2), polygons, light)[9:20, 13:28], atol=1e-12)
 
 
-def test_an_inner_polygon_adds_no_edge():
-    """The same outline again, as an inner one of the same light, changes nothing; of another light, it replaces it."""
-    polygon, light = ring_of(6, np.random.default_rng(4)), np.array([[1.0], [0.3]])
-    once, twice = drawn((30, 40, 1), polygon[None]), np.stack([polygon, polygon])
-    inner = np.array([False, True])
-    np.testing.assert_allclose(drawn((30, 40, 1), twice, np.ones((2, 1)), inner), once, atol=1e-12)
-    np.testing.assert_allclose(drawn((30, 40, 1), twice, light, inner), 0.3 * once, atol=1e-12)
+def test_facets_side_by_side_leave_no_seam():
+    """A cap of a wall, a bevel and a face of one light is a single polygon; of another light, the sides are what the face leaves."""
+    polygon = ring_of(6, np.random.default_rng(4))[None]
+    once, inside = drawn((30, 40, 1), polygon), drawn((30, 40, 1), polygon.mean(axis=1) + 0.6 * (polygon - polygon.mean(axis=1)))
+    np.testing.assert_allclose(drawn((30, 40, 1), polygon, side=1.0), once, atol=1e-12)
+    np.testing.assert_allclose(drawn((30, 40, 1), polygon, side=0.3), 0.3 * once + 0.7 * inside, atol=1e-12)
+
+
+def test_a_cap_seen_from_behind_hides_what_is_below_it():
+    """Its face and the walls' outer sides are out of sight; the inside is black."""
+    polygon = ring_of(6, np.random.default_rng(5))[None]
+    image, light, black = np.ones((30, 40, 1)), np.ones((1, 1)), np.zeros((1, 12, 1))
+    outlines = np.stack([np.repeat(polygon.mean(axis=1, keepdims=True), 6, axis=1), polygon, polygon, polygon], axis=1)
+    draw_pins(image, outlines, light, black, light, np.zeros(1, bool), np.zeros(1, int))
+    np.testing.assert_allclose(image, 1 - drawn((30, 40, 1), polygon), atol=1e-12)
 
 
 def test_triangles_show_a_linear_field_without_gaps():

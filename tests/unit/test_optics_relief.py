@@ -14,6 +14,7 @@ from twin.geometry.pins import rest_pins
 from twin.judge.pictures.aligned import Aligned
 from twin.mechanics.skin_fit import FittedPins
 from twin.optics.measured import picture_of, values_of
+from twin.optics.preview import Preview
 from twin.optics.relief import DETAILS, POWER, SKIN_FROM, CapLamp, Relief, cap_places, cap_planes, tiles_of, tiles_picture, without
 from twin.optics.static_layer import BACKGROUND_POWER, static_layer
 
@@ -77,6 +78,11 @@ def test_an_even_tile_adds_its_share_of_the_caps_own_light(spec):
         light, lamp = added(with_tiles(spec, even), shown), CapLamp(spec)(shown)
         places = cap_places(spec.view, spec.pins, shown, WINDOW, REACH)
         np.testing.assert_allclose(light.reshape(-1, 3)[places.pixels], 0.25 * lamp[places.cap], rtol=0.05)
+
+
+def test_a_drawn_picture_has_the_relief_too(spec, tiles):
+    raised, smooth = (Preview(each, static=(0.2, np.zeros((240, 320)))).render() for each in (with_tiles(spec, tiles), spec))
+    np.testing.assert_allclose(raised, np.maximum(smooth + added(with_tiles(spec, tiles), rest_pins(spec.geometry)), 0), atol=1e-6)
 
 
 def test_a_faded_cap_has_a_faded_relief(spec, tiles):

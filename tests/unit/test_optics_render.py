@@ -183,7 +183,25 @@ def test_a_color_camera_sees_three_channels_and_a_mono_one_their_luminance(small
     np.testing.assert_allclose(cap_light(mono, small, rest).mean(), luminance.mean(), rtol=interreflection)
 
 
+@pytest.mark.parametrize("aperture_mm", [0.0, 4.0])
+def test_a_drawn_picture_is_the_traced_one(small, aperture_mm):
+    """Edges in and out of focus, walls and bevels, the skin: of a state in which the shading was not fitted."""
+    look = {"skin_albedo": (0.02, 0.02, 0.02), "pin_albedo": (0.1, 0.1, 0.1)}
+    spec = changed(small, pins={"cap_height_mm": 0.6}, camera={"aperture_mm": aperture_mm, "focus_mm": 45.0}, appearance=look)
+    rest = rest_pins(spec.geometry)
+    moved = rest.base_mm * [0.02, 0.03, 0.0] - [0.0, 0.0, 0.5]
+    state = PinRest(rest.base_mm + moved, rest.axis, rest.caps_mm + moved)
+    traced, drawn = Renderer(spec, spp=128).render(state), Renderer(spec, quality="drawn").render(state)
+    places = project(spec.view, state.caps_mm)
+    apart_px = np.linalg.norm(centroids(drawn, places) - centroids(traced, places), axis=1)
+    light, within_px = 0.02, 0.06  # of the caps' light; measured: LLL, 0.053
+    assert np.sqrt(np.mean((drawn - traced) ** 2)) < light * np.percentile(traced, 98)
+    assert np.sqrt(np.mean(apart_px**2)) < within_px
+
+
 def test_what_cannot_be_rendered_is_refused(small):
+    with pytest.raises(RenderError, match="spp=4"):
+        Renderer(small, quality="drawn", spp=4)
     with pytest.raises(RenderError, match="quality"):
         Renderer(small, quality="best")
     with pytest.raises(RenderError, match="window_px"):

@@ -19,7 +19,7 @@ from twin.types import FINE, Form
 
 Images = Literal["raw", "gray", "recording", "none"]
 States = Literal["end", "all"]
-Quality = Literal["preview", "standard", "high"]
+Quality = Literal["drawn", "preview", "standard", "high"]
 
 
 MOST_CONTACTS = 1_000_000

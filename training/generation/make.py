@@ -1,6 +1,7 @@
 """One contact of a data set: a worker process makes its pictures and its truth from its number."""
 
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
 import cv2
@@ -14,6 +15,7 @@ from twin.frames.forms import gray_levels
 from twin.geometry.solid import Resolution
 from twin.mechanics.skin_map import skin_map
 from twin.mechanics.solver import SkinSolver
+from twin.optics.preview import Shading
 from twin.optics.variant import one_thread
 from twin.rig.contact import RigContact
 from twin.rig.labels import ArmLabel
@@ -78,7 +80,7 @@ def make_contact(text: str, index: int) -> Outcome:
 
 
 def _simulated(config: GenerationConfig, text: str, draw: Draw, index: int, failures: list) -> Outcome:
-    simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor)
+    simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor, _shading(config, text, draw.sensor))
     contact = RigContact(simulator.solver, config.experiment, config.object)
     way = contact.way(draw.label)
     found = list(contact.along(way, friction=draw.friction))
@@ -122,7 +124,7 @@ def _row(config: GenerationConfig, draw: Draw, simulator: Simulator, state: Cont
 
 
 def _png(config: GenerationConfig, simulator: Simulator, state: ContactState, seed: int) -> bytes:
-    with one_thread(simulator.renderer.choice):
+    with nullcontext() if simulator.renderer.drawn else one_thread(simulator.renderer.choice):
         shot = simulator.shoot(state, form=config.form, seed=seed)
     image = shot.frame.image if config.images != "gray" else gray_levels(shot.frame.image)
     return cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes()
@@ -139,5 +141,14 @@ def _nominal(text: str) -> Simulator:
     return _simulator(config, config.sensor)
 
 
-def _simulator(config: GenerationConfig, sensor: SensorSpec) -> Simulator:
-    return Simulator(sensor, quality=config.quality, solver=SkinSolver(sensor, resolution=Resolution(config.across)))
+def _simulator(config: GenerationConfig, sensor: SensorSpec, shading: Shading | None = None) -> Simulator:
+    solver = SkinSolver(sensor, resolution=Resolution(config.across))
+    return Simulator(sensor, quality=config.quality, solver=solver, shading=shading)
+
+
+def _shading(config: GenerationConfig, text: str, sensor: SensorSpec) -> Shading | None:
+    """The shading of the sensor as specified: it stands for that of the drawn sensor, of which nothing is traced."""
+    if config.quality != "drawn" or config.images == "none":
+        return None
+    shading = _nominal(text).renderer.preview.shading
+    return shading if sensor.geometry == config.sensor.geometry else replace(shading, skin=np.ones((1, 1)))

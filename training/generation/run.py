@@ -127,8 +127,8 @@ def config_for(
         The object; the experiment's own by default. For its friction on this sensor see ``friction_between``.
     seed : int, optional
         Seed of all random numbers; the experiment's own by default.
-    quality : {"preview", "standard", "high"}, optional
-        By default ``preview`` for images in the recordings' form, because these are thresholded, else ``standard``.
+    quality : {"drawn", "preview", "standard", "high"}, optional
+        By default ``drawn``: nearer to a converged picture than the few samples that a data set has time for.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def config_for(
         seed=experiment.seed if seed is None else seed,
         images=images,
         states=states,
-        quality=quality or ("preview" if images == "recording" else "standard"),
+        quality=quality or "drawn",
         across=across,
     )
     frame_size(sensor, config.form)

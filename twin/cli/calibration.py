@@ -16,6 +16,7 @@ import typer
 from twin.cli import FewCommands, app
 from twin.cli.options import (
     CORES,
+    QUALITY,
     Across,
     Force,
     FormOrAuto,
@@ -359,7 +360,7 @@ def realism(
     without: Annotated[
         list[str] | None, typer.Option("--without", metavar="DETAIL", help="relief, grain or background; may be repeated")
     ] = None,
-    quality: Annotated[Quality, typer.Option(help="samples per pixel")] = "standard",
+    quality: Annotated[Quality, typer.Option(help=QUALITY)] = "standard",
     two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
     table: Table = None,
     pipeline: Tuning = None,

@@ -19,6 +19,7 @@ from twin.cli import app
 from twin.cli.options import (
     CORES,
     MOST_SEED,
+    QUALITY,
     Across,
     Also,
     Device,
@@ -125,9 +126,7 @@ def dataset(
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of all draws; the experiment's own if not given")] = None,
     workers: Workers = CORES,
     scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
-    quality: Annotated[
-        Quality | None, typer.Option(help="samples per pixel", show_default="preview for --images recording, else standard")
-    ] = None,
+    quality: Annotated[Quality | None, typer.Option(help=QUALITY, show_default="drawn")] = None,
     across: Across = FINE,
     also: Also = None,
     force: Force = False,

@@ -30,8 +30,9 @@ MOST_SEED = 2**32 - 1
 # More threads of a CPU than this have never made a training faster, and many more can't be started.
 MOST_THREADS = 256
 
-Quality = Literal["preview", "standard", "high"]
+Quality = Literal["drawn", "preview", "standard", "high"]
 """Presets of the renderer (``twin.optics.render.Quality``, which would load the renderer)."""
+QUALITY = "drawn without noise, or path-traced with more and more samples"
 
 Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
 Object = Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]

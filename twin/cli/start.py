@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Force, Object, Out, Pair, Quality, Sensor, say, tell
+from twin.cli.options import QUALITY, Force, Object, Out, Pair, Quality, Sensor, say, tell
 from twin.types import Form
 
 
@@ -170,7 +170,7 @@ def render(
         0.0,
     ),
     form: Annotated[Form, typer.Option(help="the camera's frame, or the cropped and thresholded form of the recordings")] = Form.RAW,
-    quality: Annotated[Quality, typer.Option(help="samples per pixel")] = "standard",
+    quality: Annotated[Quality, typer.Option(help=QUALITY)] = "standard",
     seed: Annotated[int, typer.Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,
     force: Force = False,
 ) -> None:

@@ -50,17 +50,20 @@ class DirectLight:
 
         Parameters
         ----------
-        points_mm, normals : (n, 3) float
-            Places in the gel and unit normals that point into the gel, in the sensor frame.
+        points_mm : (n, 3) float
+            Places in the gel, in the sensor frame.
+        normals : (n, 3) or (n, m, 3) float
+            Unit normals of surfaces there that point into the gel.
         bump : float
             Share of the light that a place receives as a ball does, from any direction (``AppearanceSpec.cap_bump``).
 
         Returns
         -------
-        (n, 3) float
+        (n, 3) or (n, m, 3) float
             Linear RGB.
         """
-        return _irradiance(points_mm, normals, bump, self._places, self._powers, self._window, self._absorption)
+        each = normals.reshape(len(points_mm), -1, 3)
+        return _irradiance(points_mm, each, bump, self._places, self._powers, self._window, self._absorption).reshape(normals.shape)
 
     def ways(self, points_mm: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Refracted rays from points (n, 3) to a place (3,) in the air: unit directions (n, 3) and lengths (n,) in the gel."""
@@ -71,17 +74,17 @@ class DirectLight:
 def _irradiance(
     points: FloatArray, normals: FloatArray, bump: float, places: FloatArray, powers: FloatArray, window: FloatArray, absorption: FloatArray
 ) -> FloatArray:
-    result = np.zeros((len(points), 3))
+    result = np.zeros(normals.shape)
     absorbs = np.any(absorption > 0)
     for i in range(len(points)):
         for k in range(len(places)):
             x, y, z, length, factor = _way(points[i], places[k], window)
-            cosine = x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]
-            if cosine > 0:
-                strength = factor * ((1 - bump) * cosine + 0.5 * bump)
-                for c in range(3):
-                    share = np.exp(-absorption[c] * length) if absorbs else 1.0
-                    result[i, c] += strength * share * powers[k, c]
+            arriving = factor * (powers[k] * np.exp(-absorption * length) if absorbs else powers[k])
+            for j in range(normals.shape[1]):
+                cosine = x * normals[i, j, 0] + y * normals[i, j, 1] + z * normals[i, j, 2]
+                if cosine > 0:
+                    for c in range(3):
+                        result[i, j, c] += ((1 - bump) * cosine + 0.5 * bump) * arriving[c]
     return result
 
 

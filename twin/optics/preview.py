@@ -7,7 +7,7 @@ for each material; `Preview.calibrate` fits these to a path-traced frame.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import cv2
 import numpy as np
@@ -19,17 +19,17 @@ from twin.camera.projection import project, sensor_to_camera
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
 from twin.geometry.shapes import shape_of
+from twin.optics.defocus import circles_px, defocused
 from twin.optics.direct_light import DirectLight
 from twin.optics.lens import ray_table
 from twin.optics.lights import lights
-from twin.optics.raster import PinOutlines, draw_polygons, draw_triangles
-from twin.optics.render import Quality, Renderer
+from twin.optics.raster import PinOutlines, draw_pins, draw_triangles, side_normals
+from twin.optics.relief import Relief
 from twin.optics.static_layer import static_layer
 from twin.optics.surfaces import cap_albedo
 from twin.optics.tracer import luminance
 from twin.optics.window import Window
-from twin.store import cached_arrays
-from twin.types import FloatArray, IntArray, PinState
+from twin.types import BoolArray, FloatArray, IntArray, PinState
 
 Lamp: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
 """Function that gives the irradiance (n, 3), divided by n^2 of the gel, at points (n, 3) in mm with normals (n, 3)."""
@@ -48,8 +48,15 @@ NEAR_PX = 4.0
 """Standard deviation, px, of the Gaussian neighbourhood in which traced and drawn light of the skin are compared."""
 MOST_SKIN_GAIN = 4.0
 """Largest gain of one corner of the skin."""
-SHADING_QUALITY: Quality = "standard"
-"""Samples per pixel of the path-traced frame to which a kept shading is fitted."""
+
+
+class Renders(Protocol):
+    """Something that renders a window of the frame, as a `twin.optics.render.Renderer` does."""
+
+    window_px: tuple[int, int, int, int]
+
+    def render(self) -> FloatArray:
+        """Linear light (H, W, 3) or (H, W) at rest."""
 
 
 @dataclass(frozen=True)
@@ -77,18 +84,24 @@ class _Drawing:
     ----------
     corners_px : (v, 2) float
         Corners of the skin, px of the window.
-    outlines_px : (s, K, 2) float
-        Outlines of the visible stems, sides and faces, from far to near.
-    seen : (s,) int
-        Row of each outline in the pins' lights (3 N), whose order is: stem, side and face of the first pin, of the second pin, ...
-    direct, ambient : list of (v, 3) or (N, 3) float
+    outlines_px : (N, 4, K, 2) float
+        As `PinOutlines` gives them.
+    facing : (N,) bool
+        Whether the camera sees the cap's face.
+    far_first : (N,) int
+        The pins' numbers, from far to near.
+    circles : (v, 1) float32, optional
+        Diameters of the circles of confusion at the corners of the skin, px; None for a pinhole.
+    direct, ambient : list of (v, 3), (N, 3), (N, 2 K, 3) and (N, 3) float
         Irradiance of each material by the lamps, and by unit light from all directions. Both are multiplied by the gel's transmittance
-        to the camera.
+        to the camera. A cap's side has facets; one ambient light (N, 1, 3) is for all of them.
     """
 
     corners_px: FloatArray
     outlines_px: FloatArray
-    seen: IntArray
+    facing: BoolArray
+    far_first: IntArray
+    circles: FloatArray | None
     direct: list[FloatArray]
     ambient: list[FloatArray]
 
@@ -128,6 +141,8 @@ class Preview:
         through = (1 - np.asarray(cover)) * _transmittance(spec.view, self.window_px)
         self._through = through[..., None].astype(np.float32)
         self._shine = self._on_film(np.broadcast_to(shine, (*through.shape, 3)))
+        self._relief = None if spec.appearance.relief is None else Relief(spec, self.window_px)
+        self._uncovered = (1 - np.asarray(cover)).ravel().astype(np.float32)
         self._rest = rest_pins(spec.geometry)
         self._outlines = PinOutlines(spec.view, spec.pins, spec.appearance)
         self._belt_mm, self._faces = _belt(spec.geometry, self._rest.base_mm)
@@ -138,7 +153,7 @@ class Preview:
         self._albedo = (
             np.array([look.skin_albedo]),
             np.array([look.pin_albedo]),
-            cap_albedo(look, spec.pins.count),
+            cap_albedo(look, spec.pins.count)[:, None],
             cap_albedo(look, spec.pins.count),
         )
 
@@ -160,19 +175,20 @@ class Preview:
         RenderError
             The state has another number of pins.
         """
-        drawing = self._drawing(self._rest if state is None else state)
-        film = self._shine + self._through * self._gel(drawing, self.shading)
+        state = self._rest if state is None else state
+        film = self._known(state) + self._through * self._gel(self._drawing(state), self.shading)
+        np.maximum(film, 0, out=film)
         return film if self._color else film[..., 0]
 
-    def calibrate(self, renderer: Renderer) -> Shading:
+    def calibrate(self, renderer: Renders) -> Shading:
         """Fit the shading to a path-traced frame at rest, and use it for all following frames.
 
         It is a least-squares fit over the film. The weights make an error count about as much as in gray levels.
 
         Parameters
         ----------
-        renderer : Renderer
-            Renderer of the same sensor and window.
+        renderer : Renders
+            `twin.optics.render.Renderer` of the same sensor and window.
 
         Raises
         ------
@@ -183,19 +199,33 @@ class Preview:
             raise RenderError(f"the renderer's window_px is {renderer.window_px}, the preview's {self.window_px}: build both alike")
         traced = renderer.render().reshape(self._shine.shape)
         drawing = self._drawing(self._rest)
-        gel, weight = traced - self._shine, (np.maximum(traced, 0) + DARK) ** -0.5
+        gel = traced - self._known(self._rest)
+        weight = np.where(traced > 0, (np.maximum(traced, 0) + DARK) ** -0.5, 0)  # light below 0 was cut off
         alone = np.eye(8).reshape(8, 2, 4, 1)  # shadings in which one gain, or one offset, is 1 and all others are 0
         parts = np.stack([weight * self._through * self._gel(drawing, Shading(*only)) for only in alone], axis=-1)
         fitted = [_fit(parts[..., c, :].reshape(-1, 8), (weight * gel)[..., c].ravel()) for c in range(gel.shape[2])]
         fit = Shading(*np.stack(fitted, axis=-1).reshape(2, 4, -1))
-        self.shading = replace(fit, skin=self._skin_gain(drawing, fit, gel))
+        self.shading = replace(fit, skin=self._skin_gain(drawing, fit, np.where(traced > 0, gel, np.nan)))
         return self.shading
 
+    def _known(self, state: PinState) -> FloatArray:
+        """Light (H, W, C) of the static layer and the measured relief."""
+        if self._relief is None:
+            return self._shine
+        known = self._shine.copy()
+        raised, more = self._relief.light(state)
+        known.reshape(-1, known.shape[2])[raised] += self._uncovered[raised, None] * self._on_film(more)
+        return known
+
     def _skin_gain(self, drawing: _Drawing, fit: Shading, gel: FloatArray) -> FloatArray:
-        """Gain (v, 1) of each corner of the skin: ratio of traced light (H, W, C) to the fit's, in its neighbourhood without pins."""
+        """Gain (v, 1) of each corner of the skin: ratio of traced light (H, W, C) to the fit's, in its neighbourhood without pins.
+
+        Unknown light is NaN.
+        """
         bare = np.array([[1.0], [0.0], [0.0], [0.0]])
         pins = self._gel(drawing, Shading(1 - bare, 1 - bare)).max(axis=2)
         free = (cv2.dilate(pins, np.ones((3, 3))) == 0) & (self._through[..., 0] > 0.5 * self._through.max())
+        free &= np.isfinite(gel).all(axis=2)
         skin = self._through * self._gel(drawing, Shading(fit.gain * bare, fit.offset * bare))
         traced, drawn = (cv2.GaussianBlur(np.where(free, light.sum(axis=2), 0), (0, 0), NEAR_PX) for light in (gel, skin))
         ratio = np.divide(traced, drawn, out=np.ones_like(traced), where=drawn > 1e-3 * drawn.max())
@@ -207,7 +237,8 @@ class Preview:
         """Irradiance of caps. With the sensor's own lamps a share of the light (``cap_bump``) is received as by balls."""
         if self._light is self._direct:
             return self._direct(places_mm, normals, self.spec.appearance.cap_bump)
-        return self._light(places_mm, normals)
+        each = np.broadcast_to(places_mm.reshape(len(places_mm), *[1] * (normals.ndim - 2), 3), normals.shape)
+        return self._light(each.reshape(-1, 3), normals.reshape(-1, 3)).reshape(normals.shape)
 
     def _drawing(self, state: PinState) -> _Drawing:
         base, axis, caps = state.base_mm, state.axis, state.caps_mm
@@ -215,32 +246,39 @@ class Preview:
             raise RenderError(f"the state has {len(base)} pins, {self.spec.name} has {len(self._rest.base_mm)}")
         pupil = np.array([0.0, 0.0, -self.spec.camera.distance_mm])
         toward, _ = self._direct.ways(caps, pupil)
-        side = _unit(toward - np.sum(toward * axis, axis=1, keepdims=True) * axis)
         half = 0.5 * self.spec.pins.cap_height_mm
         places = [base, 0.5 * (base + caps), caps, caps + half * axis]
-        lit = [self._light(place, normal) for place, normal in zip(places[:2], (axis, side), strict=True)]
-        lit += [self._cap_light(place, normal) for place, normal in zip(places[2:], (side, axis), strict=True)]
+        side = toward - np.sum(toward * axis, axis=1, keepdims=True) * axis
+        lit = [self._light(place, normal) for place, normal in zip(places[:2], (axis, _unit(side)), strict=True)]
+        lit += [self._cap_light(place, normal) for place, normal in zip(places[2:], (side_normals(axis), axis), strict=True)]
         skin = np.concatenate([base, self._belt_mm])
         kept = [self._kept(place, pupil) for place in (skin, *places[1:])]
+        kept[SIDE] = kept[SIDE][:, None]
         direct = [light * share for light, share in zip([np.concatenate([lit[0], self._belt_light]), *lit[1:]], kept, strict=True)]
-        far_first = np.argsort(-np.linalg.norm(caps - pupil, axis=1))
-        shown = np.ones((len(base), 3), bool)
-        shown[:, FACE - STEM] = np.sum(toward * axis, axis=1) > 0
-        rows = (3 * far_first[:, None] + np.arange(3))[shown[far_first]]
         feet_px, outlines_px = self._outlines(base, axis, caps)
         corners_px = np.concatenate([feet_px, self._belt_px]) - self.window_px[:2]
-        return _Drawing(corners_px, outlines_px.reshape(3 * len(base), -1, 2)[rows] - self.window_px[:2], rows, direct, kept)
+        facing, far_first = np.sum(toward * axis, axis=1) > 0, np.argsort(-np.linalg.norm(caps - pupil, axis=1))
+        circles = None
+        if self.spec.camera.aperture_mm > 0:
+            diameter, shift = circles_px(self.spec.view, np.concatenate([caps, self._belt_mm]))
+            circles, outlines_px = diameter[:, None].astype(np.float32), outlines_px + shift[: len(caps), None, None]
+        return _Drawing(corners_px, outlines_px - self.window_px[:2], facing, far_first, circles, direct, kept)
 
     def _gel(self, drawing: _Drawing, shading: Shading) -> FloatArray:
         """Light (H, W, C) of skin and pins before it passes the window."""
         image = np.zeros(self._shine.shape, np.float32)
         offset = shading.offset * self._mean_light
         parts = zip(self._albedo, shading.gain, drawing.direct, offset, drawing.ambient, strict=True)
-        skin, *pins = (self._on_film(albedo / np.pi * (gain * direct + more * ambient)) for albedo, gain, direct, more, ambient in parts)
+        skin, stem, side, face = (
+            self._on_film(albedo / np.pi * (gain * direct + more * ambient)) for albedo, gain, direct, more, ambient in parts
+        )
         draw_triangles(image, drawing.corners_px, skin * shading.skin.astype(np.float32), self._faces)
-        light = np.concatenate([part[:, None] for part in pins], axis=1).reshape(3 * len(pins[0]), -1)[drawing.seen]
-        draw_polygons(image, drawing.outlines_px, light, drawing.seen % 3 == FACE - STEM)
-        return image
+        draw_pins(image, drawing.outlines_px, stem, side, face, drawing.facing, drawing.far_first)
+        if drawing.circles is None:
+            return image
+        circles = np.zeros((*image.shape[:2], 1), np.float32)
+        draw_triangles(circles, drawing.corners_px, drawing.circles, self._faces)
+        return defocused(image, circles[..., 0])
 
     def _kept(self, points_mm: FloatArray, pupil_mm: FloatArray) -> FloatArray:
         """Transmittance (n, 3) of the gel from points (n, 3) to the camera."""
@@ -252,23 +290,6 @@ class Preview:
     def _on_film(self, rgb: FloatArray) -> FloatArray:
         """RGB (..., 3) as the film's channels (..., C)."""
         return np.asarray(rgb if self._color else luminance(rgb)[..., None], np.float32)
-
-
-def traced_shading(preview: Preview) -> Shading:
-    """The shading that ``Preview.calibrate`` fits to a path-traced frame at rest. It is kept between runs.
-
-    Raises
-    ------
-    RenderError
-        Nothing can be path-traced here.
-    """
-
-    def trace() -> dict[str, np.ndarray]:
-        shading = preview.calibrate(Renderer(preview.spec, quality=SHADING_QUALITY, window_px=preview.window_px))
-        return {"gain": shading.gain, "offset": shading.offset, "skin": shading.skin}
-
-    key = {"sensor": preview.spec.model_dump(mode="json"), "window_px": list(preview.window_px), "quality": SHADING_QUALITY}
-    return Shading(**cached_arrays("shading", key, trace, code=(Preview, Renderer)))
 
 
 def _fit(parts: FloatArray, target: FloatArray) -> FloatArray:

@@ -9,15 +9,17 @@ import numpy as np
 from scenes.sensor import AppearanceSpec, PinsSpec, ViewSpec
 from twin.camera.projection import project
 from twin.compiled import compiled
-from twin.optics.surfaces import CAP_BEVEL, cap_outlines
+from twin.optics.surfaces import CAP_BEVEL, STEM_SIDES, cap_outlines
 from twin.types import BoolArray, FloatArray, IntArray
 
 SIDES = 16
 """Corners of an outline's polygon."""
 RIM_PLACES = 6
 """Number of places of a cap's rim that are projected. The image of the rim is smooth, so these places determine it."""
-EVENLY = np.sqrt(np.sin(np.pi / 12) / (np.pi / 12) * (2 * np.pi / SIDES) / np.sin(2 * np.pi / SIDES))
+EVENLY = np.sqrt(2 * np.pi / SIDES / np.sin(2 * np.pi / SIDES))
 """Factor on the radius with which the polygon has the area of the round outline that it approximates."""
+STEM_WIDTH = STEM_SIDES / np.pi * np.sin(np.pi / STEM_SIDES)
+"""Mean width of the traced stems, which are prisms, relative to their diameter."""
 TURN = np.arange(SIDES) * 2 * np.pi / SIDES
 """Azimuths of an outline's corners, rad."""
 ON_EDGE = 1e-9
@@ -42,14 +44,11 @@ class PinOutlines:
         self._even = (0.5 + np.cos(2 * apart)) * 2 / RIM_PLACES
 
     def __call__(self, base_mm: FloatArray, axis: FloatArray, caps_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Feet (N, 2), and outlines (N, 3, SIDES, 2) of stem, side and face of each pin, given (N, 3) each."""
+        """Feet (N, 2), and outlines (N, 4, SIDES, 2) of each pin, given (N, 3) each: stem; bottom, edge and face of the cap."""
         pins = self._pins
         radius, half = 0.5 * pins.cap_diameter_mm, 0.5 * pins.cap_height_mm
         bevel = min(CAP_BEVEL * pins.cap_height_mm, 0.5 * radius)
-        u = np.array([1.0, 0.0, 0.0]) - axis[:, :1] * axis  # direction in which an outline starts (`surfaces`)
-        u /= np.linalg.norm(u, axis=1, keepdims=True)
-        places = np.arange(RIM_PLACES) * 2 * np.pi / RIM_PLACES
-        rim = caps_mm + radius * (np.cos(places)[:, None, None] * u + np.sin(places)[:, None, None] * np.cross(u, axis))
+        rim = caps_mm + radius * np.moveaxis(_around(axis, np.arange(RIM_PLACES) * 2 * np.pi / RIM_PLACES), 1, 0)
         seen = project(self._view, np.concatenate([rim, caps_mm[None], base_mm[None]]))
         centre, foot = seen[-2, :, None], seen[-1, :, None]
         from_centre = seen[:-2] - seen[-2]
@@ -59,95 +58,156 @@ class PinOutlines:
         def disc(factor: float | FloatArray) -> FloatArray:
             return factor * odd + factor**2 * even
 
-        stem = disc(EVENLY * 0.5 * pins.diameter_mm / radius)
+        stem = disc(STEM_WIDTH * EVENLY * 0.5 * pins.diameter_mm / radius)
         bottom, edge = (centre + height * along + disc(self._cap) for height in (-half, half - bevel))
         face = centre + half * along + disc(self._cap * (1 - bevel / radius))
-        return seen[-1], np.stack([_hull(foot + stem, centre - half * along + stem), _hull(bottom, edge, face), face], axis=1)
+        return seen[-1], np.stack([_hull(foot + stem, centre - half * along + stem), bottom, edge, face], axis=1)
 
 
-def _hull(*discs: FloatArray) -> FloatArray:
-    """Outline (N, K, 2) around similar closed outlines (N, K, 2) each: its point k is the outermost of their points k."""
-    tangent = np.roll(discs[0], -1, axis=1) - np.roll(discs[0], 1, axis=1)
+def side_normals(axis: FloatArray) -> FloatArray:
+    """Outward unit normals (N, 2 SIDES, 3) of the facets of the caps' walls, then of their bevels, about axes (N, 3)."""
+    wall = _around(axis, TURN + np.pi / SIDES)
+    return np.concatenate([wall, np.sqrt(0.5) * (wall + axis[:, None])], axis=1)
+
+
+def _around(axis: FloatArray, turn: FloatArray) -> FloatArray:
+    """Unit vectors (N, k, 3) perpendicular to axes (N, 3) at azimuths (k,), which start at the sensor's x (as `surfaces` does)."""
+    u = np.array([1.0, 0.0, 0.0]) - axis[:, :1] * axis
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return np.cos(turn)[:, None] * u[:, None] + np.sin(turn)[:, None] * np.cross(u, axis)[:, None]
+
+
+def _hull(near: FloatArray, far: FloatArray) -> FloatArray:
+    """Outline (N, K, 2) around two similar closed outlines (N, K, 2): its point k is the outer one of their points k."""
+    tangent = np.roll(near, -1, axis=1) - np.roll(near, 1, axis=1)
     outward = np.stack([tangent[..., 1], -tangent[..., 0]], axis=-1)
-    arm = discs[0] - discs[0].mean(axis=1, keepdims=True)
+    arm = near - near.mean(axis=1, keepdims=True)
     outward = outward * np.sign(np.sum(arm * outward, axis=(1, 2)))[:, None, None]
-    hull, far = discs[0], np.sum(discs[0] * outward, axis=-1)
-    for disc in discs[1:]:
-        reach = np.sum(disc * outward, axis=-1)
-        hull, far = np.where((reach > far)[..., None], disc, hull), np.maximum(far, reach)
-    return hull
+    return np.where((np.sum((far - near) * outward, axis=-1) > 0)[..., None], far, near)
 
 
 @compiled(error_model="numpy")
-def draw_polygons(image: FloatArray, polygons: FloatArray, light: FloatArray, inner: BoolArray) -> None:
-    """Draw closed polygons (P, K, 2), each with one light (P, C), over the image in the given order.
+def draw_pins(
+    image: FloatArray,
+    outlines: FloatArray,
+    stem_light: FloatArray,
+    side_light: FloatArray,
+    face_light: FloatArray,
+    facing: BoolArray,
+    order: IntArray,
+) -> None:
+    """Draw stems and caps over the image, pin by pin. Each pixel gets the light of each facet by the share of its area that this covers.
 
-    A pixel gets a share of the light, equal to the share of its area that the polygon covers. A polygon that is ``inner`` (P,) lies
-    within the polygon before it and replaces the light of that one, so that common edges are not blended twice.
+    The facets of a cap that show their outer side do not overlap, so their shares are added before the cap is drawn over what is there:
+    common edges are not blended twice.
+
+    Parameters
+    ----------
+    image : (H, W, C) float
+    outlines : (N, 4, K, 2) float
+        Closed outlines (`PinOutlines`), px.
+    stem_light, face_light : (N, C) float
+    side_light : (N, 2 K, C) float
+        Of the wall's facets, then of the bevel's. Facet k lies between the corners k and k + 1.
+    facing : (N,) bool
+        Whether the camera sees the cap's face. Otherwise the black inside of the cap is drawn, where its wall does not hide it.
+    order : (N,) int
+        Numbers of the pins in the order of drawing.
     """
     height, width, channels = image.shape
-    for p in range(len(polygons)):
-        polygon = polygons[p]
-        left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
-        for x, y in polygon:
-            left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
-        if not (right > -0.5 and bottom > -0.5 and left < width - 0.5 and top < height - 0.5):
-            continue
-        x0, y0 = int(np.floor(left + 0.5)), int(np.floor(top + 0.5))
-        cover = _cover(polygon, x0, y0, int(right + 0.5) - x0 + 1, int(bottom + 0.5) - y0 + 1)
-        for y in range(max(y0, 0), min(y0 + cover.shape[0], height)):
-            for x in range(max(x0, 0), min(x0 + cover.shape[1] - 2, width)):
-                share = cover[y - y0, x - x0]
-                if share > 0:
-                    for c in range(channels):
-                        image[y, x, c] += share * (light[p, c] - (light[p - 1, c] if inner[p] else image[y, x, c]))
+    sides = outlines.shape[2]
+    quad, black = np.empty((4, 2)), np.zeros(channels)
+    for p in order:
+        for body in range(2):
+            shapes = outlines[p, 1:] if body else outlines[p, :1]
+            left, right, top, bottom = shapes[..., 0].min(), shapes[..., 0].max(), shapes[..., 1].min(), shapes[..., 1].max()
+            if not (right > -0.5 and bottom > -0.5 and left < width - 0.5 and top < height - 0.5):
+                continue
+            x0, y0 = int(np.floor(left + 0.5)), int(np.floor(top + 0.5))
+            # two additional columns take what an edge adds beyond the last pixel; the last channel is the covered share
+            cover = np.zeros((int(bottom + 0.5) - y0 + 1, int(right + 0.5) - x0 + 3, channels + 1))
+            if not body:
+                _add_polygon(cover, shapes[0], stem_light[p], x0, y0, np.sign(_area(shapes[0])))
+            else:
+                sense = np.sign(_area(shapes[2])) * (1 if facing[p] else -1)
+                for band in range(2):
+                    for k in range(sides):
+                        after = (k + 1) % sides
+                        quad[0], quad[1], quad[2], quad[3] = (
+                            shapes[band, k],
+                            shapes[band, after],
+                            shapes[band + 1, after],
+                            shapes[band + 1, k],
+                        )
+                        if sense * _area(quad) > 0:
+                            _add_polygon(cover, quad, side_light[p, band * sides + k], x0, y0, sense)
+                if facing[p]:
+                    _add_polygon(cover, shapes[2], face_light[p], x0, y0, sense)
+                else:
+                    _add_polygon(cover, shapes[0], black, x0, y0, -sense)
+            _blend(image, cover, x0, y0)
 
 
 @compiled(error_model="numpy")
-def _cover(polygon: FloatArray, x0: int, y0: int, width: int, height: int) -> FloatArray:
-    """Covered share of the pixels in a box from (x0, y0); the result has two additional columns.
+def _area(polygon: FloatArray) -> float:
+    total = 0.0
+    for k in range(len(polygon)):
+        total += polygon[k - 1, 0] * polygon[k, 1] - polygon[k, 0] * polygon[k - 1, 1]
+    return 0.5 * total
+
+
+@compiled(error_model="numpy")
+def _blend(image: FloatArray, cover: FloatArray, x0: int, y0: int) -> None:
+    """Draw the cumulative sum of each row of differences (h, w + 2, C + 1) over the image, its first pixel at (x0, y0)."""
+    height, width, channels = image.shape
+    total = np.empty(channels + 1)
+    for y in range(max(y0, 0), min(y0 + cover.shape[0], height)):
+        total[:] = 0.0
+        for x in range(x0, min(x0 + cover.shape[1] - 2, width)):
+            for c in range(channels + 1):
+                total[c] += cover[y - y0, x - x0, c]
+            if x >= 0 and total[channels] > 0:
+                left = max(1 - total[channels], 0.0)
+                for c in range(channels):
+                    image[y, x, c] = left * image[y, x, c] + total[c]
+
+
+@compiled(error_model="numpy")
+def _add_polygon(cover: FloatArray, polygon: FloatArray, light: FloatArray, x0: int, y0: int, sense: float) -> None:
+    """Add a polygon (K, 2) to differences along the rows of a box from (x0, y0). ``sense`` is the sign of the polygon's area.
 
     Each edge adds to each row the area on its right. The cumulative sum of a row is the coverage.
     """
-    cover = np.zeros((height, width + 2))
     count = len(polygon)
     for k in range(count):
         ax, ay = polygon[k, 0] - x0 + 0.5, polygon[k, 1] - y0 + 0.5
         bx, by = polygon[(k + 1) % count, 0] - x0 + 0.5, polygon[(k + 1) % count, 1] - y0 + 0.5
         if ay == by:
             continue
-        sign = 1.0
+        sign = -sense
         if ay > by:
-            ax, ay, bx, by, sign = bx, by, ax, ay, -1.0
+            ax, ay, bx, by, sign = bx, by, ax, ay, sense
         slope = (bx - ax) / (by - ay)
-        for row in range(int(ay), min(int(np.ceil(by)), height)):
+        for row in range(int(ay), min(int(np.ceil(by)), len(cover))):
             low, high = max(float(row), ay), min(row + 1.0, by)
-            _add_edge(cover[row], ax + slope * (low - ay), ax + slope * (high - ay), sign * (high - low))
-    for row in range(height):
-        total = 0.0
-        for column in range(width + 2):
-            total += cover[row, column]
-            cover[row, column] = min(abs(total), 1.0)
-    return cover
+            _add_edge(cover[row], light, ax + slope * (low - ay), ax + slope * (high - ay), sign * (high - low))
 
 
 @compiled(error_model="numpy")
-def _add_edge(row: FloatArray, start: float, end: float, rise: float) -> None:
-    """Add an edge to a row of differences. Within the row the edge goes from x = start to x = end and rises by ``rise``."""
+def _add_edge(row: FloatArray, light: FloatArray, start: float, end: float, rise: float) -> None:
+    """Add an edge to a row of differences (w, C + 1). Within the row the edge goes from x = start to x = end and rises by ``rise``."""
     left, right = min(start, end), max(start, end)
     first, last = int(left), int(right)
-    if first == last:
-        beyond = 0.5 * (left + right) - first
-        row[first] += rise * (1 - beyond)
-        row[first + 1] += rise * beyond
-        return
-    steep = rise / (right - left)
+    steep = rise if first == last else rise / (right - left)
     for x in range(first, last + 1):  # the part of the edge within pixel x
         a, b = max(left, float(x)), min(right, x + 1.0)
-        part = steep * (b - a)
+        part = steep if first == last else steep * (b - a)
         beyond = 0.5 * (a + b) - x
-        row[x] += part * (1 - beyond)
-        row[x + 1] += part * beyond
+        for c in range(len(light)):
+            row[x, c] += part * (1 - beyond) * light[c]
+            row[x + 1, c] += part * beyond * light[c]
+        row[x, len(light)] += part * (1 - beyond)
+        row[x + 1, len(light)] += part * beyond
 
 
 @compiled(error_model="numpy")

@@ -14,6 +14,7 @@ from twin.geometry.mesh import SensorMesh
 from twin.geometry.pins import rest_pins
 from twin.optics.arrays import with_room
 from twin.optics.lens import CameraRays
+from twin.optics.preview import Preview, Shading
 from twin.optics.relief import Relief
 from twin.optics.sampling import SKIN_SAVING, PixelSamples, near_pins
 from twin.optics.scalar import ScalarView
@@ -23,15 +24,17 @@ from twin.optics.surfaces import SkinSurface, Surface, caps, stems
 from twin.optics.tracer import GelTracer, luminance
 from twin.optics.variant import DrJit, VariantChoice, choose_variant, use_variant
 from twin.optics.window import Window
-from twin.store import write_bytes
+from twin.store import cached_arrays, write_bytes
 from twin.types import FloatArray, IntArray, PinState
 
-Quality = Literal["preview", "standard", "high"]
-"""Names of the numbers of samples of a render."""
-SAMPLES = {"preview": 4, "standard": 16, "high": 64}
+Quality = Literal["drawn", "preview", "standard", "high"]
+"""How a render is made: drawn with exact edges and without noise (`Preview`), or path-traced with ever more samples."""
+SAMPLES = {"drawn": 0, "preview": 4, "standard": 16, "high": 64}
 """Samples per pixel, by quality."""
-SCALAR_SAMPLES = {"preview": 1, "standard": 4, "high": 16}
+SCALAR_SAMPLES = {"drawn": 0, "preview": 1, "standard": 4, "high": 16}
 """Samples per pixel of the scalar variant, which is several times slower."""
+SHADING_QUALITY: Quality = "standard"
+"""Quality of the path-traced frame to which a kept shading is fitted."""
 BOUNCES = 2
 """Number of scatterings of a light path after the first. Because the skin is dark, a third one changes no gray level."""
 PASS_SEED = 0x10000
@@ -48,7 +51,8 @@ class Renderer:
     spec : SensorSpec
     variant : str or VariantChoice, optional
         As `twin.optics.variant.choose_variant` takes it; by default the best variant that works.
-    quality : {"preview", "standard", "high"}
+    quality : {"drawn", "preview", "standard", "high"}
+        A drawn picture costs a small part of a traced one. Its light is the lamps' direct light, with the shading of a traced frame.
     mesh : SensorMesh, optional
         The mechanics' mesh (``nodes_mm``, ``inner_quads``). With a mesh the skin follows the nodes on its inside, without one it follows
         the feet of the pins.
@@ -58,6 +62,8 @@ class Renderer:
         Samples of a pixel that shows a pin, instead of the quality's number. Pixels of bare skin get a quarter (`twin.optics.sampling`).
     bounces : int
         Number of scatterings of a light path after the first.
+    shading : Shading, optional
+        Of drawn pictures; by default that of the frame at rest (`traced_shading`).
     """
 
     def __init__(
@@ -70,6 +76,7 @@ class Renderer:
         window_px: tuple[int, int, int, int] | None = None,
         spp: int | None = None,
         bounces: int = BOUNCES,
+        shading: Shading | None = None,
     ) -> None:
         if quality not in SAMPLES:
             raise RenderError(f"quality={quality!r} is unknown: use {', '.join(SAMPLES)}")
@@ -80,14 +87,32 @@ class Renderer:
             raise RenderError(f"window_px={window} must lie within the {camera.width_px} x {camera.height_px} px frame, end exclusive")
         self.spec = spec
         self.window_px = window
-        self.choice = variant if isinstance(variant, VariantChoice) else choose_variant(camera.channels, variant)
-        self._scalar = self.choice.backend == "scalar"
-        self.spp = spp or (SCALAR_SAMPLES if self._scalar else SAMPLES)[quality]
+        self.drawn = quality == "drawn"
+        if self.drawn and spp:
+            raise RenderError(f"spp={spp}: a drawn picture has no samples; use another quality, or leave spp out")
+        self._variant, self._shading = variant, shading
+        self.spp = 0 if self.drawn else spp or (SCALAR_SAMPLES if self.choice.backend == "scalar" else SAMPLES)[quality]
         self._rest = rest_pins(spec.geometry)
-        self._inner = None if mesh is None else np.unique(mesh.inner_quads)
-        self._skin = SkinSurface(spec.skin, self._rest.base_mm if mesh is None else mesh.nodes_mm[self._inner])
+        self._mesh, self._inner = mesh, None if mesh is None else np.unique(mesh.inner_quads)
         self._bounces = bounces
         self._view: GelView | ScalarView | None = None
+
+    @cached_property
+    def choice(self) -> VariantChoice:
+        """The variant that traces paths."""
+        given = self._variant
+        return given if isinstance(given, VariantChoice) else choose_variant(self.spec.camera.channels, given)
+
+    @cached_property
+    def preview(self) -> Preview:
+        """What draws the pictures of the quality ``drawn``."""
+        preview = Preview(self.spec, window_px=self.window_px)
+        preview.shading = traced_shading(preview) if self._shading is None else self._shading
+        return preview
+
+    @cached_property
+    def _skin(self) -> SkinSurface:
+        return SkinSurface(self.spec.skin, self._rest.base_mm if self._mesh is None else self._mesh.nodes_mm[self._inner])
 
     @cached_property
     def _relief(self) -> Relief | None:
@@ -138,11 +163,14 @@ class Renderer:
         (H, W, 3) or (H, W) float32
             As ``render`` gives it.
         """
-        mi = use_variant(self.choice)
         state = self._rest if state is None else state
+        if self.drawn:
+            yield from [self.preview.render(state)] * len(samples)
+            return
+        mi = use_variant(self.choice)
         surfaces = self.surfaces(state)
         if self._view is None:
-            kind: type[GelView] | type[ScalarView] = ScalarView if self._scalar else GelView
+            kind: type[GelView] | type[ScalarView] = ScalarView if self.choice.backend == "scalar" else GelView
             self._view = kind(mi, self.spec, self.window_px, surfaces, self._bounces)
         else:
             self._view.move(surfaces)
@@ -175,6 +203,23 @@ class Renderer:
             "stems": stems(self.spec.pins, state.base_mm, state.axis),
             "caps": caps(self.spec.pins, self.spec.appearance, state.caps_mm, state.axis),
         }
+
+
+def traced_shading(preview: Preview) -> Shading:
+    """The shading that ``Preview.calibrate`` fits to a path-traced frame at rest. It is kept between runs.
+
+    Raises
+    ------
+    RenderError
+        Nothing can be path-traced here.
+    """
+
+    def trace() -> dict[str, np.ndarray]:
+        shading = preview.calibrate(Renderer(preview.spec, quality=SHADING_QUALITY, window_px=preview.window_px))
+        return {"gain": shading.gain, "offset": shading.offset, "skin": shading.skin}
+
+    key = {"sensor": preview.spec.model_dump(mode="json"), "window_px": list(preview.window_px), "quality": SHADING_QUALITY}
+    return Shading(**cached_arrays("shading", key, trace, code=(Preview, Renderer)))
 
 
 class GelView:

@@ -8,8 +8,8 @@ from scenes.sensor import SensorSpec
 from twin.camera.capture import expose, record
 from twin.errors import FrameError
 from twin.geometry.mesh import build_mesh
-from twin.optics.preview import Preview, Shading, traced_shading
-from twin.optics.render import Renderer
+from twin.optics.preview import Preview, Shading
+from twin.optics.render import Renderer, traced_shading
 from twin.optics.static_layer import static_layer
 from twin.optics.tracer import luminance
 from twin.store import cached_arrays

@@ -34,7 +34,7 @@ from twin.progress import Bar, Step
 from twin.rig.kinematics import rig_of
 from twin.types import ContactState, Form
 
-Quality = Literal["preview", "standard", "high"]
+Quality = Literal["drawn", "preview", "standard", "high"]
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ def run_realism(
         Leave out the frames to which ``calibrate_optics`` with this limit fits.
     without : collection of str
         Details that are not rendered (`twin.optics.relief.without`).
-    quality : {"preview", "standard", "high"}
+    quality : {"drawn", "preview", "standard", "high"}
     test : callable, optional
         The two-sample test.
     progress : Progress

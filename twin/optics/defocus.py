@@ -1,0 +1,86 @@
+"""The blur of a lens with a finite aperture: circles of confusion, and a picture that they blur."""
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from scenes.sensor import ViewSpec
+from twin.camera.projection import distort, window_tangent
+from twin.types import FloatArray
+
+LEAST_VARIANCE = 0.03
+"""Variance of the least blur that is not interpolated from a sharp picture, px^2: that of a disc of 0.7 px."""
+FINE = 16
+"""Number of places along each side of a pixel at which a disc's cover of the pixel is evaluated."""
+HALVINGS = 12
+"""Number of halvings of the interval in which a disc's diameter is searched."""
+
+
+def circles_px(view: ViewSpec, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Circles of confusion of points (n, 3) in the gel.
+
+    A ray through another place o of the pupil has another tangent t at the film: ``t(o) + o / focus``, because the film is sharp at the
+    focus. Away from the axis the pupil's places fill an ellipse, whose middle is not on the ray through the pupil's centre.
+
+    Returns
+    -------
+    diameter : (n,) float
+        Root of the mean of the squares of the ellipse's axes, px.
+    shift : (n, 2) float
+        From the image through the pupil's centre to the mean of all, px.
+    """
+    camera = view.camera
+    radius = 0.5 * camera.aperture_mm
+    places = radius * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])[:, None]
+    across = points_mm[:, :2] - places
+    rho = np.linalg.norm(across, axis=-1)
+    tangent = across * (window_tangent(view, rho, points_mm[:, 2]) / np.maximum(rho, 1e-12))[..., None]
+    seen = distort(camera, tangent + places / camera.focus_mm) * [camera.fx_px, camera.fy_px]
+    spread = np.stack([seen[1] - seen[2], seen[3] - seen[4]])
+    mean_square = 0.5  # of a radius over a disc, relative to its rim: the shift grows with the square
+    return np.sqrt(0.5 * np.sum(spread**2, axis=(0, 2))), mean_square * (seen[1:].mean(axis=0) - seen[0])
+
+
+def defocused(image: FloatArray, circles: FloatArray) -> FloatArray:
+    """A picture (H, W, C) float32 of which each pixel is blurred by its circle of confusion, with diameters (H, W) in px.
+
+    A few blurred pictures are interpolated by the variance of their blur, which is a sixteenth of the square of the diameter.
+    """
+    blur = circles**2 / 16 / LEAST_VARIANCE
+    above = np.floor(np.log2(np.maximum(blur, 1)))  # the variances of the blurred pictures are 0, then 1, 2, 4, ... times the least
+    at = np.where(blur < 1, blur, above + blur / 2**above)
+    first, last = int(at.min()), int(np.ceil(at.max()))
+    if last == 0:
+        return image
+    blurred: FloatArray = np.zeros_like(image)
+    for k in range(first, last + 1):
+        weight = np.maximum(1 - np.abs(at - k), 0).astype(np.float32)
+        each = cv2.filter2D(image, -1, disc(LEAST_VARIANCE * 2.0 ** (k - 1))) if k else image
+        blurred += weight[..., None] * each.reshape(image.shape)
+    return blurred
+
+
+@lru_cache(maxsize=32)
+def disc(variance: float) -> FloatArray:
+    """Kernel (k, k) of a disc with this variance, px^2, along each axis.
+
+    A pixel's cover by a disc has not the disc's variance, because the pixel is not a point. Therefore a disc of another size is used.
+    """
+    low, high = 0.0, 4 * np.sqrt(variance) + 1
+    reach = int(np.ceil(0.5 * high))
+    place = np.arange(-reach, reach + 1)
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        too_wide = float(_cover(middle, reach).sum(axis=0) @ place**2) > variance
+        low, high = (low, middle) if too_wide else (middle, high)
+    return _cover(high, reach)
+
+
+def _cover(diameter_px: float, reach: int) -> FloatArray:
+    """Share (k, k) of a disc's area in each pixel up to ``reach`` from the pixel at its centre."""
+    pixels = 2 * reach + 1
+    place = (np.arange(pixels * FINE) + 0.5) / FINE - 0.5 * pixels
+    inside = np.clip(0.5 + FINE * (0.5 * diameter_px - np.hypot(place[:, None], place)), 0, 1)
+    cover = inside.reshape(pixels, FINE, pixels, FINE).sum(axis=(1, 3)).astype(np.float32)
+    return np.asarray(cover / cover.sum())

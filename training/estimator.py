@@ -480,6 +480,17 @@ def digest_of(run: str | Path) -> str:
     return digest.hexdigest()
 
 
+def load_remembering(run: str | Path) -> PoseEstimator:
+    """A trained model for frames that follow each other in time: ``PoseEstimator.load`` and ``PoseEstimator.remembering``.
+
+    Raises
+    ------
+    TrainingError
+        The folder holds no run.
+    """
+    return PoseEstimator.load(run).remembering()
+
+
 def load_by_name(runs: Sequence[Path]) -> dict[str, PoseEstimator]:
     """Load several trained models. The keys are the names of their folders, or their whole paths if two folders have the same name.
 

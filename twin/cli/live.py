@@ -7,8 +7,9 @@
 - ``twin emulate``: arms, and the sensor's camera, emulated on this machine for any client.
 """
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +17,7 @@ from twin.cli import FewCommands, app
 from twin.cli.options import (
     SHIPPED_MODEL,
     Also,
+    AlsoFormat,
     ArmOption,
     AtRest,
     Camera,
@@ -36,6 +38,10 @@ from twin.cli.options import (
     tell,
 )
 from twin.types import FIRST, NONE
+
+if TYPE_CHECKING:
+    from hardware.following import Followed
+    from twin.estimate import SensorModel
 
 HELP_LIVE = """Show a model's estimates on a camera's frames.
 
@@ -76,7 +82,7 @@ def live(
 ) -> None:
     from hardware.live import WatchPlan, watch
     from hardware.rig import signals_as_ctrl_c
-    from training.estimator import PoseEstimator
+    from training.estimator import load_remembering
 
     plan = WatchPlan(
         camera=camera,
@@ -91,7 +97,7 @@ def live(
         also=tuple(also or ()),
     )
     with signals_as_ctrl_c():
-        watched = watch(plan, PoseEstimator.load(model).remembering(), name=str(model), on_shown=tell_view)
+        watched = watch(plan, load_remembering(model), name=str(model), on_shown=tell_view)
     say(watched.lines())
 
 
@@ -229,30 +235,71 @@ def servo(
     also: Also = None,
     force: Force = False,
 ) -> None:
-    from hardware.following import FollowPlan, follow
-    from hardware.rig import signals_as_ctrl_c
-    from scenes import load_object, load_servo
-    from training.estimator import PoseEstimator
-    from twin.cli.progress import shown
+    from hardware.following import follow
+    from training.estimator import load_remembering
     from twin.store import overwriting
 
-    plan = FollowPlan(
-        stimulus=load_object(object_name),
-        servo=load_servo(parameters),
-        camera=camera,
-        arm=arm,
-        steps=steps,
-        stream_hz=rate if stream else None,
-        limits=limits,
-        record=record,
-        seed=seed,
-        plain_light=plain_light,
-        known_place=known_place,
-        at_rest=at_rest,
-        also=tuple(also or ()),
-    )
-    with overwriting(force), signals_as_ctrl_c(), shown() as progress:
-        followed = follow(plan, PoseEstimator.load(model).remembering(), out, about={"model": str(model)}, progress=progress)
+    with overwriting(force):
+        run_along(
+            follow,
+            load_remembering,
+            model,
+            out,
+            kept_as="model",
+            object_name=object_name,
+            parameters=parameters,
+            also=also,
+            camera=camera,
+            arm=arm,
+            steps=steps,
+            stream_hz=rate if stream else None,
+            limits=limits,
+            record=record,
+            seed=seed,
+            plain_light=plain_light,
+            known_place=known_place,
+            at_rest=at_rest,
+        )
+
+
+def run_along(
+    follow: "Callable[..., Followed]",
+    load: "Callable[[Path], SensorModel]",
+    run: Path,
+    out: Path,
+    *,
+    kept_as: str,
+    object_name: str,
+    parameters: str,
+    also: list[AlsoFormat] | None,
+    **options: Any,
+) -> None:
+    """Run along an object's outline with a model or policy: from a command's options to what is said at the end.
+
+    Parameters
+    ----------
+    follow : callable
+        ``hardware.following.follow``.
+    load, run : callable, Path
+        What loads the model, and from where.
+    kept_as : str
+        The name by which the results state ``run``.
+    **options
+        The others of ``FollowPlan``.
+
+    Raises
+    ------
+    SystemExit
+        The run ended early.
+    """
+    from hardware.following import FollowPlan
+    from hardware.rig import signals_as_ctrl_c
+    from scenes import load_object, load_servo
+    from twin.cli.progress import shown
+
+    plan = FollowPlan(stimulus=load_object(object_name), servo=load_servo(parameters), also=tuple(also or ()), **options)
+    with signals_as_ctrl_c(), shown() as progress:
+        followed = follow(plan, load(run), out, about={kept_as: str(run)}, progress=progress)
     tell(followed)
     if followed.failure:
         raise SystemExit(1)
@@ -291,31 +338,29 @@ def policy_command(
     also: Also = None,
     force: Force = False,
 ) -> None:
-    from hardware.following import FollowPlan, follow
+    from hardware.following import follow
     from hardware.policy_law import load_for_outlines
-    from hardware.rig import signals_as_ctrl_c
-    from scenes import load_object, load_servo
-    from twin.cli.progress import shown
     from twin.store import overwriting
 
-    plan = FollowPlan(
-        stimulus=load_object(object_name),
-        servo=load_servo(parameters),
-        camera=camera,
-        arm=arm,
-        steps=steps,
-        limits=limits,
-        record=record,
-        seed=seed,
-        plain_light=plain_light,
-        known_place=known_place,
-        also=tuple(also or ()),
-    )
-    with overwriting(force), signals_as_ctrl_c(), shown() as progress:
-        followed = follow(plan, load_for_outlines(policy), out, about={"policy": str(policy)}, progress=progress)
-    tell(followed)
-    if followed.failure:
-        raise SystemExit(1)
+    with overwriting(force):
+        run_along(
+            follow,
+            load_for_outlines,
+            policy,
+            out,
+            kept_as="policy",
+            object_name=object_name,
+            parameters=parameters,
+            also=also,
+            camera=camera,
+            arm=arm,
+            steps=steps,
+            limits=limits,
+            record=record,
+            seed=seed,
+            plain_light=plain_light,
+            known_place=known_place,
+        )
 
 
 emulate = typer.Typer(

@@ -246,6 +246,16 @@ def test_numbers_that_do_not_fit_are_refused(tmp_path):
             written(tmp_path / to, to, [replace(EPISODES[0], steps=few)])
 
 
+def test_a_time_before_the_first_frame_is_refused(tmp_path):
+    def back():
+        for k, step in enumerate(EPISODES[0].steps()):
+            yield replace(step, time_s=-float(k))
+
+    for to in FORMATS:
+        with pytest.raises(RecordError, match="-1.0 s after its first"):
+            written(tmp_path / to, to, [replace(EPISODES[0], steps=back)])
+
+
 def test_lerobot_says_what_its_readers_want(tmp_path):
     info = json.loads((written(tmp_path / "r", "lerobot") / "meta/info.json").read_text())
     stats = json.loads((tmp_path / "r" / "meta/stats.json").read_text())

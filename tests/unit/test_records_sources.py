@@ -12,7 +12,7 @@ from training.generation.store import TruthFile
 from twin.errors import FrameError
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
-from twin.records import KeptAlso, RecordError, convert, open_records, with_pins
+from twin.records import FORMATS, KeptAlso, RecordError, convert, open_records, with_pins
 from twin.records.session import SessionWriter
 from twin.rig.mounting import Mounting
 from twin.store import contents
@@ -105,6 +105,21 @@ def test_a_picture_that_can_not_be_read_is_left_out_and_said(tmp_path):
     done = convert([folder], tmp_path / "out", "mcap", sensor=SENSOR)
     assert (done.episodes, done.steps) == (2, 2) and any(NAMES[1] in note for note in done.notes)
     assert [episode.key.split("/")[1].split("#")[0] for episode in open_records(tmp_path / "out").episodes] == [NAMES[0], NAMES[2]]
+
+
+@pytest.mark.parametrize(
+    "times", [["12:00:01"] * 4, ["0.0", "", "0.2", "0.3"], ["", "0", "1", "2"], ["0", "inf", "1", "2"], ["3", "2", "1", "0"]]
+)
+@pytest.mark.parametrize("to", FORMATS)
+def test_times_that_are_none_are_noted_and_not_taken_over(tmp_path, times, to):
+    (tmp_path / "r" / "images").mkdir(parents=True)
+    for k in range(4):
+        write_image(tmp_path / "r" / "images" / f"f{k}.png", np.random.default_rng(k).integers(0, 255, (24, 32), np.uint8))
+    rows = "".join(f"f{k}.png,{k},1,{time_s}\n" for k, time_s in enumerate(times))
+    (tmp_path / "r" / "targets.csv").write_text("image_name,pose_1,path_id,time_s\n" + rows)
+    made = convert([tmp_path / "r"], tmp_path / "out", to)
+    assert any("time_s" in note for note in made.notes)
+    assert [step.time_s for step in open_records(tmp_path / "out").episodes[0].steps()] == [0.0, 0.1, 0.2, 0.3]
 
 
 def test_a_data_sets_truth_goes_with_it(tmp_path):

@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections import Counter
 from pathlib import Path
 
 from scenes.files import require_regular
@@ -27,7 +28,8 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 def distinct_stems(names: list[str]) -> list[str]:
     """The frames' names without suffix, to name files after them; with the suffix where another frame has the same stem."""
     stems = [Path(name).stem for name in names]
-    return [stem if stems.count(stem) == 1 else Path(name).name for stem, name in zip(stems, names, strict=True)]
+    count = Counter(stems)
+    return [stem if count[stem] == 1 else Path(name).name for stem, name in zip(stems, names, strict=True)]
 
 
 def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:

@@ -130,7 +130,9 @@ class FolderWriter(ABC):
         return name
 
     def _require_fitting(self, episode: Episode, step: Step) -> None:
-        """Raise ``RecordError`` if a step is not as ``about`` says."""
+        """Raise ``RecordError`` if a step is not as ``about`` says, or its time is none."""
+        if not 0.0 <= step.time_s < float("inf"):
+            raise RecordError(f"{episode.key}: a picture {step.time_s} s after its first; look at its times, or record it again")
         height, width = step.image.shape[:2]
         if (width, height) != self.about.size_px or (step.image.ndim == 2) != self.about.gray:
             raise RecordError(f"{episode.key}: a picture of {step.image.shape}, the others have {self.about.size_px}; record it apart")

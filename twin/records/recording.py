@@ -88,7 +88,7 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
     rest = None if recording.reference is None else recording.reference.image
     facts = _own_facts(path) if own else []
     for number, rows in enumerate(_paths(recording)):
-        times_s = recording.labels[TIME_S][rows] if TIME_S in recording.labels else np.arange(len(rows)) / NOMINAL_HZ
+        times_s = _times(recording, rows, notes)
         steps = partial(_steps_of, recording, values, rows, times_s, notes)
         if own:
             if number == len(facts):  # what follows was being written when a run was killed
@@ -122,6 +122,20 @@ def _paths(recording: Recording) -> list[np.ndarray]:
     for row, path_id in enumerate(numbers(recording.labels[PATH]).tolist()):
         rows.setdefault(path_id if np.isfinite(path_id) else -1.0 - row, []).append(row)
     return [np.array(each) for each in rows.values()]
+
+
+def _times(recording: Recording, rows: np.ndarray, notes: list[str]) -> np.ndarray:
+    """Times (n,) of an episode's frames. Where the table has none, or such as can't be, which is noted, they are nominal."""
+    if TIME_S in recording.labels:
+        times_s = numbers(recording.labels[TIME_S][rows])
+        if np.isfinite(times_s).all() and (np.diff(times_s) >= 0).all():
+            return times_s
+        note = (
+            f"column {TIME_S} is not taken over where it does not rise or is no number of s; such frames count as {NOMINAL_HZ:g} a second"
+        )
+        if len(rows) > 1 and note not in notes:
+            notes.append(note)
+    return np.arange(len(rows)) / NOMINAL_HZ
 
 
 def _table_values(recording: Recording) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:

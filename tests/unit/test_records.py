@@ -174,6 +174,7 @@ def test_a_damaged_file_is_one_line(tmp_path, to, file, keep):
     [
         ("recording", "targets.csv"),
         ("recording", "pins.npz"),
+        ("lerobot", "meta/info.json"),
         ("huggingface", "episodes/000001.json"),
         ("mcap", "episode_000001.mcap"),
     ],
@@ -181,9 +182,13 @@ def test_a_damaged_file_is_one_line(tmp_path, to, file, keep):
 def test_a_missing_file_is_told(tmp_path, to, file):
     folder = written(tmp_path / "r", to, at_once=True)
     (folder / file).unlink()
+    left = {path: path.read_bytes() for path in folder.rglob("*.p*") if path.name != "tactip.json"}
     with pytest.raises(TwinError, match="is missing"):
         for episode in open_records(folder).episodes:
             list(episode.steps())
+    with pytest.raises(TwinError, match="is missing|damaged"):  # nothing is written over what is left
+        written(folder, to, [made_episode(9)])
+    assert left == {path: path.read_bytes() for path in left}
 
 
 def test_an_mcap_file_with_changed_bytes_is_told_or_read_as_it_was(tmp_path):

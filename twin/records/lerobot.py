@@ -429,6 +429,8 @@ def _film_pictures(folder: Path, row: dict[str, Any], about: About) -> Iterator[
 def _episode_rows(folder: Path) -> list[dict[str, Any]]:
     """The table of episodes without statistics, up to the number of them that the data set states."""
     if not (folder / INFO).is_file():
+        if len(list(folder.glob("data/chunk-*/file-*.parquet"))) > 1:  # only the first file is there before it
+            raise RecordError(f"{folder}: {INFO} is missing; {AGAIN}")
         return []
     parquet, total = library("pyarrow.parquet"), read_json(folder / INFO).get("total_episodes")
     rows: list[dict[str, Any]] = []
@@ -436,7 +438,7 @@ def _episode_rows(folder: Path) -> list[dict[str, Any]]:
         for path in sorted(folder.glob("meta/episodes/chunk-*/file-*.parquet")):
             names = [name for name in parquet.read_schema(path).names if not name.startswith("stats/")]
             rows += parquet.read_table(path, columns=names, page_checksum_verification=True).to_pylist()
-    except (OSError, library("pyarrow").ArrowException) as error:
+    except (OSError, ValueError, KeyError, library("pyarrow").ArrowException) as error:
         raise RecordError(f"{folder / 'meta/episodes'}: damaged ({error}); {AGAIN}") from error
     if not isinstance(total, int) or len(rows) < total:
         raise RecordError(f"{folder}: {INFO} states {total!r} episodes, {len(rows)} are there; {AGAIN}")

@@ -68,6 +68,11 @@ class Cells:
     gradients: FloatArray
     weights_mm3: FloatArray
 
+    @cached_property
+    def mean_gradients(self) -> FloatArray:
+        """The gradients on average over an element's points, (m, 3, b)."""
+        return self.gradients.mean(axis=1)
+
 
 @dataclass(frozen=True)
 class Solid:

@@ -215,27 +215,33 @@ class Problem:
 
     def balance(self, control: FloatArray, border: FloatArray) -> Balance | None:
         """The equations; None if an element is inside out."""
-        body = self.body
+        body, volume = self.body, 0.0
         residual = np.zeros_like(control)
         elastic_nmm = 0.0
         for number, (kind, given) in enumerate(zip(body.kinds, self._given, strict=True)):
             elastic_nmm += kind.add_forces(control, given, residual, border[1] if number else 0.0)
         if not np.isfinite(elastic_nmm):
             return None
-        elastic = residual[body.free].ravel()
+        if body.sealed:
+            volume = self.volume(control, np.zeros_like(control))
+            elastic_nmm -= border[1] * volume
+        return self._with_contact(control, border, residual[body.free].ravel(), volume, elastic_nmm)
+
+    def again(self, before: Balance, control: FloatArray, border: FloatArray) -> Balance:
+        """The equations where only contact and friction differ from those whose balance ``before`` is, at the same state."""
+        return self._with_contact(control, border, before.elastic, float(before.border_residual[1]), before.elastic_nmm)
+
+    def _with_contact(self, control: FloatArray, border: FloatArray, elastic: FloatArray, volume_mm3: float, elastic_nmm: float) -> Balance:
         contact = self.contact(in_object(positions(self.controls, self.weights, self.lift, control), self.T, border))
         force = contact.force_n @ self.T[:3, :3].T
-        spread_forces(self.controls, self.weights, -force, residual)
-        border_residual = np.zeros(2)
+        pushed = np.zeros_like(control)
+        spread_forces(self.controls, self.weights, force, pushed)
+        border_residual = np.array([0.0, volume_mm3])
         if self.compliance:  # the skin pushes the object with -sum f
             border_residual[0] = border[0] / self.compliance + float(force[:, 2].sum())
-        if body.sealed:
-            border_residual[1] = self.volume(control, np.zeros_like(control))
-            elastic_nmm -= border[1] * border_residual[1]
         scale = max(float(np.linalg.norm(force, axis=1).sum()), FORCE_FLOOR_N)
-        return Balance(
-            elastic, residual[body.free].ravel(), border_residual, contact, force, scale, elastic_nmm, self.volume_force_n_per_mm3
-        )
+        residual = elastic - pushed[self.body.free].ravel()
+        return Balance(elastic, residual, border_residual, contact, force, scale, elastic_nmm, self.volume_force_n_per_mm3)
 
     def stiffness(self, control: FloatArray, border: FloatArray, kept: list[KeptStiffness], *, anew: bool) -> None:
         """Bring the elements' tangents to a state; ``anew``: leave none as it was."""

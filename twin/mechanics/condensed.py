@@ -1,6 +1,6 @@
 """Contact against the eliminated body: small, dense, and solved exactly."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import blas, lapack
@@ -8,7 +8,8 @@ from scipy.linalg import blas, lapack
 from twin.compiled import compiled
 from twin.mechanics.balance import FORCE_FLOOR_N, Balance, Problem
 from twin.mechanics.contact import ContactForces, positions, spread_forces, spread_stiffness
-from twin.mechanics.linear import Eliminated
+from twin.mechanics.linear import Eliminated, split
+from twin.mechanics.turns import turned, turned_back, turned_matrix
 from twin.types import FloatArray, IntArray
 
 _ITERATIONS = 60
@@ -21,7 +22,7 @@ _HALVINGS = 5
 """Most times that the line search halves a step."""
 _LEAST_GAIN = 0.1
 """The line search accepts a step of size s that lowers the residual's norm by at least this share of s."""
-_KEEP_FACTORS = 0.1
+_KEEP_FACTORS = 0.5
 """Old factors of the matrix are used again as long as they lower the residual to this share or less."""
 _SOFTENING = 0.1
 """Factor on the contact's stiffness while the solution is still far."""
@@ -34,13 +35,14 @@ class Tangent:
     """The body's tangent, eliminated down to the kept unknowns.
 
     The sealed gel's pressure is one more unknown: ``volume_column`` (unknowns,) is its eliminated column,
-    ``volume_pivot`` what it leaves on the diagonal.
+    ``volume_pivot`` what it leaves on the diagonal. ``strains`` says for which state it was made (see ``Turns.strains``).
     """
 
     eliminated: Eliminated
     matrix: FloatArray  # (k, k), symmetric
     volume_column: FloatArray | None
     volume_pivot: float
+    strains: list[FloatArray]
 
 
 @dataclass
@@ -56,11 +58,14 @@ class Near:
     local : (q, 9) int
         Place of each point's controls among those that stay (their number: none of them).
     matrix : (n, n) float
-        What is left of the tangent, symmetric; ``column`` (n,) of the volume's column.
+        What is left of the tangent, symmetric; ``column`` (n,) of the volume's column. Both are turned by ``turns``.
     factor : (f, f) float
         L, Fortran order, lower triangle.
     coupling, far_column : (f, n), (f,) float
         L^-1 applied to the coupling of far and near, and to the volume's column.
+    turns : (n / 3, 3, 3) float, optional
+        How the controls that stay have turned since the tangent was made. What concerns the far part, and the residual given to
+        ``SmallContact``, is as before that turn.
     solved : tuple
         The contact's softening, and the factors of the matrix (n + 2, n + 2) for which Newton's direction was last found.
     """
@@ -73,6 +78,7 @@ class Near:
     factor: FloatArray
     coupling: FloatArray
     far_column: FloatArray
+    turns: FloatArray | None = None
     solved: tuple[float, FloatArray, IntArray] | None = None
 
     @classmethod
@@ -82,22 +88,28 @@ class Near:
         stays[local] = True
         stays = np.repeat(stays[:-1], 3)
         far = np.flatnonzero(~stays)
-        factor, info = lapack.spotrf(matrix[np.ix_(far, far)].T, lower=1, clean=0, overwrite_a=1) if len(far) else (np.zeros((0, 0)), 0)
-        if info > 0:  # without contact some far controls have no stiffness: eliminate none
-            stays[:], far, factor = True, far[:0], np.zeros((0, 0))
         near = np.flatnonzero(stays)
+        within, across, rest = split(matrix, far, near)
+        factor, info = lapack.spotrf(within.T, lower=1, clean=0, overwrite_a=1) if len(far) else (np.zeros((0, 0)), 0)
+        if info > 0:  # without contact some far controls have no stiffness: eliminate none
+            near, far, factor, rest = np.arange(count), far[:0], np.zeros((0, 0)), matrix
         controls = near[::3] // 3
         renumber = np.full(count // 3 + 1, len(controls))
         renumber[controls] = np.arange(len(controls))
         column = np.zeros(count, np.float32) if tangent.volume_column is None else tangent.volume_column[tangent.eliminated.kept]
-        rest, column, far_column = matrix[np.ix_(near, near)], column[near], column[far]
+        column, far_column = column[near], column[far]
         coupling = np.zeros((0, len(near)), np.float32)
         if len(far):
-            coupling = blas.strsm(1.0, factor, matrix[np.ix_(near, far)].T, lower=1, overwrite_b=1)
+            coupling = blas.strsm(1.0, factor, across.T, lower=1, overwrite_b=1)
             far_column = lapack.strtrs(factor, far_column, lower=1)[0]
             rest = rest - coupling.T @ coupling
             column = column - coupling.T @ far_column
         return cls(near, far, renumber[local], rest, column, factor, coupling, far_column)
+
+    def turned(self, turns: FloatArray) -> "Near":
+        """The same, made from a tangent whose kept controls have turned by ``turns`` (k / 3, 3, 3) since."""
+        turns = turns[self.near[::3] // 3]
+        return replace(self, matrix=turned_matrix(turns, self.matrix), column=turned(turns, self.column), turns=turns)
 
 
 class SmallContact:
@@ -123,12 +135,14 @@ class SmallContact:
         self._at = positions(problem.controls, problem.weights, problem.lift, control)
         self._far_residual = lapack.strtrs(near.factor, residual[near.far], lower=1)[0] if len(near.far) else residual[near.far]
         self._r = residual[near.near] - near.coupling.T @ self._far_residual
+        if near.turns is not None:
+            self._r = turned(near.turns, self._r)
         self._v = near.column
         self._g = volume_residual - near.far_column @ self._far_residual
         self._q = pivot - near.far_column @ near.far_column
 
     def solve(self, balance: Balance, *, soften: bool, least: float) -> tuple[FloatArray, FloatArray]:
-        """Moves of all kept unknowns (k,) and of the border (2,).
+        """Moves of all kept unknowns (k,), turned back to where the tangent was made, and of the border (2,).
 
         ``soften``: far from the solution; softened contact is solved first, and its answer is the start.
         ``least``: residual, relative to the contact forces, that is never gone below.
@@ -141,9 +155,10 @@ class SmallContact:
             y, _ = self._newton(y, 1.0, wanted, _ITERATIONS)
         near = self._near
         out = np.zeros(len(near.near) + len(near.far))
-        out[near.near] = y[:-2]
+        moved = y[:-2] if near.turns is None else turned_back(near.turns, y[:-2])
+        out[near.near] = moved
         if len(near.far):
-            right = self._far_residual + near.far_column * y[-1] + near.coupling @ y[:-2].astype(np.float32)
+            right = self._far_residual + near.far_column * y[-1] + near.coupling @ moved.astype(np.float32)
             out[near.far] = -lapack.strtrs(near.factor, right, lower=1, trans=1)[0]
         return out, y[-2:]
 

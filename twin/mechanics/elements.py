@@ -35,8 +35,6 @@ from twin.types import BoolArray, FloatArray, IntArray
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # directions (i, k) of the stored stiffness blocks
 _I = np.array([i for i, _ in PAIRS])
 _K = np.array([k for _, k in PAIRS])
-_KEPT_STRAIN = 0.01
-"""Stiffness blocks are kept while no entry of F has changed by more than this. With 0.02 the solution takes 10 % more iterations."""
 _FAR_STRAIN = 1e9
 """Stands for an F that no element has: its blocks are made anew."""
 
@@ -113,7 +111,13 @@ class Elements:
 class KeptStiffness:
     """Stiffness blocks of one kind of elements that are made anew only where the body has changed, which costs half.
 
-    What is left is old by ``_KEPT_STRAIN`` at most. The tangent that is made of the blocks leads to a solution, and does not change it.
+    The tangent that is made of the blocks leads to a solution, and does not change it.
+
+    Parameters
+    ----------
+    kind : Elements
+    kept_strain : float
+        Blocks are kept while no entry of F has changed by more than this.
 
     Attributes
     ----------
@@ -121,8 +125,9 @@ class KeptStiffness:
         In single precision (see ``Elements.stiffness``).
     """
 
-    def __init__(self, kind: Elements) -> None:
+    def __init__(self, kind: Elements, kept_strain: float) -> None:
         count, controls = kind.cells.controls.shape
+        self._kept_strain = kept_strain
         self.blocks = np.empty((count, 6, controls, controls), np.float32)
         self._at = np.empty((count, 8, 3, 3))
         self._made_of: tuple[Elements, float] | None = None
@@ -133,7 +138,7 @@ class KeptStiffness:
         if anew or len(stress) or not same:
             self._at[:] = _FAR_STRAIN
         self._made_of = kind, pressure_mpa
-        which = kind.changed(control_mm, self._at, _KEPT_STRAIN)
+        which = kind.changed(control_mm, self._at, self._kept_strain)
         kind.stiffness(control_mm, stress, pressure_mpa, self.blocks, which=which)
 
 

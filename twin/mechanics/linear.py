@@ -244,6 +244,24 @@ def whole(lower: FloatArray, shift: float) -> FloatArray:
     return out
 
 
+@compiled()
+def split(matrix: FloatArray, far: IntArray, near: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Parts of a symmetric matrix: (f, f) of the unknowns ``far``, (n, f) of ``near`` and ``far``, and (n, n) of ``near``."""
+    f, n = len(far), len(near)
+    within, across, rest = np.empty((f, f), matrix.dtype), np.empty((n, f), matrix.dtype), np.empty((n, n), matrix.dtype)
+    for i in range(f):
+        row = matrix[far[i]]
+        for j in range(f):
+            within[i, j] = row[far[j]]
+    for i in range(n):
+        row = matrix[near[i]]
+        for j in range(f):
+            across[i, j] = row[far[j]]
+        for j in range(n):
+            rest[i, j] = row[near[j]]
+    return within, across, rest
+
+
 def _runs(places: IntArray, own: int) -> IntArray:
     """Runs (k, 3) of rising places: first row, first place and length; none lies across ``own``."""
     first = np.flatnonzero(np.diff(places, prepend=-2) != 1)

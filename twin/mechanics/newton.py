@@ -2,8 +2,9 @@
 
 Two iterations are nested. The outer one is Newton's method on the elastic body. Its tangent is eliminated
 down to the controls of the outer skin that the object may touch, and is kept as long as it converges well enough
-(usually for several iterations, and from one load step into the next). The inner one solves contact and friction
-exactly on the small dense problem that remains: which points touch, stick or slip changes often, and is cheap to find there.
+(usually for several iterations, and from one load step into the next); it turns with the body meanwhile (see ``turns``).
+The inner one solves contact and friction exactly on the small dense problem that remains: which points touch, stick or slip
+changes often, and is cheap to find there.
 """
 
 from dataclasses import replace
@@ -17,6 +18,7 @@ from twin.mechanics.elements import KeptStiffness
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
 from twin.mechanics.rubbing import met, rub, rubbed, substeps
+from twin.mechanics.turns import Turns, turned, turned_back
 from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -36,7 +38,7 @@ _INNER_ITERATIONS = 400
 """Most inner iterations of one solution, all outer ones together. Where contact flickers for longer, shorter load steps are faster."""
 _WORSE = 2.0
 """A move that makes the residual larger than this many times is refused."""
-_KEEP_TANGENT = 0.8
+_KEEP_TANGENT = 0.9
 """An old tangent is kept as long as it lowers the residual to this share or less."""
 _SECANTS = 6
 """Most earlier residuals that the outer iteration combines."""
@@ -48,8 +50,16 @@ _LARGEST_SHIFT_N_MM = 50.0
 """With a shift beyond this (N/mm) the step counts as not solved."""
 _PROVIDED_MM = 1.0
 """Skin that is nearer to the object than this is kept in the elimination, so that it need not be prepared anew in the next load steps."""
+_SKIN_STRAIN = 0.01
+"""The skin's blocks of a tangent are made anew where F has changed by more than this. With 0.02 the solution takes 5 % more iterations."""
+_GEL_STRAIN = 0.05
+"""The same for the gel, which is so much softer that its tangent may be older."""
+_LEAST_TURN = 0.005
+"""The tangent is turned when a direction of a control has changed by more than this since it was last turned (rad)."""
 _REACH_MM = 0.15
 """Contact points farther than this from the object are left out of the equations; at the end it is checked that none of them touches."""
+_SOLVED_REACH_MM = 0.02
+"""The same where the step is solved but for friction within it."""
 
 
 class NoConvergence(Exception):
@@ -67,18 +77,16 @@ class _Secants:
     says c + r, r being the residual. The next c is the combination of those seen so far whose residuals, combined alike, are smallest.
     """
 
-    def __init__(self) -> None:
-        self._offset: FloatArray | float = 0.0
-        self._seen: list[tuple[FloatArray, FloatArray]] = []
+    def __init__(self, residual: FloatArray) -> None:
+        self._offset = residual
+        self._seen = [(residual, residual)]
 
-    def mend(self, residual: FloatArray) -> FloatArray | float:
+    def mend(self, residual: FloatArray) -> FloatArray:
         """What to add to the elastic force at the present state, whose residual is given, (unknowns,)."""
         offset = self._offset + residual
-        mend: FloatArray | float = 0.0
-        if self._seen:
-            errors = np.column_stack([residual - old for _, old in self._seen])
-            shares = np.linalg.lstsq(errors, residual, rcond=1e-6)[0]
-            mend = -np.column_stack([offset - old for old, _ in self._seen]) @ shares
+        errors = np.column_stack([residual - old for _, old in self._seen])
+        shares = np.linalg.lstsq(errors, residual, rcond=1e-6)[0]
+        mend = -np.column_stack([offset - old for old, _ in self._seen]) @ shares
         self._seen = [*self._seen[1 - _SECANTS :], (offset, residual)]
         self._offset = offset + mend
         return mend
@@ -100,13 +108,18 @@ class LoadStepper:
     def __init__(self, body: Body, boxes: list[IntArray], field: ObjectField, friction: Friction, compliance_mm_per_n: float) -> None:
         self._body, self._boxes, self._field, self._friction = body, boxes, field, friction
         self._compliance = compliance_mm_per_n
-        self._stiffness = [KeptStiffness(kind) for kind in body.kinds]
+        self._stiffness = [KeptStiffness(kind, _GEL_STRAIN if number else _SKIN_STRAIN) for number, kind in enumerate(body.kinds)]
         self._frontal: FrontalSolver | None = None
         self._kept: BoolArray = np.zeros(len(body.free), bool)
         self._local: IntArray = np.zeros((0, 9), int)
         self._tangent: Tangent | None = None
         self._shift = 0.0
         self._near: tuple[Tangent, IntArray, Near] | None = None
+        self._turns = Turns(body)
+        self._turned: FloatArray | None = None  # of each free control since the tangent was made; None where it is new
+        self._near_turned: tuple[FloatArray, Near] | None = None
+        self._forward: tuple[FloatArray, Tangent, FloatArray | None, FloatArray] | None = None
+        self._touch: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._last: LoadState | None = None
         self.iterations, self.inner_iterations, self.eliminations = 0, 0, 0
 
@@ -125,11 +138,12 @@ class LoadStepper:
         NoConvergence
         """
         control, border = self._extrapolate(state, T)
-        before, after = self._seen(state.control_mm, state.border, state.T), self._seen(control, border, T)
-        gap_before, gap = self._field.distance(before), self._field.distance(after)
+        before, gap_before = self._gaps(state)
+        after = self._seen(control, border, T)
+        gap = self._field.distance(after)
         looked = np.flatnonzero((gap < _REACH_MM) | state.held)
         self._provide(looked, gap)
-        anchors = met(self._field, state.held, state.anchor_mm, before, after)
+        anchors = met(state.held, state.anchor_mm, before, after, gap_before, gap)
         memory = replace(state, dissipated_nmm=0.0)
         penalty = state.penalty_mpa_mm
 
@@ -150,31 +164,46 @@ class LoadStepper:
         known = control is not state.control_mm
         touched = state.held | ((gap_before > 0) & (gap < 0))
         count = substeps(self._moved_mm(state, T, touched)) if self._friction.static and (touched & ~state.held).any() else 1
+        balance: Balance | None = None
         if count > 1:
             problem = problem_now()
             control, border, balance = self._solve(problem, control, border, known, tolerance=_ROUGH_TOLERANCE)
             known = True
+            gap_now = self._field.distance(self._seen(control, border, T))
+            looked = np.flatnonzero((gap_now < _SOLVED_REACH_MM) | state.held)
+            self._provide(looked, gap_now)
+            problem = problem_now()
+            balance = problem.again(balance, control, border)
             found = self._rubbed(problem, state, anchors, control, border, balance, count)
             if found is not None:
                 memory, anchors = found, found.anchor_mm
         for _ in range(_PENALTY_RAISES):
             problem = problem_now()
-            control, border, balance = self._solve(problem, control, border, known)
-            left_out = np.setdiff1d(np.arange(len(gap)), looked, assume_unique=True)
-            missed = left_out[self._field.distance(self._seen(control, border, T)[left_out]) < 0]
-            if len(missed):
-                looked = np.sort(np.concatenate([looked, missed]))
+            control, border, balance = self._solve(problem, control, border, known, before=balance)
+            seen = self._seen(control, border, T)
+            gap_seen = self._field.distance(seen)
+            missed = gap_seen < 0
+            missed[looked] = False
+            if missed.any():
+                looked = np.sort(np.concatenate([looked, np.flatnonzero(missed)]))
                 self._provide(looked, gap)
             elif balance.contact.penetration_mm.max(initial=0.0) > GAP_BOUND_MM:
                 penalty *= _PENALTY_GROWTH
             else:
-                self._last = state
+                self._last, self._touch = state, (control, seen, gap_seen)
                 return self._accepted(memory, problem, control, border, balance), balance, looked
-        raise NoConvergence(balance.relative)
+        raise NoConvergence(balance.relative if balance else np.inf)
 
     def touching_mm2(self, state: LoadState) -> float:
         """Rest area of the skin that touches the object in a state (see ``contact.touching_mm2``)."""
-        return touching_mm2(self._body.points, self._field.distance(self._seen(state.control_mm, state.border, state.T)))
+        return touching_mm2(self._body.points, self._gaps(state)[1])
+
+    def _gaps(self, state: LoadState) -> tuple[FloatArray, FloatArray]:
+        """All contact points in the object's frame, (p, 3), and their distances from it, (p,); those of the last state are kept."""
+        if self._touch is not None and self._touch[0] is state.control_mm:
+            return self._touch[1:]
+        seen = self._seen(state.control_mm, state.border, state.T)
+        return seen, self._field.distance(seen)
 
     def _provide(self, looked: IntArray, gap: FloatArray) -> None:
         """Prepare the elimination for contact at the points looked at (q,); ``gap`` (p,) in mm are the distances of all points."""
@@ -235,23 +264,50 @@ class LoadStepper:
         """What friction did within the step (see ``rubbing.rubbed``)."""
         if self._tangent is None:
             self._tangent = self._linearise(problem, control, border, 0.0)
+        self._turn(self._tangent, control)
         near, local = self._nearest(problem, self._tangent), self._local[problem.looked]
-        return rubbed(problem, state, anchors, self._field, near, self._tangent, local, control, border, balance, count=count)
+        forward = self._eliminated(self._tangent, balance.elastic)
+        return rubbed(
+            problem, state, anchors, self._field, near, self._tangent, self._turned, forward, local, control, border, balance, count=count
+        )
 
     def _nearest(self, problem: Problem, tangent: Tangent) -> Near:
         """The tangent eliminated down to the points looked at; the last one is kept."""
         if self._near is None or self._near[0] is not tangent or not np.array_equal(self._near[1], problem.looked):
             self._near = tangent, problem.looked, Near.of(tangent, self._local[problem.looked])
-        return self._near[2]
+            self._near_turned = None
+        if self._turned is None:
+            return self._near[2]
+        if self._near_turned is None or self._near_turned[0] is not self._turned:
+            last = self._near_turned[1] if self._near_turned else self._near[2]
+            near = self._near[2].turned(self._turned[tangent.eliminated.kept[::3] // 3])
+            near.solved = last.solved
+            self._near_turned = self._turned, near
+        return self._near_turned[1]
+
+    def _turn(self, tangent: Tangent, control: FloatArray) -> bool:
+        """Turn the tangent with the body to a state; whether that changed it."""
+        turns = self._turns.since(tangent.strains, control)
+        if np.abs(turns - (np.eye(3) if self._turned is None else self._turned)).max() <= _LEAST_TURN:
+            return False
+        self._turned = turns
+        return True
 
     def _seen(self, control: FloatArray, border: FloatArray, T: FloatArray) -> FloatArray:
         """All contact points in the object's frame, (p, 3)."""
         return in_object(self._body.points.positions(control), T, border)
 
     def _solve(
-        self, problem: Problem, control: FloatArray, border: FloatArray, extrapolated: bool, *, tolerance: float = RESIDUAL_TOLERANCE
+        self,
+        problem: Problem,
+        control: FloatArray,
+        border: FloatArray,
+        extrapolated: bool,
+        *,
+        tolerance: float = RESIDUAL_TOLERANCE,
+        before: Balance | None = None,
     ) -> tuple[FloatArray, FloatArray, Balance]:
-        balance = problem.balance(control, border)
+        balance = problem.balance(control, border) if before is None else problem.again(before, control, border)
         if balance is None:
             raise NoConvergence(np.inf)
         astray = False
@@ -269,10 +325,12 @@ class LoadStepper:
                 self._shift, fresh, secants = shift, True, None
             else:
                 fresh = False
-            mend = secants.mend(balance.residual) if secants else 0.0
-            secants = secants or _Secants()
+                if balance.relative > _ROUGH_TOLERANCE and self._turn(tangent, control):
+                    secants = None
+            elastic = balance.elastic + secants.mend(balance.residual) if secants else balance.elastic
+            secants = secants or _Secants(balance.residual)
             soften = astray or not (accepted or extrapolated)
-            move, border_move = self._contact_move(problem, tangent, control, border, balance, balance.elastic + mend, soften)
+            move, border_move = self._contact_move(problem, tangent, control, border, balance, elastic, soften)
             size = min(1.0, LARGEST_MOVE_MM / max(np.abs(move).max(), 1e-300))
             new, new_border = control.copy(), border + size * border_move
             new[self._body.free] += size * move.reshape(-1, 3)
@@ -298,7 +356,7 @@ class LoadStepper:
         """The body's tangent at a state, plus a shift on the diagonal."""
         assert self._frontal is not None, "provide first"
         self.eliminations += 1
-        self._tangent = None  # its memory is overwritten below
+        self._tangent = self._turned = None  # its memory is overwritten below
         problem.stiffness(control, border, self._stiffness, anew=shift > 0)
         blocks = [kept.blocks for kept in self._stiffness]
         while True:
@@ -309,15 +367,23 @@ class LoadStepper:
                 shift = max(_SHIFT_GROWTH * shift, _SMALLEST_SHIFT_N_MM)
                 if shift > _LARGEST_SHIFT_N_MM:
                     raise NoConvergence(np.inf) from None
-        matrix = whole(eliminated.matrix, shift)
+        matrix, strains = whole(eliminated.matrix, shift), self._turns.strains(control)
         if not self._body.sealed:
-            return Tangent(eliminated, matrix, None, 0.0)
+            return Tangent(eliminated, matrix, None, 0.0, strains)
         column = np.zeros_like(control)
         problem.volume(control, column)
         column = eliminated.forward(column[self._body.free].ravel())
         inner = np.ones(len(column), bool)
         inner[eliminated.kept] = False
-        return Tangent(eliminated, matrix, column, -float(column[inner] @ column[inner]))
+        return Tangent(eliminated, matrix, column, -float(column[inner] @ column[inner]), strains)
+
+    def _eliminated(self, tangent: Tangent, elastic: FloatArray) -> FloatArray:
+        """Elastic force (unknowns,), turned back to where the tangent was made and eliminated; the last one is kept."""
+        kept, turns = self._forward, self._turned
+        if kept is None or kept[0] is not elastic or kept[1] is not tangent or kept[2] is not turns:
+            forward = tangent.eliminated.forward(elastic if turns is None else turned_back(turns, elastic))
+            self._forward = kept = elastic, tangent, turns, forward
+        return kept[3]
 
     def _contact_move(
         self,
@@ -332,7 +398,7 @@ class LoadStepper:
         """The move (unknowns,) and (2,) that balances the linearised body with the exact contact."""
         eliminated = tangent.eliminated
         kept = eliminated.kept
-        forward = eliminated.forward(elastic)
+        forward, turns = self._eliminated(tangent, elastic), self._turned
         volume_residual, near = balance.border_residual[1], self._nearest(problem, tangent)
         if tangent.volume_column is not None:
             inner = np.ones(len(forward), bool)
@@ -343,4 +409,5 @@ class LoadStepper:
         self.inner_iterations += small.iterations
         if tangent.volume_column is not None:
             forward = forward + border_move[1] * tangent.volume_column
-        return eliminated.backward(-forward, kept_move), border_move
+        move = eliminated.backward(-forward, kept_move)
+        return move if turns is None else turned(turns, move), border_move

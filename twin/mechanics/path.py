@@ -1,6 +1,7 @@
 """Where the object goes: a path of poses through which it is moved."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -96,11 +97,22 @@ class ContactPath:
         leg = int(np.clip(np.floor(progress), 0, len(self.poses) - 2))
         share = progress - leg
         start, stop = self.poses[leg], self.poses[leg + 1]
-        turn = Rotation.from_matrix(stop[:3, :3] @ start[:3, :3].T).as_rotvec()
+        angle, once, twice = self._turns[leg]
         T = np.eye(4)
-        T[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ start[:3, :3]
+        T[:3, :3] = start[:3, :3] + (np.sin(share * angle) * once + (1 - np.cos(share * angle)) * twice) @ start[:3, :3]
         T[:3, 3] = (1 - share) * start[:3, 3] + share * stop[:3, 3]
         return T
+
+    @cached_property
+    def _turns(self) -> list[tuple[float, FloatArray, FloatArray]]:
+        """Angle of each leg's turn, the cross product with its axis as a matrix (3, 3), and that matrix' square (Rodrigues' formula)."""
+        out = []
+        for way in Rotation.from_matrix(self.poses[1:, :3, :3] @ self.poses[:-1, :3, :3].transpose(0, 2, 1)).as_rotvec():
+            angle = float(np.linalg.norm(way))
+            x, y, z = way / max(angle, 1e-300)
+            once = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            out.append((angle, once, once @ once))
+        return out
 
     def time_s(self, progress: float) -> float:
         """Time at a progress."""

@@ -18,6 +18,7 @@ from twin.mechanics.balance import Balance, LoadState, Problem, in_object
 from twin.mechanics.condensed import Near, SmallContact, Tangent
 from twin.mechanics.contact import ContactForces, positions, spread_forces
 from twin.mechanics.path import ContactPath
+from twin.mechanics.turns import turned_back
 from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -43,6 +44,8 @@ def rubbed(
     field: ObjectField,
     near: Near,
     tangent: Tangent,
+    turns: FloatArray | None,
+    forward: FloatArray,
     local: IntArray,
     control: FloatArray,
     border: FloatArray,
@@ -76,15 +79,19 @@ def rubbed(
         and ``anchor_mm`` for the last one. None where a substep was not solved.
     """
     looked, kept = problem.looked, tangent.eliminated.kept
-    forward, volume = tangent.eliminated.forward(balance.elastic), balance.border_residual[1]
-    start = (state.control_mm - control)[problem.body.free].ravel()[kept].astype(np.float32)
+    volume, start = balance.border_residual[1], (state.control_mm - control)[problem.body.free].ravel()[kept]
+    y = np.concatenate([start[near.near], state.border - border])
+    if turns is not None:
+        turns = turns[kept[::3] // 3]
+        start = turned_back(turns, start)
+    start = start.astype(np.float32)
     at_start = in_object(positions(problem.controls, problem.weights, problem.lift, state.control_mm), state.T, state.border)
     held = state.held[looked]
     pressed = problem.moved(state.T, state.anchor_mm[looked], state.slid_mm[looked]).contact(at_start).force_n @ state.T[:3, :3].T
     spread = np.zeros((len(kept) // 3 + 1, 3))
     spread_forces(local, problem.weights, pressed * held[:, None], spread)
     residual, volume_start = forward[kept], 0.0
-    residual_start = spread[:-1].ravel() - tangent.matrix @ start
+    residual_start = (spread[:-1].ravel() if turns is None else turned_back(turns, spread[:-1].ravel())) - tangent.matrix @ start
     if tangent.volume_column is not None:
         inner = np.ones(len(forward), bool)
         inner[kept] = False
@@ -93,10 +100,9 @@ def rubbed(
         residual_start -= tangent.volume_column[kept] * pressure
         volume_start = -float(tangent.volume_column[kept] @ start + tangent.volume_pivot * pressure)
 
-    y = np.concatenate([start[near.near], state.border - border])
     way = ContactPath(np.stack([state.T, problem.T]))
     anchor, slid, limit, lost = state.anchor_mm[looked], state.slid_mm[looked], state.limit_n[looked], 0.0
-    wanted, before = _TOLERANCE * balance.scale_n, at_start
+    wanted, before, gap_before = _TOLERANCE * balance.scale_n, at_start, field.distance(at_start)
     for number in range(1, count + 1):
         share, predicted = number / count, y * (1 - 1 / (count + 1 - number))
         T = way.at(share)
@@ -110,7 +116,8 @@ def rubbed(
             control,
             border,
         )
-        substep.anchor_mm = anchor = met(field, held, anchor, before, small.places(predicted))
+        after = small.places(predicted)
+        substep.anchor_mm = anchor = met(held, anchor, before, after, gap_before, field.distance(after))
         if number == count:
             break
         y, done = small.newton(predicted, wanted, _ITERATIONS)
@@ -119,6 +126,7 @@ def rubbed(
             return None
         contact = small.contact(y)
         held, before = contact.penetration_mm > 0, small.places(y)
+        gap_before = field.distance(before)
         anchor, slid, limit, more = rub(substep, contact, limit)
         lost += more
     anchors, all_held, all_slid, all_limit = anchor_mm.copy(), state.held.copy(), state.slid_mm.copy(), state.limit_n.copy()
@@ -126,12 +134,11 @@ def rubbed(
     return replace(state, anchor_mm=anchors, held=all_held, slid_mm=all_slid, limit_n=all_limit, dissipated_nmm=lost)
 
 
-def met(field: ObjectField, held: BoolArray, anchor: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+def met(held: BoolArray, anchor: FloatArray, before: FloatArray, after: FloatArray, gap_before: FloatArray, gap: FloatArray) -> FloatArray:
     """Anchors (q, 3) of a step: of a held point its own; a point that is driven into the object is anchored where it meets the surface.
 
-    ``before``, ``after`` (q, 3): the points in the object's frame, on a straight way.
+    ``before``, ``after`` (q, 3): the points in the object's frame, on a straight way; ``gap_before``, ``gap`` (q,) their distances from it.
     """
-    gap_before, gap = field.distance(before), field.distance(after)
     driven = (gap_before > 0) & (gap < 0)
     share = np.where(driven, gap_before / np.where(driven, gap_before - gap, 1.0), 0.0)[:, None]
     return np.where(held[:, None], anchor, (1 - share) * before + share * after)

@@ -203,8 +203,15 @@ def test_no_module_is_a_drawer_for_everything():
             assert not names & {"utils", "util", "helpers", "misc", "common"}, f"{path.relative_to(ROOT)}: name it after what it does"
 
 
-def test_specifications_import_nothing_heavy():
-    code = "import sys, scenes; print([m for m in ('numpy', 'torch', 'mitsuba', 'pyvista', 'cv2') if m in sys.modules])"
+@pytest.mark.parametrize(
+    ("module", "heavy"),
+    [
+        ("scenes", ("numpy", "torch", "mitsuba", "pyvista", "cv2")),
+        ("twin.studio.studio", ("torch", "mitsuba", "pyvista", "matplotlib", "trimesh")),  # the first picture would wait for them
+    ],
+)
+def test_nothing_heavy_is_imported_before_it_is_needed(module, heavy):
+    code = f"import sys, {module}; print([m for m in {heavy} if m in sys.modules])"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
 
 

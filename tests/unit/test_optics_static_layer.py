@@ -6,6 +6,7 @@ from plain_sensor import changed, plain
 
 from scenes.sensor import RimSpec, SensorSpec, SpeckSpec
 from twin.camera.projection import project
+from twin.optics.lens import ray_table
 from twin.optics.lights import led_patches
 from twin.optics.static_layer import ACROSS, static_layer
 
@@ -48,6 +49,25 @@ def centroid(image: np.ndarray) -> np.ndarray:
     """Light-weighted, px of the raw frame."""
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     return np.array([(image * x).sum(), (image * y).sum()]) / image.sum() + WINDOW[:2]
+
+
+def test_a_layer_is_computed_once_for_all_that_does_not_change_it(bare, monkeypatch):
+    computed = []
+    monkeypatch.setattr("twin.optics.static_layer.ray_table", lambda *given: computed.append(given) or ray_table(*given))
+    window = (51, 20, 255, 225)  # one that no other test has asked for
+    light, cover = static_layer(bare, window)
+    hazy = changed(bare, gel={"haze": 0.3}, camera={"vignetting": 0.4}, appearance={"pin_albedo": (0.1, 0.1, 0.1)})
+    for each in (bare, hazy):
+        again, same = static_layer(each, window)
+        assert np.array_equal(again, light) and np.array_equal(same, cover)
+    assert len(computed) == 1
+    again[:] = 0.0
+    assert np.array_equal(static_layer(bare, window)[0], light), "who writes to a layer must not change it for others"
+    with pytest.raises(ValueError, match="read-only"):
+        cover[0, 0] = 0.5
+    brighter, _ = static_layer(changed(bare, leds={"power": 2 * bare.leds.power}), window)
+    assert len(computed) == 2 and light.max() > 0
+    np.testing.assert_allclose(brighter, 2 * light, rtol=1e-5)
 
 
 @pytest.mark.parametrize("face", ["back", "front"])

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from made_up_pages import HOSTILE, PAGES
 from sound_page import PageReader, read_sound_page
 
-from twin.report.charts import dark_of, muted, new_figure, write_chart
+from twin.report.charts import muted, new_figure, write_chart
 from twin.report.numbers import GROUP, LONGEST, MINUS, NOTHING, column, number
 from twin.report.page import Page, Picture, bad, code, good, link_to, sentence, strong
 from twin.report.table import Cell, Column, make_table, write_rows, write_table
-from twin.report.themes import DARK, LIGHT, SERIES, Theme, stylesheet
+from twin.report.themes import DARK, LIGHT, SERIES, Theme, dark_of, stylesheet
 
 TEXT_CONTRAST = 4.5  # WCAG 2.1, 1.4.3, level AA
 LINE_CONTRAST = 3.0  # WCAG 2.1, 1.4.11

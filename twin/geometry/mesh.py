@@ -6,15 +6,18 @@ the gel to the lens. The mechanics are computed with the spline solid (``solid``
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pyvista as pv
 
 from scenes.sensor import GeometrySpec
 from twin.geometry.chart import Chart, Focus, RectangleChart
 from twin.geometry.shapes import shape_of
 from twin.geometry.solid import Solid, body_points, surface_operators
 from twin.types import ComplexArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    import pyvista as pv
 
 SKIN, GEL = 0, 1
 """Materials of an element."""
@@ -99,7 +102,7 @@ def outer_chart(geometry: GeometrySpec) -> Chart | RectangleChart:
 
 def to_pyvista(
     mesh: SensorMesh, *, nodes_mm: FloatArray | None = None, point_data: Mapping[str, FloatArray | IntArray] | None = None
-) -> pv.UnstructuredGrid:
+) -> "pv.UnstructuredGrid":
     """Skin and gel as one unstructured grid with cell data ``material``.
 
     Parameters
@@ -108,6 +111,8 @@ def to_pyvista(
         Deformed nodes (default: at rest).
     point_data : dict of str to (n,) or (n, 3) float, optional
     """
+    import pyvista as pv  # takes a quarter of a second
+
     nodes = mesh.nodes_mm if nodes_mm is None else nodes_mm
     cells = np.column_stack([np.full(len(mesh.hexes), 8), mesh.hexes])
     grid = pv.UnstructuredGrid(cells, np.full(len(mesh.hexes), pv.CellType.HEXAHEDRON), nodes)
@@ -119,7 +124,7 @@ def to_pyvista(
 
 def skin_surface(
     mesh: SensorMesh, *, nodes_mm: FloatArray | None = None, point_data: Mapping[str, FloatArray | IntArray] | None = None
-) -> pv.PolyData:
+) -> "pv.PolyData":
     """Closed surface of the skin alone (outside, inside, rim), ready to be written as ``.vtp``.
 
     Point data ``node`` is each point's index in ``mesh.nodes_mm``.

@@ -9,7 +9,6 @@ from scenes.object import CylinderShape, EdgeShape, MeshShape, ObjectSpec, Plane
 from twin.compiled import compiled
 from twin.objects.analytic import Cylinder, Edge, Plane, Prism, Sphere
 from twin.objects.level_set import Probe, Probed, Wrapped, unit_normals
-from twin.objects.mesh_field import load_mesh_field
 from twin.types import FloatArray
 
 _BLEND = 0.15
@@ -60,6 +59,8 @@ def build_field(spec: ObjectSpec) -> ObjectField:
         case PrismShape():
             base = Prism(shape.sides, shape.inradius_mm, shape.fillet_mm, np.radians(shape.taper_deg))
         case MeshShape():
+            from twin.objects.mesh_field import load_mesh_field  # imports trimesh, which takes a sixth of a second
+
             base = load_mesh_field(shape)
     if spec.texture is not None:
         return WireMesh(base, spec.texture.pitch_mm, spec.texture.wire_diameter_mm)

@@ -4,7 +4,7 @@ Contacts do not change this layer. It is computed once, without noise.
 """
 
 from collections.abc import Sequence
-from functools import partial
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
@@ -26,6 +26,8 @@ RIM_UNIT = 1000.0
 """Value in ``RimSpec.light`` that stands for the light 1: its numbers are thousandths."""
 BACKGROUND_POWER = 2.2
 """Power of a background's levels (see ``BackgroundSpec.light``)."""
+KEPT = 4
+"""Number of layers that are kept in memory: those of the frame and of a window of it, before and after a change."""
 SMALL = 1e-3
 """Least light or cover to which a difference within a pixel is compared. Smaller values need no relative precision."""
 
@@ -33,15 +35,28 @@ SMALL = 1e-3
 def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tuple[FloatArray, FloatArray]:
     """Light and cover of a window of the raw frame.
 
+    The last few layers are kept: what they do not depend on, as the gel's haze and the caps, may change between calls.
+
     Returns
     -------
     light : (H, W, 3) float32
         Linear RGB that reaches the film independently of the gel.
     cover : (H, W) float32
-        Share of the gel's light that is hidden: the film gets ``light + (1 - cover) * gel``.
+        Share of the gel's light that is hidden: the film gets ``light + (1 - cover) * gel``. The array is shared and can't be written to.
     """
-    table = ray_table(spec.camera, window_px) @ sensor_to_camera(spec.camera)[:3, :3]
-    seen = partial(_seen, spec.view, spec.leds, spec.housing, spec.appearance.specks)
+    view = spec.view.model_copy(update={"camera": spec.camera.model_copy(update={"vignetting": 0.0})})
+    ring = spec.housing.model_copy(update={"background": None})
+    light, cover = _computed(view, spec.leds, ring, spec.appearance.specks, tuple(window_px))
+    return light + background_light(spec, window_px), cover
+
+
+@lru_cache(maxsize=KEPT)
+def _computed(
+    view: ViewSpec, leds: LedRingSpec, ring: HousingSpec, specks: tuple[SpeckSpec, ...], window_px: tuple[int, int, int, int]
+) -> tuple[FloatArray, FloatArray]:
+    """Light (H, W, 3), without the measured background, and cover (H, W)."""
+    table = ray_table(view.camera, window_px) @ sensor_to_camera(view.camera)[:3, :3]
+    seen = partial(_seen, view, leds, ring, specks)
     at_corners = np.concatenate([part.reshape(*part.shape[:2], -1) for part in seen(table)], axis=2)
     around = np.stack([at_corners[:-1, :-1], at_corners[:-1, 1:], at_corners[1:, :-1], at_corners[1:, 1:]])
     both = around.mean(axis=0)
@@ -50,7 +65,10 @@ def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tupl
     corners = np.stack([[table[rows + j, columns + i] for i in (0, 1)] for j in (0, 1)])
     light, hidden = seen(subpixel_rays(corners, ACROSS))
     both[rows, columns] = np.concatenate([light, hidden[..., None]], axis=2).mean(axis=1)
-    return (both[..., :3] + background_light(spec, window_px)).astype(np.float32), both[..., 3].astype(np.float32)
+    seen_light, cover = both[..., :3].astype(np.float32), both[..., 3].astype(np.float32)
+    for kept in (seen_light, cover):
+        kept.flags.writeable = False
+    return seen_light, cover
 
 
 def background_light(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> FloatArray:
@@ -78,10 +96,12 @@ def _seen(
     tangents = rays[..., :2] / np.maximum(rays[..., 2:], 1e-9)
     at_ring = tangents * (ring.z_mm + view.camera.distance_mm)
     wall = beyond_aperture(ring, at_ring) >= 0
-    light = np.where(wall[..., None], housing_light(leds, ring, at_ring), reflections(view, leds, ring, tangents))
-    hidden, shine = _specks(view, specks, tangents)
-    light = np.where(wall[..., None], light, light + shine) + rim_light(ring, at_ring)
-    return light, np.where(wall, 1.0, hidden)
+    light, cover = np.empty((*wall.shape, 3)), np.ones(wall.shape)
+    light[wall] = housing_light(leds, ring, at_ring[wall])
+    hidden, shine = _specks(view, specks, tangents[~wall])
+    light[~wall] = reflections(view, leds, ring, tangents[~wall]) + shine
+    cover[~wall] = hidden
+    return light + rim_light(ring, at_ring), cover
 
 
 def rim_light(ring: HousingSpec, at_mm: FloatArray) -> FloatArray:
@@ -113,7 +133,7 @@ def beyond_aperture(ring: HousingSpec, at_mm: FloatArray) -> FloatArray:
     """Distance (...) of places (..., 2) of the housing's plane from its opening, mm; negative within it."""
     place = at_mm - ring.center_mm
     if ring.aperture_mm is None:
-        return np.linalg.norm(place, axis=-1) - ring.aperture_radius_mm
+        return np.sqrt(_squared(place)) - ring.aperture_radius_mm
     over = np.abs(place) - np.array(ring.aperture_mm) / 2
     return np.linalg.norm(np.maximum(over, 0), axis=-1) + np.minimum(over.max(axis=-1), 0)
 
@@ -132,7 +152,7 @@ def housing_light(leds: LedRingSpec, ring: HousingSpec, at_mm: FloatArray) -> Fl
     light = ring.ambient * np.mean(shares) * np.exp(-np.maximum(out, 0) / ring.ambient_falloff_mm)
     for patch, share in zip(patches, shares, strict=True):
         led = patch.center_mm[:2] / np.linalg.norm(patch.center_mm[:2])
-        away2 = np.sum((place - ring.glow_radius_mm * led) ** 2, axis=-1) / ring.glow_height_mm**2
+        away2 = _squared(place - ring.glow_radius_mm * led) / ring.glow_height_mm**2
         light = light + ring.glow * share * (1 + away2) ** -ring.glow_exponent
     light = leds.power * light * np.where(out < ring.lip_width_mm, 1.0, ring.wall_fraction)
     return light[..., None] * np.array(ring.albedo)
@@ -141,7 +161,7 @@ def housing_light(leds: LedRingSpec, ring: HousingSpec, at_mm: FloatArray) -> Fl
 def reflections(view: ViewSpec, leds: LedRingSpec, ring: HousingSpec, tangents: FloatArray) -> FloatArray:
     """Radiance (..., 3) of the lights that both faces of the window reflect, for tangents (..., 2) of rays in air."""
     lens, distance = view.lens, view.camera.distance_mm
-    u2 = np.sum(tangents**2, axis=-1)
+    u2 = _squared(tangents)
     cos_air = 1 / np.sqrt(1 + u2)
     sine2 = 1 - cos_air**2
     cos_window = np.sqrt(1 - sine2 / lens.refractive_index**2)
@@ -164,23 +184,30 @@ def _profile(leds: LedRingSpec, patch: Patch, at_mm: FloatArray) -> FloatArray:
     """A light's radiance at places (..., 2) about its centre, relative to its mean."""
     inner, outer = patch.radii_mm
     if outer > 0:
-        rho = np.linalg.norm(at_mm, axis=-1)
+        rho = np.sqrt(_squared(at_mm))
         return ((rho >= inner) & (rho <= outer)).astype(float)
-    within = np.all(np.abs(at_mm @ np.linalg.inv(patch.half_mm)) <= 1, axis=-1)
+    along, across = np.moveaxis(np.abs(at_mm @ np.linalg.inv(patch.half_mm)), -1, 0)
+    within = (along <= 1) & (across <= 1)
     share, sd = leds.core_share, leds.core_mm
-    core = patch.area_mm2 / (2 * np.pi * sd**2) * np.exp(-np.sum(at_mm**2, axis=-1) / (2 * sd**2)) if share else 0.0
+    core = patch.area_mm2 / (2 * np.pi * sd**2) * np.exp(-_squared(at_mm) / (2 * sd**2)) if share else 0.0
     return leds.mirror_share * ((1 - share) * within + share * core)
 
 
 def _specks(view: ViewSpec, specks: Sequence[SpeckSpec], tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cover (...) and light (..., 3) of the specks on the window's gel side."""
     hidden, shine = np.zeros(tangents.shape[:-1]), np.zeros((*tangents.shape[:-1], 3))
-    lens, u2 = view.lens, np.sum(tangents**2, axis=-1, keepdims=True)
+    lens, u2 = view.lens, _squared(tangents)[..., None]
     within = 1 / np.sqrt(lens.refractive_index**2 + (lens.refractive_index**2 - 1) * u2)
     at = tangents * (lens.back_mm + view.camera.distance_mm + lens.thickness_mm * within)
     for speck in specks:
-        away = np.linalg.norm(at - [speck.x_mm, speck.y_mm], axis=-1) / speck.radius_mm
-        disc = np.clip(2 - 2 * away, 0, 1)  # 1 up to half the radius
-        hidden = 1 - (1 - hidden) * (1 - speck.opacity * disc)
-        shine = shine + (disc * speck.light)[..., None]
+        squared = _squared(at - [speck.x_mm, speck.y_mm]) / speck.radius_mm**2
+        on = squared < 1
+        disc = np.minimum(2 - 2 * np.sqrt(squared[on]), 1)  # 1 up to half the radius
+        hidden[on] = 1 - (1 - hidden[on]) * (1 - speck.opacity * disc)
+        shine[on] += disc[:, None] * speck.light
     return hidden, shine
+
+
+def _squared(vectors: FloatArray) -> FloatArray:
+    """Squared lengths (...) of vectors (..., 2); a sum over an axis of two is several times slower."""
+    return np.asarray(vectors[..., 0] ** 2 + vectors[..., 1] ** 2)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from twin.report.numbers import number
-from twin.report.themes import DARK, LIGHT, SERIES, Theme
+from twin.report.themes import DARK, LIGHT, SERIES, Theme, dark_of
 from twin.store import write_bytes
 
 DPI = 140
@@ -43,7 +43,7 @@ def sized_figure(
 
 
 def write_chart(path: Path, draw: Callable[[], Figure], *, dpi: int = DPI) -> Path:
-    """Draw a chart in the light theme to ``path``, and in the dark theme to `dark_of` this path. Returns the path.
+    """Draw a chart in the light theme to ``path``, and in the dark theme to `twin.report.themes.dark_of` this path. Returns the path.
 
     Parameters
     ----------
@@ -64,11 +64,6 @@ def save_figure(path: Path, figure: Figure, *, dpi: int = DPI) -> Path:
     content = io.BytesIO()
     figure.savefig(content, dpi=dpi, format="png")
     return write_bytes(path, content.getvalue())
-
-
-def dark_of(path: Path) -> Path:
-    """Path of a chart in the dark theme."""
-    return path.with_name(f"{path.stem}-dark{path.suffix}")
 
 
 @contextmanager

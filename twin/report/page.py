@@ -18,9 +18,8 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from twin.report.charts import dark_of
 from twin.report.table import Column, Row, Table, make_table
-from twin.report.themes import stylesheet
+from twin.report.themes import dark_of, stylesheet
 from twin.store import write_text
 
 Kind = Literal["chart", "frame", "photo"]

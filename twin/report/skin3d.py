@@ -2,6 +2,8 @@
 
 VTK kills the whole process if it finds neither a display nor EGL. Therefore it is used in a child process. If that ends with an error, a
 simpler picture is drawn by matplotlib, and the caller gets the reason.
+
+PyVista and matplotlib are imported by what draws with them: they take half a second, and many who import this module do not draw.
 """
 
 import subprocess
@@ -9,19 +11,20 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pyvista as pv
-from matplotlib import colormaps
-from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
 
 from scenes.sensor import PinsSpec
 from twin.geometry.mesh import SensorMesh, skin_surface
 from twin.objects import ObjectField
-from twin.report.charts import save_figure
 from twin.store import write_bytes, write_text
 from twin.types import ContactState
+
+if TYPE_CHECKING:
+    import pyvista as pv
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
 
 # Box of the sensor frame that the picture shows: x0, x1, y0, y1, z0, z1, mm.
 SCENE_BOUNDS_MM = (-24.0, 24.0, -24.0, 24.0, -2.0, 32.0)
@@ -35,14 +38,14 @@ CUT_NORMAL, CUT_ORIGIN = (0.0, -1.0, 0.0), (0.0, -0.01, 0.0)
 REMEDY = "install libegl1 and libgl1 (apt-get install libegl1 libgl1) for shaded 3D pictures"
 
 
-def displaced_skin(mesh: SensorMesh, state: ContactState) -> pv.PolyData:
+def displaced_skin(mesh: SensorMesh, state: ContactState) -> "pv.PolyData":
     """The deformed skin with point data ``displacement_mm`` (n,) and ``displacement_xyz_mm`` (n, 3)."""
     moved = state.nodes_mm - mesh.nodes_mm
     data = {"displacement_mm": np.linalg.norm(moved, axis=1), "displacement_xyz_mm": moved}
     return skin_surface(mesh, nodes_mm=state.nodes_mm, point_data=data)
 
 
-def write_surface(path: Path, surface: pv.PolyData) -> Path:
+def write_surface(path: Path, surface: "pv.PolyData") -> Path:
     """Write a surface and its data as a ``.vtp`` file, and return the path.
 
     VTK gives the content as text and writes no file itself, because on a full disk it kills the whole process.
@@ -52,6 +55,8 @@ def write_surface(path: Path, surface: pv.PolyData) -> Path:
     StoreError
         The file cannot be written.
     """
+    import pyvista as pv
+
     writer = pv.XMLPolyDataWriter(path, surface)
     writer.data_format = "binary"  # base64
     writer.writer.WriteToOutputStringOn()
@@ -59,8 +64,10 @@ def write_surface(path: Path, surface: pv.PolyData) -> Path:
     return write_text(path, writer.writer.GetOutputString())
 
 
-def pins_surface(pins: PinsSpec, state: ContactState) -> pv.PolyData:
+def pins_surface(pins: PinsSpec, state: ContactState) -> "pv.PolyData":
     """Stems and caps of all pins as tubes."""
+    import pyvista as pv
+
     parts = []
     stem_end = state.caps_mm - state.axis * pins.cap_height_mm / 2
     for start, end, diameter_mm in (
@@ -79,7 +86,7 @@ def draw_contact_skin(mesh: SensorMesh, pins: PinsSpec, state: ContactState, fie
     return draw_skin(displaced_skin(mesh, state), pins_surface(pins, state), surface, path)
 
 
-def draw_skin(skin: pv.PolyData, pins: pv.PolyData, touched: pv.PolyData, path: Path) -> str:
+def draw_skin(skin: "pv.PolyData", pins: "pv.PolyData", touched: "pv.PolyData", path: Path) -> str:
     """Write a picture of the skin, coloured by ``displacement_mm`` and cut open, with pins and object.
 
     Returns
@@ -95,12 +102,16 @@ def draw_skin(skin: pv.PolyData, pins: pv.PolyData, touched: pv.PolyData, path: 
         if not reason:
             write_bytes(path, drawn.read_bytes())
     if reason:
+        from twin.report.charts import save_figure
+
         save_figure(path, _plain_figure(skin, touched), dpi=100)
     return reason
 
 
 def probe_offscreen() -> str:
     """Empty if VTK can draw without a window on this machine, else the reason why not."""
+    import pyvista as pv
+
     with tempfile.TemporaryDirectory() as folder:
         for name in ("skin", "pins", "object"):
             write_surface(Path(folder) / f"{name}.vtp", pv.Sphere())
@@ -109,7 +120,7 @@ def probe_offscreen() -> str:
 
 def object_surface(
     distance: Callable[[np.ndarray], np.ndarray], T_sensor_object: np.ndarray, *, bounds_mm: Sequence[float], samples: int = 100
-) -> pv.PolyData:
+) -> "pv.PolyData":
     """The surface of an object inside a box of the sensor frame: the zero level of its signed distance.
 
     Parameters
@@ -120,6 +131,8 @@ def object_surface(
     bounds_mm : (6,) float
         x0, x1, y0, y1, z0, z1 of the box.
     """
+    import pyvista as pv
+
     low, high = np.array(bounds_mm[::2], float), np.array(bounds_mm[1::2], float)
     grid = pv.ImageData(dimensions=(samples,) * 3, spacing=tuple((high - low) / (samples - 1)), origin=tuple(low))
     T_object_sensor = np.linalg.inv(T_sensor_object)
@@ -140,6 +153,8 @@ def _run_child(folder: str, path: str) -> str:
 
 
 def _draw_with_pyvista(folder: Path, path: str) -> None:
+    import pyvista as pv
+
     skin, pins, touched = (pv.PolyData(str(folder / f"{name}.vtp")) for name in ("skin", "pins", "object"))
     plotter = pv.Plotter(off_screen=True, window_size=list(WINDOW_PX))
     plotter.set_background("#0d1117", top="#27313f")  # type: ignore[arg-type]  # its decorator hides self from the checker
@@ -167,16 +182,21 @@ def _draw_with_pyvista(folder: Path, path: str) -> None:
     plotter.screenshot(path)
 
 
-def _cut(surface: pv.PolyData) -> pv.PolyData:
+def _cut(surface: "pv.PolyData") -> "pv.PolyData":
     return surface.clip(normal=CUT_NORMAL, origin=CUT_ORIGIN)
 
 
-def _glow() -> ListedColormap:
+def _glow() -> "ListedColormap":
     """Inferno without its black end, which can't be seen on the background."""
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
     return ListedColormap(colormaps["inferno"](np.linspace(0.22, 0.97, 256)))
 
 
-def _plain_figure(skin: pv.PolyData, touched: pv.PolyData) -> Figure:
+def _plain_figure(skin: "pv.PolyData", touched: "pv.PolyData") -> "Figure":
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(WINDOW_PX[0] / 100, WINDOW_PX[1] / 100), layout="constrained")
     axes = figure.add_subplot(projection="3d")
     half = _cut(skin).triangulate()

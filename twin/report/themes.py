@@ -6,6 +6,7 @@ Text colours have a contrast of at least 4.5:1 to every background of their them
 
 from dataclasses import asdict, dataclass
 from importlib import resources
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,11 @@ DARK = Theme("#0f1419", "#161c23", "#1c2f45", "#e4e9ef", "#a1b0c0", "#82bbf7", "
 # contrast above. Any two differ by at least 20 (CIELAB) for readers with normal colour vision, for protanopes and for deuteranopes.
 BLUE, RED, GREEN, PURPLE, OLIVE = "#0a7ff8", "#b73f2c", "#35956e", "#b355ac", "#a19200"
 SERIES = (BLUE, RED, GREEN, PURPLE, OLIVE)
+
+
+def dark_of(path: Path) -> Path:
+    """Path of a chart in the dark theme."""
+    return path.with_name(f"{path.stem}-dark{path.suffix}")
 
 
 def stylesheet() -> str:

@@ -5,9 +5,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 
+import cv2
 import numpy as np
 import viser
-from matplotlib import colormaps
 from scipy.interpolate import make_interp_spline
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -38,8 +38,8 @@ HOLDER_MM = 14.0
 SKIN_RGB, OBJECT_RGB, HOLDER_RGB, FORCE_RGB = (82, 96, 124), (120, 168, 232), (52, 57, 66), (255, 176, 32)
 GIZMO_MM = 16.0
 """Size of the gizmo."""
-GLOW = (colormaps["inferno"](np.linspace(0.22, 0.97, 256))[:, :3] * 255).astype(np.uint8)
-"""Colours (256, 3) of pins, the smallest value first."""
+GLOW = cv2.applyColorMap(np.linspace(0.22 * 255, 0.97 * 255, 256).astype(np.uint8)[:, None], cv2.COLORMAP_INFERNO)[:, 0, ::-1]
+"""Colours (256, 3) RGB of pins, the smallest value first."""
 
 
 class Shown(StrEnum):

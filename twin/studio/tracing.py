@@ -17,7 +17,6 @@ from pathlib import Path
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.errors import RenderError, TwinError
-from twin.one_contact import write_contact
 from twin.optics.preview import Shading
 from twin.optics.render import Renderer
 from twin.simulator import Simulator
@@ -25,6 +24,8 @@ from twin.studio.camera import PARTS, dome_renderer, dome_shading
 from twin.studio.pose import PressedPose
 from twin.types import ContactState, FloatArray, Form
 
+SHOWN_S = 0.15
+"""Time in s for which the first pass is left to be shown before the next one takes all cores."""
 END_S = 3.0
 """Longest wait in s for the process to end by itself."""
 
@@ -91,10 +92,16 @@ class Tracer:
     Parameters
     ----------
     spec : SensorSpec
+
+    Attributes
+    ----------
+    on_outcome : callable
+        Called when something has come back, in a thread of its own.
     """
 
     def __init__(self, spec: SensorSpec) -> None:
         self._spec = spec
+        self.on_outcome: Callable[[], None] = lambda: None
         self._here, self._there = Pipe()
         self._process: subprocess.Popen[bytes] | None = None
         self._found: deque[Outcome] = deque()
@@ -139,6 +146,7 @@ class Tracer:
             while True:
                 outcome = self._here.recv()
                 self._found.append(outcome)
+                self.on_outcome()
                 if isinstance(outcome, Failed) or (isinstance(outcome, Traced) and outcome.rough):
                     with self._one:
                         job, self._next = self._next, None
@@ -185,8 +193,8 @@ def serve(number: int) -> None:
             there.send(shading)
         jobs: deque[_Trace | _Save | None] = deque()
 
-        def overtaken() -> bool:
-            while there.poll():
+        def overtaken(wait_s: float) -> bool:
+            while there.poll(0 if jobs else wait_s):
                 jobs.append(there.recv())
             return any(job is None or isinstance(job, _Trace) for job in jobs)
 
@@ -201,7 +209,7 @@ def serve(number: int) -> None:
 class _Maker:
     """Does the jobs; renderer and simulator are built when they are first needed. What is ``overtaken`` is not refined."""
 
-    def __init__(self, spec: SensorSpec, overtaken: Callable[[], bool]) -> None:
+    def __init__(self, spec: SensorSpec, overtaken: Callable[[float], bool]) -> None:
         self._spec, self._overtaken = spec, overtaken
         self._renderer: Renderer | None = None
         self._simulator: Simulator | None = None
@@ -217,10 +225,12 @@ class _Maker:
         for k, light in enumerate(self._renderer.refine(job.state, job.solved, samples=samples)):
             if k == 0 or k == len(samples) - 1:
                 yield Traced(job.solved, light, 1e3 * (time.perf_counter() - started), rough=k == 0)
-            if self._overtaken():
+            if self._overtaken(SHOWN_S if k == 0 else 0.0):
                 return
 
     def _save(self, job: _Save) -> Iterator[Saved]:
+        from twin.one_contact import write_contact  # imports matplotlib, which no picture of the page needs
+
         if self._simulator is None:
             self._simulator = Simulator(self._spec)
         shot = self._simulator.shoot(job.state, form=job.form)

@@ -120,7 +120,8 @@ class TwinMode(PageMode):
             self.worker = Worker(contact, tracer, self._answered, self._said)
             self._rest = nominal_reference(setup.sensor, setup.form)
             self._scene = Scene(self._page.server, setup.sensor, contact.solver.mesh, contact.solver.rest())
-            self._scene.put_object(setup.touched)
+            if self._loading:  # else ``_load_rest`` puts it
+                self._scene.put_object(setup.touched)
             self._scene.on_drag(self._dragged)
 
     def start(self) -> None:
@@ -373,9 +374,18 @@ class TwinMode(PageMode):
         if self._path is not None:
             self._path.append((time.monotonic() - self._path_s, answer.pose))
         self._publisher.give(answer)
-        if not self._loading:  # only now, so that the first picture does not wait for it
-            self._loading = True
-            threading.Thread(target=self._load_model, args=(self._state.sensor,), name="studio-model", daemon=True).start()
+
+    def _load_rest(self) -> None:
+        """Load what the first picture does not need: the object's shape in the scene, and the model."""
+        self._loading = True
+        self.worker.do(self._put_object)
+        threading.Thread(target=self._load_model, args=(self._state.sensor,), name="studio-model", daemon=True).start()
+
+    def _put_object(self) -> None:
+        """Show the object in the scene. Only for the worker's thread."""
+        with self._showing:
+            self._scene.put_object(self.contact.setup.touched)
+        self.worker.show_again()
 
     def _publish(self, answer: Answer) -> None:
         """Show an answer: scene, pictures and numbers belong to one pose, and browsers get them together."""
@@ -383,6 +393,8 @@ class TwinMode(PageMode):
             if answer.setup.sensor is not self.contact.setup.sensor:  # the page shows another sensor since
                 return
             self._show_answer(answer)
+        if not self._loading:
+            self._load_rest()
         for follow in self.followers:
             follow(answer)
 

@@ -15,12 +15,12 @@ from twin.studio.pose import ObjectPose
 from twin.studio.tracing import Failed, Outcome, Saved, Traced, Tracer
 
 LOG = logging.getLogger(__name__)
-STILL_S = 0.06
+STILL_S = 0.04
 """The object stands still once no wish has come for this time, in s."""
 REFINE_S = 1.0
 """Time in s without a wish after which the fine mesh follows. A step on it takes some 0.1 s, for which a new wish has to wait."""
 LOOK_S = 0.02
-"""Interval in s at which it is looked for the tracer's outcomes and for what is due."""
+"""Interval in s at which it is looked for what is due."""
 
 
 def told(error: Exception) -> str:
@@ -97,6 +97,13 @@ class Worker(_OwnThread):
         self._moved_s = time.monotonic()
         self._newest: Answer | None = None
         self._traces = tracer is not None
+        if tracer is not None:
+            tracer.on_outcome = self._wake
+
+    def _wake(self) -> None:
+        """Look for outcomes of the tracer at once."""
+        with self._news:
+            self._news.notify()
 
     @property
     def newest(self) -> Answer | None:

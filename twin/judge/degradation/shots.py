@@ -20,7 +20,6 @@ from twin.judge.pictures.aligned import to_light
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview, Shading
-from twin.optics.static_layer import static_layer
 from twin.store import cached_arrays
 from twin.types import Form, Frame
 from twin.types import PinState as AnyPinState
@@ -192,7 +191,7 @@ def degraded_state(
     lit = degraded.model_copy(update={"response": spec.response})
     truth = cap_truth(geometry, rest_pins(spec.geometry), state, Form.RAW)
     view = replace(View.of(degraded, truth.caps_px), caps_px=truth.caps_px)
-    light = Preview(lit, static=_static(lit), shading=shading).render(state)
+    light = Preview(lit, shading=shading).render(state)
     for case, severity in cases:
         light = case.on_light(light, severity, view, 0)
     image = expose(light, degraded.capture, np.random.default_rng(0))
@@ -257,7 +256,7 @@ def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contac
 
     All conditions that act after the film use these films. Contacts that cannot be solved are left out.
     """
-    preview, films = Preview(spec, static=_static(spec)), []
+    preview, films = Preview(spec), []
     for draw, contact in enumerate(contacts):
         try:
             state, truth = _pressed(geometry, mechanics, contact)
@@ -274,17 +273,3 @@ def _pressed(spec: SensorSpec, mechanics: SensorSpec, contact: Contact) -> tuple
     """Pins in a contact of the sensor ``mechanics``, and their places in the picture of ``spec``'s camera."""
     state = pins_under(mechanics, contact)
     return state, cap_truth(spec, rest_pins(spec.geometry), state, Form.RAW)
-
-
-def _static(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Light and cover of the static layer. Most conditions do not change it, so it is stored."""
-    plain = spec.model_copy(update={"gel": spec.gel.model_copy(update={"haze": 0.0, "absorption_per_mm": (0.0, 0.0, 0.0)})})
-    bare = {"cap_albedo": (1.0, 1.0, 1.0), "cap_levels": (), "cap_shapes": (), "skin_albedo": (0.0, 0.0, 0.0)}
-    plain = altered(plain, appearance=bare, camera={"vignetting": 0.0}, response=NEUTRAL["response"])
-    return _static_layer(plain.model_dump_json())
-
-
-@lru_cache(maxsize=2)
-def _static_layer(spec_json: str) -> tuple[np.ndarray, np.ndarray]:
-    spec = SensorSpec.model_validate_json(spec_json)
-    return static_layer(spec, (0, 0, spec.camera.width_px, spec.camera.height_px))

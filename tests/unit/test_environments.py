@@ -1,5 +1,6 @@
 """The environments' own laws: geometry of tasks, options, spaces, seeds. Contacts are solved on few poses, by the finite elements."""
 
+import re
 import warnings
 from functools import partial
 
@@ -10,6 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from scipy.spatial.transform import Rotation
 from stable_baselines3.common.env_checker import check_env as check_for_baselines
+from studio_client import StudioClient
 
 from scenes import load_experiment, load_object, load_sensor
 from training.environments import ids
@@ -191,6 +193,27 @@ def test_wrong_calls_are_named():
         env.step(np.zeros(2))
     with pytest.raises(OptionError, match="render_mode"):
         gymnasium.make("tactip/SurfaceFollow-v0", render_mode="ansi", disable_env_checker=True, **FAST)
+
+
+def test_an_episode_is_shown_on_a_page_step_by_step(capsys):
+    """A browser gets the newest step, with its picture, pins and object, and loses the page when the environment is closed."""
+    env = gymnasium.make("tactip/SurfaceFollow-v0", render_mode="human", disable_env_checker=True, sensor="mg400-127").unwrapped
+    assert env.render() is None and not capsys.readouterr().err, "no page before the first episode"
+    env.reset(seed=0, options={"object": "plane"})
+    url = re.search(r"http://\S+", capsys.readouterr().err)[0]
+    with StudioClient(url) as client:
+        client.wait(lambda u: u.number == 0)
+        assert ">plane<" in client.html()
+        for number in (1, 2):
+            _, reward, *_ = env.step(env.action_space.sample())
+            shown = client.wait(lambda u, number=number: u.number == number)
+            assert f"{reward:+.3f}" in shown.html and shown.pictures == 2
+            assert {"/sensor/pins", "/sensor/skin", "/object"} <= shown.nodes
+    env.close()
+    with pytest.raises(OSError, match="refused"):
+        StudioClient(url).__enter__()
+    with pytest.raises(OptionError, match="one environment"):
+        gymnasium.make_vec("tactip/SurfaceFollow-v0", num_envs=2, render_mode="human")
 
 
 def test_every_task_is_registered():

@@ -20,7 +20,7 @@ from training.surrogate.model import is_mechanical, surrogate_of
 from twin.errors import ContactError, OptionError
 from twin.rig.contact import contact_law
 from twin.rig.touch import Touch
-from twin.types import BoolArray, FloatArray, ImageArray, IntArray
+from twin.types import BoolArray, FloatArray, Frame, ImageArray, IntArray
 
 BackendName = Literal["surrogate", "fem"]
 BACKENDS: tuple[str, ...] = get_args(BackendName)
@@ -317,12 +317,16 @@ class Batch:
 
     def picture(self, row: int) -> ImageArray:
         """(H, W, 3) uint8: the sensor's frame of one environment."""
+        image = self.frame(row).image
+        return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+
+    def frame(self, row: int) -> Frame:
+        """The sensor's frame of one environment."""
         if self._shows is None:
             self._shows = Eye(self.sensor, self.count, "pins", pictures="none", pin_noise_px=0.0)
             for begun, contact in enumerate(self.contacts):
                 self._shows.begin(begun, contact.sensor if contact else self.sensor)
-        image = self._shows.frame(row, self.backend.attitude(row), np.random.default_rng(int(self.steps_done[row]))).image
-        return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+        return self._shows.frame(row, self.backend.attitude(row), np.random.default_rng(int(self.steps_done[row])))
 
     def begun(self) -> dict[str, Any]:
         """What ``info`` tells of the beginning of the episodes: names (B,) of the objects."""

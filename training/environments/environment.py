@@ -1,7 +1,9 @@
 """The environments as gymnasium knows them: a single one, and a vector of them in one process."""
 
+import sys
+import time
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
@@ -14,10 +16,13 @@ from training.environments.batch import Batch, Options
 from twin.errors import OptionError
 from twin.types import FloatArray, ImageArray
 
-RENDER_MODES = ("rgb_array",)
+if TYPE_CHECKING:
+    from twin.studio.episode import EpisodePage
+
+RENDER_MODES = ("rgb_array", "human")
 """What ``render_mode`` may be besides None."""
 RENDER_FPS = 10
-"""Pictures a second at the pace of the steps."""
+"""Pictures a second at the pace of the steps. With ``human`` no step comes sooner."""
 
 Seen = dict[str, Any]
 
@@ -35,7 +40,8 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
     ----------
     task : str
         EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ObjectRoll or ObjectPush.
-    render_mode : {None, "rgb_array"}
+    render_mode : {None, "rgb_array", "human"}
+        With ``human`` each step is shown on a page of the studio, whose address is told on the error stream at the first ``reset``.
     options
         See ``training.environments.batch.Options``.
 
@@ -53,6 +59,8 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         self.observation_space = self.batch.observation_space()
         self.action_space = cast(spaces.Space[FloatArray], self.batch.action_space())
         self._state = "new"
+        self._page: EpisodePage | None = None
+        self._shown_s = 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
         """Begin an episode; ``options`` may name its ``object``."""
@@ -61,6 +69,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         self.batch.begin(0, self.np_random, options)
         self.batch.settle(np.zeros(1, int))
         self._state = "begun"
+        self._show(0.0)
         return _row(self.batch.observation()), _row(self.batch.begun())
 
     def step(self, action: FloatArray) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
@@ -72,12 +81,13 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         info = {
             name: value.item() if isinstance(value, np.generic) else value for name, value in _row(done.info).items() if value is not None
         }
+        self._show(float(done.reward[0]))
         return _row(self.batch.observation()), float(done.reward[0]), bool(done.terminated[0]), bool(done.truncated[0]), info
 
     def render(self) -> ImageArray | None:
-        """The sensor's frame, (H, W, 3) uint8, if the render mode is ``rgb_array``."""
+        """The sensor's frame, (H, W, 3) uint8, if the render mode is ``rgb_array``; with ``human`` each step is shown by itself."""
         self._require_open()
-        if self.render_mode is None:
+        if self.render_mode != "rgb_array":
             return None
         if self._state == "new":
             raise OptionError("render() before reset(); call reset() first")
@@ -86,6 +96,45 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
     def close(self) -> None:
         """End; a second call has no effect, as gymnasium wants it."""
         self._state = "closed"
+        page, self._page = self._page, None
+        if page is not None:
+            page.__exit__()
+
+    def _show(self, reward: float) -> None:
+        """Show the newest step on the page, if the render mode is ``human``."""
+        if self.render_mode != "human":
+            return
+        from twin.studio.episode import EpisodePage, EpisodeStep
+
+        batch = self.batch
+        frame, contact = batch.frame(0), batch.contacts[0]
+        assert contact is not None, "reset first"
+        if self._page is None:
+            self._page = EpisodePage(f"TacTip episode: {self.spec.id if self.spec else batch.sensor.name}", batch.sensor, frame.form)
+            self._page.__enter__()
+            print(f"open {self._page.url} in a browser: it shows the episode", file=sys.stderr, flush=True)
+        T = batch.tool.seen(batch.T_work, batch.T_object)[0]
+        place_mm, felt = batch.touch().place_mm[0], batch.backend.felt
+        told = {
+            "goal": "  ".join(f"{name} {value:g}" for name, value in zip(batch.task.goal_names, batch.goal[0], strict=True)),
+            "contact area, slipping": f"{felt.area_mm2[0]:.0f} mm2, {100 * felt.slip[0]:.0f} %",
+            "not computed": felt.lost[0],
+        }
+        self._page.show(
+            EpisodeStep(
+                int(batch.steps_done[0]),
+                frame,
+                batch.backend.attitude(0),
+                contact.touched,
+                T,
+                felt.force_n[0].copy(),
+                T[:3, :3] @ place_mm + T[:3, 3],
+                reward,
+                {name: text for name, text in told.items() if text},
+            )
+        )
+        time.sleep(max(0.0, self._shown_s + 1 / RENDER_FPS - time.monotonic()))
+        self._shown_s = time.monotonic()
 
     def _require_open(self) -> None:
         if self._state == "closed":
@@ -102,7 +151,7 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
     autoreset_mode : AutoresetMode or str
         When an ended episode is followed by the next: in the step after its end (gymnasium's default), or in the same step.
     render_mode, options
-        As for ``TactileEnv``.
+        As for ``TactileEnv``, but without ``human``: a page shows one environment.
     """
 
     def __init__(
@@ -119,7 +168,9 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
             raise OptionError("autoreset_mode='Disabled' is not offered; give 'NextStep' or 'SameStep'")
         if not isinstance(num_envs, int) or num_envs < 1:
             raise OptionError(f"num_envs={num_envs!r}: expected a whole number of at least 1")
-        self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS, "autoreset_mode": mode}
+        if render_mode == "human":
+            raise OptionError("render_mode='human' shows one environment: make it with gymnasium.make, or give 'rgb_array'")
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS, "autoreset_mode": mode}
         self.render_mode = _render_mode(render_mode)
         self.num_envs, self._mode = num_envs, mode
         self.batch = Batch(task, num_envs, Options.given(options))

@@ -17,7 +17,7 @@ from scenes.sensor import PinsSpec, SensorSpec
 from twin.geometry.mesh import SensorMesh
 from twin.objects import build_field
 from twin.report.skin3d import object_surface
-from twin.types import ContactState, FloatArray, IntArray
+from twin.types import ContactState, FloatArray, IntArray, PinState
 
 FINER = 2
 """The drawn skin has this many pieces along each side of an element of the mesh."""
@@ -160,27 +160,26 @@ def pin_shape(pins: PinsSpec) -> Surface:
     return Surface(corners, np.concatenate(faces))
 
 
-class Scene:
-    """The nodes of the scene, shared by all browsers.
+class PinScene:
+    """Skin, pins, object and force in the scene of a server, shared by all browsers.
 
     Parameters
     ----------
     server : viser.ViserServer
     sensor : SensorSpec
-    mesh : SensorMesh
-    rest : ContactState
+    skin : Surface
+        The skin at rest.
+    rest : PinState
     """
 
-    def __init__(self, server: viser.ViserServer, sensor: SensorSpec, mesh: SensorMesh, rest: ContactState) -> None:
-        self._scene, self._rest = server.scene, rest
-        radius_mm = max(sensor.skin.half_size_mm)
+    def __init__(self, server: viser.ViserServer, sensor: SensorSpec, skin: Surface, rest: PinState) -> None:
+        radius_mm, pin = max(sensor.skin.half_size_mm), pin_shape(sensor.pins)
+        self._scene = server.scene
         self._scene.configure_environment_map(None)
         self._scene.configure_default_lights(enabled=True, cast_shadow=False)
         self._scene.add_light_ambient("/light", intensity=1.2)
         server.initial_camera.position = (1.2 * radius_mm, -3.4 * radius_mm, 1.7 * radius_mm)
         server.initial_camera.look_at = (0.0, 0.0, 0.7 * sensor.skin.apex_mm)
-        self._skin_shape = SkinShape(mesh)
-        skin, pin = self._skin_shape.rest, pin_shape(sensor.pins)
         self._skin = self._scene.add_mesh_simple(
             "/sensor/skin",
             skin.corners_mm,
@@ -217,6 +216,48 @@ class Scene:
             "/force", np.zeros((1, 2, 3)), FORCE_RGB, shaft_radius=0.35, head_radius=0.9, head_length=1.8, visible=False
         )
         self._object: viser.MeshHandle | None = None
+
+    def put_object(self, touched: ObjectSpec) -> None:
+        """Show another object."""
+        surface = object_surface(build_field(touched).distance, np.eye(4), bounds_mm=OBJECT_BOX_MM, samples=OBJECT_SAMPLES).triangulate()
+        corners, faces = np.asarray(surface.points, np.float32), np.asarray(surface.regular_faces)
+        self._object = self._scene.add_mesh_simple(
+            "/object", corners, faces, color=OBJECT_RGB, opacity=0.35, side="double", cast_shadow=False, receive_shadow=False
+        )
+
+    def show_pins(self, pins: PinState, skin_mm: FloatArray, colour: np.ndarray) -> None:
+        """Show pins with their colours (N, 3) uint8, and the skin's corners (v, 3)."""
+        self._skin.vertices = skin_mm
+        self._pins.batched_positions = pins.caps_mm.astype(np.float32)
+        self._pins.batched_wxyzs = turned(pins.axis)
+        self._pins.batched_colors = colour
+
+    def show_object(self, T: FloatArray) -> None:
+        """Show the object at ``T_sensor_object`` (4, 4)."""
+        if self._object is not None:
+            self._object.position, self._object.wxyz = T[:3, 3], quaternion(T)
+
+    def show_force(self, foot_mm: FloatArray, force_n: FloatArray) -> None:
+        """Show the force (3,) on the object at a place (3,), unless it is too small."""
+        self._force.visible = bool(np.linalg.norm(force_n) > LEAST_FORCE_N)
+        if self._force.visible:
+            self._force.points = np.stack([foot_mm, foot_mm + FORCE_MM_PER_N * force_n])[None].astype(np.float32)
+
+
+class Scene(PinScene):
+    """The scene of a contact that is moved: with the solved skin, and the gizmo.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    sensor : SensorSpec
+    mesh : SensorMesh
+    rest : ContactState
+    """
+
+    def __init__(self, server: viser.ViserServer, sensor: SensorSpec, mesh: SensorMesh, rest: ContactState) -> None:
+        self._skin_shape, self._rest = SkinShape(mesh), rest
+        super().__init__(server, sensor, self._skin_shape.rest, rest)
         self.gizmo = self._scene.add_transform_controls("/wish", scale=GIZMO_MM, depth_test=False, line_width=3.0)
         self.dragging = False
 
@@ -232,14 +273,6 @@ class Scene:
             with suppress(ValueError):  # a quaternion without length, which no gizmo sends
                 moved(matrix(event.target.wxyz, event.target.position), event.phase == "end")
 
-    def put_object(self, touched: ObjectSpec) -> None:
-        """Show another object."""
-        surface = object_surface(build_field(touched).distance, np.eye(4), bounds_mm=OBJECT_BOX_MM, samples=OBJECT_SAMPLES).triangulate()
-        corners, faces = np.asarray(surface.points, np.float32), np.asarray(surface.regular_faces)
-        self._object = self._scene.add_mesh_simple(
-            "/object", corners, faces, color=OBJECT_RGB, opacity=0.35, side="double", cast_shadow=False, receive_shadow=False
-        )
-
     def place_gizmo(self, T: FloatArray) -> None:
         """Put the gizmo to a pose (4, 4), unless a user drags it."""
         if not self.dragging:
@@ -247,14 +280,7 @@ class Scene:
 
     def show(self, state: ContactState, shown: Shown) -> None:
         """Show a state of the sensor and its object."""
-        self._skin.vertices = self._skin_shape.corners(state.nodes_mm)
-        self._pins.batched_positions = state.caps_mm.astype(np.float32)
-        self._pins.batched_wxyzs = turned(state.axis)
-        self._pins.batched_colors = colours(pin_values(state, self._rest, shown), shown)
-        if self._object is not None:
-            self._object.position, self._object.wxyz = state.T_sensor_object[:3, 3], quaternion(state.T_sensor_object)
-        size_n = float(np.linalg.norm(state.force_n))
-        self._force.visible = size_n > LEAST_FORCE_N
-        if size_n > LEAST_FORCE_N:
-            foot = np.average(state.contact_mm, axis=0, weights=state.normal_n)
-            self._force.points = np.stack([foot, foot + FORCE_MM_PER_N * state.force_n])[None].astype(np.float32)
+        self.show_pins(state, self._skin_shape.corners(state.nodes_mm), colours(pin_values(state, self._rest, shown), shown))
+        self.show_object(state.T_sensor_object)
+        foot = np.average(state.contact_mm, axis=0, weights=state.normal_n) if state.normal_n.sum() > 0 else np.zeros(3)
+        self.show_force(foot, state.force_n)

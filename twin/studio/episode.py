@@ -1,0 +1,165 @@
+"""Episodes of an environment on a page: each step's picture, pins, object, force and reward as they come.
+
+Steps are handed in; this package knows no environment.
+"""
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.object import ObjectSpec
+from scenes.sensor import SensorSpec
+from twin.estimate import seen_in
+from twin.geometry.pins import rest_pins
+from twin.optics.surfaces import SkinSurface
+from twin.pins import Pipeline, nominal_reference
+from twin.studio.live_page import shot_pictures
+from twin.studio.mode import PageMode
+from twin.studio.page import Chart, Page
+from twin.studio.pictures import badge, number_table
+from twin.studio.scene import PinScene, Shown, Surface, colours
+from twin.types import FloatArray, Form, Frame, PinState
+
+
+@dataclass(frozen=True)
+class EpisodeStep:
+    """What is shown of a step.
+
+    Attributes
+    ----------
+    number : int
+        Steps done in the episode; 0 is its beginning.
+    frame : Frame
+        The sensor's picture.
+    pins : PinState
+    touched : ObjectSpec
+    T_sensor_object : (4, 4) float
+    force_n : (3,) float
+        Of the skin on the object.
+    foot_mm : (3,) float
+        Where its arrow begins.
+    reward : float
+        Of this step.
+    told : dict of str to str
+        Names and values that are told besides.
+    """
+
+    number: int
+    frame: Frame
+    pins: PinState
+    touched: ObjectSpec
+    T_sensor_object: FloatArray
+    force_n: FloatArray
+    foot_mm: FloatArray
+    reward: float
+    told: dict[str, str]
+
+
+class EpisodeMode(PageMode):
+    """The mode 'Episode'. Of several steps that come at once the newest is shown.
+
+    Parameters
+    ----------
+    page : Page
+    sensor : SensorSpec
+    form : Form
+        Of the frames.
+    """
+
+    title = "Episode"
+
+    def __init__(self, page: Page, sensor: SensorSpec, form: Form) -> None:
+        super().__init__(page)
+        self._sensor, self._rest = sensor, rest_pins(sensor.geometry)
+        self._pipeline, self._reference = Pipeline(sensor, form), nominal_reference(sensor, form)
+        self._skin = SkinSurface(sensor.skin, self._rest.base_mm)  # between the pins' feet: not every backend knows the skin
+        self._scene = PinScene(page.server, sensor, Surface(self._skin.rest_mm.astype(np.float32), self._skin.faces), self._rest)
+        self._touched: ObjectSpec | None = None
+        self._last: EpisodeStep | None = None
+        self._steps = self.newest(self._show, "episode")
+        with page.charts_tab:
+            self._rewards = Chart(page.gui, "reward of a step", ("reward",))
+            self._forces = Chart(page.gui, "force on the object, N", ("x", "y", "z"))
+
+    def give(self, step: EpisodeStep) -> None:
+        """Show a step next; returns at once."""
+        self._last = step
+        self._steps.give(step)
+
+    def show(self) -> None:
+        """Show the newest step again, or that there is none yet."""
+        if self._last is None:
+            self._page.show_nothing("Waiting for the first step.")
+        else:
+            self._steps.give(self._last)
+
+    def _show(self, step: EpisodeStep) -> None:
+        seen = seen_in(step.frame, None, self._pipeline)
+        if step.touched != self._touched:
+            self._scene.put_object(step.touched)
+            self._touched = step.touched
+        rows = {
+            "step": str(step.number),
+            "reward": f"{step.reward:+.3f}",
+            "object": step.touched.name,
+            "force x, y, z": "  ".join(f"{value:+.2f}" for value in step.force_n + 0.0) + " N",
+            "pins found": f"{seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}"),
+        }
+        way_mm = np.linalg.norm(step.pins.caps_mm - self._rest.caps_mm, axis=1)
+
+        def scene() -> None:
+            self._scene.show_pins(step.pins, self._skin.vertices(step.pins.base_mm).astype(np.float32), colours(way_mm, Shown.DISPLACEMENT))
+            self._scene.show_object(step.T_sensor_object)
+            self._scene.show_force(step.foot_mm, step.force_n)
+            self._rewards.add([step.reward])
+            self._forces.add(step.force_n.tolist())
+
+        numbers = [f"<span data-number='{step.number}' data-depth='0'></span>", badge("episode", "moving"), number_table(rows | step.told)]
+        pictures = shot_pictures(self._sensor, self._reference, step.frame, seen)
+        self.put_up(pictures, f"camera, {step.frame.form} frame", numbers, also=scene)
+
+
+class EpisodePage:
+    """A page that shows the steps of episodes, to any number of browsers. A context manager.
+
+    Parameters
+    ----------
+    title : str
+    sensor : SensorSpec
+    form : Form
+        Of the frames.
+    host, port : str, int
+        As for ``Page``.
+
+    Attributes
+    ----------
+    url : str
+        The page's address.
+
+    Raises
+    ------
+    TwinError
+        On entering: nothing can listen there.
+    """
+
+    def __init__(self, title: str, sensor: SensorSpec, form: Form, *, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._title, self._sensor, self._form, self._host, self._port = title, sensor, form, host, port
+        self._stack = ExitStack()
+        self.url = ""
+
+    def __enter__(self) -> "EpisodePage":
+        page = self._stack.enter_context(Page(self._title, host=self._host, port=self._port))
+        self._mode = EpisodeMode(page, self._sensor, self._form)
+        page.set_modes([self._mode])
+        self._stack.callback(self._mode.stop)
+        self._mode.start()
+        self.url = page.url
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def show(self, step: EpisodeStep) -> None:
+        """Show a step; returns at once."""
+        self._mode.give(step)

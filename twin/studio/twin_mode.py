@@ -407,6 +407,8 @@ class TwinMode(PageMode):
             if self._film is not None:
                 self._film.add(np.hstack([camera, cells]))
         numbers = self._numbers(answer)
+        smooth = answer.lit is Light.DRAWN and contact.setup.sensor.appearance.relief is not None
+        lacking = " without relief" if smooth else ""
 
         def change() -> None:
             self._scene.show(answer.state, self._shown)
@@ -415,7 +417,7 @@ class TwinMode(PageMode):
                 self._follow_sliders(answer)
                 put(self._link, self.state.link(self._page.url))
             if self._active:
-                self._page.show_pictures(camera, cells, f"camera, {answer.frame.form} frame, {answer.lit}")
+                self._page.show_pictures(camera, cells, f"camera, {answer.frame.form} frame, {answer.lit}{lacking}")
                 self._page.show_numbers(*numbers)
             self._draw_charts(answer)
 

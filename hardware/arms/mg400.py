@@ -40,7 +40,8 @@ SHOWS_S = 0.5
 # Feedback shows within this time (s) the alarm because of which a move was refused.
 ALARM_S = 0.2
 # For MUTE_S (s) after one of these has failed, further ones wait only STOP_AGAIN_S (s), so that the end of a program isn't delayed.
-MUTE_S, STOP_AGAIN_S = 3.0, 0.1
+# The same holds where feedback is silent: an arm that is frozen gives no reply, and that must be said within a second.
+MUTE_S, STOP_AGAIN_S = 3.0, 0.08
 # Feedback has at least this time (s) to confirm a move: two periods of the slower of the two ports in use.
 SETTLE_S = 0.5
 # Modes of an arm that is enabled, and of one that moves. All questions about them ask the feedback's mode, and no other field.
@@ -373,7 +374,8 @@ class MG400(BaseArm):
     def _tell_in_any_case(self, request: str, what: str) -> None:
         """Needs only the dashboard connection. If that is or gets lost it is opened once more, because the arm may still move."""
         self._require_in_use()
-        timeout_s = STOP_REPLY_S if time.monotonic() - self._mute_s > MUTE_S else STOP_AGAIN_S
+        expected = time.monotonic() - self._mute_s > MUTE_S and self._feedback.age_s() <= SILENCE_S
+        timeout_s = STOP_REPLY_S if expected else STOP_AGAIN_S
         try:
             with contextlib.suppress(DeviceNotConnectedError):
                 self._ask(request, timeout_s=timeout_s)

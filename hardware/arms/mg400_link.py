@@ -197,6 +197,12 @@ class Feedback:
             self._thread.join(timeout=2.0)
         self._thread, self._newest, self._came = None, None, b""
 
+    def age_s(self) -> float:
+        """How long ago the newest packet arrived; infinite if none did."""
+        with self._arrived:
+            newest = self._newest
+        return float("inf") if newest is None else time.monotonic() - newest[1]
+
     def newest(self, max_age_s: float) -> tuple[np.void, float]:
         """The newest packet and when it arrived.
 

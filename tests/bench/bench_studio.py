@@ -25,6 +25,8 @@ from scenes import load_sensor
 
 # Random drags go on for DRAG_S, then nothing moves for REST_S; the pose that was wished last has to be shown within WAIT_S.
 DRAG_S, REST_S, WAIT_S = 15.0, 1.0, 30.0
+# Longest wait for the first picture, s: the first start after a change of the code compiles.
+COLD_S = 300.0
 # Depths that differ by less are the same, mm; those of two wishes differ by more.
 SAME_MM = 5e-7
 
@@ -53,34 +55,27 @@ def cpu_s(process: subprocess.Popen) -> float:
     return times.user + times.system
 
 
-def rest(client: StudioClient, wish: tuple[float, float]) -> float | None:
-    """Wait until the last wish (its time and depth) is shown path-traced: for how long, s; None if it never was."""
+def rest(client: StudioClient, wish: tuple[float, float]) -> tuple[float, float] | None:
+    """Wait until the last wish (its time and depth) is shown path-traced: for how long, s, from the wish and from when it was shown
+    at all; None if it never was."""
     since = max(0, len(client.updates) - 50)
     try:
-        shown = client.wait(lambda u: "path-traced" in u.html and abs(u.depth_mm - wish[1]) < SAME_MM, WAIT_S, since=since)
+        drawn = client.wait(lambda u: u.number > 0 and abs(u.depth_mm - wish[1]) < SAME_MM, WAIT_S, since=since)
+        traced = client.wait(lambda u: "path-traced" in u.html and abs(u.depth_mm - wish[1]) < SAME_MM, WAIT_S, since=since)
     except AssertionError:
         return None
     time.sleep(max(0.0, REST_S - (time.monotonic() - wish[0])))
-    return shown.time_s - wish[0]
+    return traced.time_s - wish[0], traced.time_s - drawn.time_s
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sensor", default="mg400-331")
-    parser.add_argument("--object", default="sphere")
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--minutes", type=float, default=0.0, help="in place of --seconds")
-    parser.add_argument("--rate", type=float, default=20.0, help="gizmo moves a second")
-    parser.add_argument("--out", type=Path, default=Path("out/studio-bench"))
-    args = parser.parse_args()
-    seconds = 60 * args.minutes or args.seconds
-    radius = load_sensor(args.sensor).skin.outer_radius_mm
+def measure(sensor: str, touched: str, seconds: float, out: Path, *, rate: float = 20.0) -> dict:
+    """Drag for a time in s, ``rate`` moves a second; what was found, see the head of this file."""
+    radius = load_sensor(sensor).skin.outer_radius_mm
     rng = np.random.default_rng(0)
-    process, url, begun = start(args.sensor, args.object, args.out)
+    process, url, begun = start(sensor, touched, out)
     try:
         with StudioClient(url) as client:
-            first = client.wait(lambda u: u.number > 0, 60)
-            print(f"first picture {first.time_s - begun:.1f} s after the command")
+            first = client.wait(lambda u: u.number > 0, COLD_S)
             client.wait(lambda u: "90 % interval" in u.html, 120)
             client.wait(lambda u: "path-traced" in u.html, 120)
             sent: list[tuple[float, float]] = []
@@ -93,11 +88,11 @@ def main() -> None:
             memory, spent, rests, rest_s = [memory_mb(process)], cpu_s(process), [], time.monotonic() + DRAG_S
             while time.monotonic() < ended:
                 speed += rng.normal(0, 4, 3) - 0.3 * speed - 0.8 * (place - [0, 0, 2.0])
-                place = np.clip(place + speed / args.rate, [-5, -5, -2], [5, 5, 4.5])
+                place = np.clip(place + speed / rate, [-5, -5, -2], [5, 5, 4.5])
                 depth = round(20 * float(place[2])) / 20 + len(sent) * 1e-6  # its own for 50 000 moves
                 sent.append((time.monotonic(), depth))
                 client.drag((float(place[0]), float(place[1]), radius - depth))
-                time.sleep(1 / args.rate)
+                time.sleep(1 / rate)
                 if time.monotonic() > rest_s:
                     rests.append(rest(client, sent[-1]))
                     memory.append(memory_mb(process))
@@ -115,9 +110,11 @@ def main() -> None:
             stale = int((np.diff(shown) < 0).sum())  # an earlier wish after a later one
             memory.append(memory_mb(process))
             waited = [each for each in rests if each is not None]
-            result = {
-                "sensor": args.sensor,
-                "object": args.object,
+            to_traced = np.percentile(waited, (50, 95), axis=0).T.round(2).tolist() if waited else [None, None]
+            return {
+                "first_picture_s": round(first.time_s - begun, 1),
+                "sensor": sensor,
+                "object": touched,
                 "moves": len(sent),
                 "answers": len(answers),
                 "answers_per_s": round(len(answers) / (seconds - REST_S * (len(rests) - 1)), 1),
@@ -128,17 +125,33 @@ def main() -> None:
                 "stale": stale,
                 "rests": len(rests),
                 "rests_without_their_pose": rests.count(None),
-                "still_to_traced_s": [round(float(np.percentile(waited, q)), 2) for q in (50, 95)] if waited else None,
+                "last_move_to_traced_s": to_traced[0],
+                "still_to_traced_s": to_traced[1],
                 "cpu_ms_per_answer": round(1e3 * (cpu_s(process) - spent) / len(answers)),
                 "memory_mb": [round(m) for m in memory],
                 "load": psutil.getloadavg()[0],
             }
-            print(json.dumps(result))
-            if stale or rests.count(None) or not result["in_order"]:
-                raise SystemExit("something stale was shown")
     finally:
         process.terminate()
-        process.wait(20)
+        try:
+            process.wait(20)
+        except subprocess.TimeoutExpired:  # it is compiling
+            process.kill()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sensor", default="mg400-331")
+    parser.add_argument("--object", default="sphere")
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--minutes", type=float, default=0.0, help="in place of --seconds")
+    parser.add_argument("--rate", type=float, default=20.0, help="gizmo moves a second")
+    parser.add_argument("--out", type=Path, default=Path("out/studio-bench"))
+    args = parser.parse_args()
+    result = measure(args.sensor, args.object, 60 * args.minutes or args.seconds, args.out, rate=args.rate)
+    print(json.dumps(result))
+    if result["stale"] or result["rests_without_their_pose"] or not result["in_order"]:
+        raise SystemExit("something stale was shown")
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ NEAR_FOOT_MM = 2.5
 """A place in contact belongs to the nearest pin's foot within this distance; the foot is on the skin's inside."""
 HOLDER_MM = 14.0
 """Height of the drawn holder."""
-SKIN_RGB, OBJECT_RGB, HOLDER_RGB, FORCE_RGB = (82, 96, 124), (120, 168, 232), (52, 57, 66), (255, 176, 32)
+SKIN_RGB, OBJECT_RGB, HOLDER_RGB, FORCE_RGB = (128, 146, 184), (120, 168, 232), (78, 85, 98), (255, 176, 32)
 GIZMO_MM = 16.0
 """Size of the gizmo."""
 GLOW = cv2.applyColorMap(np.linspace(0.22 * 255, 0.97 * 255, 256).astype(np.uint8)[:, None], cv2.COLORMAP_INFERNO)[:, 0, ::-1]
@@ -177,7 +177,7 @@ class PinScene:
         self._scene = server.scene
         self._scene.configure_environment_map(None)
         self._scene.configure_default_lights(enabled=True, cast_shadow=False)
-        self._scene.add_light_ambient("/light", intensity=1.2)
+        self._scene.add_light_ambient("/light", intensity=2.0)
         server.initial_camera.position = (1.2 * radius_mm, -3.4 * radius_mm, 1.7 * radius_mm)
         server.initial_camera.look_at = (0.0, 0.0, 0.7 * sensor.skin.apex_mm)
         self._skin = self._scene.add_mesh_simple(

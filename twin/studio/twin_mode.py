@@ -440,12 +440,12 @@ class TwinMode(PageMode):
         state, seen = answer.state, answer.seen
         moving = "moving" if not answer.arrived else "still"
         mesh = str(answer.mesh) if len(state.contact_mm) else "no contact"
-        force = state.force_n + 0.0
-        across = float(np.hypot(force[0], force[1]))
+        force, torque = np.round(state.force_n, 2) + 0.0, round(float(state.torque_nmm[2]), 1) + 0.0
+        across, into = float(np.hypot(*state.force_n[:2])), float(state.force_n[2])
         rows = {
             "force x, y, z": f"{force[0]:+.2f}  {force[1]:+.2f}  {force[2]:+.2f} N",
-            "across, friction used": f"{across:.2f} N, {across / force[2]:.2f}" if force[2] > 0.01 else "-",
-            "torque about z": f"{state.torque_nmm[2]:+.1f} N mm",
+            "across, friction used": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
+            "torque about z": f"{torque:+.1f} N mm",
             "indentation": f"{answer.indent_mm:+.2f} mm",
             "contact area, slipping": f"{state.area_mm2:.0f} mm2, {100 * state.slip_share:.0f} %",
             "pins found": f"{seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}"),

@@ -137,7 +137,7 @@ def test_picture_and_state_are_saved_and_open_again(studio, client, tmp_path):
     client.set("Save picture", True)
     client.set("Save state", True)
     end = time.monotonic() + WAIT_S
-    while len(list(out.glob("*-1.*"))) < 2 and time.monotonic() < end:
+    while len(list(out.glob("[!.]*-1.*"))) < 2 and time.monotonic() < end:
         time.sleep(0.05)
     state = StudioState.load(out / "state-1.json")
     assert state.pose["depth_mm"] == pytest.approx(1.25) and state.pose["x_mm"] == pytest.approx(0.5)

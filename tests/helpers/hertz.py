@@ -88,6 +88,7 @@ def indent(spec, *, fine: float, size: float = SIZE, steps: int = 4) -> Indented
         held=np.zeros(count, bool),
         slid_mm=np.zeros(count),
         limit_n=np.zeros(count),
+        gap_mm=np.zeros(count),
         penalty_mpa_mm=30.0,
         T=np.eye(4),
     )

@@ -290,6 +290,15 @@ def test_a_cycle_of_friction_takes_the_work_that_is_done(solver, friction):
     assert taken == pytest.approx(work, rel=0.01)
 
 
+def test_what_a_sliding_ball_s_friction_takes_hardly_depends_on_the_load_step(solver):
+    """Also of the points that it leaves behind within a step."""
+    path = through(pose(), pose(height=-1.5), pose(1.5, 0, -1.5), pose(-1.5, 0, -1.5))
+    short, usual = (
+        sum(state.dissipated_nmm for _, state in solver.path(load_object("sphere"), path, friction=0.5, step_mm=mm)) for mm in (0.1, 0.4)
+    )
+    assert usual == pytest.approx(short, rel=0.01)
+
+
 # --- what is refused
 
 

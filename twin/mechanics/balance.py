@@ -85,6 +85,8 @@ class LoadState:
         Slip since the point last stuck.
     limit_n : (p,) float
         Largest friction force that each point could bear.
+    gap_mm : (p,) float
+        Distance of each point from the object, negative inside; 0 before the contact.
     penalty_mpa_mm : float
     T : (4, 4) float
         The object's pose before it gave way.
@@ -98,6 +100,7 @@ class LoadState:
     held: BoolArray
     slid_mm: FloatArray
     limit_n: FloatArray
+    gap_mm: FloatArray
     penalty_mpa_mm: float
     T: FloatArray
     elastic_nmm: float = 0.0

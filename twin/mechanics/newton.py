@@ -191,7 +191,7 @@ class LoadStepper:
                 penalty *= _PENALTY_GROWTH
             else:
                 self._last, self._touch = state, (control, seen, gap_seen)
-                return self._accepted(memory, problem, control, border, balance), balance, looked
+                return self._accepted(memory, problem, control, border, balance, gap_seen), balance, looked
         raise NoConvergence(balance.relative if balance else np.inf)
 
     def touching_mm2(self, state: LoadState) -> float:
@@ -237,13 +237,17 @@ class LoadStepper:
             return state.control_mm, state.border
         return state.control_mm + ratio * (state.control_mm - old.control_mm), state.border
 
-    def _accepted(self, state: LoadState, problem: Problem, control: FloatArray, border: FloatArray, balance: Balance) -> LoadState:
+    def _accepted(
+        self, state: LoadState, problem: Problem, control: FloatArray, border: FloatArray, balance: Balance, gap: FloatArray
+    ) -> LoadState:
+        """The state that a solved step ends in. ``state`` says what friction remembers, ``gap`` (p,) in mm where all points are."""
         contact, looked, count = balance.contact, problem.looked, len(state.held)
         held, anchor, slid, limit = np.zeros(count, bool), np.zeros((count, 3)), np.zeros(count), np.zeros(count)
         held[looked] = contact.penetration_mm > 0
-        anchor[looked], slid[looked], limit[looked], lost = rub(problem, contact, state.limit_n[looked])
+        before = state.gap_mm[looked]
+        anchor[looked], slid[looked], limit[looked], lost = rub(problem, contact, state.limit_n[looked], before, gap[looked])
         return LoadState(
-            control, border, anchor, held, slid, limit, problem.penalty, problem.T, balance.elastic_nmm, state.dissipated_nmm + lost
+            control, border, anchor, held, slid, limit, gap, problem.penalty, problem.T, balance.elastic_nmm, state.dissipated_nmm + lost
         )
 
     def _moved_mm(self, state: LoadState, T: FloatArray, which: BoolArray) -> float:

@@ -69,6 +69,7 @@ class OngoingContact:
             held=np.zeros(count, bool),
             slid_mm=np.zeros(count),
             limit_n=np.zeros(count),
+            gap_mm=np.zeros(count),
             penalty_mpa_mm=_PENALTY_MPA_MM,
             T=T,
         )

@@ -124,14 +124,14 @@ def rubbed(
         if not done:
             near.solved = None
             return None
-        contact = small.contact(y)
-        held, before = contact.penetration_mm > 0, small.places(y)
-        gap_before = field.distance(before)
-        anchor, slid, limit, more = rub(substep, contact, limit)
+        contact, before = small.contact(y), small.places(y)
+        held, gap, gap_before = contact.penetration_mm > 0, gap_before, field.distance(before)
+        anchor, slid, limit, more = rub(substep, contact, limit, gap, gap_before)
         lost += more
     anchors, all_held, all_slid, all_limit = anchor_mm.copy(), state.held.copy(), state.slid_mm.copy(), state.limit_n.copy()
-    anchors[looked], all_held[looked], all_slid[looked], all_limit[looked] = anchor, held, slid, limit
-    return replace(state, anchor_mm=anchors, held=all_held, slid_mm=all_slid, limit_n=all_limit, dissipated_nmm=lost)
+    gap = state.gap_mm.copy()
+    anchors[looked], all_held[looked], all_slid[looked], all_limit[looked], gap[looked] = anchor, held, slid, limit, gap_before
+    return replace(state, anchor_mm=anchors, held=all_held, slid_mm=all_slid, limit_n=all_limit, gap_mm=gap, dissipated_nmm=lost)
 
 
 def met(held: BoolArray, anchor: FloatArray, before: FloatArray, after: FloatArray, gap_before: FloatArray, gap: FloatArray) -> FloatArray:
@@ -144,12 +144,21 @@ def met(held: BoolArray, anchor: FloatArray, before: FloatArray, after: FloatArr
     return np.where(held[:, None], anchor, (1 - share) * before + share * after)
 
 
-def rub(problem: Problem, contact: ContactForces, limit_n: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+def rub(
+    problem: Problem, contact: ContactForces, limit_n: FloatArray, gap_before: FloatArray, gap: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """After a step: anchors (q, 3), slip since the points last stuck (q,), largest friction forces (q,) in N, and the work lost in N mm.
 
-    A point that slips bears the limit of friction, which changes from ``limit_n`` in the step with its normal force and its slip.
+    A point that slips bears the limit of friction, which changes from ``limit_n`` in the step with its normal force and its slip. A point
+    that slipped and leaves the object bears it until its distance, ``gap_before`` (q,) and then ``gap`` (q,), is 0.
     """
     limit = np.minimum(problem.friction * contact.normal_n, problem.bound_n)
-    moved = np.linalg.norm(contact.anchor_mm - problem.anchor_mm, axis=1)
+    way = contact.anchor_mm - problem.anchor_mm
+    moved = np.linalg.norm(way, axis=1)
     slid = np.where(contact.slipping, problem.slid_mm + moved, 0.0)
-    return contact.anchor_mm, slid, limit, float(((limit_n + limit) / 2 * moved)[contact.slipping].sum())
+    lost = float(((limit_n + limit) / 2 * moved)[contact.slipping].sum())
+    left = np.flatnonzero((gap >= 0) & (gap_before < 0) & (problem.slid_mm > 0))
+    across = way[left] - (way[left] * contact.normal[left]).sum(axis=1, keepdims=True) * contact.normal[left]
+    share = gap_before[left] / (gap_before[left] - gap[left])
+    lost += float((limit_n[left] / 2 * share * np.linalg.norm(across, axis=1)).sum())
+    return contact.anchor_mm, slid, limit, lost

@@ -22,7 +22,7 @@ _HALVINGS = 5
 """Most times that the line search halves a step."""
 _LEAST_GAIN = 0.1
 """The line search accepts a step of size s that lowers the residual's norm by at least this share of s."""
-_KEEP_FACTORS = 0.5
+_KEEP_FACTORS = 0.2
 """Old factors of the matrix are used again as long as they lower the residual to this share or less."""
 _SOFTENING = 0.1
 """Factor on the contact's stiffness while the solution is still far."""

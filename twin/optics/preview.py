@@ -199,8 +199,11 @@ class Preview:
             raise RenderError(f"the renderer's window_px is {renderer.window_px}, the preview's {self.window_px}: build both alike")
         traced = renderer.render().reshape(self._shine.shape)
         drawing = self._drawing(self._rest)
-        gel = traced - self._known(self._rest)
-        weight = np.where(traced > 0, (np.maximum(traced, 0) + DARK) ** -0.5, 0)  # light below 0 was cut off
+        known = self._known(self._rest)
+        gel = traced - known
+        # weights by the drawn light: those by the noisy traced light would favour samples that are too dark; light below 0 was cut off
+        drawn = known + self._through * self._gel(drawing, Shading())
+        weight = np.where(traced > 0, (np.maximum(drawn, 0) + DARK) ** -0.5, 0)
         alone = np.eye(8).reshape(8, 2, 4, 1)  # shadings in which one gain, or one offset, is 1 and all others are 0
         parts = np.stack([weight * self._through * self._gel(drawing, Shading(*only)) for only in alone], axis=-1)
         fitted = [_fit(parts[..., c, :].reshape(-1, 8), (weight * gel)[..., c].ravel()) for c in range(gel.shape[2])]

@@ -391,6 +391,8 @@ class ResponseSpec(Section):
         The curve is ``black + (255 - black) light^(1 / gamma)``.
     chroma_sigma_px : float
         Blur of the colour differences, in gray levels.
+    chroma_median_px : {0, 3, 5}
+        Side of the square over which the camera then takes their median, which keeps edges (0: none).
     chroma_columns : {1, 2}
         This many neighbouring columns share the colour differences of the first one (2: a 4:2:2 stream).
     stream : {"rgb", "bt601", "bt709"}
@@ -410,6 +412,7 @@ class ResponseSpec(Section):
     sharpening: NonNegative = 0.0
     sharpening_sigma_px: Positive = 1.5
     chroma_sigma_px: NonNegative = 0.0
+    chroma_median_px: Annotated[Literal[0, 3, 5], NotTruth] = 0
     chroma_columns: Annotated[Literal[1, 2], NotTruth] = 1
     noise_sigma_px: NonNegative = 0.0
     stream: Literal["rgb", "bt601", "bt709"] = "rgb"

@@ -49,17 +49,18 @@ def judged(work: Path, out: Path, *options: str) -> dict:
 
 @job(
     "render.details",
-    "twin realism DIR --sensor ur5-331 --fitted 6 --no-two-sample --without DETAIL --out OUT",
+    "twin realism DIR --sensor ur5-331 --fitted 6 --no-two-sample --quality drawn --without DETAIL --out OUT",
     sensors=("ur5-331",),
     code=("scenes", "twin"),
     recordings=("ur5-331-raw",),
     minutes=10,
 )
 def details(work: Path) -> Measured:
-    """What each measured detail is worth: likeness with all, and without each."""
+    """What each measured detail is worth: likeness of drawn pictures with all, and without each."""
     found: Measured = {}
     for name in ("all", *DETAILS):
-        images = judged(work, work / name, "--no-two-sample", *([] if name == "all" else ["--without", name]))["pin_aligned"]
+        left_out = [] if name == "all" else ["--without", name]
+        images = judged(work, work / name, "--no-two-sample", "--quality", "drawn", *left_out)["pin_aligned"]
         found |= {f"{name}_{key}": Value(images[key]["mean"], unit) for key, unit in RENDERED.items()}
     return found
 

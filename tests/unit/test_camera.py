@@ -37,7 +37,7 @@ NEUTRAL = {
     "response": {
         "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "gamma": 1.0, "black_level": 0.0, "blur_sigma_px": 0.0,
         "brightness_drift": 0.0, "read_noise": 0.0, "shot_noise": 0.0, "sharpening": 0.0, "chroma_sigma_px": 0.0,
-        "chroma_columns": 1, "noise_sigma_px": 0.0, "stream": "rgb", "jpeg_quality": 0,
+        "chroma_median_px": 0, "chroma_columns": 1, "noise_sigma_px": 0.0, "stream": "rgb", "jpeg_quality": 0,
     },
 }  # fmt: skip
 FULL = {
@@ -50,6 +50,7 @@ FULL = {
         "blur_sigma_px": 0.6,
         "sharpening": 0.5,
         "chroma_sigma_px": 1.0,
+        "chroma_median_px": 3,
         "chroma_columns": 2,
         "stream": "bt709",
     },
@@ -252,6 +253,17 @@ def test_soft_colour_of_an_edge_stays_at_the_edge():
     assert half == pytest.approx(edge, abs=0.01)
     width = np.interp(row[0] + np.array([0.16, 0.84]) * (row[-1] - row[0]), row, np.arange(30.0, 50.0))
     assert np.diff(width)[0] == pytest.approx(2 * 2.0, rel=0.1)
+
+
+def test_a_median_of_colour_flattens_specks_and_keeps_edges_and_luma():
+    light = np.full((40, 80, 3), 0.01, np.float32)
+    light[:, 40:] = (0.2, 0.3, 0.6)
+    edge = developed(light, light, CURVED.response)
+    light[4::10, 4::10, 2] += 0.1  # single pixels
+    plain, clean = (developed(light, light, changed(CURVED, response={"chroma_median_px": side}).response) for side in (0, 5))
+    rounding = 1e-3
+    np.testing.assert_allclose(luma(clean), luma(plain), atol=rounding)
+    np.testing.assert_allclose(clean - luma(clean)[..., None], edge - luma(edge)[..., None], atol=rounding)
 
 
 def test_neighbouring_columns_share_the_first_ones_chroma():

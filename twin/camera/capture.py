@@ -173,10 +173,20 @@ def developed(light: FloatArray, grainy: FloatArray, response: ResponseSpec, ori
     gray = curve(sharpened(light, response), response)
     if grainy is not light:
         gray = gray + blurred(curve(grainy, response) - curve(light, response), response.noise_sigma_px)
-    if gray.ndim == 2 or (response.chroma_sigma_px == 0 and response.chroma_columns == 1):
+    if gray.ndim == 2 or (response.chroma_sigma_px == 0 and response.chroma_median_px == 0 and response.chroma_columns == 1):
         return gray
     luma = (gray @ luma_weights(response.stream))[..., None]
-    return shared(blurred(gray - luma, response.chroma_sigma_px), response.chroma_columns, origin_px[0]) + luma
+    soft = cleaned(blurred(gray - luma, response.chroma_sigma_px), response)
+    return shared(soft, response.chroma_columns, origin_px[0]) + luma
+
+
+def cleaned(chroma: FloatArray, response: ResponseSpec) -> FloatArray:
+    """Colour differences (H, W, 3), of which those of red and blue are the medians over squares; green's follow, because luma stays."""
+    if response.chroma_median_px == 0:
+        return chroma
+    red, blue = (cv2.medianBlur(np.ascontiguousarray(chroma[..., k], np.float32), response.chroma_median_px) for k in (0, 2))
+    of_red, of_green, of_blue = luma_weights(response.stream)
+    return np.dstack([red, -(of_red * red + of_blue * blue) / of_green, blue])
 
 
 def shared(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:

@@ -55,7 +55,8 @@ CONTACTS = (
 NEUTRAL: dict[str, dict[str, float | int | str | tuple[float, ...]]] = {
     "response": {
         "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "blur_sigma_px": 0.0, "brightness_drift": 0.0, "read_noise": 0.0,
-        "shot_noise": 0.0, "sharpening": 0.0, "chroma_sigma_px": 0.0, "chroma_columns": 1, "stream": "rgb", "jpeg_quality": 0,
+        "shot_noise": 0.0, "sharpening": 0.0, "chroma_sigma_px": 0.0, "chroma_median_px": 0, "chroma_columns": 1, "stream": "rgb",
+        "jpeg_quality": 0,
     },
     "camera": {"vignetting": 0.0, "red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.0, 0.0), "blue_shift_px": (0.0, 0.0)},
     "gel": {"haze": 0.0},

@@ -1,6 +1,7 @@
 """Laws of the surrogate: contact and friction of its linear skin, its memory, its domain, its file, and its closeness to the truth."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,12 +10,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from scenes import ObjectSpec, load_object, load_sensor
 from scenes.object import CylinderShape, EdgeShape, MeshShape, PrismShape, SphereShape
 from training.surrogate.compliance import NODE_RINGS, compliance_of
-from training.surrogate.contact import LinearContacts
-from training.surrogate.contacts import SurrogateContacts, _way
+from training.surrogate.contact import LinearContacts, between
+from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.felt import Contact, FiniteElements
 from training.surrogate.fit import averaged, distil, require_dome
 from training.surrogate.model import SurrogateError, load_surrogate, representatives, rest_of, surrogate_of, unfolded
-from training.surrogate.paths import draw_path
+from training.surrogate.paths import FREE, FRICTION, STICKING, draw_path
 from training.surrogate.samples import lattice_sensor
 from training.surrogate.symmetry import ring_directions, symmetries
 from twin.camera.projection import project
@@ -32,6 +33,7 @@ ROW = np.zeros(1, int)
 PINS_BOUND_PX = 1.0  # largest mean error of the contacts below; the stated mean over all is half of it
 FORCE_BOUND = 0.25  # of the force after a reversal of the shear, the hardest; the stated mean over all contacts is a quarter of it
 SLIP_BOUND = 0.28  # of the share that slides, on average over these five poses: most is of presses, in which the linear skin slides more
+WAY_BOUND = 0.03  # of the force: where the same way is told by more poses, its steps are 0.29 instead of 0.37 mm long
 ANSWER_TOLERANCE = 2e-3  # relative: half precision in the file
 
 
@@ -175,6 +177,35 @@ def test_friction_remembers_the_way(surrogate, sensor):
     assert apart(0.8, friction_memory=False) < 0.02
 
 
+def test_what_is_felt_does_not_depend_on_the_poses_in_which_a_way_is_told(surrogate, sensor):
+    """One pose, or many on the same way: the steps of the solution are short in both."""
+    whole, parts = contacts(surrogate, sensor, "edge"), contacts(surrogate, sensor, "edge")
+    stops = [pose(-0.5), pose(3.0), pose(3.0, across=(1.5, 0.0))]
+    go(whole, *stops)
+    go(parts, *(T for start, stop in pairwise(stops) for T in between(start, stop, 12)))
+    force = whole.felt.force_n[0]
+    assert np.linalg.norm(force - parts.felt.force_n[0]) < WAY_BOUND * np.linalg.norm(force)
+
+
+def test_many_contacts_are_those_of_each_alone(surrogate, sensor):
+    """They are solved in threads; each has its own object, friction and way."""
+    things = [load_object(name) for name in ("plane", "ball-40", "edge", "cylinder")]
+    rows = np.arange(20)
+    many = SurrogateContacts(surrogate, sensor, len(rows))
+    laws = [Contact(sensor, things[row % 4], ContactLaw(Friction(0.1 + 0.04 * row, 0.1 + 0.04 * row))) for row in rows]
+    ways = [[pose(1.0 + 0.05 * row), pose(1.5 + 0.05 * row, across=(0.5, 0.02 * row))] for row in rows]
+    for row in rows:
+        many.begin(row, laws[row])
+    for number in range(2):
+        many.move(rows, np.stack([way[number] for way in ways]), np.zeros(len(rows)))
+    for row in (0, 7, 18):
+        single = SurrogateContacts(surrogate, sensor, 1)
+        single.begin(0, laws[row])
+        caps = go(single, *ways[row])
+        assert np.array_equal(single._linear.force_n[0], many._linear.force_n[row])
+        assert np.allclose(caps, many.felt.caps_mm[row], atol=1e-4)
+
+
 def test_an_arm_that_gives_way_presses_less(surrogate, sensor):
     stiff, soft = contacts(surrogate, sensor), SurrogateContacts(surrogate, sensor, 1)
     soft.begin(0, Contact(sensor, load_object("plane"), ContactLaw(Friction(0.5, 0.5), compliance_mm_per_n=0.5)))
@@ -294,6 +325,13 @@ def test_drawn_paths_start_clear_and_stay_within_the_domain(sensor, surrogate):
         assert depths[0] <= 0.1 and max(depths) <= surrogate.domain["depth_mm"]
 
 
+def test_paths_are_drawn_without_friction_and_with_much(sensor):
+    drawn = [draw_path(sensor, np.random.default_rng(number)).friction for number in range(60)]
+    assert {FREE, STICKING} <= set(drawn)
+    between_ends = [mu for mu in drawn if mu not in (FREE, STICKING)]
+    assert len(between_ends) > 40 and FRICTION[0] <= min(between_ends) and max(between_ends) <= FRICTION[1]
+
+
 def test_the_lattice_of_a_sensor_has_its_rings(sensor):
     assert lattice_sensor(load_sensor("mg400-127")).pins.count == 331
     assert len(ring_directions(NODE_RINGS, 58.0, 0.0)) == 271
@@ -305,8 +343,8 @@ def test_a_way_is_gone_straight_and_about_one_axis():
     start[:3, :3], stop[:3, :3] = turns.as_matrix()
     start[:3, 3], stop[:3, 3] = (1.0, 2.0, 3.0), (2.0, -1.0, 5.0)
     between = Slerp([0, 1], turns)(np.arange(1, 6) / 5)
-    way = np.array(_way(start, stop, 5))
+    way = between(start, stop, 5)
     np.testing.assert_allclose(way[:, :3, :3], between.as_matrix(), atol=1e-12)
     np.testing.assert_allclose(way[:, :3, 3], start[:3, 3] + np.arange(1, 6)[:, None] / 5 * (stop[:3, 3] - start[:3, 3]), atol=1e-12)
     np.testing.assert_array_equal(way[-1], stop)
-    np.testing.assert_array_equal(_way(start, stop, 1), [stop])
+    np.testing.assert_array_equal(between(start, stop, 1), [stop])

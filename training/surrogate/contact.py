@@ -5,16 +5,25 @@ each node either is clear of the object, or presses without entering it and stic
 after node is put right, the others held, until nothing changes (projected Gauss-Seidel: Jourdan, Alart & Jean 1998), beginning with the
 forces of the last pose. Anchors are places of the object: where a node touched it first, or where it stopped sliding. So what is
 remembered neither drifts nor fades, and ends with the contact.
+
+A motion is gone in short steps: what friction remembers, and the normals of a sharp edge, depend on the way. In each the arm turns as it
+gives way to the force so far, and at the end until it stands.
 """
 
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from twin.compiled import compiled
-from twin.objects import ObjectField
+from twin.objects.analytic import Solid
+from twin.objects.kernels import solid
+from twin.rig.contact import ArmTurning
 from twin.types import BoolArray, FloatArray, IntArray
 
+STEP_MM = 0.4
+"""Largest motion across the dome in one solution: with longer ones the force on an edge is up to a sixth off."""
 REACH_MM = 0.8
 """Nodes farther than this from the object are left out of a solution."""
 SWEEPS = (12, 6)
@@ -25,6 +34,20 @@ YIELDING_MM_PER_N = 2e-3
 """Each node gives way by this beside the skin: it makes nodes on sharp edges well-behaved and costs 0.5 % of the stiffness."""
 SLIDES = 0.999
 """A node slides when it bears this share of Coulomb's bound."""
+STILL_N = 1e-7
+"""Changes of a node's force that count as none."""
+ROWS_OF_A_THREAD = 8
+"""Fewer contacts than this are not worth a thread."""
+MOST_THREADS = 2
+"""More threads than this gain little beside what runs on one core."""
+NO_TURN = 1e-9
+"""Sine of an angle that is none."""
+SIZES = 4
+"""Most numbers that tell a solid's size."""
+SETTLED_MM = 0.02
+"""Most that the dome still has to move where an arm has given way."""
+MOST_SETTLING = 2
+"""Solutions at the end of a motion until an arm that gives way stands."""
 
 
 @dataclass
@@ -35,8 +58,19 @@ class LinearContacts:
     ----------
     node_mm : (M, 3) float
         At rest.
-    answer : (M, M, 3, 3) float32
-        Displacement of node j (second) for a force at node i (first), mm/N, ordered (displacement, force).
+    answer : (M, 3, 3, M) float32
+        Displacement (third) of node j (last) for a force along an axis (second) at node i (first), mm/N.
+    stiffness : float
+        Force of the true skin over that of the linear one.
+    kind : (B,) int
+        Of the solids (see ``twin.objects.kernels.solid``).
+    sizes : (B, SIZES) float
+    friction, compliance_mm_per_n : (B,) float
+        Coulomb's coefficient; how far object and holder give way along z.
+    turning : (B, 10) float
+        How arms turn (see ``ArmTurning``): across, axis, tool point, and rad/N.
+    taken : (B, 4, 4) float
+        Where the objects are: their commanded poses, turned as the arms give way.
     force_n, moved_mm : (B, M, 3) float
         Forces on the skin and displacements, sensor frame.
     anchor_mm, seen_mm : (B, M, 3) float
@@ -45,10 +79,19 @@ class LinearContacts:
         Distances at the last pose; infinite before the first.
     held, slides : (B, M) bool
         Nodes that press, and those of them that slide.
+    used : (B,) float
+        Share of Coulomb's bound that the pressing nodes bear together.
     """
 
     node_mm: FloatArray
     answer: FloatArray
+    stiffness: float
+    kind: IntArray
+    sizes: FloatArray
+    friction: FloatArray
+    compliance_mm_per_n: FloatArray
+    turning: FloatArray
+    taken: FloatArray
     force_n: FloatArray
     moved_mm: FloatArray
     anchor_mm: FloatArray
@@ -56,55 +99,263 @@ class LinearContacts:
     gap_mm: FloatArray
     held: BoolArray
     slides: BoolArray
+    used: FloatArray
 
     @classmethod
-    def at_rest(cls, node_mm: FloatArray, answer: FloatArray, count: int) -> "LinearContacts":
-        """The contacts of ``count`` sensors that touch nothing."""
+    def at_rest(cls, node_mm: FloatArray, answer: FloatArray, count: int, *, stiffness: float = 1.0) -> "LinearContacts":
+        """The contacts of ``count`` sensors that touch nothing; ``answer`` (M, M, 3, 3) as of ``Surrogate``."""
         size = len(node_mm)
         force, moved, anchor, seen = np.zeros((4, count, size, 3))
         held, slides = np.zeros((2, count, size), bool)
-        return cls(node_mm, answer, force, moved, anchor, seen, np.full((count, size), np.inf), held, slides)
+        friction, compliance, used = np.zeros((3, count))
+        return cls(
+            node_mm=node_mm,
+            answer=np.ascontiguousarray(answer.transpose(0, 3, 2, 1), np.float32),
+            stiffness=stiffness,
+            kind=np.zeros(count, np.int64),
+            sizes=np.zeros((count, SIZES)),
+            friction=friction,
+            compliance_mm_per_n=compliance,
+            turning=np.zeros((count, 10)),
+            taken=np.tile(np.eye(4), (count, 1, 1)),
+            force_n=force,
+            moved_mm=moved,
+            anchor_mm=anchor,
+            seen_mm=seen,
+            gap_mm=np.full((count, size), np.inf),
+            held=held,
+            slides=slides,
+            used=used,
+        )
 
-    def free(self, row: int) -> None:
-        """Forget a contact."""
-        for values in (self.force_n, self.moved_mm, self.held, self.slides):
+    @property
+    def radius_mm(self) -> float:
+        """Of the dome."""
+        return float(np.linalg.norm(self.node_mm[0]))
+
+    def begin(
+        self, row: int, thing: Solid, friction: float, *, compliance_mm_per_n: float = 0.0, turning: ArmTurning | None = None
+    ) -> None:
+        """Touch another object, from rest."""
+        sizes = thing.sizes
+        self.kind[row], self.sizes[row, : len(sizes)] = thing.kind, sizes
+        self.friction[row], self.compliance_mm_per_n[row] = friction, compliance_mm_per_n
+        self.turning[row] = 0.0
+        if turning is not None:
+            self.turning[row] = [*turning.across, *turning.axis, *turning.tool_mm, np.radians(turning.deg_per_n)]
+        self.free(row)
+
+    def free(self, row: int | Sequence[int] | IntArray) -> None:
+        """Forget contacts."""
+        for values in (self.force_n, self.moved_mm, self.held, self.slides, self.used):
             values[row] = 0
         self.gap_mm[row] = np.inf
 
-    def move(self, row: int, field: ObjectField, T: FloatArray, friction: float, compliance_mm_per_n: float) -> None:
-        """Bring the object to ``T`` (4, 4); it gives way along z by ``compliance_mm_per_n`` of the force."""
-        turn, shift = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
-        state = (self.force_n[row], self.moved_mm[row], self.anchor_mm[row], self.seen_mm[row], self.gap_mm[row])
-        for part, sweeps in enumerate(SWEEPS):
-            here = (self.node_mm + self.moved_mm[row] - shift) @ turn
-            gap, normal, _ = field.probe(here)
-            if part == 0:
-                near = np.flatnonzero((gap < REACH_MM) | self.held[row])
-                _anchor(near, self.held[row], here, gap, *state[2:])
-            if len(near):
-                _solve(self.answer, near, turn, here, gap, normal, *state[:3], friction, compliance_mm_per_n, sweeps)
-        if len(near):
-            here = (self.node_mm + self.moved_mm[row] - shift) @ turn
-            _remember(near, turn, here, gap, normal, *state, friction, self.held[row], self.slides[row])
-        else:
-            self.seen_mm[row], self.gap_mm[row] = here, gap
+    def move(self, rows: IntArray, start: FloatArray, stop: FloatArray) -> None:
+        """Command the objects of some rows (R,) from poses ``start`` (R, 4, 4) to ``stop``; each goes straight and turns about one axis."""
+        steps = np.maximum(np.ceil(motion_mm(start, stop, self.radius_mm) / STEP_MM), 1).astype(np.int64)
+        state = (self.force_n, self.moved_mm, self.anchor_mm, self.seen_mm, self.gap_mm, self.held, self.slides, self.used)
+        laws = (self.kind, self.sizes, self.friction, self.compliance_mm_per_n, self.turning, self.taken)
+
+        def follow(which: slice) -> None:
+            given = [np.ascontiguousarray(values[which]) for values in (rows, start, stop, steps)]
+            _follow(*given, self.node_mm, self.answer, self.stiffness, *laws, *state)
+
+        threads = min(len(rows) // ROWS_OF_A_THREAD, MOST_THREADS)
+        if threads < 2:
+            follow(slice(None))
+            return
+        with ThreadPoolExecutor(threads) as pool:  # rows do not touch each other's state, so the result does not depend on the threads
+            list(pool.map(follow, [slice(number, None, threads) for number in range(threads)]))
+
+    def distances(self, rows: IntArray, T: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How far objects at ``T`` (R, 4, 4) are from undeformed domes.
+
+        Returns
+        -------
+        gap_mm : (R, M) float
+            Of the nodes at rest.
+        centre : (R, 2) float
+            Distance of the dome's centre, and the cosine of the angle between the apex and the place nearest to the object. They tell the
+            depth exactly, for places between and beyond the nodes too.
+        """
+        gap, centre = np.empty((len(rows), len(self.node_mm))), np.empty((len(rows), 2))
+        _distances(rows, np.ascontiguousarray(T), self.node_mm, self.kind, self.sizes, gap, centre)
+        return gap, centre
+
+
+def motion_mm(start: FloatArray, stop: FloatArray, radius_mm: float) -> FloatArray:
+    """How far objects move at most over a dome, (R,), between poses (R, 4, 4)."""
+    turn = stop[:, :3, :3] @ start[:, :3, :3].transpose(0, 2, 1)
+    cosine = (turn[:, 0, 0] + turn[:, 1, 1] + turn[:, 2, 2] - 1) / 2
+    off = stop[:, :3, 3] - (turn @ start[:, :3, 3:])[:, :, 0]
+    found: FloatArray = np.sqrt((off * off).sum(axis=1)) + np.arccos(np.clip(cosine, -1.0, 1.0)) * radius_mm
+    return found
 
 
 @compiled()
-def _anchor(
-    near: IntArray, held: BoolArray, here: FloatArray, gap: FloatArray, anchor: FloatArray, seen: FloatArray, before: FloatArray
+def between(start: FloatArray, stop: FloatArray, steps: int) -> FloatArray:
+    """Poses (steps, 4, 4) after each of some equal steps of a way: the origin goes straight, the object turns about a fixed axis."""
+    T = np.empty((steps, 4, 4))
+    for k in range(steps):
+        T[k] = stop
+    if steps == 1:
+        return T
+    turn = start[:3, :3] @ stop[:3, :3].T.copy()
+    cross = (turn - turn.T) / 2  # with the axis, times the sine of the angle (less than a right one)
+    sine = np.sqrt(cross[2, 1] ** 2 + cross[0, 2] ** 2 + cross[1, 0] ** 2)
+    angle = np.arctan2(sine, (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1) / 2)
+    there = stop[:3, :3].copy()
+    for k in range(steps - 1):
+        left = 1 - (k + 1) / steps
+        T[k, :3, 3] += left * (start[:3, 3] - stop[:3, 3])
+        if sine > NO_TURN:
+            axis = cross / sine
+            T[k, :3, :3] += (np.sin(angle * left) * axis + (1 - np.cos(angle * left)) * (axis @ axis)) @ there  # Rodrigues' formula
+    return T
+
+
+@compiled()
+def _distances(
+    rows: IntArray, T: FloatArray, node: FloatArray, kind: IntArray, sizes: FloatArray, gap: FloatArray, centre: FloatArray
 ) -> None:
-    """Anchor free nodes where they stand, or where they met the surface on the way."""
-    for i in near:
-        if not held[i]:
-            share = 1.0
-            if gap[i] < 0 < before[i] and np.isfinite(before[i]):
-                share = before[i] / (before[i] - gap[i])
+    points, middle = np.empty_like(node), np.empty((1, 3))
+    still, origin = np.zeros_like(node), np.zeros((1, 3))
+    for r in range(len(rows)):
+        row, turn, place = rows[r], T[r, :3, :3], T[r, :3, 3]
+        _seen_from(node, still, turn, place, points)
+        gap[r] = solid(points, kind[row], sizes[row])[0]
+        _seen_from(origin, origin, turn, place, middle)
+        distance, outward, _ = solid(middle, kind[row], sizes[row])
+        centre[r, 0] = distance[0]
+        centre[r, 1] = -(turn[2, 0] * outward[0, 0] + turn[2, 1] * outward[0, 1] + turn[2, 2] * outward[0, 2])
+
+
+@compiled(nogil=True)
+def _follow(
+    rows: IntArray,
+    start: FloatArray,
+    stop: FloatArray,
+    steps: IntArray,
+    node: FloatArray,
+    answer: FloatArray,
+    stiffness: float,
+    kind: IntArray,
+    sizes: FloatArray,
+    friction: FloatArray,
+    compliance: FloatArray,
+    turning: FloatArray,
+    taken: FloatArray,
+    force: FloatArray,
+    moved: FloatArray,
+    anchor: FloatArray,
+    seen: FloatArray,
+    before: FloatArray,
+    held: BoolArray,
+    slides: BoolArray,
+    used: FloatArray,
+) -> None:
+    """Go each row's way (R, 4, 4) in its steps (R,); the arrays of all B rows are those of ``LinearContacts``."""
+    here = np.empty_like(node)
+    shift = np.empty((3, len(node)), np.float32)
+    near = np.empty(len(node), np.int64)
+    for r in range(len(rows)):
+        row = rows[r]
+        mu, soft, last = friction[row], compliance[row] * stiffness, steps[r] - 1
+        way = between(start[r], stop[r], steps[r])
+        for step in range(steps[r] + MOST_SETTLING):
+            T = _given_way(way[min(step, last)], turning[row], force[row], stiffness)
+            if step > last and _motion(taken[row], T, node[0, 2]) <= SETTLED_MM:
+                break
+            taken[row] = T
+            turn, place = T[:3, :3], T[:3, 3]
+            count = 0
+            gap = before[row]
+            for part in range(2 if step >= last else 1):
+                if part and not count:
+                    break
+                _seen_from(node, moved[row], turn, place, here)
+                gap, normal, _ = solid(here, kind[row], sizes[row])
+                if part == 0:
+                    for i in range(len(node)):
+                        if gap[i] < REACH_MM or held[row, i]:
+                            near[count] = i
+                            count += 1
+                            if not held[row, i]:
+                                _anchor(here[i], gap[i], anchor[row, i], seen[row, i], before[row, i])
+                if count:
+                    looked = near[:count]
+                    _solve(answer, looked, turn, here, gap, normal, force[row], moved[row], anchor[row], shift, mu, soft, part)
+            if count:
+                _seen_from(node, moved[row], turn, place, here)
+                used[row] = _remember(near[:count], turn, here, normal, force[row], anchor[row], mu, held[row], slides[row])
+            seen[row], before[row] = here, gap
+
+
+@compiled()
+def _given_way(T: FloatArray, turning: FloatArray, force: FloatArray, stiffness: float) -> FloatArray:
+    """See ``ArmTurning``: the object's pose (4, 4) as an arm turns under the linear skin's force (M, 3), made the true one's."""
+    if turning[9] == 0:
+        return T
+    angle = 0.0
+    for p in range(3):
+        angle += turning[9] * turning[p] * stiffness * force[:, p].sum()
+    sine, rest = np.sin(angle), 1 - np.cos(angle)
+    x, y, z = turning[3], turning[4], turning[5]
+    turn = np.array(
+        [
+            [1 - rest * (y * y + z * z), rest * x * y - sine * z, rest * x * z + sine * y],
+            [rest * x * y + sine * z, 1 - rest * (x * x + z * z), rest * y * z - sine * x],
+            [rest * x * z - sine * y, rest * y * z + sine * x, 1 - rest * (x * x + y * y)],
+        ]
+    )
+    there = np.zeros((4, 4))
+    there[3, 3] = 1.0
+    for p in range(3):
+        there[p, 3] = turning[6 + p]
+        for q in range(3):
+            there[p, 3] += turn[p, q] * (T[q, 3] - turning[6 + q])
             for k in range(3):
-                anchor[i, k] = here[i, k] if share == 1.0 else seen[i, k] + share * (here[i, k] - seen[i, k])
+                there[p, q] += turn[p, k] * T[k, q]
+    return there
 
 
-@compiled(fastmath=True, nogil=True)
+@compiled()
+def _motion(start: FloatArray, stop: FloatArray, radius_mm: float) -> float:
+    """See ``motion_mm``, of one pose (4, 4)."""
+    trace, off = 0.0, 0.0
+    for p in range(3):
+        here = stop[p, 3]
+        for q in range(3):
+            turn = 0.0
+            for k in range(3):
+                turn += stop[p, k] * start[q, k]
+            trace += turn if p == q else 0.0
+            here -= turn * start[q, 3]
+        off += here * here
+    return np.sqrt(off) + np.arccos(min(max((trace - 1) / 2, -1.0), 1.0)) * radius_mm
+
+
+@compiled()
+def _seen_from(node: FloatArray, moved: FloatArray, turn: FloatArray, place: FloatArray, here: FloatArray) -> None:
+    """The nodes in the object's frame."""
+    for i in range(len(node)):
+        x, y, z = node[i, 0] + moved[i, 0] - place[0], node[i, 1] + moved[i, 1] - place[1], node[i, 2] + moved[i, 2] - place[2]
+        for p in range(3):
+            here[i, p] = x * turn[0, p] + y * turn[1, p] + z * turn[2, p]
+
+
+@compiled()
+def _anchor(here: FloatArray, gap: float, anchor: FloatArray, seen: FloatArray, before: float) -> None:
+    """Anchor a free node where it stands, or where it met the surface on the way."""
+    share = 1.0
+    if gap < 0 < before and before < np.inf:
+        share = before / (before - gap)
+    for k in range(3):
+        anchor[k] = here[k] if share == 1.0 else seen[k] + share * (here[k] - seen[k])
+
+
+@compiled(fastmath={"reassoc", "contract", "arcp", "nsz"})
 def _solve(
     answer: FloatArray,
     near: IntArray,
@@ -115,23 +366,27 @@ def _solve(
     force: FloatArray,
     moved: FloatArray,
     anchor: FloatArray,
+    shift: FloatArray,
     friction: float,
     compliance: float,
-    sweeps: int,
+    part: int,
 ) -> None:
-    """Forces (M, 3) and displacements (M, 3) of the near nodes (q,), whose distances and normals are linearised at ``here`` (M, 3)."""
+    """Forces (M, 3) and displacements (M, 3) of the near nodes (q,), whose distances and normals are linearised at ``here`` (M, 3).
+
+    ``shift`` (3, M) float32 is room for the displacements.
+    """
     count = len(near)
-    c = np.empty((count, count, 3, 3), np.float32)
-    n, lag, shift = np.empty((count, 3)), np.empty((count, 3)), np.zeros((count, 3))
+    n, lag = np.empty((count, 3)), np.empty((count, 3))
     across, along = np.empty(count), np.empty(count)
+    c, moving = np.empty((count, 3, 3, count), np.float32), np.zeros((3, count), np.float32)
+    sunk = 0.0  # of the object, along z
     for a in range(count):
         i = near[a]
-        for b in range(count):
-            block = answer[i, near[b]]
+        rows = answer[i]
+        for q in range(3):
             for p in range(3):
-                for q in range(3):
-                    c[a, b, p, q] = block[p, q]
-            c[a, b, 2, 2] += compliance
+                for b in range(count):
+                    c[a, q, p, b] = rows[q, p, near[b]]
         for p in range(3):
             n[a, p] = turn[p, 0] * normal[i, 0] + turn[p, 1] * normal[i, 1] + turn[p, 2] * normal[i, 2]
             lag[a, p] = (
@@ -139,27 +394,29 @@ def _solve(
                 + turn[p, 1] * (here[i, 1] - anchor[i, 1])
                 + turn[p, 2] * (here[i, 2] - anchor[i, 2])
             )
-        total = 0.0
+        total, trace = compliance * n[a, 2] * n[a, 2], compliance
         for p in range(3):
+            trace += answer[i, p, p, i]
             for q in range(3):
-                total += n[a, p] * c[a, a, p, q] * n[a, q]
+                total += n[a, p] * answer[i, q, p, i] * n[a, q]
         across[a] = total + YIELDING_MM_PER_N
-        along[a] = (c[a, a, 0, 0] + c[a, a, 1, 1] + c[a, a, 2, 2] - total) / 2
-    for _ in range(sweeps):
+        along[a] = (trace - total) / 2
+    for _ in range(SWEEPS[part]):
         worst = 0.0
         for a in range(count):
             i = near[a]
             n0, n1, n2 = n[a, 0], n[a, 1], n[a, 2]
             f0, f1, f2 = force[i, 0], force[i, 1], force[i, 2]
+            s0, s1, s2 = float(moving[0, a]), float(moving[1, a]), moving[2, a] + sunk
             press = n0 * f0 + n1 * f1 + n2 * f2
-            off = gap[i] + n0 * shift[a, 0] + n1 * shift[a, 1] + n2 * shift[a, 2] + YIELDING_MM_PER_N * press
+            off = gap[i] + n0 * s0 + n1 * s1 + n2 * s2 + YIELDING_MM_PER_N * press
             pressed = press - off / across[a]
             if pressed <= 0:
                 if f0 == 0 and f1 == 0 and f2 == 0:
                     continue
                 d0, d1, d2 = -f0, -f1, -f2
             else:
-                x, y, z = lag[a, 0] + shift[a, 0], lag[a, 1] + shift[a, 1], lag[a, 2] + shift[a, 2]
+                x, y, z = lag[a, 0] + s0, lag[a, 1] + s1, lag[a, 2] + s2
                 up = n0 * x + n1 * y + n2 * z
                 t0 = f0 - press * n0 - (x - up * n0) / along[a]
                 t1 = f1 - press * n1 - (y - up * n1) / along[a]
@@ -168,27 +425,31 @@ def _solve(
                 keep = most / size if size > most else 1.0
                 d0, d1, d2 = pressed * n0 + keep * t0 - f0, pressed * n1 + keep * t1 - f1, pressed * n2 + keep * t2 - f2
             change = abs(d0) + abs(d1) + abs(d2)
-            if change < 1e-7:
+            if change < STILL_N:
                 continue
             worst = max(worst, change)
             force[i, 0], force[i, 1], force[i, 2] = f0 + d0, f1 + d1, f2 + d2
-            for b in range(count):
-                k = c[a, b]
-                shift[b, 0] += k[0, 0] * d0 + k[0, 1] * d1 + k[0, 2] * d2
-                shift[b, 1] += k[1, 0] * d0 + k[1, 1] * d1 + k[1, 2] * d2
-                shift[b, 2] += k[2, 0] * d0 + k[2, 1] * d1 + k[2, 2] * d2
+            sunk += compliance * d2
+            e0, e1, e2 = np.float32(d0), np.float32(d1), np.float32(d2)
+            k = c[a]
+            for p in range(3):
+                for b in range(count):
+                    moving[p, b] += k[0, p, b] * e0 + k[1, p, b] * e1 + k[2, p, b] * e2
         if worst < TOLERANCE_N:
             break
-    moved[:] = 0.0
+    shift[:] = 0.0
+    sunk = 0.0
     for a in range(count):
         i = near[a]
-        f0, f1, f2 = force[i, 0], force[i, 1], force[i, 2]
-        if f0 != 0 or f1 != 0 or f2 != 0:
-            for j in range(len(moved)):
-                k = answer[i, j]
-                moved[j, 0] += k[0, 0] * f0 + k[0, 1] * f1 + k[0, 2] * f2
-                moved[j, 1] += k[1, 0] * f0 + k[1, 1] * f1 + k[1, 2] * f2
-                moved[j, 2] += k[2, 0] * f0 + k[2, 1] * f1 + k[2, 2] * f2 + compliance * f2
+        e0, e1, e2 = np.float32(force[i, 0]), np.float32(force[i, 1]), np.float32(force[i, 2])
+        if e0 != 0 or e1 != 0 or e2 != 0:
+            sunk += compliance * force[i, 2]
+            rows = answer[i]
+            for p in range(3):
+                for j in range(shift.shape[1]):
+                    shift[p, j] += rows[0, p, j] * e0 + rows[1, p, j] * e1 + rows[2, p, j] * e2
+    for j in range(len(moved)):
+        moved[j, 0], moved[j, 1], moved[j, 2] = shift[0, j], shift[1, j], shift[2, j] + sunk
 
 
 @compiled()
@@ -196,31 +457,29 @@ def _remember(
     near: IntArray,
     turn: FloatArray,
     here: FloatArray,
-    gap: FloatArray,
     normal: FloatArray,
     force: FloatArray,
-    moved: FloatArray,
     anchor: FloatArray,
-    seen: FloatArray,
-    before: FloatArray,
     friction: float,
     held: BoolArray,
     slides: BoolArray,
-) -> None:
-    """Which nodes press and slide; the anchors of sliding nodes go with them."""
+) -> float:
+    """Which nodes press and slide; the anchors of sliding nodes go with them. Gives the share of Coulomb's bound that is borne."""
     held[:] = False
     slides[:] = False
+    bound, borne = 0.0, 0.0
     for i in near:
         press, size = 0.0, 0.0
         for p in range(3):
             press += force[i, p] * (turn[p, 0] * normal[i, 0] + turn[p, 1] * normal[i, 1] + turn[p, 2] * normal[i, 2])
         for p in range(3):
             size += (force[i, p] - press * (turn[p, 0] * normal[i, 0] + turn[p, 1] * normal[i, 1] + turn[p, 2] * normal[i, 2])) ** 2
-        if press > 1e-7:
+        if press > STILL_N:
             held[i] = True
-            slides[i] = np.sqrt(size) >= SLIDES * friction * press
+            bound += friction * press
+            borne += np.sqrt(size)
+            slides[i] = friction > 0 and np.sqrt(size) >= SLIDES * friction * press
             if slides[i]:
                 for p in range(3):
                     anchor[i, p] = here[i, p]
-    before[:] = gap
-    seen[:] = here
+    return borne / bound if bound > 0 else 0.0

@@ -1,7 +1,7 @@
 """Making a surrogate: the linear skin from the solver's own elements, and a network fitted to solved paths."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from training.surrogate.felt import Contact
 from training.surrogate.model import Surrogate, features, gate, mechanics_of
 from training.surrogate.paths import DEEPEST_MM, FRICTION
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
-from training.surrogate.symmetry import ring_directions, symmetries
+from training.surrogate.symmetry import Symmetry, ring_directions, symmetries
 from twin.camera.projection import project
 from twin.errors import OptionError
 from twin.frames.forms import from_raw
@@ -26,8 +26,9 @@ from twin.geometry.pins import rest_pins
 from twin.mechanics import Friction
 from twin.mechanics.law import ContactLaw
 from twin.objects import build_field
+from twin.objects.analytic import Solid
 from twin.progress import Progress, silent, stage
-from twin.store import writes_file
+from twin.store import Layers, writes_file
 from twin.types import FloatArray, Form
 
 PATHS = 120
@@ -38,18 +39,28 @@ LEAST_PATHS = 10
 """Fewer paths teach nothing."""
 JUDGED = 5
 """Every path of this number is kept out of the training and judged with."""
+TURNS = 3
+"""Times that each solved path is learnt from, turned by other angles about the axis: its contacts lie elsewhere between the nodes then."""
+MODE_STATES = 3000
+"""States from which the modes are found."""
+AXIS_MM = 0.9
+"""Length of a pin by which changes of its axis count as motion where modes are sought: about that of the shipped sensors."""
 MODES = 64
 """Modes of the pins' motion: what they leave out is 0.01 mm on average."""
 WIDTH = 128
 """Neurons of each of the network's two hidden layers."""
-EPOCHS = 25
+EPOCHS = 10
 BATCH = 512
 RATE = 3e-3
-"""Largest rate of Adam, at the middle of a cycle."""
+"""Largest rate of Adam, in a cycle; of a network that learns on, a third of it."""
 DECAY = 0.02
 """Decay of the weights."""
 POLAR_DEG = 48.0
 """Largest angle of a contact's deepest place from the apex: paths begin within 35 deg and go on from there."""
+OTHERS_SCALE = (*(0.5,) * 3, *(5.0,) * 3, 1.0, 1.0)
+"""Errors of force (N), torque (N mm), area (100 mm2) and sliding share that count as much as a usual one of the modes."""
+LEAST_MOVED_MM = 0.5
+"""States count by the square of one over their largest motion of a pin; below this they count alike."""
 SMALL_SCALE = 0.02
 """No input of the network is scaled by less than this share of the largest."""
 NEIGHBOURS = 24
@@ -98,6 +109,7 @@ class _Samples:
     pins: FloatArray  # (S, 2, P, 3), displacements of feet and changes of axes
     wrench: FloatArray  # (S, 6)
     area: FloatArray  # (S,)
+    slip: FloatArray  # (S,), what the linear skin's share of sliding nodes lacks
 
 
 @writes_file("out")
@@ -145,36 +157,56 @@ def require_dome(sensor: SensorSpec) -> None:
 
 
 def fit(
-    sensor: SensorSpec, solved: Sequence[SolvedPath], *, extra: Sequence[SolvedPath] = (), progress: Any = lambda *_: None
+    sensor: SensorSpec,
+    solved: Sequence[SolvedPath],
+    *,
+    extra: Sequence[SolvedPath] = (),
+    start: Surrogate | None = None,
+    progress: Any = lambda *_: None,
 ) -> Surrogate:
-    """The surrogate from solved paths of the sensor's lattice; every fifth path is only judged with, those of ``extra`` never."""
+    """The surrogate from solved paths of the sensor's lattice; every fifth path is only judged with, those of ``extra`` never.
+
+    With ``start``, a surrogate of a sensor whose pins are the lattice, its modes are used and its network learns on: sensors of one family
+    lack much the same of their linear skins.
+    """
     torch.manual_seed(0)
     torch.set_num_threads(1)
     seen = [path for number, path in enumerate(solved) if number % JUDGED] + list(extra)
     kept = [path for number, path in enumerate(solved) if not number % JUDGED]
     skin = compliance_of(lattice_sensor(sensor))
     answer = averaged(skin.nodes, sensor.pins.phase_deg)
-    rows = _joined([sampled(sensor, skin, answer, path) for path in seen])
+    rng = np.random.default_rng(0)
+    turns = rng.uniform(0.0, np.pi / 3, (len(seen), TURNS))
+    turns[:, 0] = 0.0
+    rows = _joined([sampled(sensor, skin, answer, path, turn) for path, angles in zip(seen, turns, strict=True) for turn in angles])
     flat_linear, flat_true = rows.linear[:, :3], rows.wrench[:, :3]
     stiffness = float((flat_linear * flat_true).sum() / (flat_linear**2).sum())
-    cap_mm = sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
-    weights = np.array([1.0, cap_mm], np.float32)[:, None, None]
+    weights = np.array([1.0, AXIS_MM], np.float32)[:, None, None]
     linear_pins = np.stack([skin.base, skin.axis]).astype(np.float32) * weights[..., None, None]  # (2, P, 3, M, 3)
     flat = linear_pins.reshape(linear_pins.shape[0] * linear_pins.shape[1] * 3, -1)
-    force, pins, beside, depth, wrench, linear = _turned(rows, sensor.pins.phase_deg)
-    truth = (pins * weights).reshape(len(pins), -1)
-    residual = truth - force @ flat.T
-    some = np.random.default_rng(0).choice(len(truth), min(3000, len(truth)), replace=False)
-    modes = np.linalg.svd(np.concatenate([truth[some], 3 * residual[some]]), full_matrices=False)[2][:MODES]
+    rows = replace(rows, pins=rows.pins * weights)
+    group = symmetries(sensor.pins.phase_deg)
+    modes = _modes(rows, group, flat) if start is None else _carried(start, sensor, weights)
     read = modes @ flat
-    x = np.concatenate([force @ read.T, beside], axis=1).astype(np.float32)
-    mean, scale = x.mean(axis=0), x.std(axis=0)
-    scale[:MODES] = np.maximum(scale[:MODES], SMALL_SCALE * scale[:MODES].max())
-    wanted = residual @ modes.T
-    out_scale = np.concatenate([np.full(MODES, wanted.std(axis=0).max()), np.full(3, 0.5), np.full(3, 5.0), [1.0]]).astype(np.float32)
-    area = np.tile(rows.area, len(pins) // len(rows.area))
-    y = np.concatenate([wanted, wrench - stiffness * linear, area[:, None] / 100.0], axis=1) / out_scale
-    layers = _trained((x - mean) / scale, y.astype(np.float32), gate(depth).astype(np.float32), progress)
+    inputs, outputs = [], []
+    for g in group:
+        part = _turned(rows, g)
+        inputs.append(np.concatenate([part.force.reshape(len(part.force), -1) @ read.T, part.beside], axis=1).astype(np.float32))
+        lacks = _pins_and_rest(part, flat)[1] @ modes.T
+        others = np.column_stack([part.area / 100.0, part.slip])
+        outputs.append(np.concatenate([lacks, part.wrench - stiffness * part.linear, others], axis=1).astype(np.float32))
+    x, y = np.concatenate(inputs), np.concatenate(outputs)
+    if start is None:
+        mean, scale = x.mean(axis=0), x.std(axis=0)
+        scale[:MODES] = np.maximum(scale[:MODES], SMALL_SCALE * scale[:MODES].max())
+        out_scale = np.concatenate([np.full(MODES, y[:, :MODES].std(axis=0).max()), OTHERS_SCALE]).astype(np.float32)
+    else:
+        mean, scale, out_scale = start.mean, start.scale, start.out_scale
+    largest = np.linalg.norm(rows.pins[:, 0], axis=2).max(axis=1)
+    counts = np.tile(1.0 / (LEAST_MOVED_MM**2 + largest**2), len(group))
+    gates = np.tile(gate(rows.depth), len(group))
+    given = (x - mean) / scale, y / out_scale, gates.astype(np.float32), (counts / counts.mean()).astype(np.float32)
+    layers = _trained(*given, start.layers if start else (), progress)
     onto = _interpolation(sensor)
     on_pins = np.einsum("np,kcpi->knci", onto, modes.reshape(MODES, 2, -1, 3) / weights[None], optimize=True)
     about = {
@@ -212,23 +244,62 @@ def averaged(nodes: FloatArray, phase_deg: float) -> FloatArray:
     return np.ascontiguousarray(total / len(group))
 
 
-def sampled(sensor: SensorSpec, skin: Compliance, answer: FloatArray, path: SolvedPath) -> _Samples:
-    """The linear skin led along a solved path, with the truth beside it."""
+def sampled(sensor: SensorSpec, skin: Compliance, answer: FloatArray, path: SolvedPath, turn_rad: float = 0.0) -> _Samples:
+    """The linear skin led along a solved path, with the truth beside it, both turned about the sensor's axis."""
+    about = np.eye(4)
+    about[:3, :3] = turn = _about_z(turn_rad)
+    poses = about @ path.T
     thing = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
-    linear = LinearContacts.at_rest(skin.node_mm, answer.astype(np.float32), 1)
+    assert isinstance(thing, Solid)
+    linear, row = LinearContacts.at_rest(skin.node_mm, answer.astype(np.float32), 1), np.zeros(1, int)
+    linear.begin(0, thing, path.friction)
     rest = rest_pins(lattice_sensor(sensor).geometry)
-    force, depth, held, slip = [], [], [], []
-    for T in path.T:
-        linear.move(0, thing, T, path.friction, 0.0)
-        force.append(linear.force_n[0].astype(np.float32))
-        depth.append(max(-float(thing.distance((skin.node_mm - T[:3, 3]) @ T[:3, :3]).min()), 0.0))
-        held.append(linear.held[0].sum())
-        slip.append(linear.slides[0].sum() / max(held[-1], 1))
-    forces, deep = np.array(force), np.array(depth)
+    states = []
+    for before, T in zip(poses[[0, *range(len(poses) - 1)]], poses, strict=True):
+        linear.move(row, before[None], T[None])
+        held = linear.held[0].sum()
+        slip = linear.slides[0].sum() / max(held, 1)
+        depth = max(-float(linear.distances(row, T[None])[0].min()), 0.0)
+        states.append((linear.force_n[0].astype(np.float32), depth, held, slip, linear.used[0]))
+    forces, deep, holding, slips, used = (np.array(column) for column in zip(*states, strict=True))
     wrench = -np.concatenate([forces.sum(axis=1), np.cross(skin.node_mm, forces).sum(axis=1)], axis=1)
-    beside = features(deep, np.full(len(deep), path.friction), np.array(held), np.array(slip), wrench)
-    pins = np.stack([path.base_mm - rest.base_mm, path.axis - rest.axis], axis=1).astype(np.float32)
-    return _Samples(forces, beside, deep, wrench, pins, np.concatenate([path.force_n, path.torque_nmm], axis=1), path.area_mm2)
+    beside = features(deep, np.full(len(deep), path.friction), holding, slips, used, wrench)
+    pins = np.stack([path.base_mm - rest.base_mm, path.axis - rest.axis], axis=1)
+    if turn_rad:
+        pins = _interpolated(-rest.axis @ turn.T, -rest.axis) @ (pins @ turn.T)
+    truth = np.concatenate([path.force_n @ turn.T, path.torque_nmm @ turn.T], axis=1)
+    return _Samples(forces, beside, deep, wrench, pins.astype(np.float32), truth, path.area_mm2, path.slip - slips)
+
+
+def _modes(rows: _Samples, group: Sequence[Symmetry], flat: FloatArray) -> FloatArray:
+    """Directions (MODES, 6 P) in which the pins move together most, and in which the linear skin (6 P, 3 M) is wrong most."""
+    share = max(len(rows.depth) * len(group) // MODE_STATES, 1)
+    some = [_turned(_some(rows, slice(number, None, share)), g) for number, g in enumerate(group)]
+    truth, residual = (np.concatenate(part) for part in zip(*(_pins_and_rest(part, flat) for part in some), strict=True))
+    found: FloatArray = np.linalg.svd(np.concatenate([truth, 3 * residual]), full_matrices=False)[2][:MODES]
+    return found
+
+
+def _carried(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> FloatArray:
+    """The modes (MODES, 6 P) of another sensor of the family, on this one's lattice."""
+    turn = _about_z(np.radians(sensor.pins.phase_deg - start.phase_deg)).astype(np.float32)
+    modes = (start.modes @ turn.T).transpose(0, 2, 1, 3) * weights
+    return np.ascontiguousarray(modes.reshape(len(modes), -1))
+
+
+def _about_z(angle_rad: float) -> FloatArray:
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _pins_and_rest(rows: _Samples, flat: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The pins' motion (S, 6 P), and what the linear skin's answers (6 P, 3 M) leave of it."""
+    truth = rows.pins.reshape(len(rows.pins), -1)
+    return truth, truth - rows.force.reshape(len(rows.force), -1) @ flat.T
+
+
+def _some(rows: _Samples, which: slice) -> _Samples:
+    return _Samples(*(getattr(rows, name)[which] for name in _Samples.__dataclass_fields__))
 
 
 def judge(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]) -> dict[str, Any]:
@@ -294,24 +365,26 @@ def _joined(parts: Sequence[_Samples]) -> _Samples:
     return _Samples(*(getattr(every, name)[rows] for name in _Samples.__dataclass_fields__))
 
 
-def _turned(rows: _Samples, phase_deg: float) -> tuple[FloatArray, ...]:
-    """Forces (S', 3 M), pins (S', 2, P, 3), features, depths, wrenches of truth and of the linear skin: each state twelve times."""
-    out: list[list[FloatArray]] = [[] for _ in range(6)]
-    for g in symmetries(phase_deg):
-        force = g.moved(rows.force, NODE_RINGS).reshape(len(rows.force), -1)
-        pins = np.stack([g.moved(rows.pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
-        turned = [np.concatenate([w[:, :3] @ g.matrix.T, g.parity * (w[:, 3:] @ g.matrix.T)], axis=1) for w in (rows.wrench, rows.linear)]
-        beside = rows.beside.copy()
-        beside[:, -6:-3] = beside[:, -6:-3] @ g.matrix.T
-        beside[:, -3:] = g.parity * (beside[:, -3:] @ g.matrix.T)
-        for values, part in zip(out, (force, pins, beside, rows.depth, *turned), strict=True):
-            values.append(part)
-    force_, pins_, beside_, depth_, wrench_, linear_ = (np.concatenate(part) for part in out)
-    return force_, pins_, beside_, depth_, wrench_, linear_
+def _turned(rows: _Samples, g: Symmetry) -> _Samples:
+    """The same states, turned or mirrored."""
+    wrench, linear, beside = (_turned_wrench(values, g) for values in (rows.wrench, rows.linear, rows.beside))
+    pins = np.stack([g.moved(rows.pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
+    return replace(rows, force=g.moved(rows.force, NODE_RINGS), beside=beside, linear=linear, pins=pins, wrench=wrench)
 
 
-def _trained(x: FloatArray, y: FloatArray, gates: FloatArray, progress: Any) -> tuple[tuple[FloatArray, FloatArray], ...]:
-    """Weights and offsets of a network that tells y (S, o) from x (S, i), times the gates (S,)."""
+def _turned_wrench(values: FloatArray, g: Symmetry) -> FloatArray:
+    """Rows whose last six columns are a force and a torque."""
+    out = values.copy()
+    out[:, -6:-3] = values[:, -6:-3] @ g.matrix.T
+    out[:, -3:] = g.parity * (values[:, -3:] @ g.matrix.T)
+    return out
+
+
+def _trained(x: FloatArray, y: FloatArray, gates: FloatArray, counts: FloatArray, start: Layers, progress: Any) -> Layers:
+    """Weights and offsets of a network that tells y (S, o) from x (S, i), times the gates (S,); the states count by ``counts`` (S,).
+
+    It begins with the weights and offsets of ``start``, if there are any.
+    """
     net = torch.nn.Sequential(
         torch.nn.Linear(x.shape[1], WIDTH),
         torch.nn.SiLU(),
@@ -319,25 +392,26 @@ def _trained(x: FloatArray, y: FloatArray, gates: FloatArray, progress: Any) -> 
         torch.nn.SiLU(),
         torch.nn.Linear(WIDTH, y.shape[1]),
     )
-    inputs, wanted, share = (
-        torch.from_numpy(np.ascontiguousarray(x)),
-        torch.from_numpy(np.ascontiguousarray(y)),
-        torch.from_numpy(gates)[:, None],
-    )
+    inputs, wanted, share, count = (torch.from_numpy(np.ascontiguousarray(values)) for values in (x, y, gates[:, None], counts))
     batches = max(len(x) // BATCH, 1)
-    optimiser = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=DECAY)
-    cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=EPOCHS * batches)
+    linear = [layer for layer in net if isinstance(layer, torch.nn.Linear)]
+    with torch.no_grad():
+        for layer, (weight, offset) in zip(linear, start, strict=False):
+            layer.weight.copy_(torch.from_numpy(weight))
+            layer.bias.copy_(torch.from_numpy(offset))
+    rate = RATE / 3 if start else RATE
+    optimiser = torch.optim.AdamW(net.parameters(), lr=rate, weight_decay=DECAY)
+    cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=EPOCHS * batches)
     generator = torch.Generator().manual_seed(0)
     for epoch in range(EPOCHS):
         order = torch.randperm(len(x), generator=generator)
         for batch in order[: batches * BATCH].tensor_split(batches):
-            loss = ((net(inputs[batch]) * share[batch] - wanted[batch]) ** 2).sum(dim=1).mean()
+            loss = (((net(inputs[batch]) * share[batch] - wanted[batch]) ** 2).sum(dim=1) * count[batch]).mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
             cycle.step()
         progress(epoch + 1, EPOCHS, f"loss {loss.item():.3f}")
-    linear = [layer for layer in net if isinstance(layer, torch.nn.Linear)]
     return tuple((layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy()) for layer in linear)
 
 
@@ -347,11 +421,16 @@ def _interpolation(sensor: SensorSpec) -> FloatArray:
     places = -rest_pins(sensor.geometry).axis
     if places.shape == lattice.shape and np.allclose(places, lattice, atol=1e-9):
         return np.eye(len(lattice))
+    return _interpolated(lattice, places)
+
+
+def _interpolated(start: FloatArray, places: FloatArray) -> FloatArray:
+    """(N, P) shares by which what is known in directions (P, 3) gives what is in others (N, 3)."""
 
     def laid_flat(directions: FloatArray) -> FloatArray:
         across = np.linalg.norm(directions[:, :2], axis=1, keepdims=True)
         return directions[:, :2] * np.arctan2(across, directions[:, 2:]) / np.maximum(across, 1e-12)
 
-    shares = RBFInterpolator(laid_flat(lattice), np.eye(len(lattice)), neighbors=NEIGHBOURS, kernel="thin_plate_spline")
+    shares = RBFInterpolator(laid_flat(start), np.eye(len(start)), neighbors=NEIGHBOURS, kernel="thin_plate_spline")
     found: FloatArray = shares(laid_flat(places))
     return found

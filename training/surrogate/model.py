@@ -5,8 +5,8 @@ Of one contact, with the forces f at the linear skin's nodes,
     pins = rest + modes (R f + gate(depth) net(R f, features)),   force = stiffness (-sum f) + gate net,
 
 where R is the linear skin's answer in the modes, and the gate goes to zero with the depth: a sensor that touches nothing is exactly at
-rest. The features are depth, friction, nodes that press and slide, force and torque of the linear skin. What happened before is in f
-alone, so the network has no memory of its own that could drift.
+rest. The features are depth, friction, nodes that press and slide, the share of Coulomb's bound that is borne, force and torque of the
+linear skin. What happened before is in f alone, so the network has no memory of its own that could drift.
 """
 
 from collections.abc import Mapping
@@ -34,19 +34,19 @@ OPTICAL = ("refractive_index", "absorption_per_mm", "haze", "haze_sigma_px", "th
 """Keys of these sections that only the optics need; the skin's thickness is not among them."""
 UNFELT = ("stiffness_factor",)
 """Keys that say how sure the others are: no contact depends on them."""
-FEATURES = 12
+FEATURES = 13
 """Numbers beside the modes that the network sees."""
 WRENCH_SCALE = np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
 """N and N mm that count as 1."""
-BESIDE = 7
-"""Numbers beside the modes that it gives: force, torque, area in 100 mm2."""
+BESIDE = 8
+"""Numbers beside the modes that it gives: force, torque, area in 100 mm2, share that slides."""
 
 
 class SurrogateError(TwinError):
     """A surrogate's file can't be used, or no surrogate is known for a sensor."""
 
 
-FILE = ArrayFile("surrogate", "twin surrogate", version=1, error=SurrogateError)
+FILE = ArrayFile("surrogate", "twin surrogate", version=2, error=SurrogateError)
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Surrogate:
         return {key: float(value) for key, value in self.about["domain"].items()}
 
     def correct(self, force_n: FloatArray, beside: FloatArray, depth_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coefficients of the modes (R, K), and what is added to force, torque and area (R, BESIDE), for node forces (R, M, 3)."""
+        """Coefficients of the modes (R, K), and what is added to the others (R, BESIDE), for node forces (R, M, 3)."""
         linear = force_n.reshape(len(force_n), -1).astype(np.float32) @ self.read.T
         x = (np.concatenate([linear, beside.astype(np.float32)], axis=1) - self.mean) / self.scale
         for number, (weights, offset) in enumerate(self.layers):
@@ -124,10 +124,13 @@ class Surrogate:
         }
 
 
-def features(depth_mm: FloatArray, friction: FloatArray, held: FloatArray, slip: FloatArray, wrench: FloatArray) -> FloatArray:
+def features(
+    depth_mm: FloatArray, friction: FloatArray, held: FloatArray, slip: FloatArray, used: FloatArray, wrench: FloatArray
+) -> FloatArray:
     """What the network sees beside the modes, (R, FEATURES)."""
+    rub = np.log(np.maximum(friction, 0.01))
     return np.column_stack(
-        [depth_mm, depth_mm**2 / 5.0, np.log(np.maximum(friction, 0.01)), friction * depth_mm, held / 10.0, slip, wrench / WRENCH_SCALE]
+        [depth_mm, depth_mm**2 / 5.0, rub, np.minimum(friction, 1.5) * depth_mm, held / 10.0, slip, used, wrench / WRENCH_SCALE]
     )
 
 

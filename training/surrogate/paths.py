@@ -22,12 +22,16 @@ POLAR_DEG = 35.0
 """Largest angle of the first touched place from the dome's apex."""
 BESIDE_MM = 9.0
 """The touched place of the object is drawn up to this far from its origin, so that edges lie within or near the contact."""
-SHEAR_MM = 4.0
+SHEAR_MM = 5.0
 """Largest sideways motion of one leg."""
 TURN_DEG = 15.0
 """Largest turn of one leg, about the contact's normal, its place or the dome's centre."""
 FRICTION = (0.05, 1.5)
 """Range of the coefficient of friction, uniform in its logarithm."""
+FREE, STICKING = 0.0, 3.0
+"""Coefficients of friction of a skin that slips at once, and of one that hardly ever slips."""
+END_SHARE = 0.08
+"""Share of the paths without friction, and share of those that stick."""
 LEAVE_SHARE = 0.1
 """Share of the legs that leave the object and come back elsewhere."""
 BACK_SHARE = 0.2
@@ -57,7 +61,7 @@ def draw_shape(rng: np.random.Generator) -> Shape:
     def sized(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
-    kind = rng.choice(["plane", "sphere", "cylinder", "edge", "prism"], p=[0.2, 0.25, 0.2, 0.2, 0.15])
+    kind = rng.choice(["plane", "sphere", "cylinder", "edge", "prism"], p=[0.2, 0.2, 0.2, 0.25, 0.15])
     if kind == "plane":
         return PlaneShape(kind="plane")
     if kind == "sphere":
@@ -113,8 +117,7 @@ def draw_path(sensor: SensorSpec, rng: np.random.Generator) -> DrawnPath:
         else:
             depth = _depth(rng) if rng.random() < 0.5 else _deep(field, dome, poses[-1])[0]
             poses.append(at_depth(field, dome, _moved(field, dome, poses[-1], rng), float(np.clip(depth, SHALLOWEST_MM, DEEPEST_MM))))
-    friction = float(np.exp(rng.uniform(*np.log(FRICTION))))
-    return DrawnPath(shape, ContactPath(np.stack(poses)), friction)
+    return DrawnPath(shape, ContactPath(np.stack(poses)), _friction(rng))
 
 
 def at_depth(field: ObjectField, dome_mm: FloatArray, T: FloatArray, depth_mm: float) -> FloatArray:
@@ -132,6 +135,13 @@ def _deep(field: ObjectField, dome_mm: FloatArray, T: FloatArray) -> tuple[float
     weights = np.exp(-(gap - gap.min()) / 0.2)  # a soft minimum: the direction moves smoothly with the pose
     where = weights @ dome_mm
     return -float(gap.min()), where / np.linalg.norm(where)
+
+
+def _friction(rng: np.random.Generator) -> float:
+    share = rng.random()
+    if share < 2 * END_SHARE:
+        return FREE if share < END_SHARE else STICKING
+    return float(np.exp(rng.uniform(*np.log(FRICTION))))
 
 
 def _depth(rng: np.random.Generator) -> float:

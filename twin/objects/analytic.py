@@ -4,7 +4,9 @@ Every solid has ``probe`` (and therefore ``distance`` and ``gradient``) and ``un
 (k, 2) in mm along the surface below a point, with their gradients (k, 2, 3) and their Hessians (k, 2, 3, 3) in 1/mm.
 """
 
+from abc import abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,9 +22,32 @@ def project_on_xy(points_mm: FloatArray) -> Probe:
     return points_mm[:, :2].copy(), slopes, np.zeros((len(points_mm), 2, 3, 3))
 
 
+class Solid(Wrapped):
+    """A solid that compiled code knows.
+
+    Attributes
+    ----------
+    kind : int
+        See ``kernels.solid``.
+    """
+
+    kind: ClassVar[int]
+
+    @property
+    @abstractmethod
+    def sizes(self) -> tuple[float, ...]:
+        """The numbers that ``kernels.solid`` takes."""
+
+
 @dataclass(frozen=True)
-class Plane(Wrapped):
+class Plane(Solid):
     """Half space z >= 0."""
+
+    kind = kernels.PLANE
+
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        return ()
 
     def probe(self, points_mm: FloatArray) -> Probe:
         return kernels.plane(rows(points_mm))
@@ -32,10 +57,16 @@ class Plane(Wrapped):
 
 
 @dataclass(frozen=True)
-class Sphere(Wrapped):
+class Sphere(Solid):
     """Ball behind its pole at the origin. A texture is projected along z."""
 
     radius_mm: float
+
+    kind = kernels.ROUND
+
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        return self.radius_mm, 0.0
 
     def probe(self, points_mm: FloatArray) -> Probe:
         return kernels.round_solid(rows(points_mm), self.radius_mm, 0.0)
@@ -45,10 +76,16 @@ class Sphere(Wrapped):
 
 
 @dataclass(frozen=True)
-class Cylinder(Wrapped):
+class Cylinder(Solid):
     """Cylinder along y that touches the origin from z > 0."""
 
     radius_mm: float
+
+    kind = kernels.ROUND
+
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        return self.radius_mm, 1.0
 
     def probe(self, points_mm: FloatArray) -> Probe:
         return kernels.round_solid(rows(points_mm), self.radius_mm, 1.0)
@@ -58,10 +95,16 @@ class Cylinder(Wrapped):
 
 
 @dataclass(frozen=True)
-class Edge(Wrapped):
+class Edge(Solid):
     """Quarter space x >= 0, z >= 0 with an edge rounded by a fillet. The rounded edge lies a little behind the origin."""
 
     fillet_mm: float
+
+    kind = kernels.EDGE
+
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        return (self.fillet_mm,)
 
     def probe(self, points_mm: FloatArray) -> Probe:
         return kernels.edge(rows(points_mm), self.fillet_mm)
@@ -71,7 +114,7 @@ class Edge(Wrapped):
 
 
 @dataclass(frozen=True)
-class Prism(Wrapped):
+class Prism(Solid):
     """Regular polygon in x-z extruded along y, with rounded edges, and faces tilted by a taper about x.
 
     Face 0 passes through the origin and faces -z. With a positive taper its normal tilts towards +y (the prism narrows towards +y). The
@@ -82,6 +125,12 @@ class Prism(Wrapped):
     inradius_mm: float
     fillet_mm: float
     taper_rad: float
+
+    kind = kernels.PRISM
+
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        return self.sides, self.inradius_mm, self.fillet_mm, self.taper_rad
 
     def probe(self, points_mm: FloatArray) -> Probe:
         return kernels.prism(rows(points_mm), self.sides, self.inradius_mm, self.fillet_mm, self.taper_rad)

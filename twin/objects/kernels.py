@@ -12,6 +12,8 @@ from twin.types import FloatArray
 
 _CREASE_MM = 1e-3
 """Radius of curvature below which a surface counts as a crease. The Hessian of a crease is set to 0."""
+PLANE, ROUND, EDGE, PRISM = range(4)
+"""Kinds of solids, for compiled code that takes any of them."""
 
 
 @compiled(error_model="numpy")
@@ -115,6 +117,18 @@ def prism(points: FloatArray, sides: int, inradius: float, fillet: float, taper:
         a = (edge_out * sin + edge_along * mirror * cos, edge_y, -edge_out * cos + edge_along * mirror * sin)
         _write(normal, hessian, k, n, a, away)
     return distance, normal, hessian
+
+
+@compiled(error_model="numpy")
+def solid(points: FloatArray, kind: int, sizes: FloatArray) -> Probe:
+    """The solid of a kind, with the numbers that its function takes, in their order."""
+    if kind == ROUND:
+        return round_solid(points, sizes[0], sizes[1])
+    if kind == EDGE:
+        return edge(points, sizes[0])
+    if kind == PRISM:
+        return prism(points, int(sizes[0]), sizes[1], sizes[2], sizes[3])
+    return plane(points)
 
 
 @compiled(error_model="numpy")

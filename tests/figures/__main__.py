@@ -3,7 +3,18 @@
 import argparse
 import sys
 
-from figures import data, forces, mechanics, pictures, pins, poses, robustness, servo, studio  # noqa: F401  (each registers its jobs)
+from figures import (  # noqa: F401  (each registers its jobs)
+    data,
+    environments,
+    forces,
+    mechanics,
+    pictures,
+    pins,
+    poses,
+    robustness,
+    servo,
+    studio,
+)
 from figures.jobs import FIGURES, JOBS, FiguresError, Job, is_kept, missing_recordings, run, values
 from figures.tables import documents, fill_documents, named_in_templates, used_in
 

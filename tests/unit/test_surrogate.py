@@ -13,14 +13,15 @@ from training.surrogate.compliance import NODE_RINGS, compliance_of
 from training.surrogate.contact import LinearContacts, between
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.felt import Contact, FiniteElements
-from training.surrogate.fit import averaged, distil, require_dome
+from training.surrogate.fit import _turned, averaged, distil, require_dome, sampled
 from training.surrogate.model import SurrogateError, load_surrogate, representatives, rest_of, surrogate_of, unfolded
 from training.surrogate.paths import FREE, FRICTION, STICKING, draw_path
-from training.surrogate.samples import lattice_sensor
+from training.surrogate.samples import SolvedPath, lattice_sensor
 from training.surrogate.symmetry import ring_directions, symmetries
 from twin.camera.projection import project
 from twin.errors import OptionError
 from twin.frames.forms import from_raw
+from twin.geometry.pins import rest_pins
 from twin.geometry.solid import Resolution
 from twin.mechanics import Friction
 from twin.mechanics.law import ContactLaw
@@ -85,6 +86,26 @@ def test_the_answers_of_the_linear_skin_are_reciprocal(sensor):
     answer = averaged(skin.nodes, sensor.pins.phase_deg)
     kept = answer[representatives(sensor.pins.phase_deg)]
     assert np.allclose(unfolded(kept, sensor.pins.phase_deg), answer, rtol=1e-5, atol=1e-5 * np.abs(answer).max())
+
+
+def test_a_path_that_is_learnt_from_turned_is_the_turned_path(sensor):
+    """By a sixth of a turn nodes and pins come to lie on one another, so both ways are the same."""
+    skin = compliance_of(lattice_sensor(sensor), resolution=COARSE)
+    answer = averaged(skin.nodes, sensor.pins.phase_deg)
+    rest = rest_pins(lattice_sensor(sensor).geometry)
+    poses = np.stack([beside(20.0, depth, 10.0) for depth in (-0.3, 1.0, 2.0)])
+    poses[2, :3, 3] += [0.1, 0.5, 0.0]
+    stretch = np.array([[0.1, 0.02, 0.0], [0.0, -0.05, 0.03], [0.2, 0.1, 0.0]])
+    states = np.arange(3.0)[:, None, None]
+    base, axis = rest.base_mm + states * (rest.base_mm @ stretch.T), rest.axis + 0.1 * states * (rest.axis @ stretch.T)
+    wrench = np.outer(np.arange(3.0), [1.0, 2.0, 3.0])
+    ball = SphereShape(kind="sphere", radius_mm=10.0)
+    path = SolvedPath(ball, 0.4, poses, base, axis, wrench, 2 * wrench, np.ones(3), np.array([0.0, 0.5, 1.0]))
+    sixth = next(g for g in symmetries(sensor.pins.phase_deg) if g.turns == 1 and not g.mirrored)
+    turned, other = sampled(sensor, skin, answer, path, np.pi / 3), _turned(sampled(sensor, skin, answer, path), sixth)
+    for name in turned.__dataclass_fields__:
+        assert np.allclose(getattr(turned, name), getattr(other, name), atol=1e-3), name
+    assert np.abs(turned.force[2]).max() > 0.01
 
 
 def test_every_symmetry_maps_the_lattice_onto_itself():
@@ -342,9 +363,9 @@ def test_a_way_is_gone_straight_and_about_one_axis():
     turns = Rotation.from_rotvec([[0.1, -0.2, 0.05], [-0.3, 0.4, 0.9]])
     start[:3, :3], stop[:3, :3] = turns.as_matrix()
     start[:3, 3], stop[:3, 3] = (1.0, 2.0, 3.0), (2.0, -1.0, 5.0)
-    between = Slerp([0, 1], turns)(np.arange(1, 6) / 5)
+    slerped = Slerp([0, 1], turns)(np.arange(1, 6) / 5)
     way = between(start, stop, 5)
-    np.testing.assert_allclose(way[:, :3, :3], between.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(way[:, :3, :3], slerped.as_matrix(), atol=1e-12)
     np.testing.assert_allclose(way[:, :3, 3], start[:3, 3] + np.arange(1, 6)[:, None] / 5 * (stop[:3, 3] - start[:3, 3]), atol=1e-12)
     np.testing.assert_array_equal(way[-1], stop)
     np.testing.assert_array_equal(between(start, stop, 1), [stop])

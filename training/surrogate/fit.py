@@ -15,7 +15,7 @@ from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of
 from training.surrogate.contact import LinearContacts
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.felt import Contact
-from training.surrogate.model import Surrogate, features, gate, mechanics_of
+from training.surrogate.model import SHIPPED, SUFFIX, Surrogate, features, gate, load_surrogate, mechanics_of
 from training.surrogate.paths import DEEPEST_MM, FRICTION
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
 from training.surrogate.symmetry import Symmetry, ring_directions, symmetries
@@ -31,6 +31,8 @@ from twin.progress import Progress, silent, stage
 from twin.store import Layers, writes_file
 from twin.types import FloatArray, Form
 
+FAMILY = "mg400-331"
+"""Sensor with whose shipped surrogate the network of every other begins."""
 PATHS = 120
 """Solved paths that a surrogate learns from by default: about 5000 states."""
 RADII_MM = (15.0, 25.0)
@@ -137,7 +139,7 @@ def distil(
     with stage(progress, f"contacts of {sensor.name}") as step:
         solved = solve_paths(sensor, range(seed * 100_000, seed * 100_000 + paths), processes=processes, progress=step)
     with stage(progress, "network") as step:
-        surrogate = fit(sensor, solved, progress=step)
+        surrogate = fit(sensor, solved, start=load_surrogate(SHIPPED / f"{FAMILY}{SUFFIX}"), progress=step)
     return Distilled(surrogate, surrogate.save(out), [out])
 
 

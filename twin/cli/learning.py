@@ -371,7 +371,8 @@ HELP_SURROGATE = """Make a fast stand-in for a sensor's finite elements.
 
 Finite elements solve random contacts: plates, balls, cylinders, edges and prisms that press, shear, twist, roll, leave and return. The
 surrogate is the skin at small strain with exact contact and friction at 271 nodes, and a small network for what large deformations
-change. It takes about a thousandth of the time. Every fifth path is only judged with; the errors are printed and kept in the file.
+change. The network begins with that of mg400-331 and learns on. A surrogate takes about a thousandth of the time. Every fifth path is
+only judged with; the errors are printed and kept in the file.
 
 Surrogates of the shipped sensors go with the package; the environments take others by surrogate=FILE.
 

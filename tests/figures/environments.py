@@ -1,0 +1,46 @@
+"""What the shipped surrogates tell of their errors, and how fast the environments step."""
+
+from functools import partial
+from pathlib import Path
+
+import bench_environments
+import numpy as np
+
+from figures.jobs import Measured, Value, job
+from scenes import load_sensor
+from training.surrogate.model import surrogate_of
+
+SENSORS = ("mg400-331", "mg400-127", "ur5-331")
+SECONDS = 2.0
+UNITS = {"pins_px": "px"}
+
+
+def stated_errors(work: Path, *, sensor: str) -> Measured:
+    """Errors on the paths that were kept from the training, of all states and by object; they were measured when it was made."""
+    told = surrogate_of(load_sensor(sensor)).about["errors"]
+    found = {"paths": Value(told["paths"])}
+    for name, part in {"all": told["all"], **told["by"]["object"]}.items():
+        found |= {f"{name}_{key}": Value(part[key], UNITS.get(key, "")) for key in ("pins_px", "pins_share_95", "force_share", "slip")}
+    return found
+
+
+for name in SENSORS:
+    command = f"twin surrogate --sensor {name} --out mine.safetensors"
+    job(f"surrogate.{name}", command, sensors=(name,), code=("training.surrogate",), minutes=0.1)(partial(stated_errors, sensor=name))
+
+
+@job("environments.speed", "tests/bench/bench_environments.py", sensors=("mg400-331",), code=("training.environments",), minutes=2)
+def speed(work: Path) -> Measured:
+    """Steps in a second of one core's time, of the slower task, and on the clock; against a rigid sensor's depth image in the same run."""
+    found = bench_environments.measured(SECONDS)
+    kinds = ("single", f"{bench_environments.ROWS} together")
+    (single, _), (together, clock) = (np.min([found[f"{task} {kind}"] for task in bench_environments.TASKS], axis=0) for kind in kinds)
+    rigid = found["rigid depth image"][0]
+    return {
+        "single": Value(float(single), "1/s"),
+        "together": Value(float(together), "1/s"),
+        "together_clock": Value(float(clock), "1/s"),
+        "fem": Value(float(found["SurfaceFollow fem"][0]), "1/s"),
+        "rigid": Value(float(rigid), "1/s"),
+        "share_of_rigid": Value(float(together / rigid)),
+    }

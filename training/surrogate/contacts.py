@@ -46,7 +46,7 @@ class SurrogateContacts:
         self._field = lru_cache(maxsize=64)(build_field)
         self._before = np.tile(np.eye(4), (count, 1, 1))  # the poses commanded last
         self._known = np.zeros(count, bool)
-        self._depth = np.zeros(count)
+        self._gap = np.full((count, len(surrogate.node_mm)), np.inf)
         self._parts = np.zeros((count, len(modes)), np.float32)
         self._domain = surrogate.domain
         self.felt = Felt.at_rest(count, self._caps_rest)
@@ -78,7 +78,7 @@ class SurrogateContacts:
         friction, soft = law.friction.static, law.compliance_mm_per_n
         self._linear.begin(row, thing, friction, compliance_mm_per_n=soft, turning=law.given_way)
         self._known[row] = False
-        self._depth[row] = 0.0
+        self._gap[row] = np.inf
         self._parts[row] = 0.0
         self.felt.rest(row, self._caps_rest)
 
@@ -110,7 +110,7 @@ class SurrogateContacts:
     @property
     def depth_mm(self) -> FloatArray:
         """(B,) how deep the objects are inside the undeformed domes."""
-        return self._depth
+        return np.maximum(-self._gap.min(axis=1), 0.0)
 
     def _forget(self, rows: IntArray) -> None:
         self._linear.free(rows)
@@ -125,7 +125,7 @@ class SurrogateContacts:
         away = rows[clear]
         linear.free(away)
         self._before[away] = T[clear]
-        self._known[away], self._depth[away] = True, 0.0
+        self._known[away], self._gap[away] = True, np.inf
         if not self._memory:
             self._known[rows] = False
         moves = ~clear & ~(self._known[rows] & (self._before[rows] == T).all(axis=(1, 2)))
@@ -142,7 +142,7 @@ class SurrogateContacts:
         self._before[rows], self._known[rows] = T, True
         there = linear.taken[rows]
         there[:, 2, 3] += linear.compliance_mm_per_n[rows] * self._force(rows)[:, 2]
-        self._depth[rows] = -linear.distances(rows, there)[0].min(axis=1)
+        self._gap[rows] = linear.distances(rows, there)[0]
 
     def _force(self, rows: IntArray) -> FloatArray:
         """Forces (R, 3) of the linear skin on the objects, at the true skin's stiffness."""
@@ -168,8 +168,9 @@ class SurrogateContacts:
         wrench = -np.concatenate([force.sum(axis=1), np.cross(surrogate.node_mm, force).sum(axis=1)], axis=1)
         held, slides = linear.held[rows].sum(axis=1), linear.slides[rows].sum(axis=1)
         slip = slides / np.maximum(held, 1)
-        beside = features(self._depth[rows], linear.friction[rows], held, slip, linear.used[rows], wrench)
-        parts, added = surrogate.correct(force, beside, self._depth[rows])
+        gap, depth = self._gap[rows], self.depth_mm[rows]
+        beside = features(depth, linear.friction[rows], held, slip, linear.used[rows], wrench)
+        parts, added = surrogate.correct(force, beside, gap, depth)
         self._parts[rows] = parts
         felt.caps_mm[rows] = self._caps_rest + (parts @ self._cap_modes).reshape(len(rows), -1, 3)
         felt.force_n[rows] = surrogate.stiffness * wrench[:, :3] + added[:, :3]

@@ -15,7 +15,7 @@ from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of
 from training.surrogate.contact import LinearContacts
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.felt import Contact
-from training.surrogate.model import SHIPPED, SUFFIX, Surrogate, features, gate, load_surrogate, mechanics_of
+from training.surrogate.model import SHIPPED, SUFFIX, VIEWS, Surrogate, features, gate, load_surrogate, mechanics_of, within
 from training.surrogate.paths import DEEPEST_MM, FRICTION
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
 from training.surrogate.symmetry import Symmetry, ring_directions, symmetries
@@ -107,6 +107,7 @@ class _Samples:
     force: FloatArray  # (S, M, 3) float32, of the linear skin
     beside: FloatArray  # (S, FEATURES)
     depth: FloatArray  # (S,)
+    within: FloatArray  # (S, M) float32, see ``within``
     linear: FloatArray  # (S, 6), the linear skin's wrench on the object
     pins: FloatArray  # (S, 2, P, 3), displacements of feet and changes of axes
     wrench: FloatArray  # (S, 6)
@@ -188,19 +189,28 @@ def fit(
     flat = linear_pins.reshape(linear_pins.shape[0] * linear_pins.shape[1] * 3, -1)
     rows = replace(rows, pins=rows.pins * weights)
     group = symmetries(sensor.pins.phase_deg)
-    modes = _modes(rows, group, flat) if start is None else _carried(start, sensor, weights)
+    if start is None:
+        some = [
+            _turned(_some(rows, slice(number, None, max(len(rows.depth) * len(group) // MODE_STATES, 1))), g)
+            for number, g in enumerate(group)
+        ]
+        modes, view = _modes(some, flat), _main(np.concatenate([part.within for part in some]), VIEWS)
+    else:
+        modes, view = _carried(start, sensor, weights), start.view
     read = modes @ flat
     inputs, outputs = [], []
     for g in group:
         part = _turned(rows, g)
-        inputs.append(np.concatenate([part.force.reshape(len(part.force), -1) @ read.T, part.beside], axis=1).astype(np.float32))
+        seen_by = [part.force.reshape(len(part.force), -1) @ read.T, part.beside, part.within @ view.T]
+        inputs.append(np.concatenate(seen_by, axis=1).astype(np.float32))
         lacks = _pins_and_rest(part, flat)[1] @ modes.T
         others = np.column_stack([part.area / 100.0, part.slip])
         outputs.append(np.concatenate([lacks, part.wrench - stiffness * part.linear, others], axis=1).astype(np.float32))
     x, y = np.concatenate(inputs), np.concatenate(outputs)
     if start is None:
         mean, scale = x.mean(axis=0), x.std(axis=0)
-        scale[:MODES] = np.maximum(scale[:MODES], SMALL_SCALE * scale[:MODES].max())
+        for part in (slice(0, MODES), slice(-VIEWS, None)):
+            scale[part] = np.maximum(scale[part], SMALL_SCALE * scale[part].max())
         out_scale = np.concatenate([np.full(MODES, y[:, :MODES].std(axis=0).max()), OTHERS_SCALE]).astype(np.float32)
     else:
         mean, scale, out_scale = start.mean, start.scale, start.out_scale
@@ -225,6 +235,7 @@ def fit(
         answer.astype(np.float32),
         on_pins.astype(np.float32),
         read.astype(np.float32),
+        view,
         stiffness,
         mean,
         scale,
@@ -261,24 +272,28 @@ def sampled(sensor: SensorSpec, skin: Compliance, answer: FloatArray, path: Solv
         linear.move(row, before[None], T[None])
         held = linear.held[0].sum()
         slip = linear.slides[0].sum() / max(held, 1)
-        depth = max(-float(linear.distances(row, T[None])[0].min()), 0.0)
-        states.append((linear.force_n[0].astype(np.float32), depth, held, slip, linear.used[0]))
-    forces, deep, holding, slips, used = (np.array(column) for column in zip(*states, strict=True))
+        gap = linear.distances(row, T[None])[0][0]
+        states.append((linear.force_n[0].astype(np.float32), max(-float(gap.min()), 0.0), within(gap), held, slip, linear.used[0]))
+    forces, deep, near, holding, slips, used = (np.array(column) for column in zip(*states, strict=True))
     wrench = -np.concatenate([forces.sum(axis=1), np.cross(skin.node_mm, forces).sum(axis=1)], axis=1)
     beside = features(deep, np.full(len(deep), path.friction), holding, slips, used, wrench)
     pins = np.stack([path.base_mm - rest.base_mm, path.axis - rest.axis], axis=1)
     if turn_rad:
         pins = _interpolated(-rest.axis @ turn.T, -rest.axis) @ (pins @ turn.T)
     truth = np.concatenate([path.force_n @ turn.T, path.torque_nmm @ turn.T], axis=1)
-    return _Samples(forces, beside, deep, wrench, pins.astype(np.float32), truth, path.area_mm2, path.slip - slips)
+    return _Samples(forces, beside, deep, near, wrench, pins.astype(np.float32), truth, path.area_mm2, path.slip - slips)
 
 
-def _modes(rows: _Samples, group: Sequence[Symmetry], flat: FloatArray) -> FloatArray:
+def _modes(some: Sequence[_Samples], flat: FloatArray) -> FloatArray:
     """Directions (MODES, 6 P) in which the pins move together most, and in which the linear skin (6 P, 3 M) is wrong most."""
-    share = max(len(rows.depth) * len(group) // MODE_STATES, 1)
-    some = [_turned(_some(rows, slice(number, None, share)), g) for number, g in enumerate(group)]
     truth, residual = (np.concatenate(part) for part in zip(*(_pins_and_rest(part, flat) for part in some), strict=True))
-    found: FloatArray = np.linalg.svd(np.concatenate([truth, 3 * residual]), full_matrices=False)[2][:MODES]
+    return _main(np.concatenate([truth, 3 * residual]), MODES)
+
+
+def _main(rows: FloatArray, count: int) -> FloatArray:
+    """The main directions (count, n) of rows (S, n), by their squares."""
+    rows = rows.astype(np.float64)
+    found: FloatArray = np.linalg.eigh(rows.T @ rows)[1][:, ::-1][:, :count].T.astype(np.float32)
     return found
 
 
@@ -371,7 +386,9 @@ def _turned(rows: _Samples, g: Symmetry) -> _Samples:
     """The same states, turned or mirrored."""
     wrench, linear, beside = (_turned_wrench(values, g) for values in (rows.wrench, rows.linear, rows.beside))
     pins = np.stack([g.moved(rows.pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
-    return replace(rows, force=g.moved(rows.force, NODE_RINGS), beside=beside, linear=linear, pins=pins, wrench=wrench)
+    near = np.empty_like(rows.within)
+    near[:, g.places(NODE_RINGS)] = rows.within
+    return replace(rows, force=g.moved(rows.force, NODE_RINGS), beside=beside, within=near, linear=linear, pins=pins, wrench=wrench)
 
 
 def _turned_wrench(values: FloatArray, g: Symmetry) -> FloatArray:

@@ -2,11 +2,12 @@
 
 Of one contact, with the forces f at the linear skin's nodes,
 
-    pins = rest + modes (R f + gate(depth) net(R f, features)),   force = stiffness (-sum f) + gate net,
+    pins = rest + modes (R f + gate(depth) net(R f, V g, features)),   force = stiffness (-sum f) + gate net,
 
-where R is the linear skin's answer in the modes, and the gate goes to zero with the depth: a sensor that touches nothing is exactly at
-rest. The features are depth, friction, nodes that press and slide, the share of Coulomb's bound that is borne, force and torque of the
-linear skin. What happened before is in f alone, so the network has no memory of its own that could drift.
+where R is the linear skin's answer in the modes, V g tells where the object is (its distances from the nodes at rest, in their main
+directions), and the gate goes to zero with the depth: a sensor that touches nothing is exactly at rest. The features are depth, friction,
+nodes that press and slide, the share of Coulomb's bound that is borne, force and torque of the linear skin. What happened before is in f
+alone, so the network has no memory of its own that could drift.
 """
 
 from collections.abc import Mapping
@@ -36,6 +37,10 @@ UNFELT = ("stiffness_factor",)
 """Keys that say how sure the others are: no contact depends on them."""
 FEATURES = 13
 """Numbers beside the modes that the network sees."""
+VIEWS = 32
+"""Directions of the object's distances that it sees."""
+VIEW_MM = 1.0
+"""Parts of an object farther than this from the undeformed skin are not seen."""
 WRENCH_SCALE = np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
 """N and N mm that count as 1."""
 BESIDE = 8
@@ -65,9 +70,11 @@ class Surrogate:
         Displacements of the pins' feet, mm, and changes of their axes.
     read : (K, 3 M) float32
         The linear skin's answer in the modes.
+    view : (VIEWS, M) float32
+        Directions in which the network sees the object.
     stiffness : float
         Force of the true skin over that of the linear one.
-    mean, scale : (K + FEATURES,) float32
+    mean, scale : (K + FEATURES + VIEWS,) float32
         Of the network's inputs.
     layers : tuple of ((o, i), (o,)) float32
         The network's weights and offsets.
@@ -79,6 +86,7 @@ class Surrogate:
     answer: FloatArray
     modes: FloatArray
     read: FloatArray
+    view: FloatArray
     stiffness: float
     mean: FloatArray
     scale: FloatArray
@@ -95,10 +103,13 @@ class Surrogate:
         """Ends of what it was trained on: depth (mm), angle from the apex (deg) and friction."""
         return {key: float(value) for key, value in self.about["domain"].items()}
 
-    def correct(self, force_n: FloatArray, beside: FloatArray, depth_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coefficients of the modes (R, K), and what is added to the others (R, BESIDE), for node forces (R, M, 3)."""
+    def correct(self, force_n: FloatArray, beside: FloatArray, gap_mm: FloatArray, depth_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Coefficients of the modes (R, K), and what is added to the others (R, BESIDE).
+
+        ``force_n`` (R, M, 3): at the nodes; ``gap_mm`` (R, M): distances of the object from the nodes at rest.
+        """
         linear = force_n.reshape(len(force_n), -1).astype(np.float32) @ self.read.T
-        x = (np.concatenate([linear, beside.astype(np.float32)], axis=1) - self.mean) / self.scale
+        x = (np.concatenate([linear, beside.astype(np.float32), within(gap_mm) @ self.view.T], axis=1) - self.mean) / self.scale
         for number, (weights, offset) in enumerate(self.layers):
             x = x @ weights.T + offset
             if number < len(self.layers) - 1:
@@ -116,7 +127,7 @@ class Surrogate:
 
     def _arrays(self) -> dict[str, FloatArray]:
         whole = {"stiffness": np.array([self.stiffness]), "mean": self.mean, "scale": self.scale, "out_scale": self.out_scale}
-        half = {"modes": self.modes, "read": self.read, "answer": self.answer[representatives(self.phase_deg)]}
+        half = {"modes": self.modes, "read": self.read, "view": self.view, "answer": self.answer[representatives(self.phase_deg)]}
         for key, value in layers_to(self.layers).items():
             (half if key.endswith("weights") else whole)[key] = value
         return {key: value.astype(np.float32) for key, value in whole.items()} | {
@@ -132,6 +143,11 @@ def features(
     return np.column_stack(
         [depth_mm, depth_mm**2 / 5.0, rub, np.minimum(friction, 1.5) * depth_mm, held / 10.0, slip, used, wrench / WRENCH_SCALE]
     )
+
+
+def within(gap_mm: FloatArray) -> FloatArray:
+    """How far the object is within sight of the nodes at rest, (R, M) float32."""
+    return np.maximum(VIEW_MM - gap_mm, 0.0).astype(np.float32)
 
 
 def gate(depth_mm: FloatArray) -> FloatArray:
@@ -178,6 +194,7 @@ def _of_arrays(about: dict[str, Any], arrays: Mapping[str, FloatArray]) -> Surro
         unfolded(arrays["answer"], phase),
         arrays["modes"],
         arrays["read"],
+        arrays["view"],
         float(arrays["stiffness"][0]),
         arrays["mean"],
         arrays["scale"],

@@ -62,10 +62,7 @@ class SurrogateContacts:
         if not (contact.law.given_way is None or isinstance(contact.law.given_way, ArmTurning)):
             raise outside(f"the arm gives way to {touched.name} in a way of its own")
         if friction.static > self._domain["friction"]:
-            low, high = self._surrogate.about["trained_friction"]
-            raise outside(
-                f"a friction of {friction.static:g}, at most {self._domain['friction']:g} is taken ({low:g} to {high:g} was trained)"
-            )
+            raise outside(f"a friction of {friction.static:g}, at most {self._domain['friction']:g} was trained")
         if contact.sensor is not self._sensor and mechanics_of(contact.sensor) != self._surrogate.about["mechanics"]:
             raise outside("the skin, gel, lens or pins of the sensor are drawn anew; randomise friction, camera and noise only ('moves')")
 

@@ -16,7 +16,7 @@ from training.surrogate.contact import LinearContacts
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.felt import Contact
 from training.surrogate.model import SHIPPED, SUFFIX, VIEWS, Surrogate, features, gate, load_surrogate, mechanics_of, within
-from training.surrogate.paths import DEEPEST_MM, FRICTION
+from training.surrogate.paths import DEEPEST_MM, STICKING
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
 from training.surrogate.symmetry import Symmetry, ring_directions, symmetries
 from twin.camera.projection import project
@@ -41,7 +41,7 @@ LEAST_PATHS = 10
 """Fewer paths teach nothing."""
 JUDGED = 5
 """Every path of this number is kept out of the training and judged with."""
-TURNS = 3
+TURNS = 2
 """Times that each solved path is learnt from, turned by other angles about the axis: its contacts lie elsewhere between the nodes then."""
 MODE_STATES = 3000
 """States from which the modes are found."""
@@ -49,19 +49,21 @@ AXIS_MM = 0.9
 """Length of a pin by which changes of its axis count as motion where modes are sought: about that of the shipped sensors."""
 MODES = 64
 """Modes of the pins' motion: what they leave out is 0.01 mm on average."""
-WIDTH = 128
+WIDTH = 192
 """Neurons of each of the network's two hidden layers."""
-EPOCHS = 10
+EPOCHS = 36
 BATCH = 512
 RATE = 3e-3
 """Largest rate of Adam, in a cycle; of a network that learns on, a third of it."""
-DECAY = 0.02
+DECAY = 0.005
 """Decay of the weights."""
+DEEPEST_TAKEN_MM = DEEPEST_MM + 0.5
+"""Largest indentation that is taken."""
 POLAR_DEG = 48.0
 """Largest angle of a contact's deepest place from the apex: paths begin within 35 deg and go on from there."""
 OTHERS_SCALE = (*(0.5,) * 3, *(5.0,) * 3, 1.0, 1.0)
 """Errors of force (N), torque (N mm), area (100 mm2) and sliding share that count as much as a usual one of the modes."""
-LEAST_MOVED_MM = 0.5
+LEAST_MOVED_MM = 1.0
 """States count by the square of one over their largest motion of a pin; below this they count alike."""
 SMALL_SCALE = 0.02
 """No input of the network is scaled by less than this share of the largest."""
@@ -174,6 +176,7 @@ def fit(
     """
     torch.manual_seed(0)
     torch.set_num_threads(1)
+    solved, extra = ([cut(path, sensor.skin.outer_radius_mm) for path in paths] for paths in (solved, extra))
     seen = [path for number, path in enumerate(solved) if number % JUDGED] + list(extra)
     kept = [path for number, path in enumerate(solved) if not number % JUDGED]
     skin = compliance_of(lattice_sensor(sensor))
@@ -224,8 +227,7 @@ def fit(
     about = {
         "sensor": sensor.name,
         "mechanics": mechanics_of(sensor),
-        "domain": {"depth_mm": DEEPEST_MM + 0.5, "polar_deg": POLAR_DEG, "friction": 3.0},
-        "trained_friction": list(FRICTION),
+        "domain": {"depth_mm": DEEPEST_TAKEN_MM, "polar_deg": POLAR_DEG, "friction": STICKING},
         "paths": len(solved) + len(extra),
         "states": int(sum(len(path.T) for path in (*solved, *extra))),
     }
@@ -244,6 +246,20 @@ def fit(
     ).as_kept()  # so that the errors are those of the file, which rounds
     about["errors"] = judge(made, sensor, kept)
     return made
+
+
+def cut(path: SolvedPath, radius_mm: float) -> SolvedPath:
+    """A path up to where it leaves the domain on a dome of this radius: what comes then, however large, is nothing to learn from."""
+    thing = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
+    inside = len(path.T)
+    for number, T in enumerate(path.T):
+        distance, outward, _ = thing.probe(-T[:3, 3][None] @ T[:3, :3])
+        depth = radius_mm - float(distance[0])
+        if depth > DEEPEST_TAKEN_MM or (depth > 0 and -T[2, :3] @ outward[0] < np.cos(np.radians(POLAR_DEG))):
+            inside = number
+            break
+    states = {name: getattr(path, name)[:inside] for name in ("T", "base_mm", "axis", "force_n", "torque_nmm", "area_mm2", "slip")}
+    return replace(path, **states)
 
 
 def averaged(nodes: FloatArray, phase_deg: float) -> FloatArray:

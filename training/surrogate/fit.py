@@ -212,8 +212,8 @@ def fit(
     x, y = np.concatenate(inputs), np.concatenate(outputs)
     if start is None:
         mean, scale = x.mean(axis=0), x.std(axis=0)
-        for part in (slice(0, MODES), slice(-VIEWS, None)):
-            scale[part] = np.maximum(scale[part], SMALL_SCALE * scale[part].max())
+        for columns in (slice(0, MODES), slice(-VIEWS, None)):
+            scale[columns] = np.maximum(scale[columns], SMALL_SCALE * scale[columns].max())
         out_scale = np.concatenate([np.full(MODES, y[:, :MODES].std(axis=0).max()), OTHERS_SCALE]).astype(np.float32)
     else:
         mean, scale, out_scale = start.mean, start.scale, start.out_scale

@@ -6,7 +6,7 @@ have such a folder inside: ``contacts``.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -113,6 +113,12 @@ class ContactEstimator:
     def at_known_rest(self) -> "ContactEstimator":
         """As of ``PoseEstimator``."""
         return self._with({name: part.at_known_rest() for name, part in self.parts.items()})
+
+    def at_rest_of(self, frames: Iterable[Frame]) -> tuple["ContactEstimator", bool]:
+        """As of ``PoseEstimator``."""
+        looked = list(frames)
+        told = {name: part.at_rest_of(looked) for name, part in self.parts.items()}
+        return self._with({name: part for name, (part, _) in told.items()}), any(other for _, other in told.values())
 
     def _with(self, parts: dict[str, PoseEstimator]) -> "ContactEstimator":
         found = copy(self)

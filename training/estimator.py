@@ -1,7 +1,7 @@
 """A trained model with its sensor and its pipeline: a frame goes in, a pose comes out. This is what a live loop calls."""
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -15,6 +15,7 @@ from scenes.sensor import SensorSpec
 from training.assemble import Ensemble
 from training.contact_maps import MAPS, MapModel, read_maps
 from training.dataset import Dataset
+from training.displacements import DISPLACEMENTS, Displacements, other_rest, read_displacements
 from training.models import model_named
 from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
@@ -100,6 +101,8 @@ class PoseEstimator:
         What makes contact maps; None unless the run learnt them.
     slip : SlipModel or None
         What tells slip from a sequence of frames; None unless the run learnt it.
+    displacements : Displacements or None
+        How contacts can displace the pins, which tells the rest places of a unit without a no-contact frame; None unless the run learnt it.
 
     Raises
     ------
@@ -125,6 +128,7 @@ class PoseEstimator:
         self._trained = Trained(self.sensor, self.pipeline, reference, learnt, self.ensemble)
         self.maps: MapModel | None = None
         self.slip: SlipModel | None = None
+        self.displacements: Displacements | None = None
         self._tracker: SlipTracker | None = None
 
     @classmethod
@@ -159,6 +163,8 @@ class PoseEstimator:
             found.maps = read_maps(run / MAPS, found.sensor.geometry)
         if (run / SLIP).is_file():
             found.slip = read_slip(run / SLIP)
+        if (run / DISPLACEMENTS).is_file():
+            found.displacements = read_displacements(run / DISPLACEMENTS, found.sensor.pins.count)
         return found
 
     @property
@@ -214,6 +220,26 @@ class PoseEstimator:
     def at_known_rest(self) -> "PoseEstimator":
         """The same model for frames of the unit that its weights are for, where there is no frame without contact."""
         return self._counted_from(nominal_reference(self.recorded_sensor, self.form)) if self._known_rest_px is not None else self
+
+    def other_rest(self, start: Reference, nodes_px: np.ndarray) -> Reference | None:
+        """The rest layout that contacts with their pins (M, N, 2) tell, where it is another than ``start``, from which they are counted.
+
+        None where it is the same, as far as contacts tell, where they are fewer than ``training.displacements.FEWEST_CONTACTS``, or where
+        the run did not learn how contacts displace pins.
+        """
+        found = other_rest(self.displacements, start, nodes_px) if self.counts_from_rest else None
+        return None if found is None else make_reference(found, self.sensor.pins)
+
+    def at_rest_of(self, frames: Iterable[Frame]) -> tuple["PoseEstimator", bool]:
+        """The model for the sensor that took ``frames`` of contacts, where no frame shows it without contact, and whether it is another.
+
+        Its rest places are those that were measured on the unit of the weights, unless the contacts tell others: see ``other_rest``.
+        """
+        estimator = self.at_known_rest()
+        graphs = [seen.graph for frame in frames if (seen := estimator.pipeline(frame)).valid]
+        nodes_px = np.array([graph.nodes_px for graph in graphs if graph is not None]).reshape(-1, self.sensor.pins.count, 2)
+        other = estimator.other_rest(estimator.pipeline.reference, nodes_px)
+        return (estimator, False) if other is None else (estimator._counted_from(other), True)
 
     def with_intervals(self, intervals: Mapping[str, np.ndarray]) -> "PoseEstimator":
         """The same model with other interval quantiles, as ``training.evaluate.intervals_on`` finds them for one kind of its frames."""

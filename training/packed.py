@@ -17,6 +17,7 @@ from safetensors.numpy import load, save
 
 from scenes.sensor import SensorSpec
 from training.contact_maps import MAPS
+from training.displacements import DISPLACEMENTS
 from training.identity import ASIDE
 from training.models import model_named
 from training.recipes import TrainingError
@@ -45,7 +46,7 @@ def shipped_names() -> list[str]:
     return sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS}"))
 
 
-@writes(WEIGHTS, "config.json", MAPS, SLIP)
+@writes(WEIGHTS, "config.json", MAPS, SLIP, DISPLACEMENTS)
 def pack(run: Path, out: Path) -> int:
     """Write the small copy of a finished run, and return its size in bytes.
 
@@ -81,7 +82,7 @@ def pack(run: Path, out: Path) -> int:
     about = {key: value for key, value in config.items() if key not in ASIDE} | {SHA256: hashlib.sha256(weights).hexdigest()}
     about |= {RECORDINGS: [Path(folder).name for folder in config.get("data", "").split(", ") if folder]}
     write_text(out / CONFIG, json.dumps(about) + "\n")
-    for name in (MAPS, SLIP):
+    for name in (MAPS, SLIP, DISPLACEMENTS):
         if (run / name).is_file():
             write_bytes(out / name, (run / name).read_bytes())
     return (out / WEIGHTS).stat().st_size

@@ -10,9 +10,10 @@ import torch
 from scenes import SensorSpec
 from training.contact_maps import FEWEST_STATES, MAPS, learn_maps, write_maps
 from training.dataset import Dataset, joined, load_dataset, told_apart, with_common_labels
+from training.displacements import DISPLACEMENTS, learn_displacements, write_displacements
 from training.estimator import PoseEstimator
 from training.loop import epoch_step
-from training.models import recipe_of
+from training.models import model_named, recipe_of
 from training.models.touch.model import TOUCH
 from training.networks import choose_device
 from training.run import RUN_FILES, RunConfig, train_run, training_rows
@@ -27,7 +28,7 @@ from twin.types import Form
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helpers of its other labels
 SHEAR_HELPERS = ("move_1", "move_6")  # these moves
-FILES = (CONFIG, "curves.csv", TENSORS, MAPS, SLIP)  # of a finished run
+FILES = (CONFIG, "curves.csv", TENSORS, MAPS, SLIP, DISPLACEMENTS)  # of a finished run
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class Trained:
         return lines
 
 
-@writes(*RUN_FILES, MAPS, SLIP, gone_on=(CHECKPOINT,))
+@writes(*RUN_FILES, MAPS, SLIP, DISPLACEMENTS, gone_on=(CHECKPOINT,))
 def train_model(
     model: str,
     sensor: SensorSpec,
@@ -142,6 +143,8 @@ def train_model(
             found.problems.extend(add_maps(out, config, found))
         with stage(progress, "slip"):
             found.problems.extend(add_slip(out, config, parts))
+    if finished:
+        add_displacements(out, config, found)
     return Trained(out, finished, len(found), found.targets.names, labels, found.problems)
 
 
@@ -159,6 +162,18 @@ def add_maps(run: Path, config: RunConfig, data: Dataset) -> list[str]:
         return [f"{len(rows)} contact states are too few to learn contact maps from ({FEWEST_STATES} are needed): the run has none"]
     write_maps(run / MAPS, learn_maps(estimator.modes_of(data.pins), data, rows, seed=config.seed))
     return []
+
+
+def add_displacements(run: Path, config: RunConfig, data: Dataset) -> None:
+    """Learn how contacts displace the pins from the frames that a finished run learnt from, and write it beside its weights.
+
+    Nothing is written where the model does not count pins from rest, their places at rest were not measured, or frames are few.
+    """
+    if not (model_named(config.model).counts_from_rest and data.pins.measured):
+        return
+    pins = data.in_order().pins.rows(training_rows(config, data.in_order()))
+    if (known := learn_displacements(pins.nodes_px - pins.reference.pins_px)) is not None:
+        write_displacements(run / DISPLACEMENTS, known)
 
 
 def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str]:

@@ -15,6 +15,7 @@ from figures.jobs import FiguresError, Measured, Value, job, read, real_folder, 
 from training.dataset import load_dataset
 from training.estimator import PoseEstimator
 from training.evaluate import judge
+from training.studies.evaluation import at_own_rest
 from training.studies.tac_vgnn.models import measure_training
 
 SETS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
@@ -120,7 +121,7 @@ def shipped_on_frames(work: Path) -> Measured:
 
 def without_no_contact(work: Path, *, sensor: str) -> Measured:
     """Shipped weights on some frames of their recording: with its no-contact frame, with the rest places that were measured on this unit
-    before, and with the specification's alone, as of a unit that was never measured; and the two ratios."""
+    before, with the specification's alone, as of a unit that was never measured, and with those that its contacts tell; and the ratios."""
     source, estimator = real_folder(SETS[sensor]), PoseEstimator.load(sensor)
     frames = sorted((source / "frames_bw").glob("*.png"))
     chosen = np.random.default_rng(5).choice(len(frames), WITHHELD_ON, replace=False)
@@ -138,9 +139,13 @@ def without_no_contact(work: Path, *, sensor: str) -> Measured:
         for name in beside:
             shutil.copy2(source / name, folder)
         data = load_dataset(folder, known, estimator.names, form=estimator.form)
-        rows = np.flatnonzero(data.pins.valid)
-        judged = judge(estimator.predict_rows(data, rows), data, rows)["corrected"]
-        errors[case] = {unit: judged[name]["mae"] for name, unit in UNITS.items()}
+        cases = {case: data}
+        if case == "never_measured":
+            cases["told_by_contacts"] = at_own_rest(estimator, data)
+        for which, counted in cases.items():
+            rows = np.flatnonzero(counted.pins.valid)
+            judged = judge(estimator.predict_rows(counted, rows), counted, rows)["corrected"]
+            errors[which] = {unit: judged[name]["mae"] for name, unit in UNITS.items()}
     found = {f"{case}_{unit}": Value(error, unit) for case, by in errors.items() for unit, error in by.items()}
     times = {f"{case}_{unit}_times": Value(errors[case][unit] / errors["given"][unit]) for case in errors for unit in UNITS.values()}
     return found | times

@@ -42,3 +42,12 @@ def test_a_label_that_the_experiment_varies_must_not_be_missing(tmp_path):
     with pytest.raises(FrameError, match=r"no label pose_6, which the experiment edge-circle varies \(found .*pose_3\).*--experiment"):
         read_arm_labels(found, load_experiment("edge-circle"))
     assert len(read_arm_labels(found)) == 2
+
+
+def test_a_label_that_varies_though_the_experiment_holds_it_is_said(tmp_path):
+    """A twist that no experiment has looks like noise of the pins, and no model that learns from simulated contacts knows it."""
+    table = "image_name,pose_3,pose_4,pose_5,move_1,move_6\na.png,3,1,2,0.02,-8\nb.png,4,2,3,0.01,7\n"
+    found = recording(tmp_path, table)
+    read_arm_labels(found, load_experiment("surface-3d"))
+    (said,) = found.problems
+    assert said.startswith("move_6 varies in the table, and not in the experiment surface-3d"), said

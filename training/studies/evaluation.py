@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from training.contact_estimator import ContactEstimator, contacts_folder
 from training.contact_maps import judge_maps
 from training.dataset import Dataset, joined, load_dataset, told_apart
+from training.displacements import MOST_CONTACTS
 from training.estimator import PoseEstimate, PoseEstimator, folder_of
 from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
 from training.identity import changed_since, learnt_before
@@ -19,10 +20,10 @@ from training.simulated import is_simulated
 from training.slip import Eyes, drags_of, gone_through, judge_slip, random_places
 from twin.camera.projection import project
 from twin.errors import FrameError
-from twin.frames import Recording, open_recording
+from twin.frames import Recording, evenly_read, open_recording
 from twin.frames.forms import from_raw
 from twin.mechanics.skin_map import ContactMaps
-from twin.pins.batch import UNMEASURED, recording_reference
+from twin.pins.batch import recording_reference
 from twin.progress import Progress, silent, stage
 from twin.report.contact_maps import SkinPicture, draw_contact_maps
 from twin.report.table import write_table
@@ -33,6 +34,11 @@ from twin.types import Frame
 ROWS = ("validation", "all")
 # Choices of the labels that count as truth.
 LABELS = ("corrected", "raw")
+# What is said where the contacts of a recording without a no-contact frame tell other rest places than those of the weights' own unit.
+OTHER_UNIT = (
+    "the pins at rest were found from the contacts: they are not where they were measured on the unit that the weights are for, so this is "
+    "another unit, or its camera or tip was touched; one frame without contact (init_0.png beside the frames) is more exact"
+)
 # Length along which the direction of a shear traction is seen in the frame.
 ARROW_MM = 1e-3
 
@@ -176,8 +182,9 @@ def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = N
         if recording.reference is not None:
             estimator = estimator.at_rest(recording.reference)
         else:
-            _, named = recording_reference(estimator.recorded_sensor, recording, recording.problems)
-            estimator = estimator if named == UNMEASURED else estimator.at_known_rest()
+            recording_reference(estimator.recorded_sensor, recording, recording.problems)
+            estimator, other = estimator.at_rest_of(evenly_read(recording, MOST_CONTACTS))
+            recording.problems += [OTHER_UNIT] if other else []
     if maps is not None:
         if not isinstance(estimator, PoseEstimator):
             raise TrainingError(f"{run}: models of several kinds of contact have no contact maps; leave --maps out")
@@ -190,6 +197,18 @@ def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = N
             )
         estimator = estimator.remembering()
     return Predictions(estimator, recording, maps)
+
+
+def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
+    """A recording without a no-contact frame, counted from where its contacts tell that its pins are at rest; others as they are."""
+    if not estimator.counts_from_rest or is_simulated(data.folder):
+        return data
+    if open_recording(data.folder, estimator.sensor, estimator.form).reference is not None:
+        return data
+    other = estimator.other_rest(data.pins.reference, data.pins.nodes_px)
+    if other is None:
+        return data
+    return replace(data, pins=replace(data.pins, reference=other), problems=[*data.problems, OTHER_UNIT])
 
 
 def _said(made: PoseEstimate) -> str:
@@ -316,7 +335,8 @@ def evaluate_run(
         estimator = several.parts[kinds[0]]
     for folder in recordings:
         with stage(progress, f"frames of {folder.name}") as step:
-            parts.append(load_dataset(folder, estimator.recorded_sensor, estimator.names, form=estimator.form, progress=step))
+            part = load_dataset(folder, estimator.recorded_sensor, estimator.names, form=estimator.form, progress=step)
+            parts.append(at_own_rest(estimator, part))
     found = joined(parts)
     chosen = rows_to_judge(estimator, found, rows)
     if rows == "validation":

@@ -19,6 +19,7 @@ from twin.frames.tables import bare_name, counted, numbers, pair_rows, read_tabl
 
 EXECUTED_FILES = ("labels_corrected.csv", "move_executed.csv")  # in the order in which they are looked for
 EXECUTED_COLUMNS = ("executed", "executed_estimate")
+HELD = 0.5  # mm or deg within which a label that an experiment does not vary may scatter, as where an arm reports its pose
 NOT_USED = "it is not used, and every move counts as executed"
 
 
@@ -76,9 +77,21 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
     if odd.any():
         names = [recording.names[k] for k in np.flatnonzero(odd)[:3]]
         raise FrameError(f"{recording.path}: {odd.sum()} rows hold no number in a pose or move ({', '.join(names)}); mend or remove them")
+    if experiment is not None and (fixed := _varied_beyond(experiment, values)):
+        recording.problems.append(
+            f"{', '.join(fixed)} varies in the table, and not in the experiment {experiment.name}: what is simulated by this experiment "
+            "lacks it; give the experiment that the frames were recorded with, or add the range to it"
+        )
     executed = read_executed(Path(recording.path), recording.names, recording.problems)
     done = [executed.get(name, 1.0) > 0.5 for name in recording.names]
     return [ArmLabel(*row) for row in zip(values["pose"], values["move"], done, strict=True)]
+
+
+def _varied_beyond(experiment: ExperimentSpec, values: dict[str, np.ndarray]) -> list[str]:
+    """Labels that vary in a table, by kind (M, 6), though the experiment holds them."""
+    ranges = experiment.ranges()
+    named = {f"{kind}_{axis + 1}": each[:, axis] for kind, each in values.items() for axis in range(6)}
+    return [name for name, each in named.items() if ranges[name][0] == ranges[name][1] and np.ptp(each) > HELD]
 
 
 def plate_slope(rig: RigSpec | None) -> float:

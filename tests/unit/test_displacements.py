@@ -1,0 +1,82 @@
+"""Places of the pins at rest that contacts alone tell, by what contacts can do to the pins."""
+
+import numpy as np
+import pytest
+
+from scenes.pins import PinsSpec
+from training.displacements import (
+    FEWEST_CONTACTS,
+    FEWEST_FRAMES,
+    learn_displacements,
+    other_rest,
+    read_displacements,
+    rest_from_contacts,
+    write_displacements,
+)
+from training.recipes import TrainingError
+from twin.geometry.pins import pin_lattice
+from twin.pins import make_reference
+
+PINS = PinsSpec(rings=4)
+START = make_reference(150 * pin_lattice(PINS).places + 200, PINS)
+PITCH = float(np.median(START.spacing_px))
+
+
+def contacts(count, seed, *, depth=(0.0, 1.0)):
+    """Displacements (count, N, 2) by a depth, a place and a shear, as a dome's pins move: curved in all of them."""
+    rng = np.random.default_rng(seed)
+    r = (START.pins_px - START.pins_px.mean(axis=0)) / np.abs(START.pins_px - START.pins_px.mean(axis=0)).max()
+    moved = []
+    for _ in range(count):
+        z, place, shear = rng.uniform(*depth), rng.uniform(-0.4, 0.4, 2), rng.uniform(-0.5, 0.5, 2)
+        near = np.exp(-((r - place) ** 2).sum(axis=1) / (0.2 + 0.5 * z))[:, None]
+        moved.append(PITCH * near * (z * (r - place) + np.sqrt(z + 0.1) * shear))
+    return np.array(moved)
+
+
+@pytest.fixture(scope="module")
+def known():
+    return learn_displacements(contacts(FEWEST_FRAMES, 0))
+
+
+@pytest.fixture(scope="module")
+def other_unit():
+    """Rest places of another unit: its camera sits otherwise, and its pins are not where they were drawn."""
+    off = 0.02 * (START.pins_px - START.pins_px.mean(axis=0)) + [0.1 * PITCH, -0.05 * PITCH]
+    return START.pins_px + off + np.random.default_rng(1).normal(0, 0.02 * PITCH, START.pins_px.shape)
+
+
+@pytest.mark.parametrize("depth", [(0.0, 1.0), (0.6, 1.0)], ids=["as learnt", "deep ones alone"])
+def test_contacts_without_labels_tell_where_another_units_pins_are_at_rest(known, other_unit, depth):
+    """A mean of the frames would be wrong by the mean displacement."""
+    moved = contacts(FEWEST_CONTACTS, 2, depth=depth)
+    found = rest_from_contacts(known, START, other_unit + moved)
+    off, before, mean = (np.sqrt(np.mean((px - other_unit) ** 2)) for px in (found.pins_px, START.pins_px, other_unit + moved.mean(axis=0)))
+    assert off < 0.25 * before and off < 0.5 * mean, (off, before, mean)
+    assert found.left_px < 0.03 * PITCH
+
+
+def test_the_same_unit_keeps_its_places_and_few_contacts_tell_nothing(known, other_unit):
+    moved = contacts(FEWEST_CONTACTS, 3)
+    assert other_rest(known, START, START.pins_px + moved) is None
+    assert other_rest(known, START, other_unit + moved[1:]) is None
+    assert other_rest(None, START, other_unit + moved) is None
+    told = other_rest(known, START, other_unit + moved)
+    assert told is not None and told.shape == START.pins_px.shape
+
+
+def test_displacements_survive_their_file_and_another_sensors_are_refused(known, tmp_path):
+    path = tmp_path / "displacements.safetensors"
+    write_displacements(path, known)
+    again = read_displacements(path, PINS.count)
+    at = np.random.default_rng(4).normal(size=(5, len(known.scale)))
+    assert np.abs(again.at(at) - known.at(at)).max() < 2e-3 * np.abs(known.at(at)).max()
+    with pytest.raises(TrainingError, match=r"displacements\.safetensors.*train again"):
+        read_displacements(path, 331)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(TrainingError, match=r"displacements\.safetensors"):
+        read_displacements(path, PINS.count)
+
+
+def test_few_frames_teach_no_displacements():
+    assert learn_displacements(contacts(FEWEST_FRAMES - 1, 0)) is None

@@ -1,0 +1,226 @@
+"""How the pins of a kind of sensor can be displaced, learnt without labels, and the pins' places at rest that it tells of another unit.
+
+What contacts can do to the pins is little: a few numbers (depth, tilt, shear) tell nearly all of it. With the leading principal
+coordinates a (D,) of the displacements, in standard deviations, the displacement u (2N,) is
+
+    u = mean + sum_k a_k scale_k mode_k + sum_j w_j(a) mode_(D + j) + what is left
+
+where w are polynomials of the third degree. A unit whose pins at rest are not known shows p = r + u(a) in each frame. Its rest places r
+(2N,) and all a follow together by least squares (Gauss-Newton): because u is curved, the part of r that looks like a contact is told too,
+which no mean of the frames tells.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from training.run_files import damaged
+from twin.pins import Reference
+from twin.store import write_bytes
+
+DISPLACEMENTS = "displacements.safetensors"
+"""File of a run that holds what its pins' displacements can be."""
+LEADING, MODES, DEGREE = 6, 40, 3
+"""Leading coordinates, modes in all, degree of the polynomials that tell the other modes.
+Of 3,400 frames of 331 pins they leave 0.12 of 3.8 px."""
+FEWEST_FRAMES = 400
+"""With fewer frames displacements are not learnt: the polynomials have 78 terms."""
+MOST_FRAMES = 4000
+"""Frames that displacements are learnt from at most."""
+RIDGE = 1e-3
+"""Penalty of the polynomials' coefficients, per frame."""
+FEWEST_CONTACTS, MOST_CONTACTS = 40, 120
+"""Frames from which rest places are told: with 40 they are 0.1 px off, with 120 0.03 px (331 pins); more change nothing."""
+SAME_UNIT = 0.02
+"""Rest places that are nearer than this to those that are known, rms in spacings, are taken for the same: those are more exact.
+Of one unit 40 contacts tell them within 0.011; two units of one drawing differ by 0.03 and more."""
+SMOOTH, ALONE = 0.13, 0.03
+"""Prior deviation of a unit's pins from the specification's places, in spacings: of a smooth change of place, and of each pin by itself."""
+NOISE = 0.007
+"""Least noise of a pin, in spacings."""
+SETTLE, MOST_ROUNDS, SETTLED = 6, 20, 3e-4
+"""Rounds in which the contacts alone are sought first, most rounds after them, and the change, in spacings, at which they end."""
+LONGEST_STEP = 0.7
+"""Most that a coordinate changes in a round."""
+
+
+@dataclass(frozen=True)
+class Displacements:
+    """What displacements of N pins can be; arrays as in the module's equation, px.
+
+    Attributes
+    ----------
+    mean : (2N,) float
+    modes : (K, 2N) float
+        Orthonormal.
+    scale : (D,) float
+    weights : (T, K - D) float
+        Of the constant and the products of two and three coordinates.
+    left : (K - D, K - D) float
+        Covariance of what is left in these modes, px^2.
+    noise : float
+        Standard deviation of what is left beside them.
+    """
+
+    mean: np.ndarray
+    modes: np.ndarray
+    scale: np.ndarray
+    weights: np.ndarray
+    left: np.ndarray
+    noise: float
+
+    def at(self, a: np.ndarray) -> np.ndarray:
+        """Displacements (M, 2N) at coordinates (M, D)."""
+        lead = len(self.scale)
+        found: np.ndarray = self.mean + (a * self.scale) @ self.modes[:lead] + _terms(a) @ self.weights @ self.modes[lead:]
+        return found
+
+    def slopes(self, a: np.ndarray, step: float = 1e-4) -> np.ndarray:
+        """Derivatives (M, 2N, D) of the displacements by the coordinates (M, D)."""
+        steps = step * np.eye(a.shape[1])
+        return np.stack([(self.at(a + h) - self.at(a - h)) / (2 * step) for h in steps], axis=2)
+
+    def precision(self, least: float) -> np.ndarray:
+        """Inverse covariance (2N, 2N) of what the equation leaves, with at least this noise, px, of each coordinate."""
+        others = self.modes[len(self.scale) :]
+        whole: np.ndarray = np.linalg.inv(others.T @ self.left @ others + (self.noise**2 + least**2) * np.eye(others.shape[1]))
+        return (whole + whole.T) / 2
+
+
+@dataclass(frozen=True)
+class RestFound:
+    """Pins' places at rest that contacts tell.
+
+    Attributes
+    ----------
+    pins_px : (N, 2) float
+    left_px : float
+        What the displacements leave of the frames, rms of a coordinate.
+    """
+
+    pins_px: np.ndarray
+    left_px: float
+
+
+def learn_displacements(moved_px: np.ndarray) -> Displacements | None:
+    """Learn from displacements (M, N, 2) of contacts; None from fewer than ``FEWEST_FRAMES``."""
+    if len(moved_px) < FEWEST_FRAMES:
+        return None
+    chosen = np.unique(np.linspace(0, len(moved_px) - 1, min(len(moved_px), MOST_FRAMES)).round().astype(int))
+    moved = moved_px[chosen].reshape(len(chosen), -1)
+    mean = moved.mean(axis=0)
+    _, turned = np.linalg.eigh((moved - mean).T @ (moved - mean))
+    modes = turned[:, ::-1][:, :MODES].T
+    at = (moved - mean) @ modes.T
+    scale = np.maximum(at[:, :LEADING].std(axis=0), 1e-9)
+    terms = _terms(at[:, :LEADING] / scale)
+    weights = np.linalg.solve(terms.T @ terms + RIDGE * len(terms) * np.eye(terms.shape[1]), terms.T @ at[:, LEADING:])
+    rest = at[:, LEADING:] - terms @ weights
+    beside = moved - mean - at @ modes
+    return Displacements(mean, modes, scale, weights, np.atleast_2d(np.cov(rest.T)), float(np.sqrt(np.mean(beside**2))))
+
+
+def _terms(a: np.ndarray) -> np.ndarray:
+    """One, and the products of two and three of the coordinates (M, D)."""
+    chosen = [list(term) for degree in range(2, DEGREE + 1) for term in combinations_with_replacement(range(a.shape[1]), degree)]
+    return np.column_stack([np.ones(len(a)), *(np.prod(a[:, term], axis=1) for term in chosen)])
+
+
+def rest_from_contacts(known: Displacements, start: Reference, pins_px: np.ndarray) -> RestFound:
+    """Rest places of a unit from its pins (M, N, 2) in contacts of any kind that the displacements know.
+
+    Parameters
+    ----------
+    start : Reference
+        Where the pins are without contact as far as is known: by the specification, or of another unit.
+    """
+    spacing = float(np.median(start.spacing_px))
+    seen = pins_px.reshape(len(pins_px), -1) - start.pins_px.ravel()
+    prior = np.linalg.inv(_deviation(start.pins_px, spacing))
+    precision = known.precision(NOISE * spacing)
+    whiten = np.linalg.cholesky(precision).T
+    off, a = np.zeros(seen.shape[1]), np.zeros((len(seen), len(known.scale)))
+    for _ in range(SETTLE):
+        slopes, _, inverse, pull = _round(known, whiten, seen - off, a)
+        a = a + np.clip(np.einsum("fkl,fl->fk", inverse, pull), -LONGEST_STEP, LONGEST_STEP)
+    for _ in range(MOST_ROUNDS):
+        slopes, away, inverse, pull = _round(known, whiten, seen - off, a)
+        free = (slopes @ np.linalg.cholesky(inverse)).transpose(1, 0, 2).reshape(seen.shape[1], -1)
+        told = len(seen) * np.eye(seen.shape[1]) - free @ free.T
+        force = away.sum(axis=0) - np.einsum("fnk,fk->n", slopes, np.einsum("fkl,fl->fk", inverse, pull), optimize=True)
+        change = np.linalg.solve(whiten.T @ told @ whiten + prior, whiten.T @ force - prior @ off)
+        off = off + change
+        follows = np.einsum("fkl,fl->fk", inverse, pull - np.einsum("fnk,n->fk", slopes, whiten @ change, optimize=True))
+        a = a + np.clip(follows, -LONGEST_STEP, LONGEST_STEP)
+        if np.abs(change).max() < SETTLED * spacing:
+            break
+    left = seen - off - known.at(a)
+    return RestFound(start.pins_px + off.reshape(-1, 2), float(np.sqrt(np.mean(left**2))))
+
+
+def other_rest(known: Displacements | None, start: Reference, pins_px: np.ndarray) -> np.ndarray | None:
+    """The rest places (N, 2) that contacts (M, N, 2), NaN where not found, tell, if they are others than those that are counted from.
+
+    Returns
+    -------
+    (N, 2) float or None
+        None where displacements are not known, contacts are too few, or the places are the same as far as the contacts tell.
+    """
+    whole = pins_px[np.isfinite(pins_px).all(axis=(1, 2))]
+    if known is None or len(whole) < FEWEST_CONTACTS:
+        return None
+    chosen = np.unique(np.linspace(0, len(whole) - 1, min(len(whole), MOST_CONTACTS)).round().astype(int))
+    found = rest_from_contacts(known, start, whole[chosen]).pins_px
+    away = float(np.sqrt(np.mean(np.sum((found - start.pins_px) ** 2, axis=1))))
+    return found if away > SAME_UNIT * float(np.median(start.spacing_px)) else None
+
+
+def _round(
+    known: Displacements, whiten: np.ndarray, seen: np.ndarray, a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Whitened slopes (M, 2N, D) and distances (M, 2N) at the coordinates (M, D), and each frame's inverse Hessian and gradient."""
+    slopes = whiten @ known.slopes(a)
+    away = (seen - known.at(a)) @ whiten.T
+    hessian = slopes.transpose(0, 2, 1) @ slopes + np.eye(a.shape[1])  # the prior of a coordinate is that of the frames that were learnt
+    return slopes, away, np.linalg.inv(hessian), np.einsum("fnk,fn->fk", slopes, away, optimize=True) - a
+
+
+def _deviation(rest_px: np.ndarray, spacing_px: float) -> np.ndarray:
+    """Prior covariance (2N, 2N) of a unit's rest places about the specification's, px^2."""
+    place = rest_px - rest_px.mean(axis=0)
+    x, y = (place / np.abs(place).max()).T
+    square = x * x + y * y
+    terms = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y, x * square, y * square, x**3, y**3, square * square])
+    smooth = np.linalg.qr(terms)[0] * np.sqrt(len(x))
+    alike = (SMOOTH * spacing_px) ** 2 * smooth @ smooth.T
+    return np.kron(alike, np.eye(2)) + (ALONE * spacing_px) ** 2 * np.eye(2 * len(x))
+
+
+def write_displacements(path: Path, known: Displacements) -> None:
+    """Write what ``read_displacements`` reads; modes in half precision."""
+    arrays = {name: np.ascontiguousarray(getattr(known, name), np.float32) for name in ("mean", "scale", "weights", "left")}
+    arrays |= {"modes": np.ascontiguousarray(known.modes, np.float16), "noise": np.array([known.noise], np.float32)}
+    write_bytes(path, save(arrays))
+
+
+def read_displacements(path: Path, pins: int) -> Displacements:
+    """What ``write_displacements`` wrote for a sensor of so many pins.
+
+    Raises
+    ------
+    TrainingError
+        The file can't be read, is damaged, or is of another sensor.
+    """
+    try:
+        found = {name: array.astype(float) for name, array in load(path.read_bytes()).items()}
+        noise = float(found.pop("noise")[0])
+        known = Displacements(**found, noise=noise)
+        if known.mean.shape != (2 * pins,) or not np.isfinite(known.at(np.zeros((1, len(known.scale))))).all():
+            raise ValueError("of other pins")
+        return known
+    except (OSError, SafetensorError, ValueError, KeyError, IndexError, TypeError) as error:
+        raise damaged(path, getattr(error, "strerror", None) or "no displacements of this sensor") from error

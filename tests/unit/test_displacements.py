@@ -13,9 +13,10 @@ from training.displacements import (
     rest_from_contacts,
     write_displacements,
 )
+from training.estimator import PoseEstimator
 from training.recipes import TrainingError
 from twin.geometry.pins import pin_lattice
-from twin.pins import make_reference
+from twin.pins import make_reference, nominal_reference
 
 PINS = PinsSpec(rings=4)
 START = make_reference(150 * pin_lattice(PINS).places + 200, PINS)
@@ -80,3 +81,12 @@ def test_displacements_survive_their_file_and_another_sensors_are_refused(known,
 
 def test_few_frames_teach_no_displacements():
     assert learn_displacements(contacts(FEWEST_FRAMES - 1, 0)) is None
+
+
+def test_the_shipped_weights_find_another_units_rest_places():
+    estimator = PoseEstimator.load("mg400-127")
+    start = nominal_reference(estimator.sensor, estimator.form)
+    off = np.random.default_rng(5).normal(0, 0.03 * float(np.median(start.spacing_px)), start.pins_px.shape)
+    moved = estimator.displacements.at(np.random.default_rng(6).normal(size=(FEWEST_CONTACTS, 6))).reshape(FEWEST_CONTACTS, -1, 2)
+    found = estimator.other_rest(start, start.pins_px + off + moved)
+    assert np.sqrt(np.mean((found.pins_px - start.pins_px - off) ** 2)) < 0.2 * np.sqrt(np.mean(off**2))

@@ -88,6 +88,13 @@ def test_a_folder_of_frames_becomes_a_sensor(made):
     assert "4 frames are few" in few, few
 
 
+def test_a_layout_of_too_few_pins_for_a_camera_is_told(tmp_path):
+    folder = folder_of(tmp_path, frames_of(rest_of(PinsSpec(rings=2)), 2))
+    with pytest.raises(FrameError, match="19 pins are seen in most frames, as 19 pins in 2 rings: too few.*light fades"):
+        new_sensor(folder, tmp_path / "few.toml")
+    assert not (tmp_path / "few.toml").exists()
+
+
 def test_the_specification_is_short_and_commented(made):
     text = made[0].written[0].read_text()
     assert len([line for line in text.splitlines() if line.strip() and not line.startswith("#")]) < 35

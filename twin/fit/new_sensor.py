@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from scenes.pins import PinsSpec
 from scenes.sensor import BlobSpec, CameraSpec, PipelineSpec, RecordingSpec, SensorSpec
 from twin.errors import FrameError
-from twin.fit.camera_pose import CameraReport, fit_camera
+from twin.fit.camera_pose import LEAST_PINS, CameraReport, fit_camera
 from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.frames import evenly_read, frames_at, open_recording
 from twin.frames.forms import gray_levels
@@ -189,6 +189,11 @@ def new_sensor(
         with stage(progress, "layout") as step:
             found = identify(images, progress=step) if layout is None else _given(layout, images)
         best = found.best
+        if (enough := int((best.there >= STEADY).sum())) < LEAST_PINS:
+            raise FrameError(
+                f"{enough} pins are seen in most frames, as {best.pins.in_words()}: too few, a camera is fitted to {LEAST_PINS} or more; give "
+                "frames in which more pins are bright, not thresholded if the light fades towards the rim"
+            )
         given = recording.reference
         rest = rest_of(
             best, [frame.name for frame in looked], None if given is None else gray_levels(given.image), given.name if given else ""

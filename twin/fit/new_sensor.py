@@ -191,8 +191,8 @@ def new_sensor(
         best = found.best
         if (enough := int((best.there >= STEADY).sum())) < LEAST_PINS:
             raise FrameError(
-                f"{enough} pins are seen in most frames, as {best.pins.in_words()}: too few, a camera is fitted to {LEAST_PINS} or more; give "
-                "frames in which more pins are bright, not thresholded if the light fades towards the rim"
+                f"{enough} pins are seen in most frames, as {best.pins.in_words()}: too few, a camera is fitted to {LEAST_PINS} or more; "
+                "give frames in which more pins are bright, not thresholded if the light fades towards the rim"
             )
         given = recording.reference
         rest = rest_of(

@@ -1,9 +1,12 @@
 """Places of the pins at rest that contacts alone tell, by what contacts can do to the pins."""
 
+import cv2
 import numpy as np
 import pytest
+from drawn_frames import drawn_frame
 
 from scenes.pins import PinsSpec
+from training.dataset import load_dataset
 from training.displacements import (
     FEWEST_CONTACTS,
     FEWEST_FRAMES,
@@ -15,6 +18,7 @@ from training.displacements import (
 )
 from training.estimator import PoseEstimator
 from training.recipes import TrainingError
+from training.studies.evaluation import at_own_rest
 from twin.geometry.pins import pin_lattice
 from twin.pins import make_reference, nominal_reference
 
@@ -90,3 +94,19 @@ def test_the_shipped_weights_find_another_units_rest_places():
     moved = estimator.displacements.at(np.random.default_rng(6).normal(size=(FEWEST_CONTACTS, 6))).reshape(FEWEST_CONTACTS, -1, 2)
     found = estimator.other_rest(start, start.pins_px + off + moved)
     assert np.sqrt(np.mean((found.pins_px - start.pins_px - off) ** 2)) < 0.2 * np.sqrt(np.mean(off**2))
+
+
+def test_a_recording_without_a_no_contact_frame_is_counted_from_where_its_contacts_tell(tmp_path, monkeypatch):
+    estimator = PoseEstimator.load("mg400-127")
+    rest = nominal_reference(estimator.sensor, estimator.form)
+    cv2.imwrite(str(tmp_path / "f_0.png"), drawn_frame(estimator.sensor, estimator.form, rest.pins_px).image)
+    (tmp_path / "targets.csv").write_text("image_name,pose_2,pose_6\nf_0.png,-1,2\n")
+    data = load_dataset(tmp_path, estimator.sensor, estimator.names, form=estimator.form)
+    assert at_own_rest(estimator, data) is data, "one contact tells nothing"
+    monkeypatch.setattr(estimator, "other_rest", lambda start, nodes_px: make_reference(start.pins_px + [1.0, 0.0], estimator.sensor.pins))
+    told = at_own_rest(estimator, data)
+    assert "found from the contacts" in told.problems[-1]
+    estimates = [estimator.predict_rows(each, np.arange(1)).mean for each in (data, told)]
+    assert np.abs(estimates[0] - estimates[1]).max() > 0.01
+    cv2.imwrite(str(tmp_path / "init_0.png"), drawn_frame(estimator.sensor, estimator.form, rest.pins_px).image)
+    assert at_own_rest(estimator, data) is data, "a frame without contact is more exact"

@@ -208,7 +208,7 @@ def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
     other = estimator.other_rest(data.pins.reference, data.pins.nodes_px)
     if other is None:
         return data
-    return replace(data, pins=replace(data.pins, reference=other), problems=[*data.problems, OTHER_UNIT])
+    return replace(data, pins=replace(data.pins, reference=other, measured=True), problems=[*data.problems, OTHER_UNIT])
 
 
 def _said(made: PoseEstimate) -> str:

@@ -25,6 +25,8 @@ from scenes import load_sensor
 
 # Random drags go on for DRAG_S, then nothing moves for REST_S; the pose that was wished last has to be shown within WAIT_S.
 DRAG_S, REST_S, WAIT_S = 15.0, 1.0, 30.0
+# What the page says of an object that is where it was wished. One on its way may be at any depth, by chance at that of an earlier wish.
+ARRIVED = "<span class='badge still'>still</span>"
 # Longest wait for the first picture, s: the first start after a change of the code compiles.
 COLD_S = 300.0
 # Depths that differ by less are the same, mm; those of two wishes differ by more.
@@ -100,13 +102,14 @@ def measure(sensor: str, touched: str, seconds: float, out: Path, *, rate: float
             rests.append(rest(client, sent[-1]))
             answers = [u for u in client.updates[since:] if u.number > 0]
             times = dict((round(d, 6), t) for t, d in sent)
-            late = [u.time_s - times[u.depth_mm] for u in answers if u.depth_mm in times]
+            there = [u for u in answers if ARRIVED in u.html and u.depth_mm in times]
+            late = [u.time_s - times[u.depth_mm] for u in there]
             gaps = np.diff([u.time_s for u in answers])
             moved = [u for before, u in zip(answers, answers[1:], strict=False) if u.depth_mm != before.depth_mm]
             together = np.mean([u.pictures >= 2 and "/object" in u.nodes for u in moved])
             numbers = [u.number for u in answers]
             wishes = {round(depth, 6): number for number, (_, depth) in enumerate(sent)}
-            shown = [wishes[u.depth_mm] for u in answers if u.depth_mm in wishes]
+            shown = [wishes[u.depth_mm] for u in there]
             stale = int((np.diff(shown) < 0).sum())  # an earlier wish after a later one
             memory.append(memory_mb(process))
             waited = [each for each in rests if each is not None]
@@ -122,6 +125,7 @@ def measure(sensor: str, touched: str, seconds: float, out: Path, *, rate: float
                 "move_to_page_ms": [round(1e3 * float(np.percentile(late, q))) for q in (50, 95)],
                 "together": float(together),
                 "in_order": bool((np.diff(numbers) > 0).all()),
+                "at_their_wish": len(there),
                 "stale": stale,
                 "rests": len(rests),
                 "rests_without_their_pose": rests.count(None),

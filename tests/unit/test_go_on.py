@@ -24,7 +24,7 @@ def varying(*names: str, count: int = 20) -> dict[str, np.ndarray]:
         (("pose_2", "pose_6", "move_1", "move_6"), "surface-2d"),
         (("pose_3", "pose_4", "pose_5"), "surface-3d"),
         (("pose_3", "pose_4", "pose_5", "move_1", "move_2", "move_6"), "surface-3d-tool"),
-        (("pose_3", "pose_4", "pose_5", "move_1", "move_2", "move_6"), "surface-3d-shear"),
+        (("pose_3", "pose_4", "pose_5", "move_1", "move_2", "move_4", "move_5", "move_6"), "surface-3d-sheared"),
     ],
 )
 def test_a_table_tells_how_its_contacts_were_made(labels, name):

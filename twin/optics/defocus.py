@@ -7,6 +7,7 @@ import numpy as np
 
 from scenes.sensor import ViewSpec
 from twin.camera.projection import distort, window_tangent
+from twin.compiled import compiled
 from twin.types import FloatArray
 
 LEAST_VARIANCE = 0.03
@@ -47,18 +48,37 @@ def defocused(image: FloatArray, circles: FloatArray) -> FloatArray:
 
     A few blurred pictures are interpolated by the variance of their blur, which is a sixteenth of the square of the diameter.
     """
-    blur = circles**2 / 16 / LEAST_VARIANCE
-    above = np.floor(np.log2(np.maximum(blur, 1)))  # the variances of the blurred pictures are 0, then 1, 2, 4, ... times the least
-    at = np.where(blur < 1, blur, above + blur / 2**above)
-    first, last = int(at.min()), int(np.ceil(at.max()))
+    first, last = int(_level(float(circles.min()))), int(np.ceil(_level(float(circles.max()))))
     if last == 0:
         return image
-    blurred: FloatArray = np.zeros_like(image)
-    for k in range(first, last + 1):
-        weight = np.maximum(1 - np.abs(at - k), 0).astype(np.float32)
-        each = cv2.filter2D(image, -1, disc(LEAST_VARIANCE * 2.0 ** (k - 1))) if k else image
-        blurred += weight[..., None] * each.reshape(image.shape)
-    return blurred
+    blurred = [cv2.filter2D(image, -1, disc(LEAST_VARIANCE * 2.0 ** (k - 1))) if k else image for k in range(first, last + 1)]
+    return np.asarray(_interpolated(np.stack([each.reshape(image.shape) for each in blurred]), circles, first))
+
+
+@compiled()
+def _level(diameter_px: float) -> float:
+    """Place of a blur among the blurred pictures, whose variances are 0, then 1, 2, 4, ... times the least."""
+    blur = diameter_px**2 / 16 / LEAST_VARIANCE
+    if blur < 1:
+        return blur
+    above = np.floor(np.log2(blur))
+    return above + blur / 2**above
+
+
+@compiled()
+def _interpolated(blurred: FloatArray, circles: FloatArray, first: int) -> FloatArray:
+    """Of blurred pictures (K, H, W, C), whose levels begin with ``first``, the one (H, W, C) whose pixels have these circles (H, W)."""
+    levels, height, width, channels = blurred.shape
+    found = np.empty((height, width, channels), np.float32)
+    for row in range(height):
+        for column in range(width):
+            at = _level(circles[row, column]) - first
+            low = min(int(at), levels - 1)
+            high = min(low + 1, levels - 1)
+            part = at - low
+            for k in range(channels):
+                found[row, column, k] = (1 - part) * blurred[low, row, column, k] + part * blurred[high, row, column, k]
+    return found
 
 
 @lru_cache(maxsize=32)

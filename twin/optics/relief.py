@@ -185,7 +185,7 @@ def cap_places(view: ViewSpec, pins: PinsSpec, state: PinState, window_px: tuple
     middle, plane = cap_planes(view, pins, state)
     across = np.ceil(reach * np.abs(plane).sum(axis=2)).astype(np.int64)
     cap, place = _nearest(middle - [x0, y0], np.linalg.inv(plane), across, x1 - x0, y1 - y0)
-    pixels = np.flatnonzero((cap >= 0) & (np.abs(place) < reach).all(axis=1))
+    pixels = np.flatnonzero((cap >= 0) & (np.abs(place[:, 0]) < reach) & (np.abs(place[:, 1]) < reach))
     return CapPlaces(pixels, cap[pixels], place[pixels])
 
 

@@ -24,7 +24,7 @@ from twin.types import FloatArray
 ABOUT = "about"
 """Name of what is said of the arrays (JSON), in the metadata."""
 DIGEST = "sha256"
-"""Name of the arrays' digest in the metadata. Files of version 0.1 have none."""
+"""Name of the arrays' digest in the metadata. Files of earlier states have none."""
 
 Layers = tuple[tuple[FloatArray, FloatArray], ...]
 """Weights (o, i) and offsets (o,) of a network's layers."""

@@ -182,10 +182,10 @@ def register() -> None:
         common = {"sensors": (sensor,), "code": CODE, "recordings": (SETS[sensor],)}
         command = f"twin study sim-to-real --sensor {sensor} --frames DIR --labels {LABELS} --count 300 --seed"
         for seed in (0, 1):
-            job(f"sim_to_real.{sensor}.seed{seed}", f"{command} {seed}", minutes=60, **common)(
+            job(f"sim_to_real.{sensor}.seed{seed}", f"{command} {seed}", minutes=20, **common)(
                 partial(taught_by_the_twin, sensor=sensor, seed=seed)
             )
-        job(f"sim_to_real.{sensor}.calibrated", f"{command} 0 --calibrate", minutes=90, **common)(
+        job(f"sim_to_real.{sensor}.calibrated", f"{command} 0 --calibrate", minutes=40, **common)(
             partial(taught_by_the_twin, sensor=sensor, seed=0, extra=("--calibrate",))
         )
     command = "twin study objects --sensor mg400-331 --count 60 --tests 25 --across 12 --seed 1"

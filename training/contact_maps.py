@@ -17,13 +17,14 @@ from torch import nn
 from scenes.sensor import GeometrySpec
 from training.dataset import Dataset, told_apart
 from training.recipes import TrainingError
+from training.run_files import AGAIN
 from twin.frames.truth import arrays_of, open_truth, row_of
 from twin.mechanics.skin_map import SIDE, ContactMaps, between_nodes, skin_grid
 from twin.store import ArrayFile, Layers, layers_from, layers_to
 
 MAPS = "maps.safetensors"
 """File of a run that holds its maps."""
-FILE = ArrayFile("file of contact maps", "twin train", version=1, error=TrainingError)
+FILE = ArrayFile("file of contact maps", "twin train", version=1, error=TrainingError, again=AGAIN)
 DETAIL_MM = 1.0
 """Standard deviation of the Gaussian over which forces are averaged."""
 FORCE_DIRECTIONS, SKIN_DIRECTIONS = 120, 40

@@ -17,10 +17,11 @@ from torch import nn
 from training.dataset import Dataset, split_rows
 from training.pins import PinTable
 from training.recipes import TrainingError
+from training.run_files import AGAIN
 from twin.store import ArrayFile, Layers, layers_from, layers_to
 
 CONTACTS = "contacts.safetensors"
-FILE = ArrayFile("file of kinds of contact", "training.contact_estimator.put_together", version=1, error=TrainingError)
+FILE = ArrayFile("file of kinds of contact", "training.contact_estimator.put_together", version=1, error=TrainingError, again=AGAIN)
 # Modes of the displacements of all kinds together, by which kinds are told apart.
 COMMON_MODES = 60
 # First modes of a kind, and all modes of it that are looked at.

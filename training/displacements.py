@@ -15,15 +15,15 @@ from itertools import combinations_with_replacement
 from pathlib import Path
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 
-from training.run_files import damaged
+from training.recipes import TrainingError
+from training.run_files import AGAIN
 from twin.pins import Reference
-from twin.store import write_bytes
+from twin.store import ArrayFile
 
 DISPLACEMENTS = "displacements.safetensors"
 """File of a run that holds what its pins' displacements can be."""
+FILE = ArrayFile("file of displacements", "twin train", version=1, error=TrainingError, again=AGAIN)
 LEADING, MODES, DEGREE = 6, 40, 3
 """Leading coordinates, modes in all, degree of the polynomials that tell the other modes.
 Of 3,400 frames of 331 pins they leave 0.12 of 3.8 px."""
@@ -202,9 +202,8 @@ def _deviation(rest_px: np.ndarray, spacing_px: float) -> np.ndarray:
 
 def write_displacements(path: Path, known: Displacements) -> None:
     """Write what ``read_displacements`` reads; modes in half precision."""
-    arrays = {name: np.ascontiguousarray(getattr(known, name), np.float32) for name in ("mean", "scale", "weights", "left")}
-    arrays |= {"modes": np.ascontiguousarray(known.modes, np.float16), "noise": np.array([known.noise], np.float32)}
-    write_bytes(path, save(arrays))
+    arrays = {name: getattr(known, name).astype(np.float32) for name in ("mean", "scale", "weights", "left")}
+    FILE.write(path, arrays | {"modes": known.modes.astype(np.float16)}, {"noise": known.noise})
 
 
 def read_displacements(path: Path, pins: int) -> Displacements:
@@ -215,12 +214,8 @@ def read_displacements(path: Path, pins: int) -> Displacements:
     TrainingError
         The file can't be read, is damaged, or is of another sensor.
     """
-    try:
-        found = {name: array.astype(float) for name, array in load(path.read_bytes()).items()}
-        noise = float(found.pop("noise")[0])
-        known = Displacements(**found, noise=noise)
+    with FILE.opened(path) as (about, arrays):
+        known = Displacements(**{name: array.astype(float) for name, array in arrays.items()}, noise=float(about["noise"]))
         if known.mean.shape != (2 * pins,) or not np.isfinite(known.at(np.zeros((1, len(known.scale))))).all():
             raise ValueError("of other pins")
         return known
-    except (OSError, SafetensorError, ValueError, KeyError, IndexError, TypeError) as error:
-        raise damaged(path, getattr(error, "strerror", None) or "no displacements of this sensor") from error

@@ -27,6 +27,7 @@ from training.contact_maps import HEADROOM
 from training.dataset import Dataset
 from training.pins import PinTable
 from training.recipes import TrainingError
+from training.run_files import AGAIN
 from training.surrogate.symmetry import Symmetry, symmetries
 from twin.camera.projection import project
 from twin.frames.forms import from_raw
@@ -38,7 +39,7 @@ from twin.store import ArrayFile
 
 SLIP = "slip.safetensors"
 """File of a run that holds its network for slip."""
-FILE = ArrayFile("network for slip", "twin train", version=1, error=TrainingError)
+FILE = ArrayFile("network for slip", "twin train", version=1, error=TrainingError, again=AGAIN)
 BEGINS, WHOLE = 0.1, 0.95
 """Share of the pressed skin that slides when slip begins, and when the whole contact slides."""
 FEWEST_DRAGS = 30

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -365,6 +366,12 @@ def test_a_file_of_arrays_that_is_not_whole_is_refused_with_the_remedy(damage, s
         assert changed != whole
         path.write_bytes(changed)
     with pytest.raises(StoreError, match=f"{path}: .*{says}.*'twin dream'"), KIND.opened(path):
+        pass
+
+
+def test_a_kind_of_file_has_its_own_remedy(tmp_path):
+    (tmp_path / "a").write_bytes(b"")
+    with pytest.raises(StoreError, match="damaged.*; copy it anew"), replace(KIND, again="copy it anew").opened(tmp_path / "a"):
         pass
 
 

@@ -44,12 +44,15 @@ class ArrayFile:
         Of what it holds; a file of another version is refused.
     error : type of TwinError
         Raised where a file can't be used.
+    again : str
+        What to do about a damaged file or one of another version, if not to make it anew with the command.
     """
 
     thing: str
     command: str
     version: int
     error: type[TwinError]
+    again: str = ""
 
     def write(self, path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> int:
         """Write arrays, and what is said of them; the file's size in bytes."""
@@ -91,8 +94,12 @@ class ArrayFile:
     def _about(self, path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
         about: dict[str, Any] = dict(json.loads(metadata[ABOUT]))
         if about.pop("version") != self.version:
-            raise self.error(f"{path}: of another version of this program; make it anew with '{self.command}'")
+            raise self.error(f"{path}: of another version of this program; {self._remedy}")
         return about
+
+    @property
+    def _remedy(self) -> str:
+        return self.again or f"make it anew with '{self.command}'"
 
     @contextmanager
     def _told(self, path: Path) -> Iterator[None]:
@@ -106,7 +113,7 @@ class ArrayFile:
             raise self.error(f"{path}: can't be read ({error.strerror or error}); give a file of '{self.command}'") from error
         except (SafetensorError, KeyError, IndexError, ValueError, TypeError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise self.error(f"{path}: damaged, or no {self.thing} ({reason}); make it anew with '{self.command}'") from error
+            raise self.error(f"{path}: damaged, or no {self.thing} ({reason}); {self._remedy}") from error
 
 
 def layers_to(layers: Layers) -> dict[str, np.ndarray]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from training.recipes import TrainingError
 from training.run_files import AGAIN
+from twin.frames import spread
 from twin.pins import Reference
 from twin.store import ArrayFile
 
@@ -110,7 +111,7 @@ def learn_displacements(moved_px: np.ndarray) -> Displacements | None:
     """Learn from displacements (M, N, 2) of contacts; None from fewer than ``FEWEST_FRAMES``."""
     if len(moved_px) < FEWEST_FRAMES:
         return None
-    chosen = np.unique(np.linspace(0, len(moved_px) - 1, min(len(moved_px), MOST_FRAMES)).round().astype(int))
+    chosen = spread(len(moved_px), MOST_FRAMES)
     moved = moved_px[chosen].reshape(len(chosen), -1)
     mean = moved.mean(axis=0)
     _, turned = np.linalg.eigh((moved - mean).T @ (moved - mean))
@@ -173,7 +174,7 @@ def other_rest(known: Displacements | None, start: Reference, pins_px: np.ndarra
     whole = pins_px[np.isfinite(pins_px).all(axis=(1, 2))]
     if known is None or len(whole) < FEWEST_CONTACTS:
         return None
-    chosen = np.unique(np.linspace(0, len(whole) - 1, min(len(whole), MOST_CONTACTS)).round().astype(int))
+    chosen = spread(len(whole), MOST_CONTACTS)
     found = rest_from_contacts(known, start, whole[chosen]).pins_px
     away = float(np.sqrt(np.mean(np.sum((found - start.pins_px) ** 2, axis=1))))
     return found if away > SAME_UNIT * float(np.median(start.spacing_px)) else None

@@ -11,14 +11,14 @@ from scenes.sensor import BlobSpec, CameraSpec, PipelineSpec, RecordingSpec, Sen
 from twin.errors import FrameError
 from twin.fit.camera_pose import LEAST_PINS, CameraReport, fit_camera
 from twin.fit.sensor_file import folder_beside, write_sensor
-from twin.frames import evenly_read, frames_at, open_recording
+from twin.frames import evenly_read, frames_at, open_recording, spread
 from twin.frames.forms import gray_levels
 from twin.frames.images import write_image
 from twin.pins.batch import draw_overlay
 from twin.pins.caps import measure_caps
 from twin.pins.check import CAPS_MEASURED, lost_in_view, usual_caps
 from twin.pins.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, with_detector
-from twin.pins.identify import STEADY, Identified, identify, judge_layout, spread
+from twin.pins.identify import STEADY, Identified, identify, judge_layout
 from twin.pins.pipeline import Pipeline
 from twin.pins.rest import Rest, rest_of, turn_of
 from twin.pins.tune import Tuned, tune

@@ -337,6 +337,11 @@ def _opened(path: Path, known: KnownFrames | None, form: Form | None, table: Pat
     return Recording(path, kind.form, [path.name], kind.size_px, _files=[path], _bits=kind.bits)
 
 
+def spread(count: int, wanted: int) -> list[int]:
+    """At most ``wanted`` of ``count`` indices, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int)).tolist()
+
+
 def evenly_read(recording: Recording, limit: int) -> list[Frame]:
     """At most ``limit`` frames of a recording, evenly spread from its first to its last.
 
@@ -347,8 +352,7 @@ def evenly_read(recording: Recording, limit: int) -> list[Frame]:
     FrameError
         None of them can be read.
     """
-    chosen = set(np.linspace(0, len(recording) - 1, min(limit, len(recording))).round().astype(int).tolist())
-    frames = list(recording.some(chosen))
+    frames = list(recording.some(set(spread(len(recording), limit))))
     if not frames:
         raise FrameError(f"{recording.failed[0]['image_name']}: {recording.failed[0]['reason']}")
     return frames

@@ -14,12 +14,13 @@ from scipy.spatial import cKDTree
 
 from scenes.sensor import SensorSpec, UsualCapsSpec
 from twin.camera.capture import expose
+from twin.frames import spread
 from twin.frames.forms import gray_levels
 from twin.optics.preview import Preview
 from twin.pins.blobs import Mask
 from twin.pins.caps import Caps, measure_caps
 from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
-from twin.pins.identify import judge_layout, spread
+from twin.pins.identify import judge_layout
 from twin.pins.pipeline import Pipeline
 from twin.pins.reference import Reference, nominal_reference
 from twin.pins.tune import other_layout

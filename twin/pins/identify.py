@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from scenes.pins import PinsSpec
 from twin.errors import FrameError
+from twin.frames import spread
 from twin.frames.forms import is_two_level
 from twin.geometry.pins import pin_lattice
 from twin.pins.bumps import Bumps, find_bumps
@@ -291,11 +292,6 @@ def _spots(images: list[np.ndarray], sigma_px: float) -> list[Bumps]:
     found = [find_bumps(image, sigma_px) for image in images]
     hidden = with_view(found[0], filled).hidden
     return [replace(one, hidden=hidden) for one in found]
-
-
-def spread(count: int, wanted: int) -> list[int]:
-    """At most ``wanted`` of ``count`` indices, evenly spread from the first to the last."""
-    return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int)).tolist()
 
 
 def _best_size(image: np.ndarray, looks: list[Look]) -> float | None:

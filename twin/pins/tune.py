@@ -9,11 +9,12 @@ import numpy as np
 from scenes.pins import Layout, PinsSpec
 from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
 from twin.errors import FrameError
+from twin.frames import spread
 from twin.frames.forms import gray_levels
 from twin.geometry.pins import pin_lattice
 from twin.pins.detector import Found, make_detector
 from twin.pins.detector_spec import DetectorSpec, Evidence, Method, with_detector
-from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, identify, judge_layout, spread, symmetries
+from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, identify, judge_layout, symmetries
 from twin.pins.legacy import legacy_parameters
 from twin.pins.reference import Reference, make_reference
 from twin.pins.rest import Rest, rest_of

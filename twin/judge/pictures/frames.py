@@ -8,7 +8,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.camera.projection import Disc
 from twin.errors import FrameError
-from twin.frames import open_recording
+from twin.frames import open_recording, spread
 from twin.frames.forms import gray_levels
 from twin.frames.recording import BadFrame
 from twin.pins.pipeline import Pipeline
@@ -74,10 +74,10 @@ def read_real(
             f"{path}: these are thresholded recordings; light, colours and pictures show in raw camera frames only, give a folder of those"
         )
     pipeline = Pipeline(spec, Form.RAW)
-    left = np.setdiff1d(np.arange(len(recording)), _spread(len(recording), fitted))
+    left = np.setdiff1d(np.arange(len(recording)), spread(len(recording), fitted))
     if not len(left):
         raise FrameError(f"{path}: no frame is left without the {fitted} fitted ones; give a folder with more frames")
-    chosen = left[_spread(len(left), len(left) if limit is None else limit)].tolist()
+    chosen = left[spread(len(left), len(left) if limit is None else limit)].tolist()
     frames: list[RealFrame] = []
     refused: list[BadFrame] = []
     for done, index in enumerate(chosen):
@@ -96,11 +96,6 @@ def read_real(
         first = refused[0]
         raise FrameError(f"{path}: none of {len(chosen)} frames can be used; the first, {first['image_name']}: {first['reason']}")
     return RealFrames(frames, refused)
-
-
-def _spread(count: int, number: int) -> np.ndarray:
-    """Indices of at most ``number`` of ``count`` things, spread evenly."""
-    return np.unique(np.linspace(0, count - 1, min(number, count)).round().astype(int))
 
 
 def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc) -> Observation:

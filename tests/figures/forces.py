@@ -61,13 +61,19 @@ def forces(work: Path, *, sensor: str) -> Measured:
         for thing, count in things.items():
             experiment = EDGES.get(sensor, EXPERIMENTS[sensor]) if thing == "edge" else EXPERIMENTS[sensor]
             made[thing] = contacts(work, thing, sensor, thing, count, experiment=experiment, randomise="moves", seed=seed)
-    run, taught = work / "run", [made[thing] for thing in TAUGHT]
-    data = tuple(part for folder in taught for part in ("--data", folder))
+    taught = [made[thing] for thing in TAUGHT]
+    run = trained(work, sensor, taught)
+    same = told(*judged(work, run, taught), "same")
+    return same | told(*judged(work, run, [made[thing] for thing in UNSEEN], "--rows", "all"), "unseen")
+
+
+def trained(work: Path, sensor: str, folders: list[Path]) -> Path:
+    """The run of a model that is trained on simulated contacts in folders."""
+    run, data = work / "run", tuple(part for folder in folders for part in ("--data", folder))
     run_twin(
         work, "train", "--model", "touch", "--sensor", sensor, *data, "--target", "contact", "--members", 2, "--no-kernel", "--out", run
     )
-    same = told(*judged(work, run, taught), "same")
-    return same | told(*judged(work, run, [made[thing] for thing in UNSEEN], "--rows", "all"), "unseen")
+    return run
 
 
 def slip(work: Path, *, sensor: str) -> Measured:
@@ -76,11 +82,7 @@ def slip(work: Path, *, sensor: str) -> Measured:
     for seed, things, count in ((SEED, TAUGHT, DRAGS), (UNSEEN_SEED, UNSEEN, UNSEEN_DRAGS)):
         for thing in things:
             made[thing] = contacts(work, thing, sensor, thing, count, experiment="drag", randomise="drag", seed=seed)
-    run = work / "run"
-    data = tuple(part for thing in TAUGHT for part in ("--data", made[thing]))
-    run_twin(
-        work, "train", "--model", "touch", "--sensor", sensor, *data, "--target", "contact", "--members", 2, "--no-kernel", "--out", run
-    )
+    run = trained(work, sensor, [made[thing] for thing in TAUGHT])
     metrics, _ = judged(work, run, [made[thing] for thing in UNSEEN], "--rows", "all")
     units = {"lead_mm": "mm", "left_mm": "mm", "direction_deg": "deg"}
     return {key: Value(value, units.get(key, "")) for key, value in metrics["slip"].items()}

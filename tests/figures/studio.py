@@ -1,5 +1,6 @@
 """How fast the studio answers a client of its page."""
 
+from functools import partial
 from pathlib import Path
 
 import bench_studio
@@ -9,32 +10,8 @@ from figures.jobs import FiguresError, Measured, Value, job
 SECONDS = 60.0
 
 
-@job(
-    "studio.mg400-331",
-    "python tests/bench/bench_studio.py --sensor mg400-331 --seconds 60",
-    sensors=("mg400-331",),
-    code=("scenes", "twin", "training"),
-    minutes=2,
-)
-def mono(work: Path) -> Measured:
-    """Random drags of a ball."""
-    return dragged("mg400-331", work)
-
-
-@job(
-    "studio.ur5-331",
-    "python tests/bench/bench_studio.py --sensor ur5-331 --seconds 60",
-    sensors=("ur5-331",),
-    code=("scenes", "twin", "training"),
-    minutes=2,
-)
-def colour(work: Path) -> Measured:
-    """The same with a colour sensor."""
-    return dragged("ur5-331", work)
-
-
-def dragged(sensor: str, work: Path) -> Measured:
-    """The bench's figures. The studio is started before, so that what is kept between runs is there."""
+def dragged(work: Path, *, sensor: str) -> Measured:
+    """Random drags of a ball: the bench's figures. The studio is started before, so that what is kept between runs is there."""
     bench_studio.measure(sensor, "sphere", 5.0, work / "first")
     found = bench_studio.measure(sensor, "sphere", SECONDS, work / "studio")
     if found["stale"] or found["rests_without_their_pose"] or not found["in_order"]:
@@ -50,3 +27,13 @@ def dragged(sensor: str, work: Path) -> Measured:
         "memory_mb": Value(max(found["memory_mb"]), "MB"),
         "load": Value(found["load"]),
     }
+
+
+for name in ("mg400-331", "ur5-331"):
+    job(
+        f"studio.{name}",
+        f"python tests/bench/bench_studio.py --sensor {name} --seconds {SECONDS:g}",
+        sensors=(name,),
+        code=("scenes", "twin", "training"),
+        minutes=2,
+    )(partial(dragged, sensor=name))

@@ -79,7 +79,8 @@ def rubbed(
         and ``anchor_mm`` for the last one. None where a substep was not solved.
     """
     looked, kept = problem.looked, tangent.eliminated.kept
-    volume, start = balance.border_residual[1], (state.control_mm - control)[problem.body.free].ravel()[kept]
+    volume = balance.border_residual[1]
+    start: FloatArray = (state.control_mm - control)[problem.body.free].ravel()[kept]
     y = np.concatenate([start[near.near], state.border - border])
     if turns is not None:
         turns = turns[kept[::3] // 3]

@@ -37,29 +37,16 @@ class Turns:
         """Rotation of each free control since the state of ``strains``, (free, 3, 3)."""
         total = np.zeros((len(control_mm), 3, 3))
         for (controls, gradients, weights), old in zip(self._kinds, strains, strict=True):
-            _add_turns(controls, gradients, weights, old, control_mm, total)
+            _add_to_controls(controls, weights[:, None, None] * (_mean_gradient(controls, gradients, control_mm) @ old), total)
         total = total[self._free]
         return rotations(total * np.sqrt(3 / (total**2).sum(axis=(1, 2), keepdims=True)))
 
 
 @compiled(fastmath=True)
 def _mean_gradient(elements: IntArray, gradients: FloatArray, control: FloatArray) -> FloatArray:
-    out = np.zeros((len(elements), 3, 3))
-    for m in range(len(elements)):
-        for a in range(elements.shape[1]):
-            place = control[elements[m, a]]
-            for i in range(3):
-                for j in range(3):
-                    out[m, i, j] += place[i] * gradients[m, j, a]
-    return out
-
-
-@compiled(fastmath=True)
-def _add_turns(
-    elements: IntArray, gradients: FloatArray, weights: FloatArray, old: FloatArray, control: FloatArray, out: FloatArray
-) -> None:
-    """Add each element's deformation since ``old``, weighted, to its controls."""
-    x, f, relative = np.zeros((3, elements.shape[1])), np.zeros((3, 3)), np.zeros((3, 3))
+    """Mean deformation gradient of each element, (m, 3, 3)."""
+    out = np.empty((len(elements), 3, 3))
+    x = np.empty((3, elements.shape[1]))
     for m in range(len(elements)):
         for a in range(elements.shape[1]):
             for i in range(3):
@@ -71,16 +58,19 @@ def _add_turns(
                 f0 += x[0, a] * slope
                 f1 += x[1, a] * slope
                 f2 += x[2, a] * slope
-            f[0, j], f[1, j], f[2, j] = f0, f1, f2
-        w = weights[m]
-        for i in range(3):
-            for j in range(3):
-                relative[i, j] = w * (f[i, 0] * old[m, 0, j] + f[i, 1] * old[m, 1, j] + f[i, 2] * old[m, 2, j])
+            out[m, 0, j], out[m, 1, j], out[m, 2, j] = f0, f1, f2
+    return out
+
+
+@compiled(fastmath=True)
+def _add_to_controls(elements: IntArray, values: FloatArray, out: FloatArray) -> None:
+    """Add each element's matrix (m, 3, 3) to all of its controls."""
+    for m in range(len(elements)):
         for a in range(elements.shape[1]):
             total = out[elements[m, a]]
             for i in range(3):
                 for j in range(3):
-                    total[i, j] += relative[i, j]
+                    total[i, j] += values[m, i, j]
 
 
 @compiled(fastmath=True)
@@ -95,38 +85,26 @@ def turned(turns: FloatArray, vectors: FloatArray) -> FloatArray:
     return out
 
 
-@compiled(fastmath=True)
 def turned_back(turns: FloatArray, vectors: FloatArray) -> FloatArray:
     """The inverse of ``turned``."""
-    out = np.empty_like(vectors)
-    for n in range(len(turns)):
-        r = turns[n]
-        x, y, z = vectors[3 * n], vectors[3 * n + 1], vectors[3 * n + 2]
-        for i in range(3):
-            out[3 * n + i] = r[0, i] * x + r[1, i] * y + r[2, i] * z
-    return out
+    return turned(turns.transpose(0, 2, 1), vectors)
+
+
+def turned_matrix(turns: FloatArray, matrix: FloatArray) -> FloatArray:
+    """R M R^T of a symmetric matrix M (3 n, 3 n), R having the rotations (n, 3, 3) on its diagonal."""
+    turns = turns.astype(matrix.dtype)
+    return _turned_rows(turns, _turned_rows(turns, matrix).T.copy())  # (R M)^T = M R^T by the symmetry of M
 
 
 @compiled(fastmath=True)
-def turned_matrix(turns: FloatArray, matrix: FloatArray) -> FloatArray:
-    """R M R^T of a symmetric matrix M (3 n, 3 n), R having the rotations (n, 3, 3) on its diagonal."""
-    size = len(matrix)
-    rows, out = np.empty_like(matrix), np.empty_like(matrix)
+def _turned_rows(turns: FloatArray, matrix: FloatArray) -> FloatArray:
+    """R M."""
+    out = np.empty_like(matrix)
     for n in range(len(turns)):
-        r = turns[n].astype(matrix.dtype)
         a, b, c = matrix[3 * n], matrix[3 * n + 1], matrix[3 * n + 2]
         for i in range(3):
-            r0, r1, r2 = r[i, 0], r[i, 1], r[i, 2]
-            row = rows[3 * n + i]
-            for k in range(size):
-                row[k] = r0 * a[k] + r1 * b[k] + r2 * c[k]
-    across = rows.T.copy()  # M R^T, by the symmetry of M
-    for n in range(len(turns)):
-        r = turns[n].astype(matrix.dtype)
-        a, b, c = across[3 * n], across[3 * n + 1], across[3 * n + 2]
-        for i in range(3):
-            r0, r1, r2 = r[i, 0], r[i, 1], r[i, 2]
+            r0, r1, r2 = turns[n, i, 0], turns[n, i, 1], turns[n, i, 2]
             row = out[3 * n + i]
-            for k in range(size):
+            for k in range(len(matrix)):
                 row[k] = r0 * a[k] + r1 * b[k] + r2 * c[k]
     return out

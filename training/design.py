@@ -4,6 +4,7 @@ The pins' leading modes are Gaussian processes of the labels that vary. A contac
 around it. The next contact is the candidate that lowers the mean variance over the experiment's ranges most.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -97,3 +98,33 @@ def least_sure(experiment: ExperimentSpec, labels: np.ndarray, moved_px: np.ndar
         own = np.diag(shared)[:CANDIDATES] + kernel.noises[0] ** 2
         gain += size**2 * (shared[:CANDIDATES, CANDIDATES:] ** 2).mean(axis=1) / own
     return np.asarray(candidates[int(np.argmax(gain))])
+
+
+def nearest_to_even(labels: np.ndarray, units: Sequence[str], count: int, *, seed: int) -> np.ndarray:
+    """Rows (count,) of a recording that are nearest to contacts spread evenly over its labels (M, K), none twice; the first ones as well.
+
+    So a collection that was made at random gives the frames that ``twin collect --design even`` would have made.
+
+    Parameters
+    ----------
+    seed : int
+        Of the even sequence, a scrambled one of Sobol.
+    """
+    code = LabelCode(goes_round(units, labels))
+    low, high = labels.min(axis=0), labels.max(axis=0)
+    varied = np.flatnonzero(high > low)
+    circular = np.array(code.circular)
+
+    def placed(those: np.ndarray) -> np.ndarray:
+        return code.encode(np.where(circular, those, (those - low) / np.maximum(high - low, 1e-12)))
+
+    power = int(np.ceil(np.log2(max(count, 2))))
+    wanted = np.tile(low, (2**power, 1))
+    wanted[:, varied] += Sobol(len(varied), scramble=True, rng=np.random.default_rng(seed)).random_base2(power) * (high - low)[varied]
+    places, free = placed(labels), np.ones(len(labels), bool)
+    chosen = []
+    for place in placed(wanted)[:count]:
+        far = np.where(free, ((places - place) ** 2).sum(axis=1), np.inf)
+        chosen.append(int(far.argmin()))
+        free[chosen[-1]] = False
+    return np.array(chosen)

@@ -13,7 +13,7 @@ from hardware.collect import COLUMNS, Collection, CollectPlan, WorkFrame, _Asked
 from hardware.errors import DeviceError
 from hardware.rig_geometry import PlacedObject, matrix_of
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
-from training.design import least_sure
+from training.design import least_sure, nearest_to_even
 from twin.frames import open_recording, read_image
 from twin.rig.mounting import Mounting
 from twin.types import Form
@@ -284,3 +284,14 @@ def test_contacts_of_the_design_unsure_are_chosen_after_the_first_ones(tmp_path)
     assert (asked(6).pose == 6).all() and (asked(7).move == 7).all()
     with pytest.raises(DeviceError, match="needs a chooser"):
         CollectPlan(None, None, experiment, None, "sim", "sim", 3, design="unsure")
+
+
+def test_frames_are_chosen_as_evenly_as_a_design_makes_them():
+    """None twice, the first ones as well, and each eighth of the circle as often as the others."""
+    rng = np.random.default_rng(0)
+    labels = np.column_stack([np.full(800, 2.0), rng.uniform(0, 1, 800) ** 3, rng.uniform(-180, 180, 800)])
+    rows = nearest_to_even(labels, ("mm", "mm", "deg"), 32, seed=1)
+    assert len(set(rows.tolist())) == 32 and np.array_equal(rows, nearest_to_even(labels, ("mm", "mm", "deg"), 32, seed=1))
+    for count in (8, 32):
+        assert (np.histogram(labels[rows[:count], 2], np.linspace(-180, 180, 9))[0] == count // 8).sum() >= 6
+        assert abs(np.median(labels[rows[:count], 1]) - 0.5) < 0.15 < abs(np.median(labels[:, 1]) - 0.5)

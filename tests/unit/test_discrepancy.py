@@ -110,3 +110,18 @@ def test_friction_is_drawn_in_the_range_of_the_frames():
     assert Residuals(np.zeros((23, 12)), nothing[:1], nothing[:1], *sliding).friction_spread().low == pytest.approx(0.1 / 1.25, rel=0.1)
     sticking = np.append(frictions, [3.0, 3.0]), np.append(np.ones(20), [0.0, 0.01])
     assert Residuals(np.zeros((22, 12)), nothing[:1], nothing[:1], *sticking).friction_spread().high == pytest.approx(spread.high, rel=0.05)
+
+
+def test_a_direction_has_no_beginning():
+    """What is missed at 179 deg is missed at -179 deg."""
+    rng = np.random.default_rng(3)
+    pose, still = np.zeros((60, 6)), np.zeros(6)
+    pose[:, 2], pose[:, 5] = rng.uniform(3, 5, 60), np.linspace(-175, 175, 60)
+    place = np.linspace(-1, 1, 2 * PINS).reshape(PINS, 2)
+    moved = pose[:, 2, None, None] * place
+    missed = 0.1 * moved * np.sin(np.radians(pose[:, 5]))[:, None, None] + 0.1 * moved
+    known = label_axes([ArmLabel(each, still) for each in pose])
+    learnt = Discrepancy(Residuals(known, moved, missed, np.full(60, np.nan), np.ones(60)))
+    ends = [ArmLabel(np.array([0, 0, 4.0, 0, 0, turn]), still) for turn in (179.0, -179.0)]
+    one, other = learnt.mean_px(ends, np.stack([4 * place] * 2))
+    assert np.abs(one - other).max() < 0.05 * np.abs(one).max()

@@ -15,6 +15,7 @@ from training.models.steered.network import Steered, SteeredSize
 from training.packed import pack
 from training.recipes import TrainingError
 from training.run import train_run
+from training.studies.sim_to_real.steps import model_for, put_beside
 from twin.pins import nominal_reference
 from twin.types import Form
 
@@ -86,18 +87,43 @@ def edges_instead(data):
     return replace(data, pins=replace(data.pins, nodes_px=nodes), targets=replace(data.targets, raw=labels, corrected=labels))
 
 
-def test_an_edges_direction_is_learnt_from_few_frames_and_kept_in_a_small_copy(data, tmp_path):
-    edges = edges_instead(data)
+@pytest.fixture(scope="module")
+def learnt(data, tmp_path_factory):
+    """A run, the folder of it, the edges that it learnt from, and the rows that it did not."""
+    edges, out = edges_instead(data), tmp_path_factory.mktemp("steered") / "run"
     config = replace(config_of("steered", epochs=60, batch=16, members=1), size={"modes": 20, "width": 32})
-    train_run(config, edges, tmp_path / "run")
-    estimator = PoseEstimator.load(tmp_path / "run")
-    judged = np.array([name in estimator.config["rows"]["kept_out"] for name in edges.pins.image_name])
-    made = estimator.predict_rows(edges, np.flatnonzero(judged))
-    error = np.abs(label_error(made.mean, edges.targets.corrected[judged], edges.targets.units))
-    assert error[:, 1].mean() < 6 and error[:, 0].mean() < 0.05, error.mean(axis=0)
-    pack(tmp_path / "run", tmp_path / "small")
-    small = PoseEstimator.load(tmp_path / "small").predict_rows(edges, np.flatnonzero(judged))
+    train_run(config, edges, out)
+    kept_out = PoseEstimator.load(out).config["rows"]["kept_out"]
+    return out, edges, np.flatnonzero(np.isin(edges.pins.image_name, kept_out))
+
+
+def errors(run, edges, rows):
+    made = PoseEstimator.load(run).predict_rows(edges, rows)
+    return np.abs(label_error(made.mean, edges.targets.corrected[rows], edges.targets.units)).mean(axis=0)
+
+
+def test_an_edges_direction_is_learnt_from_few_frames_and_kept_in_a_small_copy(learnt, tmp_path):
+    run, edges, judged = learnt
+    missed = errors(run, edges, judged)
+    assert missed[1] < 6 and missed[0] < 0.05, missed
+    made = PoseEstimator.load(run).predict_rows(edges, judged)
+    pack(run, tmp_path)
+    small = PoseEstimator.load(tmp_path).predict_rows(edges, judged)
     np.testing.assert_allclose(small.mean, made.mean, atol=0.5)  # half precision
+
+
+def test_labelled_frames_are_put_beside_it(learnt, tmp_path):
+    """Of a sensor whose labels are off by as much everywhere: the process learns it, the average has half of it."""
+    run, edges, judged = learnt
+    off = replace(edges, targets=replace(edges.targets, corrected=edges.targets.corrected + [0.2, 0.0]))
+    others = np.setdiff1d(np.arange(len(edges)), judged)
+    put_beside(run, tmp_path / "beside", edges.rows(others), off.rows(others[:30]), seed=0)
+    assert errors(tmp_path / "beside", off, judged)[0] < 0.7 * errors(run, off, judged)[0]
+    assert errors(tmp_path / "beside", off, judged)[1] < 2 * errors(run, off, judged)[1]
+
+
+def test_a_study_trains_it_where_there_is_a_direction(data):
+    assert (model_for(edges_instead(data)), model_for(data)) == ("steered", "vgnn")
 
 
 def test_labels_without_a_direction_are_refused(data, tmp_path):

@@ -166,12 +166,16 @@ Gaussian process of the label, and drawn --draws times for every simulated conta
 these frames first ('twin calibrate contact'; about an hour). All models are judged on the remaining fifth:
 
 \b
-  simulated            vgnn trained on simulated contacts alone; its 90 %
+  simulated            vgnn trained on simulated contacts alone (steered, if
+                       a label goes round the whole circle); its 90 %
                        intervals are calibrated on the labelled frames
   simulated and real   the same, averaged with a Gaussian process of the pins
-                       of both simulated contacts and labelled frames
-  real                 vgnn and a quadratic regression, trained on as many
-                       real frames, on 500 and on all
+                       of both simulated contacts and labelled frames;
+                       also the twin read backwards, with 0 to 500 frames
+  real                 vgnn or steered, and a quadratic regression, trained on
+                       as many real frames, on 500 and on all
+  ..., even            the same with frames that are nearest to an even
+                       sequence ('twin collect --design even')
   --ablate             also models trained on simulated contacts with one
                        change each: without the learnt difference of the pins,
                        with a fifth of the contacts, a coarse mesh, one

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from training.label_code import LabelCode
-from training.models.part import Inputs, Learnt, PinModel, Weights, refuse_sizes
+from training.models.part import Inputs, Learnt, Modes, PinModel, Weights, refuse_sizes
 from training.models.steered.field import waves_of
 from training.models.steered.network import Steered, SteeredSize
 from training.pins import PinTable
@@ -18,6 +18,8 @@ from twin.pins.reference import Reference
 
 # Buffers that a small copy leaves out, because they follow from the pins at rest.
 DERIVED = ("fit", "order")
+# Components of the turned field that are inputs of a Gaussian process. Finer ones are noise to it.
+PROCESS_MODES = 20
 
 
 class Displacements:
@@ -43,6 +45,7 @@ class SteeredModel(PinModel):
     """See the module. Unlike ``vgnn`` it does not notice that the camera sits elsewhere than in training."""
 
     counts_from_rest = True
+    has_modes = True
 
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Steered:
         """See ``Model``; sizes are the fields of ``SteeredSize``."""
@@ -66,6 +69,13 @@ class SteeredModel(PinModel):
                 f"{self.name} is for labels of which one is a direction on the whole circle, these have {sum(code.circular)}; train vgnn"
             )
         cast(Steered, network).prepare(cast(Displacements, inputs).moved[rows], numbers[rows], code)
+
+    def modes(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> Modes:
+        """See ``Model``. The inputs are the network's own numbers, and the first components of the field as turned to its direction."""
+        with torch.no_grad():
+            numbers, seen = cast(Steered, network).view(*inputs.batch(rows))
+        found = torch.cat([numbers, seen[:, :PROCESS_MODES]], dim=1).double().numpy()
+        return Modes(found, np.zeros(len(found)))
 
     def pack(self, weights: Weights) -> Weights:
         """See ``Model``. Leaves out what follows from the pins at rest."""

@@ -70,9 +70,13 @@ class Look(nn.Module):
         deviation = size.flip(0)[:keep].clamp(min=1e-12 * float(size.max())).sqrt()
         self.components.copy_(direction.flip(1)[:, :keep] * (3 * (deviation / deviation[0]).sqrt() / deviation))
 
+    def amplitudes(self, seen: torch.Tensor) -> torch.Tensor:
+        """Principal components (B, modes) of coefficients (B, C)."""
+        return (_flat(seen) - self.mean) @ self.components
+
     def forward(self, seen: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
         """Numbers (B, outputs) from coefficients (B, C) that were turned by ``turn`` (B,) rad."""
-        z = (_flat(seen) - self.mean) @ self.components
+        z = self.amplitudes(seen)
         h = torch.cat([z, turn.sin()[:, None], turn.cos()[:, None], (2 * turn).sin()[:, None], (2 * turn).cos()[:, None]], dim=1)
         h = torch.nn.functional.silu(self.enter(h))
         for layer in self.trunk:
@@ -150,6 +154,11 @@ class Steered(nn.Module):
             mean, scale = self._second(seen, guess)
             guess = self._direction(mean)
         return {"mean": mean, "log_scale": scale, "first": first}
+
+    def view(self, moved: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The estimated numbers (B, E) of displacements (B, N, 2), and the components (B, modes) of the field as turned to them."""
+        mean = self(moved)["mean"]
+        return mean, self.second.amplitudes(self.turned(self.coefficients(moved), -self._direction(mean)))
 
     def _direction(self, numbers: torch.Tensor) -> torch.Tensor:
         """(B,) direction in the picture, rad."""

@@ -6,7 +6,8 @@ Gaussian process of the label l,
 
     a(l) ~ GP(0, c^2 + s^2 exp(-sum_i (l_i - l'_i)^2 / 2 w_i^2) + n^2 [same frame])
 
-(Higdon et al. 2008). c, s, w and n maximise the marginal likelihood; l is the pose of the tap and the executed move. For each
+(Higdon et al. 2008). c, s, w and n maximise the marginal likelihood; l is the pose of the tap and the executed move, and of a direction
+on the whole circle the pose after the move, with its cosine and sine. For each
 simulated contact one function is drawn from the posterior and added to the pins. So a model is trained with the twin's known
 discrepancy, and with a wide spread of discrepancies where no labelled frame is near.
 """
@@ -17,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scenes.randomisation import FrictionSpread
+from training.audit import LabelColumns
 from training.gaussian_process import CONSTANT_AND_SMOOTH, Kernel, Points, Posterior, likeliest
 from training.recipes import TrainingError
 from twin.fit.contact.fit import expect, mean_squared, simulate
@@ -170,8 +172,10 @@ class Discrepancy:
 
     def __init__(self, residuals: Residuals) -> None:
         axes = residuals.axes
-        self.used = axes.std(axis=0) > VARIES
-        self.middle, self.spread = axes[:, self.used].mean(axis=0), axes[:, self.used].std(axis=0)
+        self.columns = LabelColumns.of(axes[:, :6] + axes[:, 6:], axes[:, 6:])
+        told = self._told(axes)
+        self.used = told.std(axis=0) > VARIES
+        self.middle, self.spread = told[:, self.used].mean(axis=0), told[:, self.used].std(axis=0)
         relative = residuals.missing_px.reshape(len(axes), -1) / _rms_px(residuals.moved_px)[:, None]
         left, sizes, self.modes = np.linalg.svd(relative, full_matrices=False)
         kept = np.searchsorted(np.cumsum(sizes**2) / (sizes**2).sum(), MODES_SHARE) + 1
@@ -207,8 +211,14 @@ class Discrepancy:
         noise = [process.kernel.noises[0] ** 2 for process in self.processes]
         return [{"share": float(a), "told": float(max(0.0, 1 - n))} for a, n in zip(share, noise, strict=True)]
 
+    def _told(self, axes: np.ndarray) -> np.ndarray:
+        """The labels (K, A) that the processes know: as ``label_axes``, but a direction by its cosine and sine (``LabelColumns``)."""
+        if self.columns.direction is None:
+            return axes
+        return self.columns.columns(axes[:, :6] + axes[:, 6:], axes[:, 6:])
+
     def _scaled(self, axes: np.ndarray) -> np.ndarray:
-        return (axes[:, self.used] - self.middle) / self.spread
+        return (self._told(axes)[:, self.used] - self.middle) / self.spread
 
     def _fields(self, amplitudes: np.ndarray, moved_px: np.ndarray, rest: np.ndarray | float = 0.0) -> np.ndarray:
         relative = (amplitudes * self.sizes) @ self.modes + rest

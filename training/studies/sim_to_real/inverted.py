@@ -1,47 +1,64 @@
 """The twin read backwards: the labels whose simulated pins are most like a frame's.
 
-The simulated displacements' modes are polynomials of the labels that vary, d(l). What the twin misses is a quadratic e(l), a ridge
-regression on the residuals of the labelled frames. With S the covariance of what is left on them, each predicted from the others, the
-estimate is
+With the waves d(l) of the twin's displacement at the labels l (``TwinField``), what the twin misses e(l), and S the covariance of what is
+left on the labelled frames, each predicted from the others, the estimate is
 
     l = argmin (t - d(l) - e(l))' S^-1 (t - d(l) - e(l)) + |l - m|^2 / w^2
 
-t are the modes of the frame, m and w the middle and the width of the ranges. It is found by Gauss-Newton steps from the nearest simulated
+t are the waves of the frame, m and w the middle and the width of the ranges. It is found by Gauss-Newton steps from the nearest simulated
 state. Moves are unknown, too, and found with the pose.
+
+What the twin misses has two parts, both found at once by a ridge regression on the residuals of the labelled frames. A quadratic of the
+labels that vary stands in the object's frame: it is what the mechanics and the object's shape miss, and the same all around an edge. Where
+there is a direction, a second part stands in the sensor's frame: it is what the camera and the pins at rest miss.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from training.audit import FRAMES_A_TERM, LabelColumns, polynomials
+from scenes.experiment import ExperimentSpec
+from training.audit import polynomials
 from training.dataset import Dataset
 from training.label_code import label_error, wrapped_deg
+from training.studies.sim_to_real.field import TwinField, parts
 from twin.rig.labels import ArmLabel
 
 BACKWARDS = "twin backwards"
 """Name of the model in the study's table."""
-MODES = 30
-"""Modes of the simulated displacements that are compared."""
-HIGHEST = 5
-"""Highest degree of the twin's polynomials; lower if the states are few."""
-RIDGE = 0.3
-"""Penalty on the terms of what the twin misses, in labels scaled to -1..1; the constant term has next to none."""
-SHRUNK = 0.3
-"""Share by which the covariance of what is left is drawn to its diagonal."""
-LEAST_PX2 = 1e-4
-"""Variance that is added to it, px^2."""
+RIDGE = 1.0
+"""Penalty on the terms of what the twin misses, in labels scaled to -1..1."""
+CONSTANT_RIDGE = 1e-3
+"""Penalty on the constant term in the sensor's frame: next to none."""
+OWN_CONSTANT = 0.3
+"""Of the penalty, on the constant term in the object's frame."""
+LEAST_SHARE = 0.1
+"""Least share of a frame's residual that the regression left out of itself, by which it is divided."""
+NOISE_FRAMES = 60.0
+"""Frames that the noise of pins counts for in the covariance of what is left, beside the labelled ones."""
+NOISE_TIMES = 1.5
+"""Times the noise of pins that what is left is expected to have before any frame tells."""
 WIDTH = 1.5
 """w above, in half ranges of the labels."""
-STEPS = 8
+STARTS = 700
+"""Simulated states that an estimate may begin at."""
+TURN_DEG = 10.0
+"""Between two directions in which each of them is tried."""
+STEPS = 7
 """Gauss-Newton steps; fewer are enough from a near start."""
-NUDGE = 1e-3
+NUDGE = 2e-3
 """Step of the difference quotients, in half ranges."""
+LONGEST = 0.35
+"""Longest step of a label, in half ranges."""
+DIRECTION_DEG = 60.0
+"""What counts as the half range of a direction."""
+BEYOND = 1.15
+"""Times the simulated range in which labels are looked for: the twin's process knows nothing farther out."""
 
 
 class TwinBackwards:
-    """A twin's polynomials of pose and move, to be read backwards.
+    """A twin, to be read backwards.
 
     Parameters
     ----------
@@ -49,74 +66,135 @@ class TwinBackwards:
         Simulated displacements.
     labels : sequence of ArmLabel
         Their labels.
+    rest_px : (N, 2) float
+        The pins at rest.
+    ranges : (12, 2) float
+        Least and largest pose and move of the frames that are asked for; labels that do not vary are known.
+    seed : int
+        Chooses the simulated states that are learnt from.
     """
 
-    def __init__(self, moved_px: np.ndarray, labels: Sequence[ArmLabel]) -> None:
-        self.known = _both(labels)
-        low, high = self.known.min(axis=0), self.known.max(axis=0)
-        self.varied = np.flatnonzero(high > low)
-        self.middle, self.half = (low + high) / 2, np.maximum(high - low, 1e-12) / 2
-        self._columns = LabelColumns.of(self.known[:, :6], self.known[:, 6:])
-        columns = self._columns.columns(self.known[:, :6], self.known[:, 6:])
-        self._shift, self._scale = columns.mean(axis=0), np.maximum(np.ptp(columns, axis=0) / 2, 1e-12)
-        fitting = [k for k in range(1, HIGHEST + 1) if FRAMES_A_TERM * polynomials(columns[:1], k).shape[1] <= len(columns)]
-        self._degree = fitting[-1] if fitting else 1
-        flat = moved_px.reshape(len(moved_px), -1)
-        _, _, directions = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
-        self._modes = directions[:MODES]
-        self.states = flat @ self._modes.T
-        self._weight = np.linalg.lstsq(self._terms(self.known, self._degree), self.states, rcond=None)[0]
+    def __init__(self, moved_px: np.ndarray, labels: Sequence[ArmLabel], rest_px: np.ndarray, ranges: np.ndarray, *, seed: int = 0) -> None:
+        self._field = TwinField(moved_px, _both(labels), rest_px, seed=seed)
+        self._ranges = ranges
 
     def estimate(self, real_px: np.ndarray, labels: Sequence[ArmLabel], asked_px: np.ndarray) -> np.ndarray:
-        """Pose and move (B, 12) of frames with displacements (B, N, 2), after n labelled ones with displacements (n, N, 2), px."""
-        told, there, asked = _both(labels), self._seen(real_px), self._seen(asked_px)
-        missed = there - self._terms(told, self._degree) @ self._weight
-        terms = self._terms(told, 2)
-        penalty = np.diag(np.r_[1e-3, np.full(terms.shape[1] - 1, RIDGE)])
-        smooth = np.linalg.solve(terms.T @ terms + penalty, terms.T)
-        correction = smooth @ missed
-        own = np.einsum("ij,ji->i", terms, smooth)
-        left = (missed - terms @ correction) / np.maximum(1 - own, 0.05)[:, None]
-        spread = left.T @ left / len(left)
-        spread = (1 - SHRUNK) * spread + SHRUNK * np.diag(np.diag(spread)) + LEAST_PX2 * np.eye(len(spread))
-        precision = np.linalg.inv(spread)
+        """Pose and move (B, 12) of frames with displacements (B, N, 2), after n labelled ones with displacements (n, N, 2), px.
+
+        Without a labelled frame the twin is taken to miss nothing but the noise of pins.
+        """
+        field, told = self._field, _both(labels)
+        missed = _Missed(field, told, field.waves(real_px) - field(told))
+        left = parts(missed.left)
+        noise = field.noise(real_px if len(real_px) else asked_px)
+        spread = (left.T @ left + NOISE_FRAMES * NOISE_TIMES * noise) / (len(left) + NOISE_FRAMES)
+        whitening = np.linalg.cholesky(np.linalg.inv(spread))
 
         def expected(those: np.ndarray) -> np.ndarray:
-            both: np.ndarray = self._terms(those, self._degree) @ self._weight + self._terms(those, 2) @ correction
-            return both
+            found: np.ndarray = parts(field(those) + missed(those)) @ whitening
+            return found
 
-        start = expected(self.known)
-        near = [int(np.argmin(np.einsum("sk,kl,sl->s", start - each, precision, start - each, optimize=True))) for each in asked]
-        return self._found(asked, self.known[near].copy(), expected, precision)
+        asked = parts(field.waves(asked_px)) @ whitening
+        fixed = np.flatnonzero(np.ptp(self._ranges, axis=1) == 0)
+        states = field.known[:STARTS].copy()
+        states[:, fixed] = self._ranges[fixed, 0]
+        unknown = np.setdiff1d(field.varied, fixed)
+        return self._found(asked, _nearest(asked, states, field.direction, expected), unknown, expected)
 
-    def _found(
-        self, asked: np.ndarray, those: np.ndarray, expected: Callable[[np.ndarray], np.ndarray], precision: np.ndarray
-    ) -> np.ndarray:
+    def _found(self, asked: np.ndarray, those: np.ndarray, unknown: np.ndarray, expected: Any) -> np.ndarray:
         """The labels (B, 12) after Gauss-Newton steps from a start."""
-        half, middle = self.half[self.varied], self.middle[self.varied]
-        prior = np.diag(1 / (WIDTH * half) ** 2)
+        field = self._field
+        columns = [*unknown.tolist(), *([] if field.direction is None else [field.direction])]
+        half = np.array([DIRECTION_DEG if k == field.direction else field.half[k] for k in columns])
+        prior = np.array([0.0 if k == field.direction else WIDTH**-2 for k in columns])
+        middle, reach = field.middle[unknown], BEYOND * field.half[unknown]
         for _ in range(STEPS):
             now = expected(those)
             slopes = []
-            for k, width in zip(self.varied, half, strict=True):
+            for k, width in zip(columns, half, strict=True):
                 nudged = those.copy()
                 nudged[:, k] += NUDGE * width
-                slopes.append((expected(nudged) - now) / (NUDGE * width))
+                slopes.append((expected(nudged) - now) / NUDGE)
             slope = np.stack(slopes, axis=1)
-            weighted = slope @ precision
-            force = np.einsum("bik,bk->bi", weighted, asked - now) - (those[:, self.varied] - middle) @ prior
-            step = np.linalg.solve(weighted @ slope.swapaxes(1, 2) + prior, force[..., None])[..., 0]
-            those[:, self.varied] += np.clip(step, -half, half)
+            force = np.einsum("bik,bk->bi", slope, asked - now) - prior * (those[:, columns] - field.middle[columns]) / half
+            step = np.linalg.solve(slope @ slope.swapaxes(1, 2) + np.diag(prior), force[..., None])[..., 0]
+            those[:, columns] += np.clip(step, -LONGEST, LONGEST) * half
+            those[:, unknown] = np.clip(those[:, unknown], middle - reach, middle + reach)
         return those
 
-    def _terms(self, those: np.ndarray, degree: int) -> np.ndarray:
-        columns = self._columns.columns(those[:, :6], those[:, 6:])
-        return polynomials((columns - self._shift) / self._scale, degree)
 
-    def _seen(self, moved_px: np.ndarray) -> np.ndarray:
-        """Modes (B, K) of displacements (B, N, 2)."""
-        seen: np.ndarray = moved_px.reshape(len(moved_px), -1) @ self._modes.T
-        return seen
+class _Missed:
+    """What the twin misses, by n labelled frames: called with contacts (B, 12), it gives waves (B, C).
+
+    Attributes
+    ----------
+    left : (n, C) complex
+        What is left of each frame's residual, predicted from the others.
+    """
+
+    def __init__(self, field: TwinField, known: np.ndarray, residual: np.ndarray) -> None:
+        self._field, self._weight = field, {}
+        self.left = np.empty_like(residual)
+        penalty = RIDGE * np.r_[1.0 if field.direction is None else OWN_CONSTANT, np.ones(self._own(known).shape[1] - 1)]
+        if field.direction is None:
+            penalty[0] = CONSTANT_RIDGE
+        else:
+            penalty = np.r_[penalty, CONSTANT_RIDGE, np.full(self._seen(known).shape[1] - 1, RIDGE)]
+        for order, waves in self._alike():
+            terms = self._terms(known, waves)
+            smooth = np.linalg.solve(terms.conj().T @ terms + np.diag(penalty), terms.conj().T)
+            self._weight[order] = smooth @ residual[:, waves]
+            own = np.einsum("ij,ji->i", terms, smooth).real
+            self.left[:, waves] = (residual[:, waves] - terms @ self._weight[order]) / np.maximum(1 - own, LEAST_SHARE)[:, None]
+
+    def __call__(self, known: np.ndarray) -> np.ndarray:
+        found = np.empty((len(known), len(self._field.order)), complex)
+        for order, waves in self._alike():
+            found[:, waves] = self._terms(known, waves) @ self._weight[order]
+        return found
+
+    def _alike(self) -> list[tuple[int, np.ndarray]]:
+        """Waves that turn alike, and so have the same terms; all of them where nothing turns."""
+        order = self._field.order if self._field.direction is not None else np.zeros_like(self._field.order)
+        return [(int(each), np.flatnonzero(order == each)) for each in np.unique(order)]
+
+    def _terms(self, known: np.ndarray, waves: np.ndarray) -> np.ndarray:
+        if self._field.direction is None:
+            return self._own(known)
+        return np.hstack([self._own(known) * self._field.turned(known)[:, waves[:1]], self._seen(known)])
+
+    def _own(self, known: np.ndarray) -> np.ndarray:
+        """Terms (B, P) in the object's frame."""
+        return polynomials(self._field.scaled(known), 2)
+
+    def _seen(self, known: np.ndarray) -> np.ndarray:
+        """Terms (B, Q) in the sensor's frame: the labels, their products with cosine and sine of the direction, and those of twice it."""
+        once = np.radians(known[:, self._field.direction]).reshape(-1, 1)
+        straight, twice = polynomials(self._field.scaled(known), 1), 2 * once
+        return np.hstack([straight, straight * np.cos(once), straight * np.sin(once), np.cos(twice), np.sin(twice)])
+
+
+def _nearest(asked: np.ndarray, states: np.ndarray, direction: int | None, expected: Any) -> np.ndarray:
+    """The states (B, 12), in any direction, whose expected waves are nearest to those asked for (B, 2C)."""
+    found, least = np.empty((len(asked), states.shape[1])), np.full(len(asked), np.inf)
+    for turn in [None] if direction is None else np.arange(-180.0, 180.0, TURN_DEG):
+        tried = states.copy()
+        if direction is not None:
+            tried[:, direction] = turn
+        there = expected(tried)
+        far = (there**2).sum(axis=1) - 2 * asked @ there.T
+        near = far.argmin(axis=1)
+        nearer = far[np.arange(len(asked)), near] < least
+        least[nearer] = far[nearer, near[nearer]]
+        found[nearer] = tried[near[nearer]]
+    return found
+
+
+def read_backwards(simulated: Dataset, labels: Sequence[ArmLabel], experiment: ExperimentSpec, *, seed: int) -> TwinBackwards:
+    """The twin of some simulated states with their labels, to be read backwards for frames of an experiment."""
+    rest_px = simulated.pins.reference.pins_px
+    ranges = np.array(list(experiment.ranges().values()))
+    return TwinBackwards(simulated.pins.nodes_px - rest_px, labels, rest_px, ranges, seed=seed)
 
 
 def inverted_row(
@@ -142,5 +220,7 @@ def inverted_row(
 def _both(labels: Sequence[ArmLabel]) -> np.ndarray:
     """(K, 12) where the arm stands, and the move that it made, mm and deg."""
     undone = np.array([0.0 if label.executed else 1.0 for label in labels])[:, None]
+    if not len(labels):
+        return np.zeros((0, 12))
     pose, move = np.stack([label.pose for label in labels]), np.stack([label.move for label in labels])
     return np.hstack([pose - undone * move, (1 - undone) * move])

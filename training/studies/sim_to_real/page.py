@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
@@ -18,6 +19,10 @@ from twin.report.themes import BLUE, OLIVE, PURPLE, RED
 
 # Name of the row of the model trained in the twin alone. Names of rows without one ingredient begin with this word and a comma.
 SIMULATED = "simulated"
+# Names of rows of models that learnt from real frames alone, and from simulated contacts and real frames.
+REAL, BOTH = "real", "simulated and real"
+# What is added to these where the frames are not drawn at random, but nearest to an even sequence.
+EVENLY = ", even"
 # Name of the row of the model trained on simulated pins without a drawn discrepancy.
 BARE = "simulated, bare"
 # Colours and lines of the models trained on real frames, in the order of the rows.
@@ -96,7 +101,7 @@ def write_page(
             _missing_said(modes, bare=bool(_of(rows, BARE))),
             _beside_said(names, left_out),
             "Twin backwards: the labels whose simulated pins are most like the frame's. What the twin misses is a quadratic of the label, "
-            "fitted to the labelled frames.",
+            "fitted to the labelled frames. Even: these are not drawn at random, but nearest to an even sequence.",
             "Pins are counted from the no-contact frame of the recording, or of each simulated sensor.",
         ]
     )
@@ -164,18 +169,19 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
     figure, axes = sized_figure((5.2 * len(names), 4.2), len(names))
     for ax, name in zip(axes, names, strict=True):
         key = f"{name}_corrected"
-        models = dict.fromkeys(row["model"] for row in _of(rows, "real"))
-        for model, (color, line) in zip(models, STYLES, strict=False):
-            mine = sorted((row for row in _of(rows, "real") if row["model"] == model), key=lambda row: row["labelled_frames"])
-            ax.plot([row["labelled_frames"] for row in mine], [row[key] for row in mine], line, color=color, label=f"real frames, {model}")
+        models = dict.fromkeys(row["model"] for row in _of(rows, REAL))
+        for model, (color, line) in zip(models, STYLES[-len(models) :], strict=False):
+            _curve(ax, _model(rows, REAL, model), key, line, color, f"real frames, {model}")
+            _curve(ax, _model(rows, f"{REAL}{EVENLY}", model), key, "s:", color, f"evenly chosen frames, {model}")
         for row in _of(rows, SIMULATED):
             ax.axhline(row[key], color=BLUE, ls=(0, (5, 2)), label="twin alone")
-        both = _of(rows, "simulated and real")
-        for row in both:
+        for row in _of(rows, BOTH):
             if row["model"] != BACKWARDS:
                 ax.plot(row["labelled_frames"], row[key], "*", color=PURPLE, ms=13, label="twin and labelled frames")
-        if back := [row for row in both if row["model"] == BACKWARDS]:
-            ax.plot([row["labelled_frames"] for row in back], [row[key] for row in back], "^-", color=PURPLE, label="twin read backwards")
+            elif not row["labelled_frames"]:
+                ax.axhline(row[key], color=PURPLE, ls=(0, (1, 2)), label="twin read backwards, no label")
+        _curve(ax, _model(rows, BOTH, BACKWARDS), key, "^-", PURPLE, "twin read backwards")
+        _curve(ax, _model(rows, f"{BOTH}{EVENLY}", BACKWARDS), key, "^:", PURPLE, "twin read backwards, evenly chosen frames")
         ax.set(
             title=f"{name} error", xlabel="labelled real frames", ylabel=f"mean absolute error, {unit_of(name)}", xscale="log", yscale="log"
         )
@@ -185,6 +191,18 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
         plain_log(ax.yaxis)
     axes[0].legend()
     return figure
+
+
+def _model(rows: Sequence[Mapping], trained_on: str, model: str) -> list[Mapping]:
+    """Rows of one model with labelled frames, by their number."""
+    mine = [row for row in _of(rows, trained_on) if row["model"] == model and row["labelled_frames"]]
+    return sorted(mine, key=lambda row: row["labelled_frames"])
+
+
+def _curve(ax: Axes, rows: Sequence[Mapping], key: str, line: str, color: str, label: str) -> None:
+    """The errors of some rows by their numbers of labelled frames."""
+    if rows:
+        ax.plot([row["labelled_frames"] for row in rows], [row[key] for row in rows], line, color=color, label=label)
 
 
 def ingredients_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:

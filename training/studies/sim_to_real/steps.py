@@ -10,6 +10,7 @@ import numpy as np
 from scenes.object import ObjectSpec
 from training.assemble import intervals
 from training.dataset import Dataset, joined, split_rows
+from training.design import nearest_to_even
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_check
 from training.gaussian_process import fit_two_fidelities
@@ -17,6 +18,8 @@ from training.identity import frame_marks, identity_of
 from training.label_code import LabelCode, goes_round, label_error
 from training.loop import epoch_step
 from training.models import model_named, recipe_of
+from training.models.steered.model import STEERED
+from training.models.vgnn.model import VGNN
 from training.pins import voronoi_areas
 from training.recipes import TrainingError
 from training.run import RunConfig, is_finished, train_run
@@ -36,6 +39,8 @@ TWIN_EPOCHS = 60
 MANY = 500
 # Numbers of labelled frames that models are compared with, beside the study's own number and ``MANY``.
 COUNTS = (5, 10, 20, 100)
+# Number of frames, nearest to an even sequence, of which the first ones are taken where labels are designed.
+DESIGNED = (5, 10, 20, 40, 100)
 # Share of the labelled frames' range of a label by which simulated states may lie outside of it.
 RANGE_MARGIN = 0.1
 # Number of modes of the displacements that are inputs of the quadratic regression.
@@ -83,6 +88,14 @@ def choose_frames(count: int, labels: int, seed: int) -> Frames:
     return Frames(test, np.sort(order[:labels]), trained | {"all": rest}, nested)
 
 
+def designed_frames(real: Dataset, chosen: Frames, seed: int) -> list[np.ndarray]:
+    """Sets of ``DESIGNED`` frames that are not judged on, nearest to contacts that are spread evenly; each contains those before it."""
+    pool = chosen.trained["all"]
+    numbers = [count for count in DESIGNED if count < len(pool)]
+    order = pool[nearest_to_even(real.targets.corrected[pool], real.targets.units, max(numbers, default=0), seed=seed)]
+    return [order[:count] for count in numbers]
+
+
 def arm_labels(data: Dataset) -> list[ArmLabel]:
     """The arm's label of each row."""
     folder, pins = data.folder, data.pins
@@ -107,6 +120,12 @@ def measured_of(part: Dataset) -> MeasuredFrames:
     return MeasuredFrames(part.pins.form, part.pins.image_name.tolist(), arm_labels(part), pins_px, part.pins.reference.pins_px, [])
 
 
+def model_for(data: Dataset) -> str:
+    """The model that is trained: ``steered`` where one label is a direction that goes round the whole circle, else ``vgnn``."""
+    turning = goes_round(data.targets.units, data.targets.corrected)
+    return STEERED.name if sum(turning) == 1 else VGNN.name
+
+
 def train_in_twin(
     sim: Dataset,
     out: Path,
@@ -128,16 +147,18 @@ def train_in_twin(
     labelled : Dataset, optional
         The real frames that told what the simulated contacts miss.
     """
-    recipe = recipe_of("vgnn", members=1, epochs=epochs or TWIN_EPOCHS, kernel=False)
+    model = model_for(sim)
+    recipe = recipe_of(model, members=1, epochs=epochs or TWIN_EPOCHS, kernel=False)
     taught: dict[str, object] = {}
     if labelled is not None:
-        taught = identity_of(labelled, model_named("vgnn")) | {"image_names": labelled.pins.image_name.tolist()}
-    _train(RunConfig("vgnn", recipe, seed=seed, split=split, labelled=taught), sim, out, progress)
+        taught = identity_of(labelled, model_named(model)) | {"image_names": labelled.pins.image_name.tolist()}
+    _train(RunConfig(model, recipe, seed=seed, split=split, labelled=taught), sim, out, progress)
 
 
 def train_on_real(real: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Step | None = None) -> None:
     """Train a run on all of the given real frames alone, or continue it."""
-    _train(RunConfig("vgnn", recipe_of("vgnn", epochs=epochs), seed=seed, split=None), real, out, progress)
+    model = model_for(real)
+    _train(RunConfig(model, recipe_of(model, epochs=epochs), seed=seed, split=None), real, out, progress)
 
 
 def _train(config: RunConfig, data: Dataset, out: Path, progress: Step | None) -> None:
@@ -188,7 +209,7 @@ class Beside:
 
 @writes(TENSORS, CONFIG)
 def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, seed: int) -> Beside:
-    """Average a run of ``vgnn`` with a Gaussian process of labelled frames, and write the result as a run to ``out``.
+    """Average a run of ``vgnn`` or ``steered`` with a Gaussian process of labelled frames, and write the result as a run to ``out``.
 
     The run ``run`` is not changed. The average has smaller errors than either model, because their errors differ. Both have the same
     weight: labelled frames can't decide a better one, because both models were trained on them. The intervals of ``out`` are those of

@@ -12,13 +12,14 @@ from training.generation import generate, require_count
 from training.recipes import TrainingError
 from training.simulated import is_simulated
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
-from training.studies.sim_to_real.inverted import TwinBackwards, inverted_row
-from training.studies.sim_to_real.page import write_page
+from training.studies.sim_to_real.inverted import inverted_row, read_backwards
+from training.studies.sim_to_real.page import BOTH, EVENLY, REAL, write_page
 from training.studies.sim_to_real.steps import (
     Beside,
     Frames,
     arm_labels,
     choose_frames,
+    designed_frames,
     judged,
     measured_of,
     put_beside,
@@ -210,7 +211,7 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
             full_learnt = learnt[0]
         rows.append(judged(twin.says, 0, folder, ground.real, ground.chosen.test))
         if twin is ground.full:
-            rows.append(judged("simulated and real", plan.labels, out / BESIDE, ground.real, ground.chosen.test))
+            rows.append(judged(BOTH, plan.labels, out / BESIDE, ground.real, ground.chosen.test))
     rows += _without_the_twin(ground)
     rows += _backwards(ground, sets[ground.full.contacts])
     page = _write_page(ground, rows, beside, known[_tried(ground.full)], full_learnt)
@@ -318,9 +319,11 @@ def _backwards(ground: _Ground, sets: list[Dataset]) -> list[dict[str, Any]]:
     by_folder = {each.folder: each for each in sets}
     told = [label for folder in bare.folders for label in arm_labels(by_folder[folder])]
     like = states_like(bare, ground.few)
-    twin = TwinBackwards((bare.pins.nodes_px - bare.pins.reference.pins_px)[like], [told[row] for row in like])
-    labels = arm_labels(ground.real)
-    return [inverted_row("simulated and real", twin, ground.real, labels, rows, ground.chosen.test) for rows in ground.chosen.nested]
+    twin = read_backwards(bare.rows(like), [told[row] for row in like], ground.plan.experiment, seed=ground.plan.seed)
+    labels, test = arm_labels(ground.real), ground.chosen.test
+    rows = [inverted_row(BOTH, twin, ground.real, labels, rows, test) for rows in (np.zeros(0, int), *ground.chosen.nested)]
+    designed = designed_frames(ground.real, ground.chosen, ground.plan.seed)
+    return rows + [inverted_row(f"{BOTH}{EVENLY}", twin, ground.real, labels, rows, test) for rows in designed]
 
 
 def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
@@ -330,11 +333,13 @@ def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
         folder = ground.out / f"real_{name}"
         with stage(ground.progress, folder.name) as step:
             train_on_real(ground.real.rows(index), folder, seed=ground.plan.seed, epochs=ground.plan.epochs, progress=step)
-        rows.append(judged("real", len(index), folder, ground.real, ground.chosen.test))
-        rows.append(quadratic_row("real", ground.real, index, ground.chosen.test))
+        rows.append(judged(REAL, len(index), folder, ground.real, ground.chosen.test))
+        rows.append(quadratic_row(REAL, ground.real, index, ground.chosen.test))
     counts = {len(index) for index in ground.chosen.trained.values()}
     others = [index for index in ground.chosen.nested if len(index) not in counts]
-    return rows + [quadratic_row("real", ground.real, index, ground.chosen.test) for index in others]
+    rows += [quadratic_row(REAL, ground.real, index, ground.chosen.test) for index in others]
+    designed = designed_frames(ground.real, ground.chosen, ground.plan.seed)
+    return rows + [quadratic_row(f"{REAL}{EVENLY}", ground.real, index, ground.chosen.test) for index in designed]
 
 
 def _write_page(ground: _Ground, rows: list[dict[str, Any]], beside: Beside, missing: Discrepancy, learnt: Dataset) -> Path:

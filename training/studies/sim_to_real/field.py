@@ -1,0 +1,128 @@
+"""The twin's displacements as a smooth function of pose and move.
+
+A displacement is written in waves (``training.models.steered.field``). Where one label is a direction c that goes round the whole circle,
+an edge's, the waves are turned back by c. They are then those that the object's own frame sees, and change little with c. One Gaussian
+process of the labels that vary, and of cos c and sin c, gives all waves: its lengths are those by which the leading components of the
+waves are likeliest.
+"""
+
+import numpy as np
+
+from training.gaussian_process import SMOOTH_AND_LINEAR, Kernel, Points, climbed
+from training.label_code import HALF_CIRCLE_DEG
+from training.models.steered.field import waves_of
+
+MOST_STATES = 2500
+"""Simulated states that the process learns from; more are slower and change no error."""
+FITTED = 400
+"""States on which lengths, sizes and noise are fitted."""
+LEADING = 3
+"""Components of the waves by which they are fitted; they hold most of the displacement."""
+LEAST_RANGE = 1e-9
+"""mm or deg by which a label varies."""
+
+
+class TwinField:
+    """Waves of simulated displacements by pose and move.
+
+    Parameters
+    ----------
+    moved_px : (S, N, 2) float
+        Simulated displacements.
+    known : (S, 12) float
+        Pose and executed move of each, mm and deg.
+    rest_px : (N, 2) float
+        The pins at rest.
+    seed : int
+        Chooses the states that are learnt from.
+
+    Attributes
+    ----------
+    known : (s, 12) float
+        Of the states that are learnt from.
+    direction : int or None
+        The column of ``known`` that goes round the whole circle.
+    varied : (V,) int
+        The other columns that vary.
+    middle, half : (12,) float
+        Middle and half width of the columns' ranges.
+    order : (C,) int
+        How many times each wave turns when the contact turns once.
+    """
+
+    def __init__(self, moved_px: np.ndarray, known: np.ndarray, rest_px: np.ndarray, *, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        rows = np.sort(rng.permutation(len(known))[:MOST_STATES])
+        self.known = known[rows]
+        low, high = self.known.min(axis=0), self.known.max(axis=0)
+        turning = [column for column in range(3, 6) if high[column] - low[column] > HALF_CIRCLE_DEG]
+        self.direction = turning[-1] if turning else None
+        self.varied = np.array([k for k in range(12) if high[k] - low[k] > LEAST_RANGE and k != self.direction], int)
+        self.middle, self.half = (low + high) / 2, np.maximum(high - low, LEAST_RANGE) / 2
+        waves = waves_of(rest_px)
+        self.order, self._fit = waves.order, waves.fit
+        seen, self._sense = self.waves(moved_px[rows]), 1
+        alike = {}
+        for self._sense in (1, -1):  # in the picture a contact turns one way or the other as its direction's label grows
+            alike[self._sense] = float((np.abs((seen * self.turned(self.known, back=True)).mean(axis=0)) ** 2)[self.order != 0].sum())
+        self._sense = max(alike, key=lambda sense: alike[sense])
+        own = seen * self.turned(self.known, back=True)
+        self._mean = own.mean(axis=0)
+        left = parts(own - self._mean)
+        points = Points.of(self._inputs(self.known))
+        self._kernel = _likeliest(points, left, rng)
+        self._placed = self._kernel.placed(points)
+        self._weight = np.linalg.solve(self._kernel.noisy(points), left)
+
+    def __call__(self, known: np.ndarray) -> np.ndarray:
+        """Expected waves (B, C) of contacts (B, 12)."""
+        found = self._kernel.between(self._kernel.placed(Points.of(self._inputs(known))), self._placed) @ self._weight
+        real, imaginary = np.split(found, 2, axis=1)
+        expected: np.ndarray = (self._mean + real + 1j * imaginary) * self.turned(known)
+        return expected
+
+    def waves(self, moved_px: np.ndarray) -> np.ndarray:
+        """Waves (B, C) of displacements (B, N, 2)."""
+        found: np.ndarray = (moved_px @ [1, 1j]) @ self._fit.T
+        return found
+
+    def noise(self, moved_px: np.ndarray) -> np.ndarray:
+        """(2C, 2C) covariance, as ``parts``, of the waves by the noise of pins: by what displacements (B, N, 2) have beside all waves."""
+        count, pins = self._fit.shape
+        beside = moved_px @ [1, 1j] - self.waves(moved_px) @ np.linalg.pinv(self._fit).T
+        variance = float((np.abs(beside) ** 2).mean()) / 2 * pins / max(pins - count, 1)
+        shared = variance * self._fit @ self._fit.conj().T
+        return np.block([[shared.real, -shared.imag], [shared.imag, shared.real]])
+
+    def turned(self, known: np.ndarray, *, back: bool = False) -> np.ndarray:
+        """Factors of the waves from the object's frame to the sensor's, or ``back``: (B, C), or (B, 1) ones if there is no direction."""
+        if self.direction is None:
+            return np.ones((len(known), 1))
+        angle = self._sense * np.radians(known[:, self.direction])[:, None]
+        factors: np.ndarray = np.exp((-1j if back else 1j) * angle * self.order)
+        return factors
+
+    def scaled(self, known: np.ndarray) -> np.ndarray:
+        """The varied labels (B, V), from -1 to 1 over their ranges."""
+        found: np.ndarray = (known[:, self.varied] - self.middle[self.varied]) / self.half[self.varied]
+        return found
+
+    def _inputs(self, known: np.ndarray) -> np.ndarray:
+        if self.direction is None:
+            return self.scaled(known)
+        angle = np.radians(known[:, self.direction])
+        return np.column_stack([self.scaled(known), np.cos(angle), np.sin(angle)])
+
+
+def parts(waves: np.ndarray) -> np.ndarray:
+    """Waves (B, C) as real numbers (B, 2C)."""
+    return np.concatenate([waves.real, waves.imag], axis=-1)
+
+
+def _likeliest(points: Points, outputs: np.ndarray, rng: np.random.Generator) -> Kernel:
+    """One kernel for all outputs (s, D): the mean, in logarithms, of those of their leading components, by their sizes."""
+    left, sizes, _ = np.linalg.svd(outputs, full_matrices=False)
+    rows = rng.permutation(len(points))[:FITTED]
+    start = Kernel(SMOOTH_AND_LINEAR, np.full(points.inputs.shape[1], 1.5), np.array([1.0, 0.3]), np.array([0.1]))
+    fitted = [climbed(start, points.rows(rows), left[rows, k] * np.sqrt(len(left))).logs() for k in range(min(LEADING, len(sizes)))]
+    return start.with_logs(np.average(fitted, axis=0, weights=sizes[: len(fitted)] ** 2))

@@ -1,0 +1,73 @@
+"""What the twin is worth: errors by the number of labelled frames, with the twin and without, of models that need no training.
+
+With the twin: read backwards (``inverted``). Without: quadratic regression. Both with frames drawn at random and with frames nearest to an
+even sequence. A recording of five thousand frames takes as long as its contacts take to be simulated; all models take a minute.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes import load_randomisation
+from training.dataset import joined, load_dataset
+from training.generation import generate
+from training.studies.sim_to_real.inverted import inverted_row, read_backwards
+from training.studies.sim_to_real.page import BOTH, EVENLY, REAL
+from training.studies.sim_to_real.steps import arm_labels, choose_frames, designed_frames, quadratic_row, states_like
+from training.studies.sim_to_real.study import FULL, Plan
+from training.studies.sim_to_real.twins import Twin
+from twin.progress import Progress, silent, stage
+
+
+def worth(plan: Plan, out: Path, seeds: Sequence[int], *, progress: Progress = silent) -> list[dict[str, Any]]:
+    """Rows as those of the study's table: the mean over the draws of frames by these seeds. Contacts have the rig's one friction.
+
+    Parameters
+    ----------
+    plan : Plan
+        ``draws``, ``calibrate``, ``ablate`` and ``epochs`` do not matter; ``seed`` is that of the contacts.
+    out : Path
+        Folder of the simulated contacts; those that it holds are used again.
+
+    Raises
+    ------
+    TrainingError
+        There are too few frames, or the labels of the simulated contacts differ from theirs.
+    """
+    with stage(progress, "frames") as step:
+        real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
+    labels = arm_labels(real)
+    folders = list(plan.simulated)
+    if not folders:
+        executed = 1.0 if all(label.executed for label in labels) else load_randomisation("moves").executed_share
+        drawn = load_randomisation("moves").model_copy(update={"friction": None, "executed_share": executed})
+        twin = Twin(FULL, "simulated", "sim", plan.sensor, plan.wider, drawn, plan.across)
+        folders = [out / twin.contacts]
+        with stage(progress, plan.wider.name) as step:
+            generate(folders[0], twin.config(plan.touched, plan.seed), plan.count, workers=plan.workers, progress=step)
+    sets = [load_dataset(folder, plan.sensor, plan.experiment.targets, form=real.pins.form) for folder in folders]
+    told = [label for each in sets for label in arm_labels(each)]
+    simulated = joined(sets)
+    like = states_like(simulated, real)
+    backwards = read_backwards(simulated.rows(like), [told[row] for row in like], plan.experiment, seed=plan.seed)
+    found: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for seed in seeds:
+        chosen = choose_frames(len(real), plan.labels, seed)
+        every = [np.zeros(0, int), *chosen.nested, chosen.trained["all"]]
+        for designed, among in (("", every), (EVENLY, designed_frames(real, chosen, seed))):
+            for rows in among:
+                made = [inverted_row(f"{BOTH}{designed}", backwards, real, labels, rows, chosen.test)]
+                if len(rows):
+                    made.append(quadratic_row(f"{REAL}{designed}", real, rows, chosen.test))
+                for row in made:
+                    found.setdefault((row["trained_on"], row["model"], row["labelled_frames"]), []).append(row)
+    return [_mean(rows) for rows in found.values()]
+
+
+def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """One row with the mean of all errors."""
+    return {key: value if isinstance(value, str) else float(np.mean([row[key] for row in rows])) for key, value in rows[0].items()} | {
+        "labelled_frames": int(rows[0]["labelled_frames"])
+    }

@@ -63,8 +63,8 @@ def over_splits(work: Path, *, model: str, sensor: str) -> Measured:
     kept = read()
     if missing := [name for name in jobs if name not in kept]:
         raise FiguresError(f"{', '.join(missing)} must be measured first: make figures ONLY={','.join(missing)}")
-    if len({kept[name]["fingerprint"] for name in jobs}) > 1:
-        raise FiguresError(f"{', '.join(jobs)} were measured with different code: make figures ONLY={','.join(jobs)}")
+    if len({kept[name]["commit"] for name in jobs}) > 1:
+        raise FiguresError(f"{', '.join(jobs)} were measured at different commits: make figures ONLY={','.join(jobs)}")
     for kind, unit in product(("corrected", "raw"), UNITS.values()):
         errors = [kept[name]["figures"][f"{kind}_{unit}"]["value"] for name in jobs]
         parts = (("mean", np.mean(errors)), ("least", min(errors)), ("most", max(errors)))

@@ -13,7 +13,7 @@ from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
 from twin.pins import Pipeline, Reference, measure_reference, nominal_reference
 from twin.store import ArrayFile, Layers, layers_from, layers_to
-from twin.types import FloatArray, Form, Frame, Observation
+from twin.types import FloatArray, Form, Frame, ImageArray, Observation
 
 
 class PolicyError(TwinError):
@@ -21,6 +21,8 @@ class PolicyError(TwinError):
 
 
 FILE = ArrayFile("policy", "twin learn", version=1, error=PolicyError)
+PICTURE_CELL_PX = 4
+"""Side of the squares of a picture of which the means are seen: about half the distance of two pins."""
 
 
 @dataclass(frozen=True)
@@ -34,29 +36,28 @@ class Policy:
     mean : (D,) float
         Of the flat observations.
     basis : (K, D) float
-        What the network sees of them, each about 1 in size.
+        What the networks see of them, each about 1 in size.
     layers : tuple of ((o, i), (o,)) float
-        Of a network with tanh between them; its inputs are the K numbers and the goal.
+        Of a network with tanh between them; its inputs are the K numbers, the goal, and what ``sight`` tells of these.
+    sight : tuple of ((o, i), (o,)) float
+        Of a network that tells what no sensor knows (such as place and force) from the K numbers and the goal; empty: there is none.
     """
 
     about: dict[str, Any]
     mean: FloatArray
     basis: FloatArray
     layers: Layers
+    sight: Layers = ()
 
     def reduced(self, tactile: FloatArray, goal: FloatArray) -> FloatArray:
-        """What the network sees, (B, K + G), of observations (B, ...) and goals (B, G)."""
-        seen = (tactile.reshape(len(tactile), -1) - self.mean) @ self.basis.T
-        return np.concatenate([seen, goal], axis=1).astype(np.float32)
+        """What the network of the actions sees, (B, K + G + S), of observations (B, ...) and goals (B, G)."""
+        seen = (flattened(tactile) - self.mean) @ self.basis.T
+        x = np.concatenate([seen, goal], axis=1).astype(np.float32)
+        return np.concatenate([x, _through(self.sight, x)], axis=1) if self.sight else x
 
     def act(self, tactile: FloatArray, goal: FloatArray) -> FloatArray:
         """Actions (B, A) in [-1, 1]."""
-        x = self.reduced(tactile, goal)
-        for number, (weights, offset) in enumerate(self.layers):
-            x = x @ weights.T + offset
-            if number < len(self.layers) - 1:
-                x = np.tanh(x)
-        return np.clip(x, -1.0, 1.0)
+        return np.clip(_through(self.layers, self.reduced(tactile, goal)), -1.0, 1.0)
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -72,7 +73,7 @@ class Policy:
 
     def save(self, path: Path) -> int:
         """Write it to a file; its size in bytes."""
-        arrays = {"mean": self.mean, "basis": self.basis, **layers_to(self.layers)}
+        arrays = {"mean": self.mean, "basis": self.basis, **layers_to(self.layers), **layers_to(self.sight, "sight")}
         return FILE.write(path, {key: value.astype(np.float32) for key, value in arrays.items()}, self.about)
 
 
@@ -86,7 +87,25 @@ def load_policy(path: Path) -> Policy:
     """
     with FILE.opened(path) as (about, arrays):
         SensorSpec.model_validate(about["sensor"])
-        return Policy(about, arrays["mean"], arrays["basis"], layers_from(arrays))
+        return Policy(about, arrays["mean"], arrays["basis"], layers_from(arrays), layers_from(arrays, "sight"))
+
+
+def flattened(tactile: FloatArray | ImageArray) -> FloatArray:
+    """Observations (B, ...) as vectors (B, D); pictures (B, H, W, k) uint8 as means of squares of ``PICTURE_CELL_PX``, 0 to 1."""
+    if tactile.dtype == np.uint8:
+        count, height, width, stack = tactile.shape
+        cells = (height // PICTURE_CELL_PX, PICTURE_CELL_PX, width // PICTURE_CELL_PX, PICTURE_CELL_PX)
+        tactile = tactile.reshape(count, *cells, stack).mean(axis=(2, 4), dtype=np.float32) / 255.0
+    return tactile.reshape(len(tactile), -1)
+
+
+def _through(layers: Layers, x: FloatArray) -> FloatArray:
+    """What a network with tanh between its layers answers to inputs (B, i)."""
+    for number, (weights, offset) in enumerate(layers):
+        x = x @ weights.T + offset
+        if number < len(layers) - 1:
+            x = np.tanh(x)
+    return x
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,13 @@
-"""What the shipped surrogates tell of their errors, and how fast the environments step."""
+"""What the shipped surrogates tell of their errors, how fast the environments step, and what is learnt from nothing."""
 
+import json
 from functools import partial
 from pathlib import Path
 
 import bench_environments
 import numpy as np
 
-from figures.jobs import Measured, Value, job
+from figures.jobs import Measured, Value, job, run_twin
 from scenes import load_sensor
 from training.surrogate.model import surrogate_of
 
@@ -44,3 +45,35 @@ def speed(work: Path) -> Measured:
         "rigid": Value(float(rigid), "1/s"),
         "share_of_rigid": Value(float(together / rigid)),
     }
+
+
+LEARNT = {
+    "EdgeFollow.pins": ("--randomise moves --fem 20", 12),
+    "EdgeFollow.oracle": ("--observation oracle", 2),
+    "EdgeFollow.image": ("--observation image", 20),
+    "EdgeFollow.forgetful": ("--randomise moves --no-memory --fem 20", 12),
+    "SurfaceFollow.pins": ("", 3),
+    "SurfaceFollow.oracle": ("--observation oracle", 3),
+    "ContourFollow.pins": ("", 20),
+    "ObjectRoll.pins": ("", 15),
+    "ObjectPush.pins": ("", 30),
+    "GentlePress.pins": ("", 15),
+}
+"""Options of ``twin learn``, and about how many minutes it takes with all judging, by task and what the policy sees."""
+WHERE = {"surrogate": "", "surrogate, friction remembers": "remembers_", "finite elements, drawn frames": "fem_"}
+"""Beginnings of the figures' names, by where ``twin learn`` judged the policy."""
+
+
+def learnt(work: Path, *, name: str) -> Measured:
+    """Shares of the episodes that a policy solves, which was learnt from nothing by one command, and how long that took."""
+    task, options = name.split(".")[0], LEARNT[name][0].split()
+    run_twin(work, "learn", "--task", task, "--sensor", "mg400-331", *options, "--out", work / "learnt", "--force")
+    told = json.loads((work / "learnt" / "result.json").read_text())
+    shares = {f"{WHERE[where]}success": Value(share) for where, share in told["success"].items()}
+    return shares | {"steps": Value(told["steps"]), "minutes": Value(told["minutes"], "min")}
+
+
+for name, (options, minutes) in LEARNT.items():
+    command = f"twin learn --task {name.split('.')[0]} --sensor mg400-331 {options} --out out/learnt".replace("  ", " ")
+    code = ("training.environments", "training.surrogate", "twin.policy")
+    job(f"policies.{name}", command, sensors=("mg400-331",), code=code, minutes=minutes)(partial(learnt, name=name))

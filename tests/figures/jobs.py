@@ -136,9 +136,20 @@ UNMEASURED = ("twin.cli", "twin.report")
 
 
 def code_of_packages(*packages: str) -> str:
-    """Fingerprint of all modules of some packages that may change a figure."""
-    files = (path.relative_to(ROOT).with_suffix("") for package in packages for path in sorted((ROOT / package).rglob("*.py")))
-    modules = [".".join(path.parts).removesuffix(".__init__") for path in files]
+    """Fingerprint of all modules of some packages (``training.surrogate``) that may change a figure.
+
+    Raises
+    ------
+    FiguresError
+        There is no such package or module.
+    """
+    modules: list[str] = []
+    for package in packages:
+        place = ROOT / package.replace(".", "/")
+        files = sorted(place.rglob("*.py")) or [path for path in (place.with_suffix(".py"),) if path.is_file()]
+        if not files:
+            raise FiguresError(f"a figure depends on the code of {package!r}, which is no package; name one such as 'training.surrogate'")
+        modules += [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in files]
     return store.fingerprint(*(name for name in modules if not name.startswith(UNMEASURED)))
 
 

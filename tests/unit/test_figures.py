@@ -45,6 +45,15 @@ def test_what_it_was_made_from_decides_whether_it_counts(counted, tmp_path, monk
     assert is_kept(job, path) and values(path)["probe.force.force"].value == 1.0
 
 
+def test_every_jobs_code_is_found():
+    """Code that is not found would never make a figure count as old."""
+    assert all(module.code_of_packages(*job.code) for job in JOBS.values())
+    part, module_alone = module.code_of_packages("training.surrogate"), module.code_of_packages("twin.policy")
+    assert len({part, module_alone, module.code_of_packages("training")}) == 3
+    with pytest.raises(FiguresError, match="'training.nowhere'"):
+        module.code_of_packages("training.nowhere")
+
+
 def test_other_jobs_figures_stay(counted, tmp_path):
     job, _ = counted
     path = tmp_path / "figures.json"

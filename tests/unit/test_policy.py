@@ -18,7 +18,7 @@ from training.environments.world import Surfaces, standing_on
 from twin.cli import command_line
 from twin.errors import FrameError, OptionError
 from twin.geometry.pins import rest_pins
-from twin.policy import PolicyError, PolicyModel, load_policy, with_goal
+from twin.policy import Policy, PolicyError, PolicyModel, flattened, load_policy, with_goal
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
 
@@ -108,7 +108,13 @@ def start_on(batch, depth_mm):
     return standing_on(batch.tool, Surfaces()[load_object("plane")], 0.0, depth_mm, 0.0)
 
 
-def test_a_policy_is_learnt_in_small(tmp_path):
+@pytest.fixture
+def few_looks(monkeypatch):
+    """Little random motion: what a test learns need not be seen well."""
+    monkeypatch.setattr(learn, "RANDOM_STEPS", 10)
+
+
+def test_a_policy_is_learnt_in_small(tmp_path, few_looks):
     plan = LearnPlan("SurfaceFollow", SMALL, minutes=0.02, environments=2, episodes=2)
     made = learn_policy(plan, tmp_path)
     assert {path.name for path in made.written} == {"policy.safetensors", "learning.csv", "learning.png", "result.json"}
@@ -116,6 +122,37 @@ def test_a_policy_is_learnt_in_small(tmp_path):
     again = load_policy(tmp_path / "policy.safetensors")
     assert again.about["sensor"]["name"] == "mg400-127" and again.axes == ("z", "Ry")
     assert set(made.success) == {"surrogate"} and "solved" in made.lines()[0]
+    seen, goal = np.random.default_rng(0).normal(size=(3, 1, 127, 2)), np.array([[3.0, 0.0]] * 3)
+    assert np.allclose(again.act(seen, goal), made.policy.act(seen, goal), atol=1e-4) and len(again.sight) == 3
+
+
+def test_a_policy_is_learnt_from_pictures_in_small(tmp_path, few_looks):
+    options = replace(SMALL, observation="image", objects=("plane",))
+    made = learn_policy(LearnPlan("SurfaceFollow", options, minutes=0.001, environments=2, episodes=1), tmp_path)
+    assert load_policy(made.written[0]).mean.shape == (1024,)  # of 32 x 32 means of 4 x 4 px
+
+
+def test_pictures_are_seen_as_means_of_squares():
+    picture = np.zeros((1, 128, 128, 2), np.uint8)
+    picture[0, 4:8, 8:10, 1] = 255
+    seen = flattened(picture).reshape(32, 32, 2)
+    assert seen[1, 2, 1] == pytest.approx(0.5) and seen.sum() == pytest.approx(0.5)
+
+
+def test_a_policy_that_learnt_without_friction_memory_is_also_judged_with_it(tmp_path, few_looks, monkeypatch):
+    asked = []
+    monkeypatch.setattr(learn, "judge_policy", lambda policy, task, options, episodes, seed: asked.append(options.friction_memory) or 0.5)
+    made = learn_policy(LearnPlan("SurfaceFollow", replace(SMALL, friction_memory=False), minutes=0.001, environments=2), tmp_path)
+    assert asked == [False, True] and len(made.success) == 2
+
+
+def test_a_policys_sight_tells_what_the_pins_do_not_say_at_once():
+    """The network learns the product of two numbers, which no linear one could tell."""
+    given = np.random.default_rng(0).uniform(-1, 1, (4000, 3))
+    truth = np.column_stack([given[:, 0] * given[:, 1], np.zeros(4000)])
+    layers = learn._sight((given[:, :2], given[:, 2:]), truth, 0)
+    told = Policy({}, np.zeros(2), np.eye(2), (), layers).reduced(given[:, :2], given[:, 2:])[:, 3:]
+    assert np.abs(told[:, 0] - truth[:, 0] / truth[:, 0].std()).mean() < 0.1 and np.abs(told[:, 1]).max() < 0.1  # of a deviation
 
 
 def test_judging_counts_long_episodes_as_well_as_short_ones(policy, monkeypatch):
@@ -141,7 +178,7 @@ def test_judging_counts_long_episodes_as_well_as_short_ones(policy, monkeypatch)
     assert [judge_policy(policy, "SurfaceFollow", SMALL, episodes) for episodes in (2, 8, 24)] == [0.5] * 3
 
 
-def test_a_policy_is_kept_where_judging_it_is_interrupted(tmp_path, monkeypatch):
+def test_a_policy_is_kept_where_judging_it_is_interrupted(tmp_path, few_looks, monkeypatch):
     def interrupted(*args, **kwargs):
         raise KeyboardInterrupt
 
@@ -187,5 +224,3 @@ WRONG = [
 def test_a_plan_that_cannot_be_meant_is_refused(task, more, says):
     with pytest.raises(OptionError, match=says):
         LearnPlan(task, SMALL, **more)
-    with pytest.raises(OptionError, match="image"):
-        LearnPlan("EdgeFollow", Options(observation="image"))

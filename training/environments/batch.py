@@ -313,7 +313,15 @@ class Batch:
         """The newest observations of all rows; copies."""
         assert self._seen is not None, "settle first"
         seen = np.moveaxis(self._seen, 1, -1) if self.options.observation == "image" else self._seen
-        return {"tactile": seen.copy(), "goal": self.goal.astype(np.float32)}
+        return {"tactile": seen.copy(), "goal": self.asked().astype(np.float32)}
+
+    def asked(self) -> FloatArray:
+        """What the episodes ask for, (B, G), by the task's ``goal_names``."""
+        return self.task.asked(self.goal, self.T_work)
+
+    def oracle(self) -> FloatArray:
+        """What no real sensor knows of the newest states, (B, K), by the task's ``oracle_names``."""
+        return np.clip(self.task.oracle(self._seen_now()), -MOST_ORACLE, MOST_ORACLE)
 
     def picture(self, row: int) -> ImageArray:
         """(H, W, 3) uint8: the sensor's frame of one environment."""
@@ -382,7 +390,7 @@ class Batch:
     def _look(self, rows: IntArray, *, first: bool) -> None:
         newest: FloatArray | ImageArray
         if self.eye is None:
-            newest = np.clip(self.task.oracle(self._seen_now())[rows], -MOST_ORACLE, MOST_ORACLE).astype(np.float32)
+            newest = self.oracle()[rows].astype(np.float32)
             valid = np.ones(len(rows), bool)
         else:
             newest, valid = self.eye.look(self.backend, rows, self._rngs)

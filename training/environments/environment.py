@@ -116,7 +116,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         T = batch.tool.seen(batch.T_work, batch.T_object)[0]
         place_mm, felt = batch.touch().place_mm[0], batch.backend.felt
         told = {
-            "goal": "  ".join(f"{name} {value:g}" for name, value in zip(batch.task.goal_names, batch.goal[0], strict=True)),
+            "goal": "  ".join(f"{name} {value:g}" for name, value in zip(batch.task.goal_names, batch.asked()[0], strict=True)),
             "contact area, slipping": f"{felt.area_mm2[0]:.0f} mm2, {100 * felt.slip[0]:.0f} %",
             "not computed": felt.lost[0],
         }

@@ -1,11 +1,13 @@
 """Learning a policy by proximal policy optimisation (stable-baselines3), and judging it on either backend.
 
-The network does not see some hundred pins but the directions in which they move together most, found in random motions.
+The network does not see some hundred pins but the directions in which they move together most, found in random motions. In the same
+motions a second network learns to tell from these what only the simulation knows, such as place and force; the policy sees what it tells.
 """
 
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +23,22 @@ from training.environments.batch import Options, require_task, require_whole
 from training.environments.environment import TactileVectorEnv
 from training.environments.observe import Pictures
 from twin.errors import OptionError
-from twin.policy import Policy
+from twin.policy import Policy, flattened
 from twin.progress import Progress, Step, silent, stage
 from twin.report.charts import new_figure, save_figure
-from twin.store import text_file, write_json, writes
+from twin.store import Layers, text_file, write_json, writes
 from twin.types import FloatArray
 
 COMPONENTS = 24
 """Directions of the pins' motion that a network sees."""
-RANDOM_STEPS = 40
-"""Steps of random motion of each environment, in which those directions are found."""
+RANDOM_STEPS = 250
+"""Steps of random motion of each environment, in which those directions are found, and what they tell is learnt."""
+SIGHT_LAYERS = (128, 128)
+"""Neurons of the hidden layers of the network that tells what only the simulation knows, with tanh."""
+SIGHT_EPOCHS, SIGHT_BATCH, SIGHT_RATE = 30, 256, 2e-3
+"""How it learns, by Adam; the rate falls to nothing."""
+LEAST_DEVIATION = 1e-3
+"""What it tells is scaled by no less than this: a number that never changes tells nothing."""
 LEAST_SPREAD = 0.02
 """Directions are scaled by no less than this share of the largest one's spread: the rest is noise."""
 LAYERS = (64, 64)
@@ -75,8 +83,6 @@ class LearnPlan:
 
     def __post_init__(self) -> None:
         require_task(self.task)
-        if self.options.observation not in ("pins", "oracle", "pose", "graph"):
-            raise OptionError(f"observation={self.options.observation!r}: this example learns from pins, graph, pose or oracle")
         if not (self.minutes > 0 and np.isfinite(self.minutes)):
             raise OptionError(f"minutes={self.minutes!r}: expected more than 0")
         for name, least in (("environments", 2), ("episodes", 1), ("fem_episodes", 0), ("seed", 0)):
@@ -104,12 +110,12 @@ class SteppedTogether(VecEnv):
 
     def __init__(self, vector: TactileVectorEnv, policy: Policy) -> None:
         self.vector, self.policy = vector, policy
-        size = len(policy.basis) + len(vector.batch.task.goal_names)
+        size = policy.reduced(*_seen(vector.batch.observation())).shape[1]
         super().__init__(vector.num_envs, spaces.Box(-np.inf, np.inf, (size,), np.float32), vector.single_action_space)
         self._actions: FloatArray = np.zeros((vector.num_envs, *(vector.single_action_space.shape or ())))
 
     def _reduced(self, seen: dict[str, Any]) -> FloatArray:
-        return self.policy.reduced(seen["tactile"], seen["goal"])
+        return self.policy.reduced(*_seen(seen))
 
     def reset(self) -> FloatArray:
         """See ``VecEnv``."""
@@ -127,7 +133,7 @@ class SteppedTogether(VecEnv):
         for row in np.flatnonzero(done):
             last = told["final_obs"][row]
             infos[row] = {
-                "terminal_observation": self.policy.reduced(last["tactile"][None], last["goal"][None])[0],
+                "terminal_observation": self.policy.reduced(*(part[None] for part in _seen(last)))[0],
                 "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
                 "is_success": bool(told["final_info"]["is_success"][row]),
             }
@@ -157,9 +163,9 @@ class SteppedTogether(VecEnv):
 class _Watch(BaseCallback):
     """Keeps the learning curve, and ends the learning when it is good enough or takes too long."""
 
-    def __init__(self, plan: LearnPlan, step: Step) -> None:
+    def __init__(self, plan: LearnPlan, step: Step, begun_s: float) -> None:
         super().__init__()
-        self._plan, self._step, self._begun = plan, step, time.monotonic()
+        self._plan, self._step, self._begun = plan, step, begun_s
         self._ended: list[bool] = []
         self._rewards: list[float] = []
         self.curve: list[tuple[int, float, float, float]] = []
@@ -191,6 +197,7 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
         Something that is asked for can't be had.
     """
     torch.set_num_threads(1)
+    begun_s = time.monotonic()
     vector = TactileVectorEnv(plan.task, plan.environments, autoreset_mode=AutoresetMode.SAME_STEP, **_given(plan.options))
     blank = _untrained(plan, vector)
     env = SteppedTogether(vector, blank)
@@ -210,19 +217,24 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
         device="cpu",
     )
     with stage(progress, f"learning {plan.task}") as step:
-        watch = _Watch(plan, step)
+        watch = _Watch(plan, step, begun_s)
         ppo.learn(10**9, callback=watch)
-    made = replace(blank, layers=_layers_of(ppo))
+    made = replace(blank, layers=_layers_of([*ppo.policy.mlp_extractor.policy_net, ppo.policy.action_net]))
     written = [out / "policy.safetensors", out / "learning.csv", out / "learning.png", out / "result.json"]
     made.save(written[0])  # before it is judged, which takes long and may be interrupted
     _write_curve(watch.curve, written[1], written[2])
     success: dict[str, float] = {
         str(plan.options.backend): judge_policy(made, plan.task, plan.options, plan.episodes, seed=10_000 + plan.seed)
     }
+    if not plan.options.friction_memory:
+        remembering = replace(plan.options, friction_memory=True)
+        success["surrogate, friction remembers"] = judge_policy(made, plan.task, remembering, plan.episodes, seed=10_000 + plan.seed)
     if plan.fem_episodes:
         true = on_finite_elements(plan.options, tuple(vector.batch.objects))
         success["finite elements, drawn frames"] = judge_policy(made, plan.task, true, plan.fem_episodes, seed=20_000 + plan.seed)
-    write_json(written[3], {"task": plan.task, "options": asdict(plan.options), "success": success, "steps": ppo.num_timesteps})
+    steps, seconds = watch.curve[-1][:2] if watch.curve else (ppo.num_timesteps, time.monotonic() - begun_s)
+    told = {"success": success, "steps": steps, "minutes": round(seconds / 60, 2)}
+    write_json(written[3], {"task": plan.task, "options": asdict(plan.options), **told})
     return Learnt(made, watch.curve, success, written)
 
 
@@ -254,7 +266,7 @@ def judge_policy(policy: Policy, task: str, options: Options, episodes: int, *, 
     share = np.array([len(range(row, episodes, rows)) for row in range(rows)])
     ended = solved = np.zeros(rows, int)
     while (ended < share).any():
-        seen, _, terminated, truncated, told = vector.step(policy.act(seen["tactile"], seen["goal"]))
+        seen, _, terminated, truncated, told = vector.step(policy.act(*_seen(seen)))
         counted = (terminated | truncated) & (ended < share)
         if counted.any():
             ended, solved = ended + counted, solved + (counted & told["final_info"]["is_success"])
@@ -265,23 +277,29 @@ def _given(options: Options) -> dict[str, Any]:
     return {name: getattr(options, name) for name in Options.__dataclass_fields__}
 
 
+def _seen(observed: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
+    """The parts of an observation as a policy takes them."""
+    return observed["tactile"], observed["goal"]
+
+
 def _untrained(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
-    """What a network sees, from random motions; no network."""
+    """What the network of the actions sees, from random motions; that network itself is left out."""
+    batch, task = vector.batch, vector.batch.task
     rng = np.random.default_rng(plan.seed)
-    seen, _ = vector.reset(seed=plan.seed)
-    rows, goals = [], [seen["goal"]]
+    vector.reset(seed=plan.seed)
+    rows, goals, truths = [], [], []
     drift = np.zeros((vector.num_envs, *(vector.single_action_space.shape or ())))
     for _ in range(RANDOM_STEPS):
         drift = np.clip(0.8 * drift + 0.4 * rng.normal(size=drift.shape), -1, 1)
         seen, *_ = vector.step(drift)
-        rows.append(seen["tactile"].reshape(vector.num_envs, -1))
+        rows.append(flattened(seen["tactile"]))
         goals.append(seen["goal"])
-    flat = np.concatenate(rows)
+        truths.append(batch.oracle())
+    flat, goal = np.concatenate(rows).astype(np.float32), np.concatenate(goals)
     mean = flat.mean(axis=0)
-    _, sizes, basis = np.linalg.svd(flat - mean, full_matrices=False)
-    count = min(COMPONENTS, flat.shape[1])
-    spread = np.maximum(sizes[:count], LEAST_SPREAD * sizes[0]) / np.sqrt(len(flat))
-    batch, task = vector.batch, vector.batch.task
+    variance, basis = np.linalg.eigh(np.cov(flat - mean, rowvar=False).reshape(flat.shape[1], -1))
+    largest = np.argsort(variance)[::-1][:COMPONENTS]
+    spread = np.sqrt(np.maximum(variance[largest], LEAST_SPREAD**2 * variance.max()))
     about = {
         "task": plan.task,
         "experiment": task.experiment,
@@ -292,14 +310,35 @@ def _untrained(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
         "scale": batch.action_scale.tolist(),
         "feed_mm": list(task.feed_mm),
         "goal_names": list(task.goal_names),
-        "goal": np.median(np.concatenate(goals), axis=0).tolist(),
+        "goal": np.median(goal, axis=0).tolist(),
         "trained": {**{key: value for key, value in asdict(plan.options).items()}, "seed": plan.seed},
     }
-    return Policy(about, mean, basis[:count] / spread[:, None], ())
+    blank = Policy(about, mean, basis[:, largest].T / spread[:, None], ())
+    if plan.options.observation == "oracle":
+        return blank
+    return replace(blank, sight=_sight(((flat - mean) @ blank.basis.T, goal), np.concatenate(truths), plan.seed))
 
 
-def _layers_of(ppo: PPO) -> tuple[tuple[FloatArray, FloatArray], ...]:
-    """The network of the mean action."""
-    parts: Sequence[torch.nn.Module] = [*ppo.policy.mlp_extractor.policy_net, ppo.policy.action_net]
+def _sight(given: Sequence[FloatArray], truth: FloatArray, seed: int) -> Layers:
+    """A network that tells what only a simulation knows (S, O), each about 1 in size, from what is given (S, ...)."""
+    inputs = torch.tensor(np.concatenate(given, axis=1), dtype=torch.float32)
+    wanted = torch.tensor((truth - truth.mean(axis=0)) / np.maximum(truth.std(axis=0), LEAST_DEVIATION), dtype=torch.float32)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        sizes = (inputs.shape[1], *SIGHT_LAYERS, wanted.shape[1])
+        linear = [torch.nn.Linear(size, following) for size, following in pairwise(sizes)]
+        network = torch.nn.Sequential(*[part for layer in linear for part in (layer, torch.nn.Tanh())][:-1])
+        adam = torch.optim.Adam(network.parameters(), SIGHT_RATE)
+        for epoch in range(SIGHT_EPOCHS):
+            adam.param_groups[0]["lr"] = SIGHT_RATE * (1.0 - epoch / SIGHT_EPOCHS)
+            for some in torch.randperm(len(inputs)).split(SIGHT_BATCH):
+                adam.zero_grad()
+                torch.nn.functional.mse_loss(network(inputs[some]), wanted[some]).backward()
+                adam.step()
+    return _layers_of(linear)
+
+
+def _layers_of(parts: Sequence[torch.nn.Module]) -> Layers:
+    """The weights and offsets of a network's linear parts."""
     linear = [part for part in parts if isinstance(part, torch.nn.Linear)]
     return tuple((layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy()) for layer in linear)

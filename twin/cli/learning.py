@@ -424,7 +424,7 @@ def learn(
     task: Annotated[str, typer.Option("--task", metavar="T", help="EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ...")],
     sensor: Sensor,
     out: Out,
-    observation: Annotated[str, typer.Option("--observation", help="pins, graph, pose or oracle")] = "pins",
+    observation: Annotated[str, typer.Option("--observation", help="pins, image, graph, pose or oracle")] = "pins",
     randomise: Annotated[str | None, typer.Option("--randomise", metavar="R", help="what differs between episodes, e.g. moves")] = None,
     surrogate: Annotated[Path | None, typer.Option("--surrogate", metavar="FILE", help="for a sensor of one's own")] = None,
     objects: Annotated[str | None, typer.Option("--objects", callback=each_once, help="in place of the task's, commas between")] = None,

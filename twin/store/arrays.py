@@ -116,21 +116,21 @@ class ArrayFile:
             raise self.error(f"{path}: damaged, or no {self.thing} ({reason}); {self._remedy}") from error
 
 
-def layers_to(layers: Layers) -> dict[str, np.ndarray]:
+def layers_to(layers: Layers, name: str = "layers") -> dict[str, np.ndarray]:
     """A network's layers as arrays by name."""
-    return {f"layers.{n}.{part}": array for n, layer in enumerate(layers) for part, array in zip(("weights", "offset"), layer, strict=True)}
+    return {f"{name}.{n}.{part}": array for n, layer in enumerate(layers) for part, array in zip(("weights", "offset"), layer, strict=True)}
 
 
-def layers_from(arrays: Mapping[str, FloatArray]) -> Layers:
-    """The layers that ``layers_to`` put among arrays.
+def layers_from(arrays: Mapping[str, FloatArray], name: str = "layers") -> Layers:
+    """The layers that ``layers_to`` put among arrays under a name; none if there are none.
 
     Raises
     ------
     KeyError
         A layer is missing.
     """
-    count = sum(key.startswith("layers.") and key.endswith(".weights") for key in arrays)
-    return tuple((arrays[f"layers.{n}.weights"], arrays[f"layers.{n}.offset"]) for n in range(count))
+    count = sum(key.startswith(f"{name}.") and key.endswith(".weights") for key in arrays)
+    return tuple((arrays[f"{name}.{n}.weights"], arrays[f"{name}.{n}.offset"]) for n in range(count))
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:

@@ -70,7 +70,11 @@ def learnt(work: Path, *, name: str) -> Measured:
     run_twin(work, "learn", "--task", task, "--sensor", "mg400-331", *options, "--out", work / "learnt", "--force")
     told = json.loads((work / "learnt" / "result.json").read_text())
     shares = {f"{WHERE[where]}success": Value(share) for where, share in told["success"].items()}
-    return shares | {"steps": Value(told["steps"]), "minutes": Value(told["minutes"], "min")}
+    return shares | {
+        "steps": Value(told["steps"]),
+        "minutes": Value(told["minutes"], "min"),
+        "core_minutes": Value(told["core_minutes"], "min"),
+    }
 
 
 for name, (options, minutes) in LEARNT.items():

@@ -312,7 +312,9 @@ class ObjectRoll(Task):
     steps = 60
     """A ball goes half as far as the tool: across all of the places it takes 16 steps at full speed."""
     within_mm = 4.0
-    """Starts and goals lie so far from the apex: farther out a ball that is 1 mm deep under the apex is hardly touched."""
+    """Starts and goals lie up to so far from the apex."""
+    indents_mm = (1.5, 2.5)
+    """Of a ball under the apex; at the ends of these places it is 0.4 mm less, and what is touched with less than 1 mm is hardly seen."""
     farthest_mm = 6.0
     near_mm = 0.6
     holds_n = 1e-3
@@ -327,7 +329,7 @@ class ObjectRoll(Task):
         assert isinstance(touched.shape, SphereShape)  # required
         self.kept[row] = touched.shape.radius_mm
         self._apex = tool.T_work_sensor[:2, 3]
-        indent = rng.uniform(1.0, 2.0)
+        indent = rng.uniform(*self.indents_mm)
         away, toward = self.within_mm * np.sqrt(rng.uniform(size=2)), rng.uniform(0.0, 2 * np.pi, 2)
         start, goal = np.column_stack([away * np.cos(toward), away * np.sin(toward)])  # uniform in a disc
         T = np.eye(4)

@@ -92,11 +92,12 @@ def load_policy(path: Path) -> Policy:
 
 def flattened(tactile: FloatArray | ImageArray) -> FloatArray:
     """Observations (B, ...) as vectors (B, D); pictures (B, H, W, k) uint8 as means of squares of ``PICTURE_CELL_PX``, 0 to 1."""
-    if tactile.dtype == np.uint8:
-        count, height, width, stack = tactile.shape
-        cells = (height // PICTURE_CELL_PX, PICTURE_CELL_PX, width // PICTURE_CELL_PX, PICTURE_CELL_PX)
-        tactile = tactile.reshape(count, *cells, stack).mean(axis=(2, 4), dtype=np.float32) / 255.0
-    return tactile.reshape(len(tactile), -1)
+    if tactile.dtype != np.uint8:
+        return np.asarray(tactile, float).reshape(len(tactile), -1)
+    count, height, width, stack = tactile.shape
+    cells = (height // PICTURE_CELL_PX, PICTURE_CELL_PX, width // PICTURE_CELL_PX, PICTURE_CELL_PX)
+    means: FloatArray = tactile.reshape(count, *cells, stack).mean(axis=(2, 4), dtype=np.float32)
+    return means.reshape(count, -1) / 255.0
 
 
 def _through(layers: Layers, x: FloatArray) -> FloatArray:

@@ -73,8 +73,8 @@ class FollowPlan:
         Whether the object really stands at the servo's placement, so that the results can be compared with the truth. In the twin it
         always does.
     at_rest : str
-        What pins are counted from: ``first`` (the frame that is taken clear of the object), ``none`` (the specification's layout), or
-        a file.
+        What pins are counted from: ``first`` (the frame that is taken clear of the object), ``none`` (the rest places that the model
+        knows, or that the contacts tell once they do), or a file.
     also : tuple of str
         Further formats that the session is kept in at its end, each in a subfolder of it.
     """
@@ -165,6 +165,8 @@ def follow(
     rest = given_frame(plan.at_rest, model)
     if rest is not None:
         model = model.at_rest(rest)
+    elif model.counts_from_rest and plan.at_rest != FIRST:
+        model = model.seeking_rest()
     rig = _rig_of(plan, model)
     round_steps, wanted_mm = steps_round(rig.placed, plan.servo, 1.0)
     steps = plan.steps or round_steps

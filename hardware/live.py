@@ -243,7 +243,8 @@ class WatchPlan:
     seconds, count : float or None, int or None
         Stop after this time in s, or after this number of frames.
     at_rest : str
-        What pins are counted from: ``first`` (the first frame), ``none`` (the specification's layout), or a file.
+        What pins are counted from: ``first`` (the first frame), ``none`` (the rest places that the model knows, or that the contacts
+        tell once they do), or a file.
     port : int
         Port of the page; 0: a free one.
     also : tuple of str
@@ -392,14 +393,14 @@ def _catch_up(session: LiveSession, kept: KeptAlso) -> None:
 
 
 def _at_rest(plan: WatchPlan, model: SensorModel, source: FrameSource, rest: Frame | None) -> tuple[SensorModel, Frame | None]:
-    """The model that counts pins from the frame without contact, and that frame."""
+    """The model that counts pins from the frame without contact, or from where contacts tell that they are at rest; and that frame."""
     if plan.at_rest == FIRST:
         rest = await_frame(source)
         return counting_from_first(model, rest), rest
     # A session may be replayed with another model than its own, which may not count pins from a frame without contact.
     if rest is not None and (model.counts_from_rest or plan.replay is None):
         return model.at_rest(rest), rest
-    return model, rest
+    return (model.seeking_rest() if model.counts_from_rest else model), rest
 
 
 def _view(plan: WatchPlan, title: str, pipeline: Pipeline) -> View | None:

@@ -47,6 +47,11 @@ SETTLE, MOST_ROUNDS, SETTLED = 6, 20, 3e-4
 """Rounds in which the contacts alone are sought first, most rounds after them, and the change, in spacings, at which they end."""
 LONGEST_STEP = 0.7
 """Most that a coordinate changes in a round."""
+OTHER_UNIT = (
+    "the pins at rest were found from the contacts: they are not where they were measured on the unit that the weights are for, so this is "
+    "another unit, or its camera or tip was touched; one frame without contact (init_0.png beside the frames) is more exact"
+)
+"""What is said where contacts tell other rest places than those that are known."""
 
 
 @dataclass(frozen=True)

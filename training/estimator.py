@@ -21,6 +21,7 @@ from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.pins import PinTable
 from training.recipes import TrainingError
+from training.rest_seeking import RestSeeker
 from training.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, require_together
 from training.slip import NAMES as SLIP_NAMES
 from training.slip import SLIP, SLIP_UNITS, Slip, SlipModel, SlipTracker, read_slip
@@ -235,11 +236,19 @@ class PoseEstimator:
 
         Its rest places are those that were measured on the unit of the weights, unless the contacts tell others: see ``other_rest``.
         """
+        pipeline = self.at_known_rest().pipeline
+        graphs = [seen.graph for frame in frames if (seen := pipeline(frame)).valid]
+        return self.told_rest(np.array([graph.nodes_px for graph in graphs if graph is not None]).reshape(-1, self.sensor.pins.count, 2))
+
+    def told_rest(self, nodes_px: np.ndarray) -> tuple["PoseEstimator", bool]:
+        """As ``at_rest_of``, from the pins (M, N, 2), px, of contacts."""
         estimator = self.at_known_rest()
-        graphs = [seen.graph for frame in frames if (seen := estimator.pipeline(frame)).valid]
-        nodes_px = np.array([graph.nodes_px for graph in graphs if graph is not None]).reshape(-1, self.sensor.pins.count, 2)
         other = estimator.other_rest(estimator.pipeline.reference, nodes_px)
         return (estimator, False) if other is None else (estimator._counted_from(other), True)
+
+    def seeking_rest(self) -> "RestSeeker[PoseEstimator]":
+        """The model for a camera's frames where no frame shows its sensor without contact: as ``at_rest_of``, while the frames come."""
+        return RestSeeker(self)
 
     def with_intervals(self, intervals: Mapping[str, np.ndarray]) -> "PoseEstimator":
         """The same model with other interval quantiles, as ``training.evaluate.intervals_on`` finds them for one kind of its frames."""

@@ -59,6 +59,9 @@ class SensorModel(Protocol):
     def at_rest(self, frame: Frame) -> Self:
         """The same model, counting pins from a frame without contact."""
 
+    def seeking_rest(self) -> "SensorModel":
+        """The model for a stream of frames where none is known to show no contact; it may find the pins' rest places by the contacts."""
+
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """Raise an error if the model was not trained on frames of this sensor and form."""
 

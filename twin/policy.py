@@ -165,6 +165,10 @@ class PolicyModel:
         """The same policy, counting pins from a frame without contact."""
         return self._counted_from(measure_reference(self.sensor, self.form, frame))
 
+    def seeking_rest(self) -> "PolicyModel":
+        """Itself: a policy does not know how contacts displace pins."""
+        return self
+
     def _counted_from(self, reference: Reference) -> "PolicyModel":
         found = PolicyModel(self.policy, goal=self._goal)
         found.pipeline = Pipeline(self.sensor, self.form, reference)

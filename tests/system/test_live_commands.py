@@ -21,15 +21,18 @@ from typer.testing import CliRunner
 
 from hardware import following
 from hardware.arms.simulated import SimulatedArm
+from hardware.cameras.reader import LiveSource, Picture
 from hardware.cameras.twin import preview_of
+from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import run_until_told
 from hardware.errors import DeviceError
-from hardware.live import LiveSession, Shower
+from hardware.live import LiveSession, Shower, WatchPlan, watch
 from hardware.rig import build_rig, steps_round
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionSource
 from scenes import load_experiment, load_object, load_sensor, load_servo
+from training.displacements import FEWEST_CONTACTS
 from training.estimator import PoseEstimator
 from twin.camera.capture import expose, record
 from twin.cli import command_line
@@ -208,6 +211,51 @@ def test_live_records_and_replays_the_same(stand_in, tmp_path):
     with pytest.raises(OptionError, match="--also goes with --record"):
         run("live", "--camera", folder, "--model", "any", "--headless", "--also", "lerobot")
     assert "5 of 5 estimates" in run("live", "--replay", tmp_path / "s", "--model", "any", "--headless")
+
+
+class ShownPictures(LiveSource):
+    """A live source of given pictures, one after the other, again and again."""
+
+    def __init__(self, images) -> None:
+        super().__init__("pictures", Form.RECORDING)
+        self._images, self._next = images, 0
+
+    def _open(self) -> None:
+        pass
+
+    def _close(self) -> None:
+        pass
+
+    def _grab(self) -> Picture:
+        self._end.wait(0.02)
+        self._next += 1
+        return Picture(self._images[self._next % len(self._images)], time.monotonic())
+
+
+def test_a_camera_that_was_never_shown_a_rest_is_counted_from_where_its_contacts_tell():
+    """As a recording of the same contacts is: here of another unit than the weights', over the emulated camera."""
+    model = PoseEstimator.load("mg400-127")
+    known = model.at_known_rest()
+    rest_px = known.pipeline.reference.pins_px
+    spread = np.random.default_rng(7).normal(size=(FEWEST_CONTACTS + 5, 6))
+    moved = model.displacements.at(spread).reshape(len(spread), -1, 2)
+    off_px = [0.1 * float(np.median(known.pipeline.reference.spacing_px)), 0.0]
+    images = [drawn_frame(model.sensor, model.form, px).image for px in rest_px + off_px + moved]
+    newest = []
+
+    def keep(frame, estimate) -> None:
+        newest[:] = [frame, estimate]
+        if seeker.other and estimate.valid:
+            raise KeyboardInterrupt
+
+    seeker = model.seeking_rest()
+    with CameraEmulator(ShownPictures(images)) as camera:
+        watched = watch(WatchPlan(camera=camera.url, shown=False, count=20 * len(images)), seeker, on_estimate=keep)
+    assert watched.interrupted, "the contacts told other rest places"
+    frame, estimate = newest
+    recorded, other = model.at_rest_of([Frame(image, model.form) for image in images])
+    as_recorded, as_known = (each(frame).value - estimate.value for each in (recorded, known))
+    assert other and np.abs(as_recorded).max() < 0.2 * np.abs(as_known).max(), (as_recorded, as_known)
 
 
 def test_the_page_shows_the_newest_frame_with_estimate_and_rates():

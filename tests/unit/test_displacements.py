@@ -1,5 +1,7 @@
 """Places of the pins at rest that contacts alone tell, by what contacts can do to the pins."""
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from training.displacements import (
 )
 from training.estimator import PoseEstimator
 from training.recipes import TrainingError
+from training.rest_seeking import RestSeeker
 from training.studies.evaluation import at_own_rest
 from twin.geometry.pins import pin_lattice
 from twin.pins import make_reference, nominal_reference
@@ -110,3 +113,50 @@ def test_a_recording_without_a_no_contact_frame_is_counted_from_where_its_contac
     assert np.abs(estimates[0] - estimates[1]).max() > 0.01
     cv2.imwrite(str(tmp_path / "init_0.png"), drawn_frame(estimator.sensor, estimator.form, rest.pins_px).image)
     assert at_own_rest(estimator, data) is data, "a frame without contact is more exact"
+
+
+class PinsSeen:
+    """A model whose frames are pins; it tells how far they are, on average, from the rest places that it counts from."""
+
+    def __init__(self, known, reference=START):
+        self.known, self.pipeline = known, SimpleNamespace(reference=reference)
+
+    def at_known_rest(self):
+        return PinsSeen(self.known)
+
+    def told_rest(self, nodes_px):
+        other = other_rest(self.known, START, nodes_px)
+        return (self.at_known_rest(), False) if other is None else (PinsSeen(self.known, make_reference(other, PINS)), True)
+
+    def __call__(self, pins_px):
+        seen = SimpleNamespace(graph=SimpleNamespace(nodes_px=pins_px))
+        return SimpleNamespace(seen=seen, value=(pins_px - self.pipeline.reference.pins_px).mean())
+
+
+def test_a_stream_tells_the_rest_places_once_enough_contacts_differ(known, other_unit, caplog):
+    """A contact that is held tells nothing new; those that differ tell what they tell as a recording."""
+    frames = other_unit + contacts(2 * FEWEST_CONTACTS, 2)
+    seeker, gathered = RestSeeker(PinsSeen(known)), []
+    for frame in frames:
+        for noise in np.random.default_rng(8).normal(0, 0.007 * PITCH, (3, *frame.shape)):
+            if not seeker.other:
+                made = seeker(frame + noise)
+        gathered.append(frame)
+        if seeker.other:
+            break
+        assert np.array_equal(seeker.pipeline.reference.pins_px, START.pins_px)
+    assert FEWEST_CONTACTS <= len(gathered) < 1.3 * FEWEST_CONTACTS
+    as_recording = other_rest(known, START, np.array(gathered))
+    assert np.sqrt(np.mean((seeker.pipeline.reference.pins_px - as_recording) ** 2)) < 0.02 * PITCH
+    assert made.value == pytest.approx((frames[len(gathered) - 1] - as_recording).mean(), abs=0.02 * PITCH), (
+        "the frame that tells it counts"
+    )
+    assert "they are not where they were measured" in caplog.text
+
+
+def test_a_stream_of_the_known_unit_keeps_its_model(known):
+    seeker = RestSeeker(PinsSeen(known))
+    model = seeker._model
+    for frame in START.pins_px + contacts(2 * FEWEST_CONTACTS, 3):
+        seeker(frame)
+    assert not seeker.other and seeker._model is model

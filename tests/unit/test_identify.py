@@ -97,6 +97,39 @@ def test_a_layout_whose_end_is_cut_off_is_never_sure(pins, part):
         assert found.candidates[1].pins.rings == found.best.pins.rings + 1, "the next larger layout is shown"
 
 
+def masked(images, rest, share, *, level=0.0, soft_px=0.0, noise_sd=3.0):
+    """Frames that show a disc of a share of the layout's radius, around it one level, and the camera's noise over all."""
+    middle, radius = rest.mean(axis=0), np.linalg.norm(rest - rest.mean(axis=0), axis=1).max()
+    y, x = np.mgrid[: images[0].shape[0], : images[0].shape[1]]
+    kept = np.clip((share * radius - np.hypot(x - middle[0], y - middle[1])) / max(soft_px, 1e-6) + 0.5, 0, 1)
+    noise = np.random.default_rng(0).normal(0, noise_sd, (len(images), *images[0].shape))
+    return [np.clip(kept * image + (1 - kept) * level + more, 0, 255).astype(np.uint8) for image, more in zip(images, noise, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("share", "look"),
+    [
+        (0.86, {}),
+        (0.9, {"level": 12.0, "soft_px": 8.0}),
+        (0.62, {"noise_sd": 8.0}),
+    ],
+    ids=["noise", "a soft gray edge", "much noise, two rings hidden"],
+)
+def test_a_layout_behind_a_round_mask_is_never_sure(share, look):
+    """What the mask leaves looks like a smaller layout that explains everything: nothing is seen beyond it, not even a housing."""
+    pins = PinsSpec(rings=6)
+    rest = rest_of(pins)
+    found = identify(masked(frames_of(rest, contact_px=3.0), rest, share, **look))
+    assert found.best.pins.count < pins.count and found.best.explained > 0.95, found.best.line()
+    assert not found.sure and any("may be cut off" in doubt for doubt in found.doubts)
+
+
+def test_a_mask_that_shows_the_housing_leaves_the_layout_sure():
+    rest = rest_of(PinsSpec(rings=6))
+    found = identify(masked(frames_of(rest, contact_px=3.0), rest, 1.3))
+    assert found.sure and same(found.best.pins, PinsSpec(rings=6)), found.doubts
+
+
 def test_a_layout_whose_pins_fall_together_explains_nothing():
     """Labels of a grid that are put on rings can bring two of its pins to one place."""
     pins = PinsSpec(rings=3)
@@ -198,7 +231,7 @@ def test_frames_of_inverted_contrast_are_refused_as_such():
 def test_thresholded_frames_of_fading_light_are_not_sure():
     """A fixed threshold makes caps in dark corners black, and those before them small; a local one leaves them alike."""
     pins = PinsSpec(rings=6)
-    images = frames_of(rest_of(pins, radius=150.0), 3, ring=False, contact_px=3.0)
+    images = frames_of(rest_of(pins, radius=150.0), 3, contact_px=3.0)
     y, x = np.mgrid[: images[0].shape[0], : images[0].shape[1]]
     light = np.clip(1.0 - 0.8 * np.hypot(x - 259, y - 204) / 150, 0, 1)
     even = identify([np.where(image > 70, 255, 0).astype(np.uint8) for image in images])

@@ -265,6 +265,15 @@ def test_a_rim_of_another_size_is_not_valid(pipeline):
     assert not observation.valid
 
 
+def test_a_frame_that_lacks_its_rim_is_not_valid():
+    """Four of five pins are found, but a layout of one ring less explains the frame as well: so it looks where a threshold is too high."""
+    pipeline = Pipeline(load_sensor("mg400-331"), Form.RECORDING)
+    pins_px, rim = pipeline.reference.pins_px, pipeline.reference.outmost
+    faded = pipeline(draw(pipeline, np.delete(pins_px, rim, axis=0)))
+    assert not faded.valid and f"{len(rim)} of the {len(rim)} outermost pins are lost" in faded.reason and "twin tune" in faded.reason
+    assert pipeline(draw(pipeline, np.delete(pins_px, rim[::2], axis=0))).valid
+
+
 def test_exchanged_pins_fold_the_layout():
     rest = nominal_reference(load_sensor("mg400-331"), Form.RECORDING)
     exchanged = rest.pins_px.copy()

@@ -11,7 +11,7 @@ import numpy as np
 from training.contact_estimator import ContactEstimator, contacts_folder
 from training.contact_maps import judge_maps
 from training.dataset import Dataset, joined, load_dataset, told_apart
-from training.displacements import MOST_CONTACTS
+from training.displacements import MOST_CONTACTS, OTHER_UNIT
 from training.estimator import PoseEstimate, PoseEstimator, folder_of
 from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
 from training.identity import changed_since, learnt_before
@@ -34,11 +34,6 @@ from twin.types import Frame
 ROWS = ("validation", "all")
 # Choices of the labels that count as truth.
 LABELS = ("corrected", "raw")
-# What is said where the contacts of a recording without a no-contact frame tell other rest places than those of the weights' own unit.
-OTHER_UNIT = (
-    "the pins at rest were found from the contacts: they are not where they were measured on the unit that the weights are for, so this is "
-    "another unit, or its camera or tip was touched; one frame without contact (init_0.png beside the frames) is more exact"
-)
 # Length along which the direction of a shear traction is seen in the frame.
 ARROW_MM = 1e-3
 

@@ -51,7 +51,9 @@ the same in its mode 'Live', with an arm and the sensor's health beside it.
 
 With --record DIR every frame is kept, lossless, with its estimate. The folder can be read even if the program was killed. --replay
 DIR runs the model on the same frames again, and says whether the estimates are the same. With --at-rest first there must be no
-contact at the start; the first frame is then kept with the session. --also keeps the session in further formats when it ends.
+contact at the start; the first frame is then kept with the session. Without it pins are counted from where the model knows them to be at
+rest, or, once 40 contacts that differ have told other places, from there, as 'twin predict' does. --also keeps the session in further
+formats when it ends.
 
 A model that learnt from simulated drags remembers the frames and tells slip: see 'twin predict --help', --sequence.
 
@@ -191,8 +193,8 @@ end, Ctrl-C included, the arm stops, retreats along the surface's normal and is 
 Once on a round the last axis of an MG400 comes to its end. Then the sensor leaves the object by 50 mm, the axis turns back by a full
 turn, and the sensor touches the same place again. The place is said before the arm moves.
 
-Before the arm touches anything, a frame is taken from which the model counts pins. With --at-rest none it counts them from the
-specification's layout, as models on graphs always do.
+Before the arm touches anything, a frame is taken from which the model counts pins. With --at-rest none it counts them from where it
+knows them to be at rest, or where the contacts tell that they are. Models on graphs count them from the specification's layout.
 
 \b
 Example:

@@ -103,7 +103,7 @@ AtRest = Annotated[
         "--at-rest",
         metavar="FRAME|first|none",
         help="frame without contact that pins are counted from: a file, the first frame (an error if the sensor seems pressed in it), "
-        "or none (the specification's layout)",
+        "or none (the places that the model knows, or that some forty contacts tell)",
     ),
 ]
 

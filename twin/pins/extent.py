@@ -1,11 +1,13 @@
 """Where frames show a sensor at all, and whether they show where its layout ends.
 
 A frame's edge, or a mask laid over it, may cut outer rings or rows off. What is left looks like a smaller layout that explains everything.
-So a layout's end is only known where the places of the next ring, row and column would be in view, and are empty.
+So a layout's end is only known where the places of the next ring, row and column would be in view, and are empty. Such a place is in view
+if the frames show anything farther out in its direction: the housing, its light, the skin's slow shading. A mask shows nothing but one
+level and the camera's noise. There is no room for such a place where something as bright as a cap stands beside it: the housing too.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -29,9 +31,20 @@ FILLED_SIGMAS = 4.0
 IN_VIEW = 1.0
 """A pin is in view if it is at least this many sds of its spot inside the frame."""
 CAP_EDGE = 0.3
-"""A cap's edge is this far from its middle, in spacings. A mask that ends beyond the next cap's near edge would show a part of it."""
-SEEN_EMPTY, FEWEST_EMPTY = 0.15, 4
-"""A layout ends where at least this share of the next places is in view and empty, and at least this many of them."""
+"""A cap's edge is this far from its middle, in spacings. What a mask leaves of the next caps reaches less far."""
+IN_FRAME, FEWEST_IN_FRAME = 0.15, 4
+"""A layout can be seen to end only where at least this share of the next places is in the frame, and at least this many of them,"""
+SEEN_PAST, FEWEST_SEEN_PAST = 0.25, 3
+"""and where something is seen past at least this share of these places, and at least this many of them."""
+SEEN_LEVELS, SEEN_NOISES = 1.0, 6.0
+"""Frames show something where their mean differs from the usual level around the pins by more gray levels than the first, and by more
+standard errors of the mean than the second."""
+SEEN_SIGMAS = 0.5
+"""Sd of the Gaussian with which frames are smoothed for that, in sds of a spot: noise is averaged, a thin ring of light stays."""
+SKIN_AND_CAPS = (20, 90)
+"""Percentiles of the levels among the pins that are those of the skin and of the caps: caps cover a quarter or so."""
+BESIDE = 0.5
+"""The direction of a place is this wide to each side, in spacings; and from this far beyond the outermost pins on, frames are looked at."""
 
 
 def filled_area(images: Sequence[np.ndarray]) -> np.ndarray | None:
@@ -109,16 +122,78 @@ def own_places(pins: PinsSpec) -> np.ndarray:
     return np.delete(places, list(pins.missing))
 
 
-def open_sides(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps) -> int:
-    """Number of sides on which frames do not show that a layout with its pins at rest (N, 2), px, ends: more pins may be cut off there."""
+@dataclass(frozen=True)
+class Beyond:
+    """What gray frames show around a layout: what differs there from the level that most of the picture has.
+
+    Attributes
+    ----------
+    px : (k, 2) float
+        Pixels.
+    bright : (k,) bool
+        Which of them are as bright as caps: no skin.
+    """
+
+    px: np.ndarray
+    bright: np.ndarray
+
+
+def seen_beyond(images: Sequence[np.ndarray], rest_px: np.ndarray, sigma_px: float) -> Beyond:
+    """What gray frames (H, W) uint8 show around a layout with its pins at rest (N, 2), px, beyond the noise of their mean."""
+    height, width = images[0].shape
+    reach = max(round(BESIDE * _spacing(rest_px)), 1)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    pins = np.zeros((height, width), np.uint8)
+    cv2.fillConvexPoly(pins, cv2.convexHull(np.round(rest_px).astype(np.int32)), 1)
+    around = cv2.dilate(pins, disc) == 0
+    if not around.any() or not pins.any():
+        return Beyond(np.zeros((0, 2)), np.zeros(0, bool))
+    smooth = np.stack([cv2.GaussianBlur(image.astype(np.float32), (0, 0), SEEN_SIGMAS * sigma_px) for image in images])
+    level = smooth.mean(axis=0)
+    noise = float(np.median(smooth[:, around].std(axis=0))) / np.sqrt(max(len(images) - 1, 1))
+    told = np.round(level[around]).astype(int)
+    usual = float(np.median(level[around][told == np.bincount(told).argmax()]))
+    skin, caps = np.percentile(level[pins > 0], SKIN_AND_CAPS)
+    rows, columns = np.nonzero(around & (np.abs(level - usual) > max(SEEN_LEVELS, SEEN_NOISES * noise)))
+    bright = level[rows, columns] > max(skin, usual) + (caps - skin) / 2
+    return Beyond(np.column_stack([columns, rows]).astype(float), bright)
+
+
+def _spacing(px: np.ndarray) -> float:
+    """Median distance of pins (N, 2) from the nearest other one."""
+    return float(np.median(cKDTree(px).query(px, k=2)[0][:, 1]))
+
+
+def open_sides(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps, beyond: Beyond) -> int:
+    """Number of sides on which frames do not show that a layout with its pins at rest (N, 2), px, ends: more pins may be cut off there.
+
+    ``beyond`` is what the frames show around the pins (``seen_beyond``).
+    """
     around = sides(pins)
     if not around:
         return 0
     by = family(pins.layout)
     spot = np.full(len(by.lattice), -1)
     spot[own_places(pins)] = np.arange(pins.count)
-    beyond = seen_places(by.lattice, by.around, rest_px, spot, spots.size_px)
-    framed = in_view(beyond, replace(spots, hidden=None))
-    nearest = rest_px[cKDTree(rest_px).query(np.nan_to_num(beyond))[1]]
-    shown = framed & in_view(beyond + CAP_EDGE * (nearest - beyond), spots)
-    return sum(int(shown[side].sum()) < max(FEWEST_EMPTY, SEEN_EMPTY * len(side)) for side in around)
+    places = seen_places(by.lattice, by.around, rest_px, spot, spots.size_px)
+    framed = in_view(places, replace(spots, hidden=None))
+    middle = rest_px.mean(axis=0)
+    ends = 0
+    for side in around:
+        looked = places[side[framed[side]]]
+        past = sum(_ended(place, rest_px, middle, beyond) for place in looked)
+        in_frame = len(looked) >= max(FEWEST_IN_FRAME, IN_FRAME * len(side))
+        ends += in_frame and past >= max(FEWEST_SEEN_PAST, SEEN_PAST * len(looked))
+    return len(around) - ends
+
+
+def _ended(place: np.ndarray, rest_px: np.ndarray, middle: np.ndarray, beyond: Beyond) -> bool:
+    """Whether frames show that no cap stands at a place (2,): something is seen past it, or something bright that is no cap beside it."""
+    away = place - middle
+    far, spacing = float(np.linalg.norm(away)), float(np.linalg.norm(rest_px - place, axis=1).min())
+    along = (beyond.px - middle) @ away / far
+    across = np.abs((beyond.px - middle) @ np.array([-away[1], away[0]]) / far)
+    near = across < BESIDE * spacing
+    past = along > far + CAP_EDGE * spacing
+    beside = beyond.bright & (across > CAP_EDGE * spacing) & (along > far - BESIDE * spacing)
+    return bool((near & (past | beside)).any())

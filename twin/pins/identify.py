@@ -19,7 +19,7 @@ from twin.frames import spread
 from twin.frames.forms import is_two_level
 from twin.geometry.pins import pin_lattice
 from twin.pins.bumps import Bumps, find_bumps
-from twin.pins.extent import filled_area, in_view, open_sides, with_view
+from twin.pins.extent import filled_area, in_view, open_sides, seen_beyond, with_view
 from twin.pins.families import Family, family, family_of_positions, label_spots
 from twin.pins.growth import seen_places
 from twin.pins.matching import match
@@ -224,14 +224,16 @@ def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
     if not candidates:
         raise FrameError(f"none of {len(images)} frames shows a whole layout of pins; {NO_LAYOUT}")
     doubts = _doubts(candidates)
-    if open_sides(candidates[0].pins, candidates[0].rest_px, spots[0]):
-        doubts.append(_end_not_seen(candidates[0].pins))
-        candidates = _with_larger(candidates, spots)
-    elif _faded(candidates[0], images) < FADED:
-        doubts.append(
-            f"the outermost caps of {candidates[0].pins.in_words()} are smaller than the others, as where light fades: pins further out "
+    best, ends = candidates[0], []
+    if open_sides(best.pins, best.rest_px, spots[0], seen_beyond(images, best.rest_px, sigma)):
+        ends.append(_end_not_seen(best.pins))
+    if _faded(best, images) < FADED:
+        ends.append(
+            f"the outermost caps of {best.pins.in_words()} are smaller than the others, as where light fades: pins further out "
             "may have been thresholded away; frames that were not thresholded, or with a local threshold, decide, or give the layout"
         )
+    if ends:
+        doubts += ends
         candidates = _with_larger(candidates, spots)
     return Identified(tuple(candidates), not doubts, tuple(doubts), sigma)
 
@@ -258,8 +260,8 @@ def _end_not_seen(pins: PinsSpec) -> str:
     """Why a layout that explains everything may yet be too small."""
     lines = "rows or columns" if pins.layout == "grid" else "rings"
     return (
-        f"the frames end where {pins.in_words()} end: more {lines} may be cut off; frames that show the sensor's rim decide, or count the "
-        f"{lines} of the sensor and give the layout"
+        f"the frames show nothing beyond {pins.in_words()}: more {lines} may be cut off or masked; frames that show the sensor's rim "
+        f"decide, or count the {lines} of the sensor and give the layout"
     )
 
 

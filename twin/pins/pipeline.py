@@ -19,6 +19,8 @@ from twin.pins.reference import Reference, folded_fraction, make_reference, nomi
 from twin.pins.split import split_chains, split_merged
 from twin.types import Form, Frame, Observation
 
+MOST_RIM_LOST = 0.75
+"""Largest share of the outermost pins in view that may be lost. Without them a smaller layout explains the frame as well."""
 MIN_FOUND = 0.8
 """Least share of the pins that must be found."""
 AT_BORDER = 1.0
@@ -129,7 +131,7 @@ class Pipeline:
         between = self._between_caps(frame, pins_px)
         ms["complete"], now = _since(now)
         expected = int((paired | ~self._cut_off(nodes_px)).sum())
-        reason = self._reason(blobs, int(paired.sum()), expected, nodes_px, extra_px)
+        reason = self._reason(blobs, int(paired.sum()), expected, nodes_px, extra_px) or self._rim_lost(paired, nodes_px)
         if not reason and between > MOST_BETWEEN:
             reason = f"wrong pins: {between:.0%} of them stand between caps; stray light, a wrong threshold, or another sensor's frame"
         graph = None
@@ -256,6 +258,17 @@ class Pipeline:
         with np.errstate(invalid="ignore"):
             cut: np.ndarray = self._cut_off(seen.predicted_px)  # NaN where a pin was found
         return cut
+
+    def _rim_lost(self, paired: np.ndarray, nodes_px: np.ndarray) -> str:
+        """Why a frame is no valid observation whose pins (N,) are found but for those of the rim; "" if it is one."""
+        rim = self.reference.outmost[~self._cut_off(nodes_px)[self.reference.outmost]]
+        lost = int((~paired[rim]).sum())
+        if lost <= MOST_RIM_LOST * len(rim):
+            return ""
+        return (
+            f"the rim is not seen: {lost} of the {len(rim)} outermost pins are lost; light that fades, too high a threshold, or a sensor "
+            "of fewer pins: run 'twin tune' on these frames, or 'twin new'"
+        )
 
     def _between_caps(self, frame: Frame, pins_px: np.ndarray) -> float:
         """Share of the found pins (N, 2), NaN where lost, that are no brighter than the places between them and their neighbours."""

@@ -22,7 +22,6 @@ from training.models.part import Prediction, Unseen
 from training.packed import pack
 from training.pins import PinTable
 from training.recipes import TrainingError
-from training.rest_seeking import RestSeeker
 from training.run_files import damaged
 from twin.camera.capture import record
 from twin.frames import Recording
@@ -118,18 +117,8 @@ class ContactEstimator:
     def at_rest_of(self, frames: Iterable[Frame]) -> tuple["ContactEstimator", bool]:
         """As of ``PoseEstimator``."""
         looked = list(frames)
-        return self._told({name: part.at_rest_of(looked) for name, part in self.parts.items()})
-
-    def told_rest(self, nodes_px: np.ndarray) -> tuple["ContactEstimator", bool]:
-        """As of ``PoseEstimator``."""
-        return self._told({name: part.told_rest(nodes_px) for name, part in self.parts.items()})
-
-    def seeking_rest(self) -> "RestSeeker[ContactEstimator]":
-        """As of ``PoseEstimator``."""
-        return RestSeeker(self)
-
-    def _told(self, parts: dict[str, tuple[PoseEstimator, bool]]) -> tuple["ContactEstimator", bool]:
-        return self._with({name: part for name, (part, _) in parts.items()}), any(other for _, other in parts.values())
+        told = {name: part.at_rest_of(looked) for name, part in self.parts.items()}
+        return self._with({name: part for name, (part, _) in told.items()}), any(other for _, other in told.values())
 
     def _with(self, parts: dict[str, PoseEstimator]) -> "ContactEstimator":
         found = copy(self)

@@ -28,6 +28,7 @@ from training.slip import SLIP, SLIP_UNITS, Slip, SlipModel, SlipTracker, read_s
 from training.targets import limits_of
 from training.touched import TouchAnswer
 from twin.errors import FrameError
+from twin.estimate import SensorModel
 from twin.frames.forms import blob_spec
 from twin.mechanics.skin_map import ContactMaps
 from twin.pins import Pipeline, Reference, make_reference, measure_reference, nominal_reference
@@ -246,7 +247,7 @@ class PoseEstimator:
         other = estimator.other_rest(estimator.pipeline.reference, nodes_px)
         return (estimator, False) if other is None else (estimator._counted_from(other), True)
 
-    def seeking_rest(self) -> "RestSeeker[PoseEstimator]":
+    def seeking_rest(self) -> SensorModel:
         """The model for a camera's frames where no frame shows its sensor without contact: as ``at_rest_of``, while the frames come."""
         return RestSeeker(self)
 

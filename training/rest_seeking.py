@@ -1,13 +1,13 @@
 """A model for a camera whose sensor nobody showed without contact: it gathers contacts until they tell the pins' rest places."""
 
 import logging
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Protocol
 
 import numpy as np
 
 from scenes.sensor import SensorSpec
 from training.displacements import FEWEST_CONTACTS, MOST_CONTACTS, OTHER_UNIT
-from twin.estimate import Estimate
+from twin.estimate import Estimate, SensorModel
 from twin.pins import Pipeline
 from twin.types import Form, Frame, Observation
 
@@ -18,28 +18,15 @@ UNLIKE = 0.05
 of 40 random contacts (331 and 127 pins) differ so from the next one; a contact that is held differs by the pins' noise, 0.01."""
 
 
-class RestingModel(Protocol):
-    """A model that counts pins from rest and can be told by contacts where that is (``training.estimator.PoseEstimator``)."""
+class RestingModel(SensorModel, Protocol):
+    """A model that contacts can tell where its pins are at rest (``training.estimator.PoseEstimator``)."""
 
-    sensor: SensorSpec
-    form: Form
-    pipeline: Pipeline
+    def at_known_rest(self) -> "RestingModel": ...
 
-    def __call__(self, frame: Frame) -> Estimate: ...
-
-    def check(self, sensor: SensorSpec, form: Form) -> None: ...
-
-    def at_rest(self, frame: Frame) -> Self: ...
-
-    def at_known_rest(self) -> Self: ...
-
-    def told_rest(self, nodes_px: np.ndarray) -> tuple[Self, bool]: ...
+    def told_rest(self, nodes_px: np.ndarray) -> tuple["RestingModel", bool]: ...
 
 
-M = TypeVar("M", bound=RestingModel)
-
-
-class RestSeeker(Generic[M]):
+class RestSeeker:
     """A model on a stream of frames: it counts from the rest places that are known, and from those that the contacts tell once they do.
 
     They are asked after ``FEWEST_CONTACTS`` contacts that differ, and again, for the last time, after ``MOST_CONTACTS``. The frame at
@@ -51,41 +38,32 @@ class RestSeeker(Generic[M]):
 
     Attributes
     ----------
+    sensor, form, pipeline : SensorSpec, Form, Pipeline
+        As the model's; the pipeline has the rest places that are counted from at present.
     other : bool
         Whether the contacts told other rest places than those that are known.
     """
 
+    sensor: SensorSpec
+    form: Form
+    pipeline: Pipeline
     counts_from_rest = True
 
-    def __init__(self, model: M) -> None:
+    def __init__(self, model: RestingModel) -> None:
         self._given, self._model, self.other = model, model.at_known_rest(), False
+        self.sensor, self.form, self.pipeline = model.sensor, model.form, self._model.pipeline
         self._contacts_px: list[np.ndarray] = []
-        self._unlike_px = UNLIKE * float(np.median(self._model.pipeline.reference.spacing_px))
-
-    @property
-    def sensor(self) -> SensorSpec:
-        """The model's sensor."""
-        return self._model.sensor
-
-    @property
-    def form(self) -> Form:
-        """Form of the model's frames."""
-        return self._model.form
-
-    @property
-    def pipeline(self) -> Pipeline:
-        """What finds the pins, with the rest places that are counted from at present."""
-        return self._model.pipeline
+        self._unlike_px = UNLIKE * float(np.median(self.pipeline.reference.spacing_px))
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """As the model's."""
         self._model.check(sensor, form)
 
-    def at_rest(self, frame: Frame) -> M:
+    def at_rest(self, frame: Frame) -> SensorModel:
         """The model, counting from a frame without contact: nothing is sought any more."""
         return self._given.at_rest(frame)
 
-    def seeking_rest(self) -> Self:
+    def seeking_rest(self) -> SensorModel:
         """Itself."""
         return self
 
@@ -95,7 +73,7 @@ class RestSeeker(Generic[M]):
         if self._gathered(made.seen) and len(self._contacts_px) in (FEWEST_CONTACTS, MOST_CONTACTS):
             told, other = self._given.told_rest(np.array(self._contacts_px))
             if other or self.other:  # else the model that remembers the frames so far goes on
-                self._model, self.other = told, other
+                self._model, self.other, self.pipeline = told, other, told.pipeline
                 made = self._model(frame)
                 LOG.warning("%s, after %d contacts", OTHER_UNIT if other else SAME_UNIT, len(self._contacts_px))
         return made

@@ -1,7 +1,7 @@
 """What the rest of the program knows of a trained model: a frame goes in, an estimate with its interval comes out."""
 
 from collections.abc import Callable
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 
@@ -56,7 +56,7 @@ class SensorModel(Protocol):
 
     def __call__(self, frame: Frame) -> Estimate: ...
 
-    def at_rest(self, frame: Frame) -> Self:
+    def at_rest(self, frame: Frame) -> "SensorModel":
         """The same model, counting pins from a frame without contact."""
 
     def seeking_rest(self) -> "SensorModel":

@@ -119,7 +119,7 @@ class PinsSeen:
     """A model whose frames are pins; it tells how far they are, on average, from the rest places that it counts from."""
 
     def __init__(self, known, reference=START):
-        self.known, self.pipeline = known, SimpleNamespace(reference=reference)
+        self.known, self.pipeline, self.sensor, self.form = known, SimpleNamespace(reference=reference), None, None
 
     def at_known_rest(self):
         return PinsSeen(self.known)

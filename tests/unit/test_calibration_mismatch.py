@@ -47,7 +47,7 @@ def test_a_mono_specification_refuses_colour_frames_by_name(drawn, tmp_path):
     spec, image = drawn
     mono = revised(spec, camera={"channels": "mono"})
     cv2.imwrite(str(tmp_path / "seen.png"), image[..., ::-1])
-    assert len(read_frames(tmp_path, spec, 6, quiet)) == 1
+    assert len(read_frames(tmp_path, spec, 6, quiet)[0]) == 1
     with pytest.raises(FrameError, match=r'seen.png: a colour frame.*channels = "color"'):
         read_frames(tmp_path, mono, 6, quiet)
     with pytest.raises(FrameError, match=r'seen.png: a colour frame.*channels = "color"'):
@@ -58,7 +58,7 @@ def test_gray_frames_stored_as_colour_suit_a_mono_specification(drawn, tmp_path)
     spec, image = drawn
     mono = revised(spec, camera={"channels": "mono"})
     cv2.imwrite(str(tmp_path / "seen.png"), np.repeat(image[..., 1:2], 3, axis=2))
-    ((_, found, _),) = read_frames(tmp_path, mono, 6, quiet)
+    ((_, found, _),), _ = read_frames(tmp_path, mono, 6, quiet)
     np.testing.assert_array_equal(found, image[..., 1])
 
 

@@ -8,7 +8,7 @@ from drawn_frames import drawn_frame
 from scenes import load_sensor
 from twin.camera.projection import lens_disc
 from twin.errors import FrameError
-from twin.judge.pictures.frames import read_real
+from twin.judge.pictures.frames import FEW_LOST, read_real
 from twin.pins import nominal_reference
 from twin.types import Form
 
@@ -42,6 +42,18 @@ def test_bad_frames_are_refused_by_name_and_good_ones_kept(tmp_path, spec, good)
     reasons = {refused["image_name"]: refused["reason"] for refused in found.refused}
     for name, said in {"b_black": "black", "c_white": "saturated", "d_gap": "of 331 pins", "e_small": "expected 640x480"}.items():
         assert said in reasons[f"{name}.png"]
+
+
+def test_few_lost_pins_are_left_out_where_the_others_are_fitted_and_many_are_not(tmp_path, spec, good):
+    glint, gap = good.copy(), good.copy()
+    glint[225:245, 270:290] = 15  # a cap or two
+    gap[180:300, 230:350] = 15
+    found = read(tmp_path, spec, {"a_glint.png": glint, "b_gap.png": gap}, lost=FEW_LOST)
+    assert [real.frame.name for real in found.frames] == ["a_glint.png"]
+    assert 0 < np.isnan(found.frames[0].pins_px[:, 0]).sum() <= FEW_LOST * 331
+    assert "of 331 pins" in found.refused[0]["reason"]
+    with pytest.raises(FrameError, match="a_glint.png: .*pins"):
+        read(tmp_path, spec, {})
 
 
 def test_a_folder_without_a_usable_frame_names_the_first(tmp_path, spec, good):

@@ -16,8 +16,10 @@ from training.estimator import PoseEstimator
 from training.studies.evaluation import predict_frames
 from twin.errors import FrameError, TwinError
 from twin.fit.camera_pose import CameraReport
-from twin.fit.new_sensor import _doubtful, _given, _health, new_sensor
+from twin.fit.new_sensor import _camera, _doubtful, _given, _health, new_sensor
 from twin.frames import frames_at, open_recording
+from twin.geometry.pins import rest_pins
+from twin.optics.relief import cap_planes
 from twin.pins import Grade, Pipeline, examine, nominal_reference, tune, with_detector
 from twin.pins.batch import recording_reference
 from twin.pins.detector_spec import shipped_detector
@@ -108,6 +110,24 @@ def test_the_minimal_specification_of_the_documentation_is_one(tmp_path):
     spec = load_sensor(file)
     assert spec.pins.count == 331 and spec.skin.outer_radius_mm == 20.0
     assert len([line for line in block.splitlines() if line.strip()]) <= 28
+
+
+@pytest.mark.parametrize("spacing", ["polar", "plan"])
+def test_the_sizes_of_caps_decide_how_rings_are_spaced_where_contacts_blur_their_places(spacing):
+    """Pins spread by contacts fit a lens of another kind better; their caps' sizes from the middle to the rim do not."""
+    start = load_sensor("ur5-331")
+    cap_mm = 1.4
+    pins = start.pins.model_copy(update={"spacing": spacing, "cap_diameter_mm": cap_mm})
+    truth = start.model_copy(update={"pins": pins})
+    state = rest_pins(truth.geometry)
+    middle, plane = cap_planes(truth.view, truth.pins, state)
+    away = (middle - middle[0]) / np.linalg.norm(middle - middle[0], axis=1).max()
+    swing = 2.5 * np.sin(np.pi * np.linalg.norm(away, axis=1, keepdims=True))  # px, as other spacings and lenses move pins
+    seen = middle + (swing if spacing == "polar" else -swing) * away
+    sizes = 2 * np.sqrt(np.abs(np.linalg.det(plane))) * np.random.default_rng(0).normal(1, 0.04, len(plane))
+    found, _ = _camera(start, seen, "made", sizes)
+    assert found.pins.spacing == spacing
+    assert found.pins.cap_diameter_mm == pytest.approx(cap_mm, rel=0.06)
 
 
 def test_without_a_no_contact_frame_a_rest_layout_is_made_and_said():

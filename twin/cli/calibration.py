@@ -128,8 +128,8 @@ app.add_typer(calibrate_app, name="calibrate")
 
 HELP_CALIBRATE_OPTICS = """Fit light, colours, sharpness and noise to raw frames.
 
-Start from the shipped specification that is most like your sensor. The frames may show any contact: their pins are found,
-the skin is fitted to them, the twin renders the same state, and its parameters are moved until both agree, by
+Start from your sensor's specification ('twin new'), or from the shipped one that is most like it. The frames may show any contact:
+their pins are found (a few may be lost), the skin is fitted to them, the twin renders the same state, and its parameters are moved until both agree, by
 differentiating the path tracer (LEDs, reflectances, haze) and by least squares (ring, reflections, specks, each cap's own
 reflectance and outline, blur, aperture, sharpening, colour fringes, compression, noise). What is left then is measured: a
 tile of light and colour that moves with each cap and the skin around it, and a background that stays in place. With

@@ -4,21 +4,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from scenes.pins import PinsSpec
 from scenes.sensor import BlobSpec, CameraSpec, PipelineSpec, RecordingSpec, SensorSpec
 from twin.errors import FrameError
-from twin.fit.camera_pose import LEAST_PINS, CameraReport, fit_camera
+from twin.fit.camera_pose import LEAST_PINS, MODEL_PX, CameraReport, fit_camera
 from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.frames import evenly_read, frames_at, open_recording, spread
 from twin.frames.forms import gray_levels
 from twin.frames.images import write_image
+from twin.geometry.pins import rest_pins
+from twin.judge.pictures.spots import pin_spacing_px
+from twin.optics.relief import cap_planes
 from twin.pins.batch import draw_overlay
 from twin.pins.caps import measure_caps
 from twin.pins.check import CAPS_MEASURED, lost_in_view, usual_caps
 from twin.pins.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, with_detector
-from twin.pins.identify import STEADY, Identified, identify, judge_layout
+from twin.pins.identify import STEADY, Candidate, Identified, identify, judge_layout
 from twin.pins.pipeline import Pipeline
 from twin.pins.rest import Rest, rest_of, turn_of
 from twin.pins.tune import Tuned, tune
@@ -42,7 +44,11 @@ FITTED_FISHEYE = (*FITTED_PINHOLE, "k2")
 UNTUNED_OFFSET = -12.0
 """Threshold, gray levels above the local mean, for raw frames of a sensor of which only thresholded ones were seen."""
 BETTER = 0.85
-"""A camera model is taken instead of a simpler one if its error is smaller by this factor."""
+"""A camera model is taken instead of a simpler one if its misfit is smaller by this factor."""
+SIZE_SD = 0.05
+"""Standard deviation of a cap's diameter from that of the model, as a share: real prints, lit unevenly, in contact."""
+MADE_SD = 0.1
+"""Standard deviation of pins at rest that were made from contacts, in spacings (see ``Rest.line``)."""
 GOOD_SHARE = 0.99
 """From this share of frames with all pins on, a sensor is well seen."""
 FAIR_SHARE = 0.9
@@ -200,7 +206,8 @@ def new_sensor(
         )
         start = _started(out.stem, looked[0], best.pins, rest, frames.name)
         with stage(progress, "camera"):
-            fitted, camera = _camera(start, np.where((best.there >= STEADY)[:, None], rest.pins_px, np.nan))
+            sizes_px = _sizes(best, images) if looked[0].form == Form.RAW else None
+            fitted, camera = _camera(start, np.where((best.there >= STEADY)[:, None], rest.pins_px, np.nan), rest.source, sizes_px)
         with stage(progress, "pins") as step:
             tuned = tune(looked, fitted, known=best, rest=rest, progress=step)
         sensor = _with_usual_caps(_with_pipeline(fitted, tuned.detector), looked)
@@ -275,9 +282,31 @@ def _whole(width: int, height: int) -> RecordingSpec:
     )
 
 
-def _camera(start: SensorSpec, pins_px: np.ndarray) -> tuple[SensorSpec, CameraReport]:
-    """The camera, of pinhole and fisheye, and the spacing of the pins that meet the pins at rest best; the simpler of nearly equal ones."""
-    best: tuple[SensorSpec, CameraReport] | None = None
+def _sizes(layout: Candidate, images: list[np.ndarray]) -> np.ndarray:
+    """Diameters (N,) px of the caps, the median over some of the gray frames; NaN where a cap is never measured."""
+    chosen = spread(len(images), CAPS_MEASURED)
+    found = np.stack([measure_caps(images[k], layout.seen[k].pins_px).diameter_px for k in chosen])
+    some = np.isfinite(found).any(axis=0)
+    return np.where(some, np.nanmedian(np.where(some, found, 0.0), axis=0), np.nan)
+
+
+def _camera(start: SensorSpec, pins_px: np.ndarray, source: str, sizes_px: np.ndarray | None) -> tuple[SensorSpec, CameraReport]:
+    """The camera, of pinhole and fisheye, and the spacing of the pins that meet pins at rest and caps' sizes best; the simpler of equals.
+
+    Pins at rest alone hardly tell rings evenly spaced on the dome from rings evenly spaced in plan under another lens, but the caps of
+    the two differ in size from the middle to the rim. The caps' diameter follows from their mean size.
+
+    Parameters
+    ----------
+    pins_px : (N, 2) float
+        Pins at rest, NaN where unknown.
+    source : str
+        Where they come from: ``Rest.source``.
+    sizes_px : (N,) float, optional
+        Diameters of the caps, NaN where unknown.
+    """
+    sd_px = MODEL_PX if source != "made" else max(MODEL_PX, MADE_SD * pin_spacing_px(pins_px))
+    best: tuple[float, SensorSpec, CameraReport] | None = None
     for projection, spacing in (("perspective", "polar"), ("perspective", "plan"), ("fisheye", "polar"), ("fisheye", "plan")):
         pins = start.pins.model_copy(update={"spacing": spacing})
         camera = start.camera
@@ -285,11 +314,28 @@ def _camera(start: SensorSpec, pins_px: np.ndarray) -> tuple[SensorSpec, CameraR
             focal = camera.fx_px * FISHEYE_MM / PINHOLE_MM
             camera = camera.model_copy(update={"projection": projection, "fx_px": focal, "fy_px": focal, "distance_mm": FISHEYE_MM})
         trial = _scaled(start.model_copy(update={"pins": pins, "camera": camera}), pins_px)
-        fitted = fit_camera(trial, pins_px, free=FITTED_FISHEYE if projection == "fisheye" else FITTED_PINHOLE, named=True)
-        if best is None or fitted[1].rms_px < BETTER * best[1].rms_px:
-            best = fitted
+        fitted, report = fit_camera(trial, pins_px, free=FITTED_FISHEYE if projection == "fisheye" else FITTED_PINHOLE, named=True)
+        fitted, uneven = _with_sizes(fitted, sizes_px)
+        misfit = float(np.hypot(report.rms_px / sd_px, uneven / SIZE_SD))
+        if best is None or misfit < BETTER * best[0]:
+            best = misfit, fitted, report
     assert best is not None
-    return best
+    return best[1:]
+
+
+def _with_sizes(sensor: SensorSpec, sizes_px: np.ndarray | None) -> tuple[SensorSpec, float]:
+    """The sensor with caps, and pins below them, of the mean measured size, and the spread of the sizes about its own, as a share."""
+    if sizes_px is None:
+        return sensor, 0.0
+    _, plane = cap_planes(sensor.view, sensor.pins, rest_pins(sensor.geometry))
+    share = sizes_px / (2 * np.sqrt(np.abs(np.linalg.det(plane))))
+    known = np.log(share[np.isfinite(share)])
+    if len(known) < LEAST_PINS:
+        return sensor, 0.0
+    scale = float(np.exp(np.median(known)))
+    cap_mm, pin_mm = (round(scale * value, 3) for value in (sensor.pins.cap_diameter_mm, sensor.pins.diameter_mm))
+    pins = sensor.pins.model_copy(update={"cap_diameter_mm": cap_mm, "diameter_mm": pin_mm})
+    return sensor.model_copy(update={"pins": pins}), float(np.std(known))
 
 
 def _scaled(sensor: SensorSpec, pins_px: np.ndarray) -> SensorSpec:
@@ -355,7 +401,7 @@ def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
     """What speaks against a camera that was fitted to the pins at rest, and what to do."""
     notes = []
     seen = rest.pins_px[np.isfinite(rest.pins_px[:, 0])]
-    away = camera.rms_px / float(np.median(cKDTree(seen).query(seen, k=2)[0][:, 1]))
+    away = camera.rms_px / pin_spacing_px(seen)
     if away > MOST_AWAY:
         notes.append(
             f"no camera sees this layout as the frames show it: the best one misses the pins at rest by {camera.rms_px:.1f} px (rms), "
@@ -441,6 +487,9 @@ def _notes(found: Identified, rest: Rest, camera: CameraReport) -> dict[str, str
         "pins.columns": sure,
         "pins.missing": "not seen in any frame, though in view",
         "pins.phase_deg": "turn of the first pin of each ring",
+        "pins.spacing": "decided by the caps' sizes",
+        "pins.cap_diameter_mm": "seen: the caps' mean size, for a dome of this radius",
+        "pins.diameter_mm": "assumed: as wide relative to the caps as a usual pin",
         "camera.fx_px": met,
         "camera.distance_mm": "assumed: pins at rest do not tell it",
         "recording.crop_px": "assumed: how the frames were made is not known",

@@ -63,8 +63,15 @@ ALWAYS = (
     "directions a crest would look different",
 )
 """Parameters that no set of frames determines."""
+FEW_FRAMES_FITTED = 4
+"""With fewer frames than this the background and the relief of caps can hardly be told apart."""
 RING_HELD = "ring, LEDs' places and reflections: held; the frames show no bright ring around the disc (a crop, or a sensor without one)"
 """What is said where frames show no ring."""
+REST_MADE = (
+    "the camera's kind, focal length and distance: held as 'twin new' chose them without a frame without contact; pictures of the same "
+    "contact are alike, depths in mm may not be; give --no-contact FRAME"
+)
+"""What is said of a camera that was fitted to rest places which contacts told."""
 Stage = Callable[[SensorSpec], SensorSpec]
 """One stage of the fit: a function from a specification to a better one."""
 
@@ -212,13 +219,20 @@ def fit_optics(
         spec, report = fit_camera(spec, _pins_at_rest(no_contact, spec))
         notes += [f"camera fitted to {report.pins} pins, {report.rms_px:.2f} px rms", *report.held.values()]
     with bar("read the frames, find their pins") as step:
-        raw = read_frames(folder, spec, limit, step)
+        raw, refused = read_frames(folder, spec, limit, step)
+    notes += [f"left out {each['image_name']}: {each['reason']}" for each in refused]
     log = _Log(work, spec, raw)
     with bar("fit the skin to the pins") as step:
         frames = log.aligned(spec, raw, step)
     inside, studio = lens_disc(spec.view, spec.housing).inside, _Studio(bar)
     if unseen := undetermined_tiles(spec, frames):
         notes.append(f"the relief of {unseen} of {spec.pins.count} caps: fewer than two frames show them; use more frames")
+    if len(frames) < FEW_FRAMES_FITTED:
+        notes.append(
+            f"what moves with a cap and what stays in place: {len(frames)} frames hardly tell them apart; give {FRAMES} of different contacts"
+        )
+    if spec.pipeline.raw.rest_origin == "contacts":
+        notes.append(REST_MADE)
     first = studio.shots(spec, frames, "render the start")
     spec = without(spec, DETAILS)
     held = spec.housing

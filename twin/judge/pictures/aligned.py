@@ -10,7 +10,8 @@ import numpy as np
 from scenes.sensor import CameraSpec, ResponseSpec, SensorSpec
 from twin.camera.projection import lens_disc
 from twin.errors import FrameError
-from twin.judge.pictures.frames import read_real
+from twin.frames.recording import BadFrame
+from twin.judge.pictures.frames import FEW_LOST, read_real
 from twin.mechanics.skin_fit import FittedPins
 from twin.progress import Step
 
@@ -37,8 +38,12 @@ class Aligned:
     state: FittedPins
 
 
-def read_frames(folder: Path, spec: SensorSpec, limit: int, progress: Step) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Read usable frames of a folder, spread evenly: name, image (H, W[, 3]) uint8 and pins (N, 2) px of each.
+def read_frames(
+    folder: Path, spec: SensorSpec, limit: int, progress: Step
+) -> tuple[list[tuple[str, np.ndarray, np.ndarray]], list[BadFrame]]:
+    """Read usable frames of a folder, spread evenly: name, image (H, W[, 3]) uint8 and pins (N, 2) px of each; and the refused ones.
+
+    A frame may lack a few pins (``FEW_LOST``), which are NaN.
 
     Raises
     ------
@@ -46,11 +51,11 @@ def read_frames(folder: Path, spec: SensorSpec, limit: int, progress: Step) -> l
         No frame can be used, or a frame does not fit the camera: its size differs, or one of both is colour and the other mono. The
         message names the first such frame and the reason.
     """
-    real = read_real(folder, spec, lens_disc(spec.view, spec.housing), limit=limit, progress=progress)
+    real = read_real(folder, spec, lens_disc(spec.view, spec.housing), limit=limit, lost=FEW_LOST, progress=progress)
     read = [(found.frame.name, in_channels(found.frame.image, spec.camera), found.pins_px) for found in real.frames]
     for name, image, _ in read:
         require_cameras_own(image, name, spec.camera)
-    return read
+    return read, real.refused
 
 
 def in_channels(image: np.ndarray, camera: CameraSpec) -> np.ndarray:

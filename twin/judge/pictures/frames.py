@@ -1,4 +1,4 @@
-"""Reading real frames. They must be raw, of one size, neither dark nor saturated, and show every pin."""
+"""Reading real frames. They must be raw, of one size, neither dark nor saturated, and show every pin, or nearly every one."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +19,8 @@ from twin.types import Form, Frame, Observation
 DARK_LEVEL, BRIGHT_PERCENTILE = 40.0, 99.0
 # Least gray level of a saturated pixel, and largest share of saturated pixels in the disc.
 SATURATED_LEVEL, MOST_SATURATED = 250, 0.1
+FEW_LOST = 0.03
+"""Share of the pins in view that a frame may lack where light and skin are fitted to the others: a glint, or a dark cap at the rim."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,14 @@ class RealFrames:
 
 
 def read_real(
-    path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = None, fitted: int = 0, progress: Step | None = None
+    path: Path,
+    spec: SensorSpec,
+    disc: Disc,
+    *,
+    limit: int | None = None,
+    fitted: int = 0,
+    lost: float = 0.0,
+    progress: Step | None = None,
 ) -> RealFrames:
     """Read raw frames. If there are more than ``limit``, those that are read are spread evenly over the recording.
 
@@ -62,6 +71,8 @@ def read_real(
     limit : int, optional
     fitted : int
         Leave out the frames that are read with this number as the limit, because a specification was fitted to them.
+    lost : float
+        Largest share of the pins in view that a frame may lack; the lacking ones are NaN.
 
     Raises
     ------
@@ -84,7 +95,7 @@ def read_real(
         name = recording.names[index]
         try:
             frame = recording.read(index)
-            observation = check_frame(frame, pipeline, disc)
+            observation = check_frame(frame, pipeline, disc, lost)
         except FrameError as error:
             refused.append({"image_name": name, "reason": str(error).removeprefix(f"{name}: ")})
         else:
@@ -98,8 +109,8 @@ def read_real(
     return RealFrames(frames, refused)
 
 
-def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc) -> Observation:
-    """Check that a frame can be compared, and return its observation.
+def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc, lost: float = 0.0) -> Observation:
+    """Check that a frame can be compared, and return its observation; at most the share ``lost`` of its pins may lack.
 
     Raises
     ------
@@ -114,7 +125,9 @@ def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc) -> Observation:
         if saturated > MOST_SATURATED:
             raise FrameError(f"{frame.name}: saturated ({saturated:.0%} of the disc); record it with a shorter exposure")
     observation = pipeline(frame)
-    if observation.found != observation.expected or not observation.valid:
-        why = observation.reason or f"{observation.found} of {observation.expected} pins found, all are needed"
+    least = int(np.ceil((1 - lost) * observation.expected))
+    if observation.found < least or not observation.valid:
+        needed = f"{least} are needed" if lost else "all are needed"
+        why = observation.reason or f"{observation.found} of {observation.expected} pins found, {needed}"
         raise FrameError(f"{frame.name}: {why}; leave it out, or give the right --sensor")
     return observation

@@ -10,7 +10,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.camera.projection import lens_disc
 from twin.judge.pictures.compare import Quality, pin_aligned, pose_aligned, statistics
-from twin.judge.pictures.frames import read_real
+from twin.judge.pictures.frames import FEW_LOST, read_real
 from twin.judge.pictures.report import (
     image_summary,
     pose_summary,
@@ -96,7 +96,7 @@ def run_realism(
     spec = plain_of(spec, without)
     disc, bar = lens_disc(spec.view, spec.housing), partial(stage, progress)
     with bar("read the real frames, find their pins") as step:
-        real = read_real(folder, spec, disc, limit=limit, fitted=fitted, progress=step)
+        real = read_real(folder, spec, disc, limit=limit, fitted=fitted, lost=0.0 if with_poses else FEW_LOST, progress=step)
     with bar("fit the skin to the pins, render") as step:
         pairs = pin_aligned(spec, real.frames, disc, quality=quality, progress=step)
     poses = pose_aligned(spec, real.frames, disc, quality=quality, bar=bar) if with_poses else None

@@ -368,6 +368,44 @@ class AppearanceSpec(Section):
     relief: ReliefSpec | None = None
 
 
+class ResidualSpec(Section):
+    """A small network that adds to a colour frame what the models of light and camera leave out, before the stream rounds it.
+
+    It makes frames look like the camera's. Pins do not need it: it moves their centroids by a few hundredths of a pixel. It is off unless
+    ``used`` is set, and belongs to the calibration that it was taught with.
+
+    Attributes
+    ----------
+    weights : tuple of float
+        Kernels and biases of its four convolutions, one after the other.
+    channels, noises : int
+        Number of channels within, and of random numbers at each pixel.
+    center_px, radius_px : two numbers, float
+        It acts within this circle of the full frame: the lens disc.
+    used : bool
+    """
+
+    weights: tuple[float, ...]
+    channels: Annotated[int, Field(ge=1, le=64)]
+    noises: Annotated[int, Field(ge=0, le=8)]
+    center_px: tuple[float, float]
+    radius_px: Positive
+    used: bool = False
+
+    @property
+    def shapes(self) -> list[tuple[int, int, int, int]]:
+        """Shapes (out, in, k, k) of the four kernels."""
+        inner = (self.channels, self.channels, 3, 3)
+        return [(self.channels, 3 + self.noises, 5, 5), inner, inner, (3, self.channels, 3, 3)]
+
+    @model_validator(mode="after")
+    def _check_count(self) -> Self:
+        expected = sum(math.prod(shape) + shape[0] for shape in self.shapes)
+        if len(self.weights) != expected:
+            raise ValueError(f"weights has {len(self.weights)} numbers, {self.channels} channels and {self.noises} noises need {expected}")
+        return self
+
+
 class ResponseSpec(Section):
     """From linear light to 8-bit gray levels. The steps follow one another in this order.
 
@@ -399,6 +437,8 @@ class ResponseSpec(Section):
         The frame comes as whole numbers of luma and colour differences (ITU-R BT.601 or BT.709, studio range), or as RGB.
     jpeg_quality : int
         Of the stream; 0: not compressed.
+    residual : ResidualSpec, optional
+        A small network that comes before the stream, if it is switched on.
     """
 
     exposure: Positive = 1.0
@@ -417,6 +457,7 @@ class ResponseSpec(Section):
     noise_sigma_px: NonNegative = 0.0
     stream: Literal["rgb", "bt601", "bt709"] = "rgb"
     jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 0
+    residual: ResidualSpec | None = None
 
 
 class RecordingSpec(Section):

@@ -22,7 +22,7 @@ SECTIONS = {
     "response": {
         "exposure": 1.0, "gamma": 2.2, "black_level": 4.0, "blur_sigma_px": 0.6, "read_noise": 2e-4, "shot_noise": 6e-5, "sharpening": 0.0,
         "sharpening_sigma_px": 1.5, "chroma_sigma_px": 0.0, "chroma_median_px": 0, "chroma_columns": 1, "noise_sigma_px": 0.0,
-        "stream": "rgb", "jpeg_quality": 0,
+        "stream": "rgb", "jpeg_quality": 0, "residual": None,
     },
 }  # fmt: skip
 

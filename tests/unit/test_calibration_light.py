@@ -10,7 +10,7 @@ from twin.camera.capture import expose
 from twin.camera.projection import lens_disc, project
 from twin.fit.caps import ORDERS, fit_caps, outline_steps
 from twin.fit.photometry import fit_photometry
-from twin.fit.response import apparent_mm, defocus_px, fit_blur, fit_focus, fit_noise, fit_response, sharpness
+from twin.fit.response import apparent_mm, defocus_px, fit_blur, fit_focus, fit_haze, fit_noise, fit_response, sharpness
 from twin.fit.rim import fit_rim
 from twin.frames.forms import gray_levels
 from twin.geometry.pins import rest_pins
@@ -68,6 +68,15 @@ def shoot(spec, frames):
 
 def quiet(*_):
     pass
+
+
+def test_the_haze_is_found_again_where_light_around_the_disc_was_added_later(known, light, frame):
+    """What the veil adds cannot be taken away where the light is 0: a share that is too large must be corrected."""
+    inside = np.ones(light.shape[:2], bool)
+    found = fit_haze(revised(known, gel={"haze": 0.08}), [frame], [light], inside)
+    assert found.gel.haze == pytest.approx(known.gel.haze, abs=0.003)
+    kept = fit_haze(known, [frame], [light], inside)
+    assert kept.gel.haze == pytest.approx(known.gel.haze, abs=0.003)
 
 
 def test_levels_and_light_are_inverse(known):

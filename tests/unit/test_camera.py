@@ -38,6 +38,7 @@ NEUTRAL = {
         "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "gamma": 1.0, "black_level": 0.0, "blur_sigma_px": 0.0,
         "brightness_drift": 0.0, "read_noise": 0.0, "shot_noise": 0.0, "sharpening": 0.0, "chroma_sigma_px": 0.0,
         "chroma_median_px": 0, "chroma_columns": 1, "noise_sigma_px": 0.0, "stream": "rgb", "jpeg_quality": 0,
+        "residual": None,
     },
 }  # fmt: skip
 FULL = {

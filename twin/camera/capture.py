@@ -12,6 +12,7 @@ import numpy as np
 
 from scenes.body import GelSpec
 from scenes.sensor import CameraSpec, CaptureSpec, RecordingSpec, ResponseSpec
+from twin.camera.residual import refined
 from twin.errors import FrameError
 from twin.types import BoolArray, FloatArray, ImageArray, IntArray
 
@@ -49,7 +50,8 @@ def expose(
     """The raw frame that gel, lens and camera make of the light.
 
     Gel haze, lateral chromatic aberration, blur and vignetting act on light. They are followed by gain, noise, sharpening of the luma,
-    the response curve, loss of colour detail, the video stream and its compression (`GelSpec`, `CameraSpec`, `ResponseSpec`).
+    the response curve, loss of colour detail, the video stream and its compression (`GelSpec`, `CameraSpec`, `ResponseSpec`). A residual
+    network that is switched on comes before the stream.
     A step whose parameter is neutral changes nothing.
 
     Parameters
@@ -66,15 +68,34 @@ def expose(
     -------
     (H, W, 3) or (H, W) uint8
     """
-    camera, response = capture.camera, capture.response
+    response = capture.response
+    if response.residual is not None and response.residual.used and np.ndim(linear) == 3:
+        gray = before_stream(linear, capture, rng, origin_px=origin_px)
+        gray = refined(gray, response.residual, luma_weights(response.stream), response.chroma_columns, rng, origin_px)
+    else:
+        gray = _developed_light(linear, capture, response, rng, origin_px)
+    frame = through_stream(gray, response.stream) if gray.ndim == 3 else np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+    return compressed(frame, response.jpeg_quality, origin_px)
+
+
+def before_stream(
+    linear: FloatArray, capture: CaptureSpec, rng: np.random.Generator | None = None, *, origin_px: tuple[int, int] = (0, 0)
+) -> FloatArray:
+    """Gray levels (H, W[, 3]) float of a frame before columns share colour differences and a stream rounds them: as for ``expose``."""
+    return _developed_light(linear, capture, capture.response.model_copy(update={"chroma_columns": 1}), rng, origin_px)
+
+
+def _developed_light(
+    linear: FloatArray, capture: CaptureSpec, response: ResponseSpec, rng: np.random.Generator | None, origin_px: tuple[int, int]
+) -> FloatArray:
+    """Gray levels of light after gel, lens, noise and response curve."""
+    camera = capture.camera
     light = hazed(np.asarray(linear, np.float32), capture.gel)
     light = dispersed(light, camera, origin_px)
     light = blurred(light, response.blur_sigma_px)
     light = vignetted(light, camera, origin_px)
     light = amplified(light, response, rng)
-    gray = developed(light, noisy(light, response, rng), response, origin_px)
-    frame = through_stream(gray, response.stream) if gray.ndim == 3 else np.clip(np.rint(gray), 0, 255).astype(np.uint8)
-    return compressed(frame, response.jpeg_quality, origin_px)
+    return developed(light, noisy(light, response, rng), response, origin_px)
 
 
 def hazed(light: FloatArray, gel: GelSpec) -> FloatArray:

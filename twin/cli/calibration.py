@@ -23,11 +23,13 @@ from twin.cli.options import (
     NoContact,
     Out,
     Quality,
+    Residual,
     Sensor,
     Table,
     Tuning,
     Workers,
     if_given,
+    refined_if,
     say,
     sensor_with,
     tell,
@@ -129,9 +131,9 @@ app.add_typer(calibrate_app, name="calibrate")
 HELP_CALIBRATE_OPTICS = """Fit light, colours, sharpness and noise to raw frames.
 
 Start from your sensor's specification ('twin new'), or from the shipped one that is most like it. The frames may show any contact:
-their pins are found (a few may be lost), the skin is fitted to them, the twin renders the same state, and its parameters are moved until both agree, by
-differentiating the path tracer (LEDs, reflectances, haze) and by least squares (ring, reflections, specks, each cap's own
-reflectance and outline, blur, aperture, sharpening, colour fringes, compression, noise). What is left then is measured: a
+their pins are found (a few may be lost), the skin is fitted to them, the twin renders the same state, and its parameters are moved
+until both agree, by differentiating the path tracer (LEDs, reflectances, haze) and by least squares (ring, reflections, specks, each
+cap's own reflectance and outline, blur, aperture, sharpening, colour fringes, compression, noise). What is left then is measured: a
 tile of light and colour that moves with each cap and the skin around it, and a background that stays in place. With
 --no-contact one frame without contact fits the camera first.
 
@@ -338,7 +340,8 @@ How to read it: no render can do better than PSNR and SSIM of two real frames
 with the same contact. Two-sample accuracy is the share of patches of unseen
 frames that a small network puts into the right set: at 100 % it always tells
 real from rendered, at 50 % never. --without shows what a measured detail is
-worth: the caps' relief, the skin's grain, the background.
+worth: the caps' relief, the skin's grain, the background. --residual adds the
+sensor's residual network; judge it on frames that it was not taught on.
 
 \b
 Example:
@@ -360,6 +363,7 @@ def realism(
     without: Annotated[
         list[str] | None, typer.Option("--without", metavar="DETAIL", help="relief, grain or background; may be repeated")
     ] = None,
+    residual: Residual = False,
     quality: Annotated[Quality, typer.Option(help=QUALITY)] = "standard",
     two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
     table: Table = None,
@@ -374,7 +378,7 @@ def realism(
     with overwriting(force), shown() as progress:
         found = compare_with_renders(
             frames_at(path, table),
-            sensor_with(sensor, pipeline),
+            refined_if(residual, sensor_with(sensor, pipeline)),
             out,
             pose_aligned=pose_aligned,
             limit=limit,

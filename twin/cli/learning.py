@@ -28,6 +28,7 @@ from twin.cli.options import (
     NoContact,
     Out,
     Quality,
+    Residual,
     Sensor,
     Split,
     Table,
@@ -40,6 +41,7 @@ from twin.cli.options import (
     if_given,
     names_in,
     one_recording,
+    refined_if,
     say,
     sensor_with,
     tell,
@@ -127,6 +129,7 @@ def dataset(
     workers: Workers = CORES,
     scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
     quality: Annotated[Quality | None, typer.Option(help=QUALITY, show_default="drawn")] = None,
+    residual: Residual = False,
     across: Across = FINE,
     also: Also = None,
     force: Force = False,
@@ -137,7 +140,7 @@ def dataset(
     from twin.store import overwriting
 
     config = config_for(
-        load_sensor(sensor),
+        refined_if(residual, load_sensor(sensor)),
         load_experiment(experiment),
         touched=if_given(load_object, object_),
         images=images.value,

@@ -39,6 +39,7 @@ Object = Annotated[str, typer.Option("--object", metavar="O", help="object name 
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder to write to; made if missing")]
 Force = Annotated[bool, typer.Option("--force", help="write over files that this program did not write")]
 FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; found from size and content if not given")]
+Residual = Annotated[bool, typer.Option("--residual", help="add the sensor's residual network")]
 Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch finds one), cpu or cuda")]
 
 
@@ -146,6 +147,13 @@ def sensor_with(name: str, tuning: Path | None) -> "SensorSpec":
 
     spec = load_sensor(name)
     return spec if tuning is None else with_detector(spec, load_detector(tuning))
+
+
+def refined_if(wanted: bool, sensor: "SensorSpec") -> "SensorSpec":
+    """The sensor, its residual network switched on if this is wanted."""
+    from twin.camera.residual import with_residual
+
+    return with_residual(sensor) if wanted else sensor
 
 
 def one_recording(folders: list[Path], table: Path | None, no_contact: Path | None) -> list[Path]:

@@ -19,7 +19,7 @@ from twin.fit.camera_pose import fit_camera
 from twin.fit.caps import fit_caps
 from twin.fit.details import fit_details, undetermined_tiles
 from twin.fit.photometry import fit_photometry
-from twin.fit.response import fit_blur, fit_focus, fit_noise, fit_response, sharpness
+from twin.fit.response import fit_blur, fit_focus, fit_haze, fit_noise, fit_response, sharpness
 from twin.fit.rim import fit_rim
 from twin.fit.ring import NoRing
 from twin.fit.sensor_file import folder_beside, write_sensor
@@ -229,12 +229,13 @@ def fit_optics(
         notes.append(f"the relief of {unseen} of {spec.pins.count} caps: fewer than two frames show them; use more frames")
     if len(frames) < FEW_FRAMES_FITTED:
         notes.append(
-            f"what moves with a cap and what stays in place: {len(frames)} frames hardly tell them apart; give {FRAMES} of different contacts"
+            f"what moves with a cap and what stays in place: {len(frames)} frames hardly tell them apart; "
+            f"give {FRAMES} of different contacts"
         )
     if spec.pipeline.raw.rest_origin == "contacts":
         notes.append(REST_MADE)
     first = studio.shots(spec, frames, "render the start")
-    spec = without(spec, DETAILS)
+    spec = revised(without(spec, DETAILS), response={"residual": None})  # it belongs to the calibration that it was taught with
     held = spec.housing
     for number, fit in enumerate(_stages(frames, inside, studio, bar)):
         spec = log.stage(f"{number:02d}-{fit.__name__}", fit, spec)
@@ -278,7 +279,8 @@ def _stages(frames: list[Aligned], inside: np.ndarray, studio: _Studio, bar: Bar
         return fit_details(spec, frames, studio.light(without(spec, DETAILS), frames, "render for relief and background"))
 
     def detailed_response(spec: SensorSpec) -> SensorSpec:
-        return fit_response(spec, frames, studio.light(spec, frames, "render for the response to details"), inside)
+        light = studio.light(spec, frames, "render for the response to details")
+        return fit_response(fit_haze(spec, frames, light, inside), frames, light, inside)
 
     def noise(spec: SensorSpec) -> SensorSpec:
         return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"))

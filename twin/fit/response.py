@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 
 from scenes.sensor import CameraSpec, LensSpec, ResponseSpec, SensorSpec
 from twin.camera.capture import expose, hazed, luma_weights, stream_of
 from twin.camera.projection import lens_disc, project
+from twin.fit.photometry import MOST_HAZE
 from twin.frames.forms import gray_levels
 from twin.judge.pictures.aligned import SATURATED, Aligned, revised
 from twin.judge.pictures.spectra import bin_of, equal_count_edges, noise_sd
@@ -38,6 +39,8 @@ ROBUST_LEVELS = 10.0
 MOST_TRIES = 10
 # Most frames that the sharpness is fitted to; one pixel in EVERY is used in each direction.
 MOST_FRAMES, EVERY = 3, 3
+# How exactly the haze is found.
+HAZE_STEP = 5e-4
 # Largest aperture, mm. A larger one would need more samples per pixel than the frames for training have.
 MOST_APERTURE_MM = 3.0
 # Range of the focus, relative to the distances of the nearest and farthest caps; number of tried values of focus and of aperture.
@@ -106,6 +109,34 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     best = with_values(fit.x)
     errors = {q: float(np.mean(np.abs(misfit(revised(best, response={"jpeg_quality": q}))))) for q in QUALITIES}
     return revised(best, response={"jpeg_quality": min(QUALITIES, key=lambda q: errors[q])}, gel={"haze": spec.gel.haze})
+
+
+def fit_haze(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], inside: np.ndarray) -> SensorSpec:
+    """Fit the share of light that the gel scatters, to light that has its background.
+
+    The veil is made of the whole frame's light. A background that was added later, bright glare around the disc for example, makes the veil
+    brighter than it was when the haze was fitted, and nothing can be taken away where the light is 0.
+
+    Parameters
+    ----------
+    light : list of (H, W, 3) or (H, W) float
+        Rendered light of each frame's state.
+    inside : (H, W) bool
+        The disc.
+    """
+    pick = np.zeros_like(inside)
+    pick[::EVERY, ::EVERY] = True
+    chosen = list(zip(frames, light, strict=True))[:MOST_FRAMES]
+    useful = [inside & pick & (gray_levels(f.image) < SATURATED) for f, _ in chosen]
+
+    def misfit(haze: float) -> float:
+        shown = revised(spec, gel={"haze": haze}, response={"jpeg_quality": 0}).capture
+        away = [np.abs(expose(x, shown)[u] - f.image[u].astype(float)).mean() for (f, x), u in zip(chosen, useful, strict=True)]
+        return float(np.mean(away))
+
+    found = minimize_scalar(misfit, bounds=(0.0, MOST_HAZE), method="bounded", options={"xatol": HAZE_STEP, "maxiter": MOST_TRIES})
+    haze = round(float(found.x), 5)
+    return revised(spec, gel={"haze": haze}) if misfit(haze) < misfit(spec.gel.haze) else spec
 
 
 def chroma_columns(images: list[np.ndarray]) -> int:

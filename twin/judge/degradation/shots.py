@@ -52,11 +52,11 @@ CONTACTS = (
     Contact("cylinder", "cylinder", ContactPose(3.0, offset_mm=(3.0, 2.0))),
 )
 """Contacts of a sweep."""
-NEUTRAL: dict[str, dict[str, float | int | str | tuple[float, ...]]] = {
+NEUTRAL: dict[str, dict[str, float | int | str | tuple[float, ...] | None]] = {
     "response": {
         "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "blur_sigma_px": 0.0, "brightness_drift": 0.0, "read_noise": 0.0,
         "shot_noise": 0.0, "sharpening": 0.0, "chroma_sigma_px": 0.0, "chroma_median_px": 0, "chroma_columns": 1, "stream": "rgb",
-        "jpeg_quality": 0,
+        "jpeg_quality": 0, "residual": None,
     },
     "camera": {"vignetting": 0.0, "red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.0, 0.0), "blue_shift_px": (0.0, 0.0)},
     "gel": {"haze": 0.0},

@@ -1,0 +1,130 @@
+"""A small network that adds to a frame what the models of light and camera leave out: the texture of edges, colours and noise.
+
+It changes each pixel by what stands around it and by random numbers of its own, with four convolutions; its middle two add to what they
+are given. It was taught against judges that tell real frames from rendered ones (`training.residual`). It works on luma and colour
+differences before the stream rounds them, within the lens disc, and only where ``response.residual.used`` is set.
+"""
+
+import numpy as np
+
+from scenes.sensor import ResidualSpec, SensorSpec
+from twin.errors import RenderError
+from twin.types import FloatArray
+
+LEVELS = 64.0
+"""Gray levels that the value 1 of the network's input stands for."""
+MIDDLE = (1.0, 0.0, 0.0)
+"""What is taken from the input's luma and colour differences, in ``LEVELS``."""
+LEAK = 0.1
+"""Slope of a leaky rectifier below 0."""
+MOST_LEVELS, STEEPNESS = 16.0, 2.0
+"""Largest change of luma and colour differences, gray levels, and the factor before the tanh that bounds it."""
+
+
+def with_residual(spec: SensorSpec) -> SensorSpec:
+    """The specification with its residual network switched on.
+
+    Raises
+    ------
+    RenderError
+        The specification has none.
+    """
+    residual = spec.response.residual
+    if residual is None:
+        raise RenderError(f"sensor {spec.name} has no residual network (response.residual); leave --residual out, or use ur5-331")
+    response = spec.response.model_copy(update={"residual": residual.model_copy(update={"used": True})})
+    return spec.model_copy(update={"response": response})
+
+
+def refined(
+    gray: FloatArray,
+    residual: ResidualSpec,
+    luma: FloatArray,
+    columns: int,
+    rng: np.random.Generator | None = None,
+    origin_px: tuple[int, int] = (0, 0),
+) -> FloatArray:
+    """Gray levels (H, W, 3) after the network, with the mean colour differences of the columns that share them.
+
+    Parameters
+    ----------
+    gray : (H, W, 3) float
+        Gray levels in which no columns share their colour differences yet.
+    luma : (3,) float
+        Shares of the colours in the luma.
+    columns : int
+        Number of neighbouring columns of the full frame that share colour differences.
+    rng : numpy.random.Generator, optional
+        Source of the network's random numbers; without it they are 0.
+    origin_px : (x, y)
+        Place of the first pixel in the camera's full frame.
+    """
+    matrix = differences(luma)
+    signal = np.asarray(gray, np.float32) @ matrix.T
+    height, width = gray.shape[:2]
+    middle_x, middle_y = (at - start for at, start in zip(residual.center_px, origin_px, strict=True))
+    inside = (np.arange(width) - middle_x) ** 2 + (np.arange(height)[:, None] - middle_y) ** 2 <= residual.radius_px**2
+    if inside.any():
+        rows, across = (slice(k.min(), k.max() + 1) for k in np.nonzero(inside))
+        part = signal[rows, across]
+        noise = np.zeros((*part.shape[:2], residual.noises), np.float32)
+        if rng is not None:
+            noise = rng.standard_normal(noise.shape, dtype=np.float32)
+        signal[rows, across] = part + inside[rows, across, None] * change(part, noise, residual)
+    signal[..., 1:] = averaged(signal[..., 1:], columns, origin_px[0])
+    return np.asarray(signal @ np.linalg.inv(matrix).T, np.float32)
+
+
+def differences(luma: FloatArray) -> FloatArray:
+    """Matrix (3, 3) from red, green and blue to luma, blue and red difference, all in gray levels; ``luma`` (3,): shares in the luma."""
+    rows = [luma, *((np.eye(3)[k] - luma) / (2 * (1 - luma[k])) for k in (2, 0))]
+    return np.array(rows, np.float32)
+
+
+def change(signal: FloatArray, noise: FloatArray, residual: ResidualSpec) -> FloatArray:
+    """What the network adds (H, W, 3) to luma and colour differences (H, W, 3), gray levels, given noise (H, W, noises)."""
+    first, second, third, last = layers(residual)
+    seen = np.concatenate([signal / np.float32(LEVELS) - np.array(MIDDLE, np.float32), noise], axis=2)
+    hidden = rectified(convolved(seen, *first))
+    hidden = hidden + rectified(convolved(hidden, *second))
+    hidden = hidden + rectified(convolved(hidden, *third))
+    return np.float32(MOST_LEVELS) * np.tanh(np.float32(STEEPNESS) * convolved(hidden, *last))
+
+
+def layers(residual: ResidualSpec) -> list[tuple[FloatArray, FloatArray]]:
+    """Kernels (out, in, k, k) and biases (out,) of the four convolutions."""
+    weights, found, at = np.array(residual.weights, np.float32), [], 0
+    for shape in residual.shapes:
+        size = int(np.prod(shape))
+        found.append((weights[at : at + size].reshape(shape), weights[at + size : at + size + shape[0]]))
+        at += size + shape[0]
+    return found
+
+
+def convolved(signal: FloatArray, kernel: FloatArray, bias: FloatArray) -> FloatArray:
+    """Cross-correlation of a signal (H, W, in) with a kernel (out, in, k, k); zeros are around it."""
+    height, width, channels = signal.shape
+    side = kernel.shape[2]
+    padded = np.pad(signal, ((side // 2, side // 2), (side // 2, side // 2), (0, 0)))
+    found = np.broadcast_to(bias, (height * width, len(bias))).copy()
+    for down in range(side):
+        rows = padded[down : down + height]
+        seen = np.concatenate([rows[:, across : across + width] for across in range(side)], axis=2)
+        weights = kernel[:, :, down].transpose(2, 1, 0).reshape(side * channels, -1)
+        found += seen.reshape(height * width, -1) @ weights
+    return found.reshape(height, width, -1)
+
+
+def rectified(signal: FloatArray) -> FloatArray:
+    """The signal, its negative part times ``LEAK``."""
+    return np.maximum(signal, np.float32(LEAK) * signal)
+
+
+def averaged(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:
+    """Colour differences (H, W, 2) of which groups of columns of the full frame have their mean; ``left_px`` is the first one's number."""
+    if columns == 1:
+        return chroma
+    group = (left_px + np.arange(chroma.shape[1])) // columns
+    start = np.flatnonzero(np.r_[True, np.diff(group) > 0])
+    mean = np.add.reduceat(chroma, start, axis=1) / np.diff(np.r_[start, len(group)])[None, :, None]
+    return np.asarray(np.repeat(mean, np.diff(np.r_[start, len(group)]), axis=1), np.float32)

@@ -67,9 +67,8 @@ def refined(
     if inside.any():
         rows, across = (slice(k.min(), k.max() + 1) for k in np.nonzero(inside))
         part = signal[rows, across]
-        noise = np.zeros((*part.shape[:2], residual.noises), np.float32)
-        if rng is not None:
-            noise = rng.standard_normal(noise.shape, dtype=np.float32)
+        size = (*part.shape[:2], residual.noises)
+        noise: FloatArray = np.zeros(size, np.float32) if rng is None else rng.standard_normal(size, dtype=np.float32)
         signal[rows, across] = part + inside[rows, across, None] * change(part, noise, residual)
     signal[..., 1:] = averaged(signal[..., 1:], columns, origin_px[0])
     return np.asarray(signal @ np.linalg.inv(matrix).T, np.float32)

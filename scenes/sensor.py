@@ -383,6 +383,7 @@ class ResidualSpec(Section):
     center_px, radius_px : two numbers, float
         It acts within this circle of the full frame: the lens disc.
     used : bool
+        Whether frames get it.
     """
 
     weights: tuple[float, ...]

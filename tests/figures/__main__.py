@@ -7,6 +7,7 @@ from figures import (  # noqa: F401  (each registers its jobs)
     data,
     environments,
     forces,
+    labels,
     mechanics,
     pictures,
     pins,

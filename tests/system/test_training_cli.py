@@ -11,8 +11,12 @@ from drawn_recording import drawn_pins
 from small_generation import ACROSS, EXPERIMENT, SENSOR
 from typer.testing import CliRunner
 
-from scenes import load_sensor
+from scenes import load_experiment, load_sensor
 from training.recipes import TrainingError
+from training.studies.sim_to_real import Plan
+from training.studies.sim_to_real.inverted import BACKWARDS
+from training.studies.sim_to_real.page import BOTH, EVENLY, REAL
+from training.studies.sim_to_real.worth import worth
 from twin.cli import command_line
 from twin.errors import FrameError, TwinError
 from twin.pins import nominal_reference
@@ -123,7 +127,7 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
     twin("dataset", *gentle, "--images", "none", "--count", 20, "--seed", 7, "--randomise", "contact", "--out", tmp_path / "frames")
     command = ("study", "sim-to-real", *gentle, "--frames", tmp_path / "frames", "--labels", 8, "--count", 12, "--draws", 1)
     command += (*(["--ablate"] if left_out else []), "--epochs", 2, "--out", tmp_path / "study")
-    said = twin(*command)
+    said, sims = twin(*command), tmp_path / "study" / "sim"
     rows = list(csv.DictReader((tmp_path / "study" / "study.csv").open()))
     told = [("simulated", "0"), ("simulated and real", "8"), *((name, "0") for name in left_out), ("real", "8")]
     assert [(row["trained_on"], row["labelled_frames"]) for row in rows[: len(told)]] == told
@@ -134,6 +138,11 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
     judged = [line for line in said.splitlines() if "labelled" in line and "pose_2" in line]
     assert len(judged) == len(rows) and [line for line in twin(*command).splitlines() if line in judged] == judged
     assert [weights.stat().st_mtime_ns for weights in trained] == written, "trained once"
+    plan = Plan(load_sensor(SENSOR), tmp_path / "frames", load_experiment(str(tmp_path / "gentle.toml")), labels=8, simulated=(sims,))
+    curves = worth(plan, tmp_path / "worth", (0, 1))
+    assert {row["labelled_frames"] for row in curves if row["model"] == BACKWARDS and row["trained_on"] == BOTH} >= {0, 5, 8}
+    assert {row["trained_on"] for row in curves} == {REAL, BOTH, REAL + EVENLY, BOTH + EVENLY}
+    assert all(np.isfinite(row["pose_2_corrected"]) for row in curves)
     for run in ("sim_only", "sim_plus_real"):
         told = twin("evaluate", tmp_path / "study" / run, "--data", tmp_path / "frames", "--rows", "all", "--out", tmp_path / run)
         assert "pose_6: mean error" in told

@@ -50,7 +50,7 @@ def worth(plan: Plan, out: Path, seeds: Sequence[int], *, progress: Progress = s
     sets = [load_dataset(folder, plan.sensor, plan.experiment.targets, form=real.pins.form) for folder in folders]
     told = [label for each in sets for label in arm_labels(each)]
     simulated = joined(sets)
-    like = states_like(simulated, real)
+    like = states_like(simulated, real.rows(choose_frames(len(real), plan.labels, plan.seed).few))
     backwards = read_backwards(simulated.rows(like), [told[row] for row in like], plan.experiment, seed=plan.seed)
     found: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for seed in seeds:
@@ -68,6 +68,6 @@ def worth(plan: Plan, out: Path, seeds: Sequence[int], *, progress: Progress = s
 
 def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """One row with the mean of all errors."""
-    return {key: value if isinstance(value, str) else float(np.mean([row[key] for row in rows])) for key, value in rows[0].items()} | {
-        "labelled_frames": int(rows[0]["labelled_frames"])
-    }
+    errors = [key for key in rows[0] if key.endswith(("_corrected", "_raw"))]
+    named = {key: rows[0][key] for key in ("trained_on", "labelled_frames", "model")}
+    return named | {key: float(np.mean([row[key] for row in rows])) for key in errors}

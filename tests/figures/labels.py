@@ -1,0 +1,89 @@
+"""On six recordings: what the twin is worth by the number of labelled frames, and whether shipped intervals hold what they say."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from figures.jobs import ROOT, Measured, Value, job, real_folder
+from scenes import load_experiment, load_sensor
+from training.dataset import load_dataset
+from training.estimator import PoseEstimator
+from training.evaluate import judge
+from training.studies.evaluation import models_of_kinds
+from training.studies.sim_to_real import Plan
+from training.studies.sim_to_real.page import errors_figure
+from training.studies.sim_to_real.worth import worth
+from training.targets import unit_of
+from twin.frames import open_recording
+from twin.report.charts import write_chart
+
+RECORDINGS = {  # by recording: sensor, experiment, contacts, elements across, minutes on two idle cores
+    "tac-vgnn-331": ("mg400-331", "surface-2d", 300, 20, 12.0),
+    "tac-vgnn-127": ("mg400-127", "surface-2d", 300, 20, 12.0),
+    "ur5-331-surface-3d-tap": ("ur5-331", "surface-3d", 300, 12, 5.0),
+    "ur5-331-surface-3d-shear": ("ur5-331", "surface-3d-sheared", 300, 12, 9.0),
+    "ur5-331-edge-2d-tap": ("ur5-331", "edge-circle", 800, 12, 8.0),
+    "ur5-331-edge-2d-shear": ("ur5-331", "edge-circle-sheared", 500, 12, 14.0),
+}
+SEEDS = (0, 1, 2)
+CHARTS = ROOT / "docs" / "pictures"
+"""Where the charts are written, one for each recording."""
+
+
+def by_labels(work: Path, *, recording: str) -> Measured:
+    """Mean errors over three draws of frames, and their chart."""
+    sensor, experiment, count, across, _ = RECORDINGS[recording]
+    plan = Plan(load_sensor(sensor), real_folder(recording), load_experiment(experiment), count=count, across=across, workers=2)
+    rows = worth(plan, work / "worth", SEEDS)
+    CHARTS.mkdir(parents=True, exist_ok=True)
+    write_chart(CHARTS / f"labels-{recording}.png", lambda: errors_figure(rows, plan.experiment.targets))
+    found = {}
+    for row in rows:
+        about = "_".join((row["trained_on"], str(row["labelled_frames"]), row["model"]))
+        name = "".join(letter if letter.isalnum() else "_" for letter in about)
+        found |= {f"{name}.{column}": Value(row[f"{column}_corrected"], unit_of(column)) for column in plan.experiment.targets}
+    return found
+
+
+def inside(work: Path, *, recording: str) -> Measured:
+    """Share of the frames that the shipped weights did not learn from whose labels lie inside their intervals of 90 %."""
+    sensor, folder = RECORDINGS[recording][0], real_folder(recording)
+    several = models_of_kinds(sensor, folder)
+    kinds = several.for_labels(open_recording(folder, several.sensor)) if several else []
+    estimator = several.parts[kinds[0]] if several else PoseEstimator.load(sensor)
+    data = load_dataset(folder, estimator.recorded_sensor, estimator.names, form=estimator.form)
+    kept_out, learnt = (estimator.config[part].get(key, []) for part, key in (("rows", "kept_out"), ("labelled", "image_names")))
+    if kept_out:
+        rows = np.flatnonzero(np.isin([f"{recording}/{name}" for name in data.pins.image_name], kept_out))
+    else:
+        rows = np.flatnonzero(~np.isin(data.pins.image_name, learnt or list(estimator.config["labelled"])))
+    made = several.predict_rows(data, rows, kinds) if several else estimator.predict_rows(data, rows)
+    judged = judge(made, data, rows)["corrected"]
+    shares = {f"{name}.inside": Value(judged[name]["coverage_90"]) for name in estimator.names}
+    return shares | {f"{name}.error": Value(judged[name]["mae"], unit_of(name)) for name in estimator.names} | {"frames": Value(len(rows))}
+
+
+def register() -> None:
+    """Two jobs for each recording."""
+    for recording, (sensor, experiment, count, across, minutes) in RECORDINGS.items():
+        command = f"worth(Plan({sensor}, {recording}, {experiment}, count={count}, across={across}), out, {SEEDS})"
+        job(
+            f"labels.{recording}",
+            command,
+            sensors=(sensor,),
+            code=("scenes", "twin", "training"),
+            recordings=(recording,),
+            minutes=minutes,
+        )(partial(by_labels, recording=recording))
+        job(
+            f"intervals.{recording}",
+            f"shipped weights of {sensor} on frames of {recording} that they did not learn from",
+            sensors=(sensor,),
+            code=("scenes", "twin", "training"),
+            recordings=(recording,),
+            minutes=2.0,
+        )(partial(inside, recording=recording))
+
+
+register()

@@ -48,16 +48,17 @@ def speed(work: Path) -> Measured:
 
 
 LEARNT = {
-    "EdgeFollow.pins": ("--randomise moves --fem 20", 12),
+    "EdgeFollow.seeing": ("--randomise moves --fem 20", 12),
+    "EdgeFollow.pins": ("--randomise moves --no-sight --fem 20", 12),
     "EdgeFollow.oracle": ("--observation oracle", 2),
     "EdgeFollow.image": ("--observation image", 20),
-    "EdgeFollow.forgetful": ("--randomise moves --no-memory --fem 20", 12),
+    "EdgeFollow.forgetful": ("--randomise moves --no-sight --no-memory --fem 20", 12),
     "SurfaceFollow.pins": ("", 3),
     "SurfaceFollow.oracle": ("--observation oracle", 3),
-    "ContourFollow.pins": ("", 20),
-    "ObjectRoll.pins": ("", 15),
+    "ContourFollow.pins": ("", 5),
+    "ObjectRoll.pins": ("--minutes 8", 10),
     "ObjectPush.pins": ("", 30),
-    "GentlePress.pins": ("", 15),
+    "GentlePress.pins": ("--minutes 8", 10),
 }
 """Options of ``twin learn``, and about how many minutes it takes with all judging, by task and what the policy sees."""
 WHERE = {"surrogate": "", "surrogate, friction remembers": "remembers_", "finite elements, drawn frames": "fem_"}

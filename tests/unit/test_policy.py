@@ -108,6 +108,12 @@ def start_on(batch, depth_mm):
     return standing_on(batch.tool, Surfaces()[load_object("plane")], 0.0, depth_mm, 0.0)
 
 
+def test_a_policy_without_sight_sees_fewer_directions_alone(few_looks):
+    vector = learn.TactileVectorEnv("SurfaceFollow", 2, sensor="mg400-127", objects=("plane",))
+    with_sight, without = (learn._untrained(LearnPlan("SurfaceFollow", SMALL, sight=sight), vector) for sight in (True, False))
+    assert len(with_sight.basis) == 2 * len(without.basis) and with_sight.sight and not without.sight
+
+
 @pytest.fixture
 def few_looks(monkeypatch):
     """Little random motion: what a test learns need not be seen well."""

@@ -432,6 +432,7 @@ def learn(
     surrogate: Annotated[Path | None, typer.Option("--surrogate", metavar="FILE", help="for a sensor of one's own")] = None,
     objects: Annotated[str | None, typer.Option("--objects", callback=each_once, help="in place of the task's, commas between")] = None,
     memory: Annotated[bool, typer.Option("--memory/--no-memory", help="whether friction remembers; to see what that is worth")] = True,
+    sight: Annotated[bool, typer.Option("--sight/--no-sight", help="whether it first learns to tell place and force")] = True,
     minutes: Annotated[float, typer.Option("--minutes", min=0, callback=finite, help="most time")] = 30.0,
     environments: Annotated[int, typer.Option("--environments", min=2, help="stepped together")] = 32,
     fem: Annotated[int, typer.Option("--fem", min=0, metavar="N", help="episodes on finite elements in which the policy is judged")] = 0,
@@ -451,7 +452,7 @@ def learn(
         "surrogate": surrogate,
         "objects": names_in(objects) if objects else None,
     }
-    plan = LearnPlan(task, Options.given(asked), minutes=minutes, environments=environments, fem_episodes=fem, seed=seed)
+    plan = LearnPlan(task, Options.given(asked), minutes=minutes, environments=environments, fem_episodes=fem, seed=seed, sight=sight)
     with overwriting(force), shown() as progress:
         made = learn_policy(plan, out, progress=progress)
     tell(made)

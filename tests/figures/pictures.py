@@ -8,6 +8,7 @@ from bench_render import CHOSEN, DRAWN, Bench
 
 from figures.jobs import Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
+from training.residual import calibrate_residual
 from twin.frames import open_recording
 from twin.judge.pictures.images import compare_images
 from twin.optics.relief import DETAILS
@@ -48,20 +49,38 @@ def judged(work: Path, out: Path, *options: str) -> dict:
 
 
 @job(
-    "render.details",
-    "twin realism DIR --sensor ur5-331 --fitted 6 --no-two-sample --quality drawn --without DETAIL --out OUT",
+    "render.residual.ur5-331",
+    "training.residual.calibrate_residual(DIR, load_sensor('ur5-331'), OUT)",
     sensors=("ur5-331",),
-    code=("scenes", "twin"),
+    code=("scenes", "twin", "training"),
     recordings=("ur5-331-raw",),
-    minutes=10,
+    minutes=15,
+)
+def residual(work: Path) -> Measured:
+    """The residual network, taught on half of the unfitted frames and judged on the other half: what the two-sample test tells of them."""
+    found = calibrate_residual(real_folder("ur5-331-raw"), load_sensor("ur5-331"), work / "taught.toml", fitted=FITTED)
+    told = {f"told_apart_{name}": Value(test.accuracy) for name, test in (("before", found.before), ("after", found.after))}
+    psnr = dict(zip(("psnr_before_db", "psnr_after_db"), (Value(value, "dB") for value in found.psnr_db), strict=True))
+    shift = dict(zip(("shift_px", "shift_95_px"), (Value(value, "px") for value in found.shift_px), strict=True))
+    return told | psnr | shift | {"frames": Value(found.frames)}
+
+
+@job(
+    "render.details",
+    "twin realism DIR --sensor ur5-331 --fitted 6 --quality drawn --without DETAIL --out OUT",
+    sensors=("ur5-331",),
+    code=("scenes", "twin", "training"),
+    recordings=("ur5-331-raw",),
+    minutes=20,
 )
 def details(work: Path) -> Measured:
     """What each measured detail is worth: likeness of drawn pictures with all, and without each."""
     found: Measured = {}
     for name in ("all", *DETAILS):
         left_out = [] if name == "all" else ["--without", name]
-        images = judged(work, work / name, "--no-two-sample", "--quality", "drawn", *left_out)["pin_aligned"]
-        found |= {f"{name}_{key}": Value(images[key]["mean"], unit) for key, unit in RENDERED.items()}
+        metrics = judged(work, work / name, "--quality", "drawn", *left_out)
+        found |= {f"{name}_{key}": Value(metrics["pin_aligned"][key]["mean"], unit) for key, unit in RENDERED.items()}
+        found[f"{name}_told_apart"] = Value(metrics["two_sample"]["accuracy"])
     return found
 
 

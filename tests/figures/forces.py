@@ -104,7 +104,8 @@ def real_forces(work: Path, *, split: int) -> Measured:
         run_twin(work, "train", "--model", "touch", "--sensor", sensor, "--data", data, *options, "--out", run)
     metrics, _ = judged(work, run, [data])
     found = {"frames": Value(metrics["frames"])}
-    for (name, unit), label in zip(TACPAD_LABELS.items(), metrics["corrected"].values(), strict=True):
+    for name, unit in TACPAD_LABELS.items():
+        label = metrics["corrected"][name]
         found |= {name: Value(label["mae"], unit), f"{name}_inside": Value(label["coverage_90"])}
     return found
 

@@ -58,7 +58,7 @@ LEARNT = {
     "ContourFollow.pins": ("", 5),
     "ObjectRoll.pins": ("--minutes 8", 10),
     "ObjectPush.pins": ("", 30),
-    "GentlePress.pins": ("--minutes 8", 10),
+    "GentlePress.pins": ("--no-sight --minutes 15", 16),
 }
 """Options of ``twin learn``, and about how many minutes it takes with all judging, by task and what the policy sees."""
 WHERE = {"surrogate": "", "surrogate, friction remembers": "remembers_", "finite elements, drawn frames": "fem_"}

@@ -223,7 +223,7 @@ def feed(monkeypatch):
     """The studio's camera with an armed arm, an emulator of it, and the texts that it ended with."""
     monkeypatch.setattr("hardware.live_feed.open_camera", lambda *_: NoisyCamera())
     value = np.zeros(1)
-    model = SimpleNamespace(sensor=load_sensor("mg400-331"), form=Form.RAW, check=lambda *_: None)
+    model = SimpleNamespace(sensor=load_sensor("mg400-331"), form=Form.RAW, check=lambda *_: None, counts_from_rest=False)
     offset = free_offset()
 
     class Model(SimpleNamespace):

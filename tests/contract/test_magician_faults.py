@@ -181,7 +181,7 @@ def test_the_queue_refuses_when_it_is_full():
 
 
 def test_an_arc_goes_through_its_places_and_a_line_is_none():
-    with MagicianEmulator(time_scale=20.0) as emulator:
+    with MagicianEmulator(time_scale=4.0) as emulator:
         ask(emulator, Id.QUEUE_START, ctrl=WRITE)
         here = pose_of(emulator)[:4]
         via, end = (here[0] + 20, here[1] + 20, here[2], here[3]), (here[0] + 40, here[1], here[2], here[3] + 10)

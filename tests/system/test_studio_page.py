@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from urllib.request import Request, urlopen
 
+import cv2
 import numpy as np
 import pytest
 from drawn_frames import drawn_frame, smooth_warp
@@ -262,8 +263,11 @@ def test_live_shows_a_source_and_an_arm_that_is_read_only(studio, client, tmp_pa
 
 def test_a_specification_is_proposed_corrected_and_used(studio, client, tmp_path):
     reference, rng = nominal_reference(load_sensor(SENSOR), Form.RECORDING), np.random.default_rng(1)
+    middle = reference.pins_px.mean(axis=0)
+    radius = np.linalg.norm(reference.pins_px - middle, axis=1).max()
     for k in range(4):
         frame = drawn_frame(load_sensor(SENSOR), Form.RECORDING, smooth_warp(reference.pins_px, 2.0, rng))
+        cv2.circle(frame.image, tuple(int(v) for v in middle), int(1.16 * radius), 255, 4)  # the housing: nothing is cut off
         write_image(tmp_path / f"mine_{k}.png", frame.image)
     client.set("mode", "Your own sensor")
     client.set("Use this sensor", True)

@@ -13,8 +13,7 @@ from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.frames import evenly_read, frames_at, open_recording, spread
 from twin.frames.forms import gray_levels
 from twin.frames.images import write_image
-from twin.geometry.pins import rest_pins
-from twin.judge.pictures.spots import pin_spacing_px
+from twin.geometry.pins import rest_pins, usual_spacing
 from twin.optics.relief import cap_planes
 from twin.pins.batch import draw_overlay
 from twin.pins.caps import measure_caps
@@ -305,7 +304,7 @@ def _camera(start: SensorSpec, pins_px: np.ndarray, source: str, sizes_px: np.nd
     sizes_px : (N,) float, optional
         Diameters of the caps, NaN where unknown.
     """
-    sd_px = MODEL_PX if source != "made" else max(MODEL_PX, MADE_SD * pin_spacing_px(pins_px))
+    sd_px = MODEL_PX if source != "made" else max(MODEL_PX, MADE_SD * usual_spacing(pins_px))
     best: tuple[float, SensorSpec, CameraReport] | None = None
     for projection, spacing in (("perspective", "polar"), ("perspective", "plan"), ("fisheye", "polar"), ("fisheye", "plan")):
         pins = start.pins.model_copy(update={"spacing": spacing})
@@ -401,7 +400,7 @@ def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
     """What speaks against a camera that was fitted to the pins at rest, and what to do."""
     notes = []
     seen = rest.pins_px[np.isfinite(rest.pins_px[:, 0])]
-    away = camera.rms_px / pin_spacing_px(seen)
+    away = camera.rms_px / usual_spacing(seen)
     if away > MOST_AWAY:
         notes.append(
             f"no camera sees this layout as the frames show it: the best one misses the pins at rest by {camera.rms_px:.1f} px (rms), "

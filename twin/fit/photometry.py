@@ -13,8 +13,9 @@ import numpy as np
 from scenes.body import GelSpec
 from scenes.sensor import BlobSpec, ResponseSpec, SensorSpec
 from twin.camera.capture import blurred
+from twin.geometry.pins import usual_spacing
 from twin.judge.pictures.aligned import SATURATED, Aligned, levels_slope, require_cameras_own, revised, to_levels, to_light
-from twin.judge.pictures.spots import clear_of_pins, pin_spacing_px
+from twin.judge.pictures.spots import clear_of_pins
 from twin.optics.light_model import Knobs, LightModel
 from twin.optics.render import Renderer
 from twin.progress import Step
@@ -110,7 +111,7 @@ def sample_frame(
     caps = np.rint(frame.pins_px[np.isfinite(frame.pins_px).all(axis=1)]).astype(int)
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     bare = np.hypot(x - blob.mask_center_px[0], y - blob.mask_center_px[1]) < DISC_SHARE * blob.mask_radius_px
-    bare &= clear_of_pins(image.shape, caps, round(SKIN_CLEARANCE * pin_spacing_px(caps)))
+    bare &= clear_of_pins(image.shape, caps, round(SKIN_CLEARANCE * usual_spacing(caps)))
     rows, columns = np.nonzero(bare)
     chosen = rng.permutation(len(rows))[:SKIN_SAMPLES]
     pixels = np.concatenate([caps, np.column_stack([columns[chosen], rows[chosen]])])

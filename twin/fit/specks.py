@@ -10,8 +10,9 @@ from twin.camera.capture import blurred
 from twin.camera.projection import lens_disc
 from twin.fit.still import Still, fit_bounded, level_misfit, sampled, subpixel_offsets
 from twin.frames.forms import gray_levels
+from twin.geometry.pins import usual_spacing
 from twin.judge.pictures.aligned import revised, to_light
-from twin.judge.pictures.spots import clear_of_pins, pin_spacing_px
+from twin.judge.pictures.spots import clear_of_pins
 from twin.optics.static_layer import reflections
 
 # Distance from the disc's edge, px, within which nothing is searched, because the edge is blurred.
@@ -102,7 +103,7 @@ def fit_specks(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np.n
 def _window_view(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np.ndarray) -> _WindowView:
     """Compute the window's appearance in the frames, and the places of its pixels."""
     gray = np.array([gray_levels(image) for image in images])
-    spacing = pin_spacing_px(pins_px[0])
+    spacing = usual_spacing(pins_px[0])
     clear = np.array([clear_of_pins(gray.shape[1:], pins, CLEAR_SHARE * spacing) for pins in pins_px])
     y, x = np.mgrid[: gray.shape[1], : gray.shape[2]]
     disc, response, lens = lens_disc(spec.view, spec.housing), spec.response, spec.lens

@@ -121,6 +121,12 @@ _COMPLETE: dict[str, Callable[[PinsSpec], tuple[FloatArray, IntArray | None, Int
 }
 
 
+def usual_spacing(places: FloatArray) -> float:
+    """Median distance of places (N, 2) or (N, 3) from their nearest neighbours; those that are NaN are left out."""
+    known = places[np.isfinite(places).all(axis=1)]
+    return float(np.median(cKDTree(known).query(known, k=2)[0][:, 1]))
+
+
 def border_of(places: FloatArray) -> IntArray:
     """Indices (m,) of the outermost of some places (N, 2), in order around them: the border of their Delaunay triangles.
 
@@ -128,8 +134,7 @@ def border_of(places: FloatArray) -> IntArray:
     border stays one loop.
     """
     triangles = Delaunay(places).simplices
-    neighbour = cKDTree(places).query(places, k=2)[0][:, 1]
-    longest = LONGEST_LINK * float(np.median(neighbour))
+    longest = LONGEST_LINK * usual_spacing(places)
     kept = {tuple(sorted(t)) for t in triangles.tolist()}
     while True:
         uses = Counter(side for t in kept for side in combinations(t, 2))

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from scenes.pins import PinsSpec
+from twin.geometry.pins import usual_spacing
 from twin.pins.bumps import Bumps
 from twin.pins.families import HALF_GRID, MOST_RINGS, family
 from twin.pins.growth import seen_places
@@ -141,7 +141,7 @@ class Beyond:
 def seen_beyond(images: Sequence[np.ndarray], rest_px: np.ndarray, sigma_px: float) -> Beyond:
     """What gray frames (H, W) uint8 show around a layout with its pins at rest (N, 2), px, beyond the noise of their mean."""
     height, width = images[0].shape
-    reach = max(round(BESIDE * _spacing(rest_px)), 1)
+    reach = max(round(BESIDE * usual_spacing(rest_px)), 1)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     pins = np.zeros((height, width), np.uint8)
     cv2.fillConvexPoly(pins, cv2.convexHull(np.round(rest_px).astype(np.int32)), 1)
@@ -157,11 +157,6 @@ def seen_beyond(images: Sequence[np.ndarray], rest_px: np.ndarray, sigma_px: flo
     rows, columns = np.nonzero(around & (np.abs(level - usual) > max(SEEN_LEVELS, SEEN_NOISES * noise)))
     bright = level[rows, columns] > max(skin, usual) + (caps - skin) / 2
     return Beyond(np.column_stack([columns, rows]).astype(float), bright)
-
-
-def _spacing(px: np.ndarray) -> float:
-    """Median distance of pins (N, 2) from the nearest other one."""
-    return float(np.median(cKDTree(px).query(px, k=2)[0][:, 1]))
 
 
 def open_sides(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps, beyond: Beyond) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scenes.pins import PinsSpec
-from twin.geometry.pins import pin_lattice
+from twin.geometry.pins import pin_lattice, usual_spacing
 from twin.pins.bumps import Bumps
 from twin.pins.growth import NEIGHBOURS, grow
 
@@ -76,7 +76,7 @@ def family(name: str) -> Family:
 def family_of_positions(pins: PinsSpec) -> Family:
     """A layout itself as a lattice, whatever its kind."""
     places = pin_lattice(pins).places
-    spacing = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+    spacing = usual_spacing(places)
     return _family("positions", places / spacing, np.zeros(len(places), int))
 
 
@@ -129,7 +129,7 @@ def _laid(found: Bumps, by: Family) -> Iterator[tuple[np.ndarray, float]]:
     middle, size = inside.mean(axis=0), np.sqrt(np.mean(np.sum((inside - inside.mean(axis=0)) ** 2, axis=1)))
     lattice = by.lattice - by.lattice.mean(axis=0)
     lattice = lattice / np.sqrt(np.mean(np.sum(lattice**2, axis=1)))
-    spacing = float(np.median(cKDTree(lattice).query(lattice, k=2)[0][:, 1]))
+    spacing = usual_spacing(lattice)
     laid: list[tuple[int, np.ndarray, float]] = []
     for scale in LAID_SCALES:
         for turn in np.exp(1j * np.radians(TURNS_DEG)):

@@ -17,7 +17,7 @@ from scenes.pins import PinsSpec
 from twin.errors import FrameError
 from twin.frames import spread
 from twin.frames.forms import is_two_level
-from twin.geometry.pins import pin_lattice
+from twin.geometry.pins import pin_lattice, usual_spacing
 from twin.pins.bumps import Bumps, find_bumps
 from twin.pins.extent import filled_area, in_view, open_sides, seen_beyond, with_view
 from twin.pins.families import Family, family, family_of_positions, label_spots
@@ -64,6 +64,8 @@ FADED = 0.8
 Measured: 0.96 to 1.7 in thresholded frames of three sensors, 0.3 and 0.6 in those of a sensor with dark corners."""
 LEAST_EXPLAINED = 0.6
 """A candidate that explains less than this is none."""
+FEWEST_VIEWED = 12
+"""Fewest pins to which a smooth view, which has ten terms, is fitted."""
 
 
 @dataclass(frozen=True)
@@ -509,7 +511,7 @@ def _candidate(pins: PinsSpec, seen: list[Seen], spots: list[Bumps], *, may_miss
         float(np.mean(share >= SHOWN)),
         float(np.median([one.not_seen for one in again])),
         float(np.median([len(one.left_over_px) for one in again])),
-        _misfit(pins, rest),
+        unevenness(pin_lattice(pins).places, rest),
         rest,
         there,
         tuple(again),
@@ -581,14 +583,13 @@ def smooth_view(places: np.ndarray, px: np.ndarray) -> np.ndarray:
     return terms @ solved
 
 
-def _misfit(pins: PinsSpec, rest_px: np.ndarray) -> float:
-    """Rms distance of pins (N, 2) from the smooth view of their layout, in their median spacing."""
-    known = np.isfinite(rest_px[:, 0])
-    if known.sum() < 12:
-        return np.inf
-    away = np.linalg.norm(rest_px - smooth_view(pin_lattice(pins).places, rest_px), axis=1)[known]
-    spacing = float(np.median(cKDTree(rest_px[known]).query(rest_px[known], k=2)[0][:, 1]))
-    return float(np.sqrt(np.mean(away**2)) / max(spacing, 1e-9))
+def unevenness(places: np.ndarray, pins_px: np.ndarray) -> float:
+    """Rms distance of pins (N, 2), NaN where lost, from the smooth view of their layout (N, 2), in spacings."""
+    known = np.isfinite(pins_px[:, 0])
+    if known.sum() < FEWEST_VIEWED:
+        return float("inf")
+    away = np.linalg.norm(pins_px - smooth_view(places, pins_px), axis=1)[known]
+    return float(np.sqrt(np.mean(away**2)) / max(usual_spacing(pins_px), 1e-9))
 
 
 def _merit(candidate: Candidate) -> float:

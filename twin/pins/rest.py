@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from scenes.pins import PinsSpec
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
-from twin.pins.identify import SHOWN, Candidate, judge_layout, smooth_view, symmetries
+from twin.pins.identify import SHOWN, Candidate, judge_layout, symmetries, unevenness
 
 STILL = 0.035
 """Largest rms distance of pins without contact from a smooth view of their layout, in spacings. Measured: 0.028 in no-contact frames of
@@ -73,16 +72,6 @@ def rest_of(layout: Candidate, names: list[str], given: np.ndarray | None = None
         if unevenness(places, layout.seen[still].pins_px) < STILL:
             return Rest(layout.seen[still].pins_px, "found", names[still])
     return Rest(rest_from_contacts(layout), "made")
-
-
-def unevenness(places: np.ndarray, pins_px: np.ndarray) -> float:
-    """Rms distance of pins (N, 2), NaN where lost, from the smooth view of their layout (N, 2), in spacings."""
-    known = np.isfinite(pins_px[:, 0])
-    if known.sum() < 12:
-        return float("inf")
-    away = np.linalg.norm(pins_px - smooth_view(places, pins_px), axis=1)[known]
-    spacing = float(np.median(cKDTree(pins_px[known]).query(pins_px[known], k=2)[0][:, 1]))
-    return float(np.sqrt(np.mean(away**2)) / spacing)
 
 
 def rest_from_contacts(layout: Candidate) -> np.ndarray:

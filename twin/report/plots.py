@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from mpl_toolkits.mplot3d import Axes3D
 from scipy.interpolate import CloughTocher2DInterpolator
-from scipy.spatial import cKDTree
 
 from twin.errors import FrameError
+from twin.geometry.pins import usual_spacing
 from twin.report.charts import faint, new_figure, sequential
 from twin.types import Frame, Observation, PinGraph
 
@@ -90,7 +90,7 @@ def draw_displacement(ax: Axes, rest_px: np.ndarray, pins_px: np.ndarray, title:
 
 def enlargement(rest_px: np.ndarray, pins_px: np.ndarray) -> float:
     """Factor to enlarge arrows between points (N, 2): the largest one with which a long arrow does not exceed the distance of two pins."""
-    apart = np.median(cKDTree(rest_px).query(rest_px, k=2)[0][:, 1])
+    apart = usual_spacing(rest_px)
     longest = np.percentile(np.hypot(*(pins_px - rest_px).T), LONG_PERCENTILE)
     return max((factor for factor in ENLARGEMENTS if factor * longest <= apart), default=ENLARGEMENTS[0])
 

@@ -68,13 +68,6 @@ def clear_of_pins(shape: tuple[int, ...], pins_px: np.ndarray, radius_px: float)
     return blocked == 0
 
 
-def pin_spacing_px(pins_px: np.ndarray) -> float:
-    """Median distance of a pin (N, 2) from its nearest neighbour; NaN pins are left out."""
-    pins = pins_px[np.isfinite(pins_px).all(axis=1)]
-    apart = np.linalg.norm(pins[:, None] - pins[None], axis=2)
-    return float(np.median(np.sort(apart, axis=1)[:, 1]))
-
-
 def pair_spots(real: Spots, rendered: Spots) -> np.ndarray:
     """Distances (m,) px of real spots and their rendered counterparts, for all pairs within ``MOST_APART_PX``."""
     apart = np.linalg.norm(real.px[:, None] - rendered.px[None], axis=2)

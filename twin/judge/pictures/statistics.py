@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.camera.projection import Disc
+from twin.geometry.pins import usual_spacing
 from twin.judge.pictures.spectra import RadialRow, equal_count_edges, log_distance_db, noise_sd, radial_rows, radial_spectrum
-from twin.judge.pictures.spots import Spots, clear_of_pins, find_spots, pair_spots, pin_spacing_px, steady_spots
+from twin.judge.pictures.spots import Spots, clear_of_pins, find_spots, pair_spots, steady_spots
 from twin.pins.caps import Caps, measure_caps
 
 # Least distance of bare skin from every pin, as a share of the pins' spacing.
@@ -89,7 +90,7 @@ def measure_frame(gray: np.ndarray, pins_px: np.ndarray, disc: Disc) -> FrameSta
         noise_sd=noise_sd(gray, bare) if bare.any() else np.nan,
         frequency=frequency,
         power=power,
-        spots=find_spots(gray, disc, pins_px, pin_spacing_px(pins_px)),
+        spots=find_spots(gray, disc, pins_px, usual_spacing(pins_px)),
     )
 
 
@@ -97,7 +98,7 @@ def bare_skin(shape: tuple[int, ...], pins_px: np.ndarray, disc: Disc) -> np.nda
     """(H, W) bool: pixels between the pins at (N, 2) px that show no pin."""
     places = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=2)
     among = disc.distance_px(places) < np.nanmax(disc.distance_px(pins_px))
-    return clear_of_pins(shape, pins_px, CLEAR_SHARE * pin_spacing_px(pins_px)) & disc.inside & among
+    return clear_of_pins(shape, pins_px, CLEAR_SHARE * usual_spacing(pins_px)) & disc.inside & among
 
 
 def compare_statistics(real: list[FrameStatistics], rendered: list[FrameStatistics]) -> Statistics:

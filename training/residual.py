@@ -19,8 +19,8 @@ from torch import nn
 from torch.nn import functional
 
 from scenes.sensor import ResidualSpec, SensorSpec
-from training.two_sample import LEVEL_SCALE, PATCH_PX, TwoSample, patch_corners, two_sample
-from twin.camera.capture import before_stream, expose, luma_weights
+from training.two_sample import LEVEL_SCALE, PATCH_PX, TwoSample, patch_corners, patch_network, two_sample
+from twin.camera.capture import CHROMA_RANGE, LUMA_RANGE, before_stream, expose, luma_weights
 from twin.camera.projection import Disc, lens_disc
 from twin.camera.residual import LEAK, LEVELS, MIDDLE, MOST_LEVELS, STEEPNESS, differences, with_residual
 from twin.errors import FrameError
@@ -56,7 +56,7 @@ KEPT_SHARE = 0.01
 """Share of each step's weights in the moving average that is the result."""
 START_SD = 1e-3
 """Standard deviation of the last kernel at the start, so that the network begins by changing nothing."""
-NUMBERS = (219 / 255, 224 / 255, 224 / 255)
+NUMBERS = (LUMA_RANGE / 255, CHROMA_RANGE / 255, CHROMA_RANGE / 255)
 """Whole numbers of the stream's studio range for a gray level of luma, blue and red difference."""
 DIGITS = 5
 """Significant digits of a written weight."""
@@ -223,7 +223,7 @@ def teach(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = ResidualNetwork()
-        judges = [_judge(), _judge(), _fine_judge()]
+        judges = [patch_network(), patch_network(), _fine_judge()]
         their = [_optimizer(judge) for judge in judges]
         mine = torch.optim.Adam(network.parameters(), RATE, betas=MOMENTS)
         kept = [weights.detach().clone() for weights in network.parameters()]
@@ -234,7 +234,7 @@ def teach(
                 )
             if done and done % ANEW == 0:
                 turn = done // ANEW % 2
-                judges[turn] = _judge()
+                judges[turn] = patch_network()
                 their[turn] = _optimizer(judges[turn])
             mine.param_groups[0]["lr"] = RATE * (1 - (1 - LAST_SHARE) * done / steps)
             given, wanted = _pairs(signal, shown, corners, rng)
@@ -294,14 +294,6 @@ def _through_stream(signal: torch.Tensor, matrix: torch.Tensor, stream: str) -> 
 
 def _averages(signal: torch.Tensor) -> torch.Tensor:
     return functional.avg_pool2d(signal, AVERAGED_PX, AVERAGED_STRIDE)
-
-
-def _judge() -> nn.Module:
-    """A judge like the two-sample test's network."""
-    layers: list[nn.Module] = []
-    for given, made in ((3, 16), (16, 32), (32, 64), (64, 64)):
-        layers += [nn.Conv2d(given, made, 3, stride=2, padding=1), nn.BatchNorm2d(made), nn.ReLU()]
-    return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(64, 1), nn.Flatten(0))
 
 
 def _fine_judge() -> nn.Module:

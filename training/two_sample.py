@@ -124,7 +124,8 @@ def patch_corners(inside: np.ndarray) -> np.ndarray:
     return corners
 
 
-def _network() -> nn.Module:
+def patch_network() -> nn.Module:
+    """A network, not trained, that gives patches (B, 3, p, p) one number each, (B,): the larger, the likelier they are real."""
     layers, before = [], 3
     for channels in CHANNELS:
         layers += [nn.Conv2d(before, channels, 3, stride=2, padding=1), nn.BatchNorm2d(channels), nn.ReLU()]
@@ -135,7 +136,7 @@ def _network() -> nn.Module:
 def _trained(sets: list[np.ndarray], frames: np.ndarray, corners: np.ndarray, rng: np.random.Generator, seed: int) -> nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = _network()
+        network = patch_network()
     steps = EPOCHS * -(-2 * len(frames) * PATCHES // BATCH)
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)

@@ -165,7 +165,7 @@ def follow(
     rest = given_frame(plan.at_rest, model)
     if rest is not None:
         model = model.at_rest(rest)
-    elif model.counts_from_rest and plan.at_rest != FIRST:
+    elif plan.at_rest != FIRST:
         model = model.seeking_rest()
     rig = _rig_of(plan, model)
     round_steps, wanted_mm = steps_round(rig.placed, plan.servo, 1.0)

@@ -400,7 +400,7 @@ def _at_rest(plan: WatchPlan, model: SensorModel, source: FrameSource, rest: Fra
     # A session may be replayed with another model than its own, which may not count pins from a frame without contact.
     if rest is not None and (model.counts_from_rest or plan.replay is None):
         return model.at_rest(rest), rest
-    return (model.seeking_rest() if model.counts_from_rest else model), rest
+    return model.seeking_rest(), rest
 
 
 def _view(plan: WatchPlan, title: str, pipeline: Pipeline) -> View | None:

@@ -158,7 +158,7 @@ class CameraFeed:
     """
 
     def __init__(self, camera: str, arm: str, model: SensorModel) -> None:
-        self.model = model = model.seeking_rest() if model.counts_from_rest else model
+        self.model = model = model.seeking_rest()
         self._source = open_camera(camera, model.sensor, model.form)
         model.check(model.sensor, self._source.form)
         self.robot = WatchedArm(arm) if arm else None

@@ -248,8 +248,11 @@ class PoseEstimator:
         return (estimator, False) if other is None else (estimator._counted_from(other), True)
 
     def seeking_rest(self) -> SensorModel:
-        """The model for a camera's frames where no frame shows its sensor without contact: as ``at_rest_of``, while the frames come."""
-        return RestSeeker(self)
+        """The model for a camera's frames where no frame shows its sensor without contact: as ``at_rest_of``, while the frames come.
+
+        Itself if it does not count pins from rest.
+        """
+        return RestSeeker(self) if self.counts_from_rest else self
 
     def with_intervals(self, intervals: Mapping[str, np.ndarray]) -> "PoseEstimator":
         """The same model with other interval quantiles, as ``training.evaluate.intervals_on`` finds them for one kind of its frames."""

@@ -227,6 +227,9 @@ def feed(monkeypatch):
     offset = free_offset()
 
     class Model(SimpleNamespace):
+        def seeking_rest(self):
+            return self
+
         def __call__(self, frame):
             return TrueEstimate(("pose_2",), value, value, value)
 

@@ -63,6 +63,9 @@ class StandIn:
     def remembering(self) -> "StandIn":
         return self
 
+    def seeking_rest(self) -> "StandIn":
+        return self
+
     def __call__(self, frame):
         if self.true is not None:
             return self.true(frame)

@@ -78,20 +78,14 @@ def least_sure(experiment: ExperimentSpec, labels: np.ndarray, moved_px: np.ndar
     def scaled(those: np.ndarray) -> np.ndarray:
         return code.encode(np.where(round_trip, those[:, varied], (those[:, varied] - middle) / half))
 
-    def spread(count: int, own_seed: int) -> np.ndarray:
-        shares = Sobol(len(varied), scramble=True, rng=np.random.default_rng([seed, own_seed])).random(count)
-        contacts = np.tile(low, (count, 1))
-        contacts[:, varied] += shares * (high - low)[varied]
-        return contacts
-
     flat = moved_px.reshape(len(moved_px), -1)
     left, sizes, _ = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
     kept = min(MODES, len(labels) - 1)
     amplitudes = (left * sizes)[:, :kept]
     spreads = np.maximum(amplitudes.std(axis=0), 1e-9)
     processes, _ = fit_smooth_processes(scaled(labels), amplitudes / spreads)
-    candidates = spread(CANDIDATES, 0)
-    asked = Points.of(scaled(np.concatenate([candidates, spread(WHERE, 1)])))
+    candidates = _even(low, high, CANDIDATES, np.random.default_rng([seed, 0]))
+    asked = Points.of(scaled(np.concatenate([candidates, _even(low, high, WHERE, np.random.default_rng([seed, 1]))])))
     gain = np.zeros(CANDIDATES)
     for kernel, size in zip(processes.kernels, spreads, strict=True):
         shared = Posterior(kernel, processes.points, np.zeros(len(labels))).covariance(asked)
@@ -112,15 +106,13 @@ def nearest_to_even(labels: np.ndarray, units: Sequence[str], count: int, *, see
     """
     code = LabelCode(goes_round(units, labels))
     low, high = labels.min(axis=0), labels.max(axis=0)
-    varied = np.flatnonzero(high > low)
     circular = np.array(code.circular)
 
     def placed(those: np.ndarray) -> np.ndarray:
         return code.encode(np.where(circular, those, (those - low) / np.maximum(high - low, 1e-12)))
 
     power = int(np.ceil(np.log2(max(count, 2))))
-    wanted = np.tile(low, (2**power, 1))
-    wanted[:, varied] += Sobol(len(varied), scramble=True, rng=np.random.default_rng(seed)).random_base2(power) * (high - low)[varied]
+    wanted = _even(low, high, 2**power, np.random.default_rng(seed))
     places, free = placed(labels), np.ones(len(labels), bool)
     chosen = []
     for place in placed(wanted)[:count]:
@@ -128,3 +120,11 @@ def nearest_to_even(labels: np.ndarray, units: Sequence[str], count: int, *, see
         chosen.append(int(far.argmin()))
         free[chosen[-1]] = False
     return np.array(chosen)
+
+
+def _even(low: np.ndarray, high: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """A power of two of labels (count, K) that fill the ranges (K,) evenly: a scrambled sequence of Sobol."""
+    varied = np.flatnonzero(high > low)
+    found = np.tile(low, (count, 1))
+    found[:, varied] += Sobol(len(varied), scramble=True, rng=rng).random(count) * (high - low)[varied]
+    return found

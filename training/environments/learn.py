@@ -318,7 +318,7 @@ def _untrained(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
         "feed_mm": list(task.feed_mm),
         "goal_names": list(task.goal_names),
         "goal": np.median(goal, axis=0).tolist(),
-        "trained": {**{key: value for key, value in asdict(plan.options).items()}, "seed": plan.seed},
+        "trained": {**asdict(plan.options), "seed": plan.seed},
     }
     blank = Policy(about, mean, basis[:, largest].T / spread[:, None], ())
     if plan.options.observation == "oracle" or not plan.sight:

@@ -8,8 +8,8 @@ waves are likeliest.
 
 import numpy as np
 
+from training.audit import LabelColumns
 from training.gaussian_process import SMOOTH_AND_LINEAR, Kernel, Points, climbed
-from training.label_code import HALF_CIRCLE_DEG
 from training.models.steered.field import waves_of
 
 MOST_STATES = 2500
@@ -55,8 +55,7 @@ class TwinField:
         rows = np.sort(rng.permutation(len(known))[:MOST_STATES])
         self.known = known[rows]
         low, high = self.known.min(axis=0), self.known.max(axis=0)
-        turning = [column for column in range(3, 6) if high[column] - low[column] > HALF_CIRCLE_DEG]
-        self.direction = turning[-1] if turning else None
+        self.direction = LabelColumns.of(self.known[:, :6], self.known[:, 6:]).direction
         self.varied = np.array([k for k in range(12) if high[k] - low[k] > LEAST_RANGE and k != self.direction], int)
         self.middle, self.half = (low + high) / 2, np.maximum(high - low, LEAST_RANGE) / 2
         waves = waves_of(rest_px)

@@ -13,7 +13,7 @@ labels that vary stands in the object's frame: it is what the mechanics and the 
 there is a direction, a second part stands in the sensor's frame: it is what the camera and the pins at rest miss.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,8 @@ DIRECTION_DEG = 60.0
 """What counts as the half range of a direction."""
 BEYOND = 1.15
 """Times the simulated range in which labels are looked for: the twin's process knows nothing farther out."""
+Expected = Callable[[np.ndarray], np.ndarray]
+"""From contacts (B, 12) to their expected waves (B, 2C)."""
 
 
 class TwinBackwards:
@@ -101,7 +103,7 @@ class TwinBackwards:
         unknown = np.setdiff1d(field.varied, fixed)
         return self._found(asked, _nearest(asked, states, field.direction, expected), unknown, expected)
 
-    def _found(self, asked: np.ndarray, those: np.ndarray, unknown: np.ndarray, expected: Any) -> np.ndarray:
+    def _found(self, asked: np.ndarray, those: np.ndarray, unknown: np.ndarray, expected: Expected) -> np.ndarray:
         """The labels (B, 12) after Gauss-Newton steps from a start."""
         field = self._field
         columns = [*unknown.tolist(), *([] if field.direction is None else [field.direction])]
@@ -174,7 +176,7 @@ class _Missed:
         return np.hstack([straight, straight * np.cos(once), straight * np.sin(once), np.cos(twice), np.sin(twice)])
 
 
-def _nearest(asked: np.ndarray, states: np.ndarray, direction: int | None, expected: Any) -> np.ndarray:
+def _nearest(asked: np.ndarray, states: np.ndarray, direction: int | None, expected: Expected) -> np.ndarray:
     """The states (B, 12), in any direction, whose expected waves are nearest to those asked for (B, 2C)."""
     found, least = np.empty((len(asked), states.shape[1])), np.full(len(asked), np.inf)
     for turn in [None] if direction is None else np.arange(-180.0, 180.0, TURN_DEG):

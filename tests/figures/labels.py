@@ -29,6 +29,7 @@ RECORDINGS = {  # by recording: sensor, experiment, contacts, elements across, m
 SEEDS = (0, 1, 2)
 CHARTS = ROOT / "docs" / "pictures"
 """Where the charts are written, one for each recording."""
+CHART_DPI = 90
 
 
 def by_labels(work: Path, *, recording: str) -> Measured:
@@ -37,7 +38,7 @@ def by_labels(work: Path, *, recording: str) -> Measured:
     plan = Plan(load_sensor(sensor), real_folder(recording), load_experiment(experiment), count=count, across=across, workers=2)
     rows = worth(plan, work / "worth", SEEDS)
     CHARTS.mkdir(parents=True, exist_ok=True)
-    write_chart(CHARTS / f"labels-{recording}.png", lambda: errors_figure(rows, plan.experiment.targets))
+    write_chart(CHARTS / f"labels-{recording}.png", lambda: errors_figure(rows, plan.experiment.targets), dpi=CHART_DPI)
     found = {}
     for row in rows:
         about = "_".join((row["trained_on"], str(row["labelled_frames"]), row["model"]))

@@ -207,7 +207,7 @@ def test_pictures_are_small_and_shown():
     shown = {
         (path.parent / target).resolve()
         for path in DOCUMENTS
-        for target in re.findall(r"!\[[^\]]*\]\(([^)\s]+)\)", path.read_text(encoding="utf-8"))
+        for target in re.findall(r"(?:!\[[^\]]*\]\(|```\{image\} )([^)\s]+)", path.read_text(encoding="utf-8"))
     }
     kept = set((ROOT / "docs" / "pictures").iterdir())
     assert kept <= shown, f"no document shows {sorted(path.name for path in kept - shown)}"

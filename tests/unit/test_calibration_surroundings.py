@@ -8,6 +8,8 @@ from plain_sensor import plain
 from twin.camera.capture import expose
 from twin.camera.projection import project
 from twin.errors import FrameError
+from twin.fit.leds import fit_reflections
+from twin.fit.still import median_still
 from twin.fit.surroundings import fit_surroundings
 from twin.geometry.pins import rest_pins
 from twin.judge.pictures.aligned import SATURATED, revised
@@ -25,6 +27,7 @@ RING_LEVELS = 1.5  # rms: gray levels are rounded, the edge of the lip falls bet
 SPECK_MM = 0.03
 SPECK_SHARE = 0.25  # of radius and light, of a spot of 3 to 5 px
 OPACITY = 0.2
+DIM_LEVELS = 40  # at single pixels of a spot's edge
 
 HOUSING = {
     "center_mm": (0.3, -0.2),
@@ -101,6 +104,20 @@ def test_leds_are_found_by_their_reflections(known, found):
     assert ours.radius_mm / reach[0] * reach[1] == pytest.approx(real.radius_mm, abs=LED_MM)
     assert ours.size_mm == pytest.approx(real.size_mm, abs=SIZE_MM)
     assert 1 - ours.core_share == pytest.approx(1 - real.core_share, rel=0.3)
+
+
+def test_reflections_that_the_housing_dims_are_met(known):
+    """Spots of the whole LEDs' light, over which a camera sharpens, would be white with black rings around them."""
+    _, spec, images, _ = known
+    dim = revised(spec, leds={"mirror_share": 0.01, "core_share": 0.5, "core_mm": 0.2, "size_mm": 1.0}, appearance={"specks": ()})
+    real, start = drawn(dim, images), revised(dim, leds={"mirror_share": 1.0, "core_share": 0.0})
+    miss = drawn(fit_reflections(start, median_still(start, real[None])), images).astype(float) - real
+    assert np.abs(miss).max() < DIM_LEVELS
+
+
+def drawn(spec, images):
+    """The frame without skin and pins that a sensor gives in the size of some images."""
+    return expose(static_layer(spec, (0, 0, images.shape[2], images.shape[1]))[0], spec.capture)
 
 
 def test_the_rings_light(known, found):

@@ -42,6 +42,9 @@ BEHIND_MM = (0.2, 4.0)
 # Bounds of the fitted quantities, whose logarithms are fitted: the LED's side in mm, the share of its light outside the core
 # (1 - core_share), the core's standard deviation in mm, and the radius relative to that of the reflections' middles.
 BOUNDS = {"size_mm": (0.3, 5.0), "rest": (5e-4, 1.0), "core_mm": (0.04, 2.0), "radius": (0.98, 1.02)}
+# Shares of an LED's light that show in its reflection: the housing may hide the rest. The others are tried if the first does not explain
+# the reflections as well, by the factor DIMMER_BETTER in the sum of squares.
+MIRROR_SHARES, DIMMER_BETTER = (1.0, 0.1, 0.01), 0.8
 # Starting values of the first three. All combinations are tried, and the best one is refined.
 START_SIZES_MM = (0.7, 1.0, 1.4, 2.0)
 START_RESTS = (0.005, 0.02, 0.1, 0.4)
@@ -122,12 +125,22 @@ class _Reflections:
 def fit_reflections(spec: SensorSpec, still: Still) -> SensorSpec:
     """The specification with LEDs whose modelled reflections in the window have the place and the look of the real ones.
 
-    Radius, size, core and azimuths are fitted. An LED without a visible reflection keeps its azimuth. If no reflection is visible, the
-    specification is returned unchanged.
+    Radius, size, core, azimuths and the share of the light that shows are fitted. An LED without a visible reflection keeps its azimuth.
+    If no reflection is visible, the specification is returned unchanged.
     """
     seen = _seen_reflections(spec, still)
     if seen is None:
         return spec
+    found, least = spec, np.inf
+    for share in MIRROR_SHARES:
+        fitted, squares = _with_reflections(revised(spec, leds={"mirror_share": share}), seen)
+        if squares < DIMMER_BETTER * least:
+            found, least = fitted, squares
+    return found
+
+
+def _with_reflections(spec: SensorSpec, seen: _Reflections) -> tuple[SensorSpec, float]:
+    """The specification with LEDs fitted to reflections, and the sum of squared differences that is left."""
 
     def residual(values: np.ndarray) -> np.ndarray:
         return _reflection_misfit(spec, seen, values)
@@ -139,7 +152,8 @@ def fit_reflections(spec: SensorSpec, still: Still) -> SensorSpec:
     found = fit_bounded(residual, first, low, high)
     azimuth_deg = np.array(spec.leds.azimuth_deg)
     azimuth_deg[seen.leds] = np.degrees(seen.azimuth_rad + found[4:])
-    return revised(spec, leds=_led_shape(seen, found) | {"azimuth_deg": tuple((azimuth_deg % 360).tolist())})
+    fitted = revised(spec, leds=_led_shape(seen, found) | {"azimuth_deg": tuple((azimuth_deg % 360).tolist())})
+    return fitted, float((residual(found) ** 2).sum())
 
 
 def _seen_reflections(spec: SensorSpec, still: Still) -> _Reflections | None:

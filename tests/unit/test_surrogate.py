@@ -9,12 +9,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from scenes import ObjectSpec, load_object, load_sensor
 from scenes.object import CylinderShape, EdgeShape, MeshShape, PrismShape, SphereShape
+from training.surrogate.bending import bend
 from training.surrogate.compliance import NODE_RINGS, compliance_of
 from training.surrogate.contact import LinearContacts, between
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.felt import Contact, FiniteElements
 from training.surrogate.fit import _turned, averaged, cut, distil, require_dome, sampled
 from training.surrogate.model import SurrogateError, load_surrogate, representatives, rest_of, surrogate_of, unfolded
+from training.surrogate.nodes import AtNodes
 from training.surrogate.paths import FREE, FRICTION, STICKING, draw_path
 from training.surrogate.samples import SolvedPath, lattice_sensor
 from training.surrogate.symmetry import ring_directions, symmetries
@@ -23,7 +25,7 @@ from twin.errors import OptionError
 from twin.frames.forms import from_raw
 from twin.geometry.pins import rest_pins
 from twin.geometry.solid import Resolution
-from twin.mechanics import Friction
+from twin.mechanics import ContactPose, Friction, SkinSolver
 from twin.mechanics.law import ContactLaw
 from twin.objects import build_field
 from twin.types import Form
@@ -35,6 +37,7 @@ PINS_BOUND_PX = 1.0  # largest mean error of the contacts below; the stated mean
 FORCE_BOUND = 0.3  # of the force after a reversal of the shear, the hardest (edge: 0.26); over all contacts a quarter of it
 SLIP_BOUND = 0.18  # of the share that slides, on average over these five poses; the worst, the ball, has 0.13
 WAY_BOUND = 0.03  # of the force: where the same way is told by more poses, its steps are 0.29 instead of 0.37 mm long
+NO_NODES = np.zeros((2, 3, 0, 3))
 ANSWER_TOLERANCE = 2e-3  # relative: half precision in the file
 
 
@@ -100,7 +103,7 @@ def test_a_path_that_is_learnt_from_turned_is_the_turned_path(sensor):
     base, axis = rest.base_mm + states * (rest.base_mm @ stretch.T), rest.axis + 0.1 * states * (rest.axis @ stretch.T)
     wrench = np.outer(np.arange(3.0), [1.0, 2.0, 3.0])
     ball = SphereShape(kind="sphere", radius_mm=10.0)
-    path = SolvedPath(ball, 0.4, poses, base, axis, wrench, 2 * wrench, np.ones(3), np.array([0.0, 0.5, 1.0]))
+    path = SolvedPath(ball, 0.4, poses, base, axis, wrench, 2 * wrench, np.ones(3), np.array([0.0, 0.5, 1.0]), *NO_NODES)
     sixth = next(g for g in symmetries(sensor.pins.phase_deg) if g.turns == 1 and not g.mirrored)
     turned, other = sampled(sensor, skin, answer, path, np.pi / 3), _turned(sampled(sensor, skin, answer, path), sixth)
     for name in turned.__dataclass_fields__:
@@ -113,10 +116,38 @@ def test_a_path_is_learnt_from_as_far_as_it_is_within_the_domain(sensor):
     poses = np.stack([beside(*place, 5.0) for place in ((10.0, 1.0), (47.0, 2.0), (60.0, -1.0), (49.0, 1.0), (10.0, 1.0))])
     count = len(poses)
     still, number = np.zeros((count, 1, 3)), np.arange(float(count))
-    path = SolvedPath(SphereShape(kind="sphere", radius_mm=5.0), 0.4, poses, still, still, still[:, 0], still[:, 0], number, number)
+    path = SolvedPath(
+        SphereShape(kind="sphere", radius_mm=5.0), 0.4, poses, still, still, still[:, 0], still[:, 0], number, number, still, still
+    )
     assert np.array_equal(cut(path, 20.0).area_mm2, [0.0, 1.0, 2.0])
     deep = replace(path, T=np.stack([beside(0.0, depth, 5.0) for depth in (1.0, 5.4, 5.6, 1.0, 1.0)]))
     assert len(cut(deep, 20.0).T) == 2
+
+
+def test_the_skin_comes_to_bend_as_the_network_tells(surrogate):
+    """The compiled network takes a share of each new answer; held at the same forces it comes to the whole."""
+    force = np.random.default_rng(0).normal(0.0, 0.02, surrogate.node_mm.shape)
+    force[40:] = 0.0
+    bent, moved = np.zeros((3, len(force)), np.float32), np.ones_like(force)
+    for _ in range(30):
+        bend(force, bent, moved, *surrogate.bending.kernel(surrogate.read))
+    wanted = surrogate.bending.of(force.reshape(1, -1) @ surrogate.read.T)[0]
+    assert np.abs(wanted).max() > 0.01
+    assert np.allclose(bent.T, wanted, atol=1e-4) and np.allclose(moved, 1.0 + bent.T, atol=1e-5)
+    bend(0 * force, bent, moved, *surrogate.bending.kernel(surrogate.read))
+    assert np.abs(bent).max() < 0.6 * np.abs(wanted).max()
+
+
+def test_the_nodes_bear_and_move_what_the_finite_elements_do(sensor):
+    """Shared among the nodes, forces keep their sum and their torque nearly; a node under a plate's middle moves as deep as the plate."""
+    solver = SkinSolver(lattice_sensor(sensor), resolution=COARSE)
+    nodes = AtNodes.of(solver)
+    state = solver.press(load_object("plane"), ContactPose(1.5), friction=0.3)
+    force, moved = nodes.force_n(state), nodes.moved_mm(state)
+    assert np.allclose(force.sum(axis=0), -state.force_n, atol=1e-5) and state.force_n[2] > 0.5
+    assert force.shape == moved.shape == (271, 3)
+    assert moved[0, 2] == pytest.approx(-1.5, abs=0.05)
+    assert np.abs(nodes.moved_mm(solver.rest())).max() < 1e-9 and not nodes.force_n(solver.rest()).any()
 
 
 def test_every_symmetry_maps_the_lattice_onto_itself():
@@ -291,7 +322,9 @@ def test_a_file_gives_back_what_was_saved(surrogate, tmp_path):
         np.array_equal(a, b) for ours, theirs in zip(again.layers, kept.layers, strict=True) for a, b in zip(ours, theirs, strict=True)
     )
     assert np.allclose(again.answer, surrogate.answer, rtol=ANSWER_TOLERANCE, atol=ANSWER_TOLERANCE * np.abs(surrogate.answer).max())
-    assert again.stiffness == pytest.approx(surrogate.stiffness) and again.about == surrogate.about
+    assert again.about == surrogate.about
+    for name in ("scale", "straight", "modes"):
+        assert np.array_equal(getattr(again.bending, name), getattr(kept.bending, name))
 
 
 def test_a_surrogate_of_another_skin_is_refused(surrogate, sensor, tmp_path):

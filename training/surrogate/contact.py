@@ -1,10 +1,10 @@
-"""Contact and friction on the linear skin: exact Coulomb contact at some hundred nodes, with all that friction remembers.
+"""Contact and friction on the skin: exact Coulomb contact at some hundred nodes, with all that friction remembers.
 
-The skin's answer to forces f at its nodes is u = C f (see ``compliance``). At every pose of the object the forces are sought for which
-each node either is clear of the object, or presses without entering it and sticks to its anchor, or slides at Coulomb's bound. Node
-after node is put right, the others held, until nothing changes (projected Gauss-Seidel: Jourdan, Alart & Jean 1998), beginning with the
-forces of the last pose. Anchors are places of the object: where a node touched it first, or where it stopped sliding. So what is
-remembered neither drifts nor fades, and ends with the contact.
+The skin's answer to forces f at its nodes is u = C f (see ``compliance``) and what ``bending`` adds. At every pose of the object the
+forces are sought for which each node either is clear of the object, or presses without entering it and sticks to its anchor, or slides at
+Coulomb's bound. Node after node is put right, the others held, until nothing changes (projected Gauss-Seidel: Jourdan, Alart & Jean 1998),
+beginning with the forces of the last pose; then what they bend is looked up anew. Anchors are places of the object: where a node touched it
+first, or where it stopped sliding. So what is remembered neither drifts nor fades, and ends with the contact.
 
 A motion is gone in short steps: what friction remembers, and the normals of a sharp edge, depend on the way. In each the arm turns as it
 gives way to the force so far, and at the end until it stands.
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from training.surrogate.bending import bend, unbent
 from twin.compiled import compiled
 from twin.objects.analytic import Solid
 from twin.objects.kernels import solid
@@ -26,8 +27,9 @@ STEP_MM = 0.4
 """Largest motion across the dome in one solution: with longer ones the force on an edge is up to a sixth off."""
 REACH_MM = 0.8
 """Nodes farther than this from the object are left out of a solution."""
-SWEEPS = (12, 6)
-"""Most sweeps over the nodes, before and after the distances are looked up anew."""
+SWEEPS = (12, 6, 6, 6)
+"""Most sweeps over the nodes each time that the distances, and what the forces bend, are looked up anew; the first is of
+every step, the others of a motion's last."""
 TOLERANCE_N = 5e-4
 """A solution ends when no node's force changes by more in a sweep: a hundredth of a usual contact's force at a node."""
 YIELDING_MM_PER_N = 2e-3
@@ -60,8 +62,8 @@ class LinearContacts:
         At rest.
     answer : (M, 3, 3, M) float32
         Displacement (third) of node j (last) for a force along an axis (second) at node i (first), mm/N.
-    stiffness : float
-        Force of the true skin over that of the linear one.
+    bending : tuple of float32 arrays
+        Of the network that tells how the skin bends (see ``Bending.kernel``).
     kind : (B,) int
         Of the solids (see ``twin.objects.kernels.solid``).
     sizes : (B, SIZES) float
@@ -75,6 +77,8 @@ class LinearContacts:
         Forces on the skin and displacements, sensor frame.
     anchor_mm, seen_mm : (B, M, 3) float
         Friction's anchors, and the nodes at the last pose, in the object's frame.
+    bent_mm : (B, 3, M) float32
+        The network's part of the displacements.
     gap_mm : (B, M) float
         Distances at the last pose; infinite before the first.
     held, slides : (B, M) bool
@@ -85,7 +89,7 @@ class LinearContacts:
 
     node_mm: FloatArray
     answer: FloatArray
-    stiffness: float
+    bending: tuple[FloatArray, ...]
     kind: IntArray
     sizes: FloatArray
     friction: FloatArray
@@ -94,6 +98,7 @@ class LinearContacts:
     taken: FloatArray
     force_n: FloatArray
     moved_mm: FloatArray
+    bent_mm: FloatArray
     anchor_mm: FloatArray
     seen_mm: FloatArray
     gap_mm: FloatArray
@@ -102,8 +107,13 @@ class LinearContacts:
     used: FloatArray
 
     @classmethod
-    def at_rest(cls, node_mm: FloatArray, answer: FloatArray, count: int, *, stiffness: float = 1.0) -> "LinearContacts":
-        """The contacts of ``count`` sensors that touch nothing; ``answer`` (M, M, 3, 3) as of ``Surrogate``."""
+    def at_rest(
+        cls, node_mm: FloatArray, answer: FloatArray, count: int, *, bending: tuple[FloatArray, ...] | None = None
+    ) -> "LinearContacts":
+        """The contacts of ``count`` sensors that touch nothing; ``answer`` (M, M, 3, 3) as of ``Surrogate``.
+
+        ``bending`` is what ``Bending.kernel`` gives; without it the skin is linear.
+        """
         size = len(node_mm)
         force, moved, anchor, seen = np.zeros((4, count, size, 3))
         held, slides = np.zeros((2, count, size), bool)
@@ -111,7 +121,7 @@ class LinearContacts:
         return cls(
             node_mm=node_mm,
             answer=np.ascontiguousarray(answer.transpose(0, 3, 2, 1), np.float32),
-            stiffness=stiffness,
+            bending=unbent(size) if bending is None else bending,
             kind=np.zeros(count, np.int64),
             sizes=np.zeros((count, SIZES)),
             friction=friction,
@@ -120,6 +130,7 @@ class LinearContacts:
             taken=np.tile(np.eye(4), (count, 1, 1)),
             force_n=force,
             moved_mm=moved,
+            bent_mm=np.zeros((count, 3, size), np.float32),
             anchor_mm=anchor,
             seen_mm=seen,
             gap_mm=np.full((count, size), np.inf),
@@ -147,19 +158,19 @@ class LinearContacts:
 
     def free(self, row: int | Sequence[int] | IntArray) -> None:
         """Forget contacts."""
-        for values in (self.force_n, self.moved_mm, self.held, self.slides, self.used):
+        for values in (self.force_n, self.moved_mm, self.bent_mm, self.held, self.slides, self.used):
             values[row] = 0
         self.gap_mm[row] = np.inf
 
     def move(self, rows: IntArray, start: FloatArray, stop: FloatArray) -> None:
         """Command the objects of some rows (R,) from poses ``start`` (R, 4, 4) to ``stop``; each goes straight and turns about one axis."""
         steps = np.maximum(np.ceil(motion_mm(start, stop, self.radius_mm) / STEP_MM), 1).astype(np.int64)
-        state = (self.force_n, self.moved_mm, self.anchor_mm, self.seen_mm, self.gap_mm, self.held, self.slides, self.used)
+        state = (self.force_n, self.moved_mm, self.bent_mm, self.anchor_mm, self.seen_mm, self.gap_mm, self.held, self.slides, self.used)
         laws = (self.kind, self.sizes, self.friction, self.compliance_mm_per_n, self.turning, self.taken)
 
         def follow(which: slice) -> None:
             given = [np.ascontiguousarray(values[which]) for values in (rows, start, stop, steps)]
-            _follow(*given, self.node_mm, self.answer, self.stiffness, *laws, *state)
+            _follow(*given, self.node_mm, self.answer, self.bending, *laws, *state)
 
         threads = min(len(rows) // ROWS_OF_A_THREAD, MOST_THREADS)
         if threads < 2:
@@ -239,7 +250,7 @@ def _follow(
     steps: IntArray,
     node: FloatArray,
     answer: FloatArray,
-    stiffness: float,
+    bending: tuple[FloatArray, ...],
     kind: IntArray,
     sizes: FloatArray,
     friction: FloatArray,
@@ -248,6 +259,7 @@ def _follow(
     taken: FloatArray,
     force: FloatArray,
     moved: FloatArray,
+    bent: FloatArray,
     anchor: FloatArray,
     seen: FloatArray,
     before: FloatArray,
@@ -261,19 +273,20 @@ def _follow(
     near = np.empty(len(node), np.int64)
     for r in range(len(rows)):
         row = rows[r]
-        mu, soft, last = friction[row], compliance[row] * stiffness, steps[r] - 1
+        mu, soft, last = friction[row], compliance[row], steps[r] - 1
         way = between(start[r], stop[r], steps[r])
         for step in range(steps[r] + MOST_SETTLING):
-            T = _given_way(way[min(step, last)], turning[row], force[row], stiffness)
+            T = _given_way(way[min(step, last)], turning[row], force[row])
             if step > last and _motion(taken[row], T, node[0, 2]) <= SETTLED_MM:
                 break
             taken[row] = T
             turn, place = T[:3, :3], T[:3, 3]
             count = 0
             gap = before[row]
-            for part in range(2 if step >= last else 1):
+            for part in range(len(SWEEPS) if step >= last else 1):
                 if part and not count:
                     break
+                bend(force[row], bent[row], moved[row], *bending)
                 _seen_from(node, moved[row], turn, place, here)
                 gap, normal, _ = solid(here, kind[row], sizes[row])
                 if part == 0:
@@ -285,7 +298,7 @@ def _follow(
                                 _anchor(here[i], gap[i], anchor[row, i], seen[row, i], before[row, i])
                 if count:
                     looked = near[:count]
-                    _solve(answer, looked, turn, here, gap, normal, force[row], moved[row], anchor[row], shift, mu, soft, part)
+                    _solve(answer, looked, turn, here, gap, normal, force[row], moved[row], bent[row], anchor[row], shift, mu, soft, part)
             if count:
                 _seen_from(node, moved[row], turn, place, here)
                 used[row] = _remember(near[:count], turn, here, normal, force[row], anchor[row], mu, held[row], slides[row])
@@ -293,13 +306,13 @@ def _follow(
 
 
 @compiled()
-def _given_way(T: FloatArray, turning: FloatArray, force: FloatArray, stiffness: float) -> FloatArray:
-    """See ``ArmTurning``: the object's pose (4, 4) as an arm turns under the linear skin's force (M, 3), made the true one's."""
+def _given_way(T: FloatArray, turning: FloatArray, force: FloatArray) -> FloatArray:
+    """See ``ArmTurning``: the object's pose (4, 4) as an arm turns under the skin's forces (M, 3)."""
     if turning[9] == 0:
         return T
     angle = 0.0
     for p in range(3):
-        angle += turning[9] * turning[p] * stiffness * force[:, p].sum()
+        angle += turning[9] * turning[p] * force[:, p].sum()
     sine, rest = np.sin(angle), 1 - np.cos(angle)
     x, y, z = turning[3], turning[4], turning[5]
     turn = np.array(
@@ -365,6 +378,7 @@ def _solve(
     normal: FloatArray,
     force: FloatArray,
     moved: FloatArray,
+    bent: FloatArray,
     anchor: FloatArray,
     shift: FloatArray,
     friction: float,
@@ -373,7 +387,7 @@ def _solve(
 ) -> None:
     """Forces (M, 3) and displacements (M, 3) of the near nodes (q,), whose distances and normals are linearised at ``here`` (M, 3).
 
-    ``shift`` (3, M) float32 is room for the displacements.
+    ``bent`` (3, M) float32 is added to the linear skin's displacements, for which ``shift`` (3, M) float32 is room.
     """
     count = len(near)
     n, lag = np.empty((count, 3)), np.empty((count, 3))
@@ -449,7 +463,7 @@ def _solve(
                 for j in range(shift.shape[1]):
                     shift[p, j] += rows[0, p, j] * e0 + rows[1, p, j] * e1 + rows[2, p, j] * e2
     for j in range(len(moved)):
-        moved[j, 0], moved[j, 1], moved[j, 2] = shift[0, j], shift[1, j], shift[2, j] + sunk
+        moved[j, 0], moved[j, 1], moved[j, 2] = shift[0, j] + bent[0, j], shift[1, j] + bent[1, j], shift[2, j] + bent[2, j] + sunk
 
 
 @compiled()

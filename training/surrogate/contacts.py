@@ -42,7 +42,7 @@ class SurrogateContacts:
         flat = len(modes), -1
         self._cap_modes = np.ascontiguousarray((modes[:, :, 0] + self._cap_mm * modes[:, :, 1]).reshape(flat), np.float32)
         self._caps_rest = self._rest[:, 0] + self._cap_mm * self._rest[:, 1]
-        self._linear = LinearContacts.at_rest(surrogate.node_mm, surrogate.answer, count, stiffness=surrogate.stiffness)
+        self._linear = LinearContacts.at_rest(surrogate.node_mm, surrogate.answer, count, bending=surrogate.bending.kernel(surrogate.read))
         self._field = lru_cache(maxsize=64)(build_field)
         self._before = np.tile(np.eye(4), (count, 1, 1))  # the poses commanded last
         self._known = np.zeros(count, bool)
@@ -142,8 +142,8 @@ class SurrogateContacts:
         self._gap[rows] = linear.distances(rows, there)[0]
 
     def _force(self, rows: IntArray) -> FloatArray:
-        """Forces (R, 3) of the linear skin on the objects, at the true skin's stiffness."""
-        return -self._surrogate.stiffness * self._linear.force_n[rows].sum(axis=1)
+        """Forces (R, 3) of the nodes on the objects."""
+        return -self._linear.force_n[rows].sum(axis=1)
 
     def _outside(self, distance_mm: float, cosine: float) -> str:
         """Why a contact of the dome is too deep, or too far from the apex; "" for one that is not."""
@@ -170,7 +170,7 @@ class SurrogateContacts:
         parts, added = surrogate.correct(force, beside, gap, depth)
         self._parts[rows] = parts
         felt.caps_mm[rows] = self._caps_rest + (parts @ self._cap_modes).reshape(len(rows), -1, 3)
-        felt.force_n[rows] = surrogate.stiffness * wrench[:, :3] + added[:, :3]
-        felt.torque_nmm[rows] = surrogate.stiffness * wrench[:, 3:] + added[:, 3:6]
+        felt.force_n[rows] = wrench[:, :3] + added[:, :3]
+        felt.torque_nmm[rows] = wrench[:, 3:] + added[:, 3:6]
         felt.area_mm2[rows] = np.maximum(added[:, 6], 0.0) * 100.0
         felt.slip[rows] = np.clip(slip + added[:, 7], 0.0, 1.0)

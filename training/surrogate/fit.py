@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.interpolate import RBFInterpolator
 
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
+from training.surrogate.bending import Bending, ample
 from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of
 from training.surrogate.contact import LinearContacts
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.felt import Contact
 from training.surrogate.model import SHIPPED, SUFFIX, VIEWS, Surrogate, features, gate, load_surrogate, mechanics_of, within
+from training.surrogate.nodes import interpolated
 from training.surrogate.paths import DEEPEST_MM, STICKING
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
 from training.surrogate.symmetry import Symmetry, ring_directions, symmetries
@@ -51,6 +52,16 @@ MODES = 64
 """Modes of the pins' motion: what they leave out is 0.01 mm on average."""
 WIDTH = 192
 """Neurons of each of the network's two hidden layers."""
+BENT_MODES = 48
+"""Modes of what the skin bends."""
+BENT_WIDTH = 128
+"""Neurons of each hidden layer of the network that bends the skin."""
+LIGHT = 0.01
+"""Mean square of that network's inputs below which all states tell alike of its linear part."""
+STEADY = 1e-3
+"""Ridge of that part's regression."""
+LOST = 0.02
+"""Share of the force that may lie beyond the nodes in a state to learn the skin's bending from."""
 EPOCHS = 36
 BATCH = 512
 RATE = 3e-3
@@ -67,8 +78,6 @@ LEAST_MOVED_MM = 1.0
 """States count by the square of one over their largest motion of a pin; below this they count alike."""
 SMALL_SCALE = 0.02
 """No input of the network is scaled by less than this share of the largest."""
-NEIGHBOURS = 24
-"""Points of the lattice by which the motion of a pin between them is interpolated."""
 TOUCHES_MM = 0.05
 """Contacts shallower than this are not judged."""
 LARGE_PX = 2.0
@@ -115,6 +124,25 @@ class _Samples:
     wrench: FloatArray  # (S, 6)
     area: FloatArray  # (S,)
     slip: FloatArray  # (S,), what the linear skin's share of sliding nodes lacks
+
+
+@dataclass(frozen=True)
+class _Truths:
+    """States S of the finite elements: what the nodes have moved and bear (S, M, 3), and what the pins have moved (S, 6 P); float32."""
+
+    moved: FloatArray
+    force: FloatArray
+    pins: FloatArray
+
+    def turned(self, g: Symmetry) -> "_Truths":
+        """The same states, turned or mirrored."""
+        pins = self.pins.reshape(len(self.pins), 2, -1, 3)
+        pins = np.stack([g.moved(pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
+        return _Truths(g.moved(self.moved, NODE_RINGS), g.moved(self.force, NODE_RINGS), pins.reshape(len(pins), -1))
+
+    def some(self, first: int, every: int) -> "_Truths":
+        """Each of so many states, from the first on."""
+        return _Truths(self.moved[first::every], self.force[first::every], self.pins[first::every])
 
 
 @writes_file("out")
@@ -181,26 +209,31 @@ def fit(
     kept = [path for number, path in enumerate(solved) if not number % JUDGED]
     skin = compliance_of(lattice_sensor(sensor))
     answer = averaged(skin.nodes, sensor.pins.phase_deg)
-    rng = np.random.default_rng(0)
-    turns = rng.uniform(0.0, np.pi / 3, (len(seen), TURNS))
-    turns[:, 0] = 0.0
-    rows = _joined([sampled(sensor, skin, answer, path, turn) for path, angles in zip(seen, turns, strict=True) for turn in angles])
-    flat_linear, flat_true = rows.linear[:, :3], rows.wrench[:, :3]
-    stiffness = float((flat_linear * flat_true).sum() / (flat_linear**2).sum())
     weights = np.array([1.0, AXIS_MM], np.float32)[:, None, None]
     linear_pins = np.stack([skin.base, skin.axis]).astype(np.float32) * weights[..., None, None]  # (2, P, 3, M, 3)
     flat = linear_pins.reshape(linear_pins.shape[0] * linear_pins.shape[1] * 3, -1)
-    rows = replace(rows, pins=rows.pins * weights)
     group = symmetries(sensor.pins.phase_deg)
+    truths = _truths(sensor, seen, weights)
+    moves = truths.force.reshape(len(truths.force), -1) @ answer.transpose(0, 3, 1, 2).reshape(3 * len(answer), -1)
+    softness = float((moves * truths.moved.reshape(moves.shape)).sum() / (moves**2).sum())
+    answer, flat = softness * answer, softness * flat
+    turned = [truths.turned(g) for g in group]
     if start is None:
-        some = [
-            _turned(_some(rows, slice(number, None, max(len(rows.depth) * len(group) // MODE_STATES, 1))), g)
-            for number, g in enumerate(group)
-        ]
-        modes, view = _modes(some, flat), _main(np.concatenate([part.within for part in some]), VIEWS)
+        some = [part.some(number, max(len(truths.force) * len(group) // MODE_STATES, 1)) for number, part in enumerate(turned)]
+        pins = np.concatenate([part.pins for part in some])
+        forces = np.concatenate([part.force.reshape(len(part.force), -1) for part in some])
+        modes = _main(np.concatenate([pins, 3 * (pins - forces @ flat.T)]), MODES)
     else:
-        modes, view = _carried(start, sensor, weights), start.view
+        modes = _carried(start, sensor, weights)
     read = modes @ flat
+    bending = _bending(turned, answer, read, start, progress)
+    kernel = bending.kernel(read)
+    rng = np.random.default_rng(0)
+    turns = rng.uniform(0.0, np.pi / 3, (len(seen), TURNS))
+    turns[:, 0] = 0.0
+    rows = _joined([sampled(sensor, skin, answer, path, turn, kernel) for path, angles in zip(seen, turns, strict=True) for turn in angles])
+    rows = replace(rows, pins=rows.pins * weights)
+    view = start.view if start else _main(np.concatenate([_turned(rows, g).within[:: 4 * len(group)] for g in group]), VIEWS)
     inputs, outputs = [], []
     for g in group:
         part = _turned(rows, g)
@@ -208,7 +241,7 @@ def fit(
         inputs.append(np.concatenate(seen_by, axis=1).astype(np.float32))
         lacks = _pins_and_rest(part, flat)[1] @ modes.T
         others = np.column_stack([part.area / 100.0, part.slip])
-        outputs.append(np.concatenate([lacks, part.wrench - stiffness * part.linear, others], axis=1).astype(np.float32))
+        outputs.append(np.concatenate([lacks, part.wrench - part.linear, others], axis=1).astype(np.float32))
     x, y = np.concatenate(inputs), np.concatenate(outputs)
     if start is None:
         mean, scale = x.mean(axis=0), x.std(axis=0)
@@ -221,7 +254,7 @@ def fit(
     counts = np.tile(1.0 / (LEAST_MOVED_MM**2 + largest**2), len(group))
     gates = np.tile(gate(rows.depth), len(group))
     given = (x - mean) / scale, y / out_scale, gates.astype(np.float32), (counts / counts.mean()).astype(np.float32)
-    layers = _trained(*given, start.layers if start else (), progress)
+    layers = _trained(*given, start.layers if start else (), WIDTH, progress)
     onto = _interpolation(sensor)
     on_pins = np.einsum("np,kcpi->knci", onto, modes.reshape(MODES, 2, -1, 3) / weights[None], optimize=True)
     about = {
@@ -238,7 +271,7 @@ def fit(
         on_pins.astype(np.float32),
         read.astype(np.float32),
         view,
-        stiffness,
+        bending,
         mean,
         scale,
         layers,
@@ -258,7 +291,8 @@ def cut(path: SolvedPath, radius_mm: float) -> SolvedPath:
         if depth > DEEPEST_TAKEN_MM or (depth > 0 and -T[2, :3] @ outward[0] < np.cos(np.radians(POLAR_DEG))):
             inside = number
             break
-    states = {name: getattr(path, name)[:inside] for name in ("T", "base_mm", "axis", "force_n", "torque_nmm", "area_mm2", "slip")}
+    names = ("T", "base_mm", "axis", "force_n", "torque_nmm", "area_mm2", "slip", "node_mm", "node_n")
+    states = {name: getattr(path, name)[:inside] for name in names}
     return replace(path, **states)
 
 
@@ -273,14 +307,24 @@ def averaged(nodes: FloatArray, phase_deg: float) -> FloatArray:
     return np.ascontiguousarray(total / len(group))
 
 
-def sampled(sensor: SensorSpec, skin: Compliance, answer: FloatArray, path: SolvedPath, turn_rad: float = 0.0) -> _Samples:
-    """The linear skin led along a solved path, with the truth beside it, both turned about the sensor's axis."""
+def sampled(
+    sensor: SensorSpec,
+    skin: Compliance,
+    answer: FloatArray,
+    path: SolvedPath,
+    turn_rad: float = 0.0,
+    bending: tuple[FloatArray, ...] | None = None,
+) -> _Samples:
+    """The skin led along a solved path, with the truth beside it, both turned about the sensor's axis.
+
+    ``bending`` as of ``LinearContacts.at_rest``.
+    """
     about = np.eye(4)
     about[:3, :3] = turn = _about_z(turn_rad)
     poses = about @ path.T
     thing = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
     assert isinstance(thing, Solid)
-    linear, row = LinearContacts.at_rest(skin.node_mm, answer.astype(np.float32), 1), np.zeros(1, int)
+    linear, row = LinearContacts.at_rest(skin.node_mm, answer.astype(np.float32), 1, bending=bending), np.zeros(1, int)
     linear.begin(0, thing, path.friction)
     rest = rest_pins(lattice_sensor(sensor).geometry)
     states = []
@@ -295,15 +339,9 @@ def sampled(sensor: SensorSpec, skin: Compliance, answer: FloatArray, path: Solv
     beside = features(deep, np.full(len(deep), path.friction), holding, slips, used, wrench)
     pins = np.stack([path.base_mm - rest.base_mm, path.axis - rest.axis], axis=1)
     if turn_rad:
-        pins = _interpolated(-rest.axis @ turn.T, -rest.axis) @ (pins @ turn.T)
+        pins = interpolated(-rest.axis @ turn.T, -rest.axis) @ (pins @ turn.T)
     truth = np.concatenate([path.force_n @ turn.T, path.torque_nmm @ turn.T], axis=1)
     return _Samples(forces, beside, deep, near, wrench, pins.astype(np.float32), truth, path.area_mm2, path.slip - slips)
-
-
-def _modes(some: Sequence[_Samples], flat: FloatArray) -> FloatArray:
-    """Directions (MODES, 6 P) in which the pins move together most, and in which the linear skin (6 P, 3 M) is wrong most."""
-    truth, residual = (np.concatenate(part) for part in zip(*(_pins_and_rest(part, flat) for part in some), strict=True))
-    return _main(np.concatenate([truth, 3 * residual]), MODES)
 
 
 def _main(rows: FloatArray, count: int) -> FloatArray:
@@ -331,8 +369,39 @@ def _pins_and_rest(rows: _Samples, flat: FloatArray) -> tuple[FloatArray, FloatA
     return truth, truth - rows.force.reshape(len(rows.force), -1) @ flat.T
 
 
-def _some(rows: _Samples, which: slice) -> _Samples:
-    return _Samples(*(getattr(rows, name)[which] for name in _Samples.__dataclass_fields__))
+def _truths(sensor: SensorSpec, solved: Sequence[SolvedPath], weights: FloatArray) -> _Truths:
+    """The pressed states of solved paths whose forces the nodes bear."""
+    rest = rest_pins(lattice_sensor(sensor).geometry)
+    at_rest = np.stack([rest.base_mm, rest.axis])
+    moved, force, pins = [], [], []
+    for path in solved:
+        lost = np.linalg.norm(path.node_n.sum(axis=1) + path.force_n, axis=1)
+        whole = lost < LOST * np.linalg.norm(path.force_n, axis=1)
+        moved.append(path.node_mm[whole])
+        force.append(path.node_n[whole])
+        if whole.any():
+            states = np.stack([path.base_mm[whole], path.axis[whole]], axis=1)
+            pins.append(((states - at_rest) * weights).reshape(len(states), -1))
+    return _Truths(*(np.concatenate(part).astype(np.float32) for part in (moved, force, pins)))
+
+
+def _bending(turned: Sequence[_Truths], answer: FloatArray, read: FloatArray, start: Surrogate | None, progress: Any) -> Bending:
+    """What the displacements of true states, turned by all symmetries, lack where the linear skin bears the same forces."""
+    compliance = answer.transpose(0, 3, 1, 2).reshape(3 * len(answer), -1).astype(np.float32)
+    forces = [part.force.reshape(len(part.force), -1) for part in turned]
+    lacks = [part.moved.reshape(len(part.moved), -1) - force @ compliance for part, force in zip(turned, forces, strict=True)]
+    modes = start.bending.modes.reshape(-1, len(compliance)) if start else _main(np.concatenate([part[::4] for part in lacks]), BENT_MODES)
+    x, y = np.concatenate([force @ read.T for force in forces]), np.concatenate([part @ modes.T for part in lacks])
+    scale = start.bending.scale if start else np.maximum(x.std(axis=0), SMALL_SCALE * x.std(axis=0).max()).astype(np.float32)
+    x = x / scale
+    counts = np.tile(1.0 / (LEAST_MOVED_MM**2 + (turned[0].moved ** 2).sum(axis=2).max(axis=1)), len(turned))
+    light = (1.0 / (LIGHT + (x**2).mean(axis=1)))[:, None]  # light contacts are those of which the linear part tells
+    straight = np.linalg.solve((x * light).T @ x + STEADY * len(x) * np.eye(x.shape[1]), (x * light).T @ y).T
+    rest, size = y - x @ straight.T, 1.0 if start else float(y.std(axis=0).max())
+    given = x, rest / size, ample(x), (counts / counts.mean()).astype(np.float32)
+    layers = _trained(*given, start.bending.layers if start else (), BENT_WIDTH, progress)
+    layers = (*layers[:-1], (size * layers[-1][0], size * layers[-1][1]))
+    return Bending(scale, straight.astype(np.float32), layers, modes.reshape(len(modes), -1, 3))
 
 
 def judge(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]) -> dict[str, Any]:
@@ -415,17 +484,17 @@ def _turned_wrench(values: FloatArray, g: Symmetry) -> FloatArray:
     return out
 
 
-def _trained(x: FloatArray, y: FloatArray, gates: FloatArray, counts: FloatArray, start: Layers, progress: Any) -> Layers:
+def _trained(x: FloatArray, y: FloatArray, gates: FloatArray, counts: FloatArray, start: Layers, width: int, progress: Any) -> Layers:
     """Weights and offsets of a network that tells y (S, o) from x (S, i), times the gates (S,); the states count by ``counts`` (S,).
 
     It begins with the weights and offsets of ``start``, if there are any.
     """
     net = torch.nn.Sequential(
-        torch.nn.Linear(x.shape[1], WIDTH),
+        torch.nn.Linear(x.shape[1], width),
         torch.nn.SiLU(),
-        torch.nn.Linear(WIDTH, WIDTH),
+        torch.nn.Linear(width, width),
         torch.nn.SiLU(),
-        torch.nn.Linear(WIDTH, y.shape[1]),
+        torch.nn.Linear(width, y.shape[1]),
     )
     inputs, wanted, share, count = (torch.from_numpy(np.ascontiguousarray(values)) for values in (x, y, gates[:, None], counts))
     batches = max(len(x) // BATCH, 1)
@@ -456,16 +525,4 @@ def _interpolation(sensor: SensorSpec) -> FloatArray:
     places = -rest_pins(sensor.geometry).axis
     if places.shape == lattice.shape and np.allclose(places, lattice, atol=1e-9):
         return np.eye(len(lattice))
-    return _interpolated(lattice, places)
-
-
-def _interpolated(start: FloatArray, places: FloatArray) -> FloatArray:
-    """(N, P) shares by which what is known in directions (P, 3) gives what is in others (N, 3)."""
-
-    def laid_flat(directions: FloatArray) -> FloatArray:
-        across = np.linalg.norm(directions[:, :2], axis=1, keepdims=True)
-        return directions[:, :2] * np.arctan2(across, directions[:, 2:]) / np.maximum(across, 1e-12)
-
-    shares = RBFInterpolator(laid_flat(start), np.eye(len(start)), neighbors=NEIGHBOURS, kernel="thin_plate_spline")
-    found: FloatArray = shares(laid_flat(places))
-    return found
+    return interpolated(lattice, places)

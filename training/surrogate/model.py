@@ -1,12 +1,12 @@
-"""The surrogate: a linear skin with exact contact and friction, and a small network that adds what large deformations change.
+"""The surrogate: a skin with exact contact and friction, and two small networks that add what large deformations change.
 
-Of one contact, with the forces f at the linear skin's nodes,
+The first bends the skin while its contact is solved (see ``bending``). Of the forces f at the nodes that are found so,
 
-    pins = rest + modes (R f + gate(depth) net(R f, V g, features)),   force = stiffness (-sum f) + gate net,
+    pins = rest + modes (R f + gate(depth) net(R f, V g, features)),   force = -sum f + gate net,
 
 where R is the linear skin's answer in the modes, V g tells where the object is (its distances from the nodes at rest, in their main
 directions), and the gate goes to zero with the depth: a sensor that touches nothing is exactly at rest. The features are depth, friction,
-nodes that press and slide, the share of Coulomb's bound that is borne, force and torque of the linear skin. What happened before is in f
+nodes that press and slide, the share of Coulomb's bound that is borne, force and torque of the nodes' forces. What happened before is in f
 alone, so the network has no memory of its own that could drift.
 """
 
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from scenes.sensor import SensorSpec
+from training.surrogate.bending import Bending
 from training.surrogate.compliance import NODE_RINGS, POLAR_DEG
 from training.surrogate.symmetry import ring_directions, symmetries
 from twin.errors import ContactError, TwinError
@@ -51,7 +52,7 @@ class SurrogateError(TwinError):
     """A surrogate's file can't be used, or no surrogate is known for a sensor."""
 
 
-FILE = ArrayFile("surrogate", "twin surrogate", version=2, error=SurrogateError)
+FILE = ArrayFile("surrogate", "twin surrogate", version=3, error=SurrogateError)
 
 
 @dataclass(frozen=True)
@@ -65,15 +66,15 @@ class Surrogate:
     node_mm : (M, 3) float
         Nodes of the linear skin at rest.
     answer : (M, M, 3, 3) float32
-        Displacement of node j (second) for a force at node i (first), mm/N.
+        The linear skin's displacement of node j (second) for a force at node i (first), mm/N.
     modes : (K, N, 2, 3) float32
         Displacements of the pins' feet, mm, and changes of their axes.
     read : (K, 3 M) float32
         The linear skin's answer in the modes.
     view : (VIEWS, M) float32
         Directions in which the network sees the object.
-    stiffness : float
-        Force of the true skin over that of the linear one.
+    bending : Bending
+        What large deformations add to the displacements of the nodes.
     mean, scale : (K + FEATURES + VIEWS,) float32
         Of the network's inputs.
     layers : tuple of ((o, i), (o,)) float32
@@ -87,7 +88,7 @@ class Surrogate:
     modes: FloatArray
     read: FloatArray
     view: FloatArray
-    stiffness: float
+    bending: Bending
     mean: FloatArray
     scale: FloatArray
     layers: Layers
@@ -126,9 +127,16 @@ class Surrogate:
         return _of_arrays(self.about, {key: value.astype(np.float32) for key, value in self._arrays().items()})
 
     def _arrays(self) -> dict[str, FloatArray]:
-        whole = {"stiffness": np.array([self.stiffness]), "mean": self.mean, "scale": self.scale, "out_scale": self.out_scale}
-        half = {"modes": self.modes, "read": self.read, "view": self.view, "answer": self.answer[representatives(self.phase_deg)]}
-        for key, value in layers_to(self.layers).items():
+        whole = {"mean": self.mean, "scale": self.scale, "out_scale": self.out_scale, "bending.scale": self.bending.scale}
+        half = {
+            "modes": self.modes,
+            "read": self.read,
+            "view": self.view,
+            "answer": self.answer[representatives(self.phase_deg)],
+            "bending.straight": self.bending.straight,
+            "bending.modes": self.bending.modes,
+        }
+        for key, value in (layers_to(self.layers) | layers_to(self.bending.layers, "bending")).items():
             (half if key.endswith("weights") else whole)[key] = value
         return {key: value.astype(np.float32) for key, value in whole.items()} | {
             key: value.astype(np.float16) for key, value in half.items()
@@ -195,7 +203,7 @@ def _of_arrays(about: dict[str, Any], arrays: Mapping[str, FloatArray]) -> Surro
         arrays["modes"],
         arrays["read"],
         arrays["view"],
-        float(arrays["stiffness"][0]),
+        Bending(arrays["bending.scale"], arrays["bending.straight"], layers_from(arrays, "bending"), arrays["bending.modes"]),
         arrays["mean"],
         arrays["scale"],
         layers_from(arrays),

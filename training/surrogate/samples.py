@@ -9,6 +9,7 @@ import numpy as np
 from scenes.object import ObjectSpec, Shape
 from scenes.pins import PinsSpec
 from scenes.sensor import SensorSpec
+from training.surrogate.nodes import AtNodes
 from training.surrogate.paths import DrawnPath, draw_path
 from twin.errors import ContactError
 from twin.mechanics import Friction, SkinSolver
@@ -39,6 +40,8 @@ class SolvedPath:
     force_n, torque_nmm : (S, 3) float
     area_mm2, slip : (S,) float
         Area of the skin at rest that is pressed, and the share of it that slides.
+    node_mm, node_n : (S, M, 3) float32
+        Displacements of the skin at the surrogate's nodes, and the forces on it, each shared among the nodes around its place.
     """
 
     shape: Shape
@@ -50,6 +53,8 @@ class SolvedPath:
     torque_nmm: FloatArray
     area_mm2: FloatArray
     slip: FloatArray
+    node_mm: FloatArray
+    node_n: FloatArray
 
 
 def lattice_sensor(sensor: SensorSpec) -> SensorSpec:
@@ -59,7 +64,7 @@ def lattice_sensor(sensor: SensorSpec) -> SensorSpec:
     return sensor.model_copy(update={"pins": PinsSpec.model_validate(kept)})
 
 
-def solve_path(solver: SkinSolver, drawn: DrawnPath, *, step_mm: float = STEP_MM) -> SolvedPath | None:
+def solve_path(solver: SkinSolver, nodes: AtNodes, drawn: DrawnPath, *, step_mm: float = STEP_MM) -> SolvedPath | None:
     """Follow a path with the finite elements as far as they converge; None if not even the first step does."""
     field = build_field(ObjectSpec(name="drawn", description="", shape=drawn.shape))
     rest = solver.rest(T_sensor_object=drawn.path.at(0.0))
@@ -81,6 +86,8 @@ def solve_path(solver: SkinSolver, drawn: DrawnPath, *, step_mm: float = STEP_MM
         np.array([s.torque_nmm for s in states]),
         np.array([s.point_area_mm2.sum() for s in states]),
         np.array([s.slip_share for s in states]),
+        np.array([nodes.moved_mm(s) for s in states]),
+        np.array([nodes.force_n(s) for s in states]),
     )
 
 
@@ -95,9 +102,10 @@ def solve_paths(sensor: SensorSpec, numbers: Sequence[int], *, processes: int, p
 
 
 def _begin(sensor: SensorSpec) -> Callable[[int], tuple[int, SolvedPath | None]]:
-    return partial(_solve, sensor, SkinSolver(sensor))
+    solver = SkinSolver(sensor)
+    return partial(_solve, sensor, solver, AtNodes.of(solver))
 
 
-def _solve(sensor: SensorSpec, solver: SkinSolver, number: int) -> tuple[int, SolvedPath | None]:
+def _solve(sensor: SensorSpec, solver: SkinSolver, nodes: AtNodes, number: int) -> tuple[int, SolvedPath | None]:
     drawn = draw_path(sensor, np.random.default_rng((number, 26)))
-    return number, solve_path(solver, drawn)
+    return number, solve_path(solver, nodes, drawn)

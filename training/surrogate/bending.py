@@ -1,0 +1,135 @@
+"""What large deformations add to the linear skin's answer: a small network inside the contact's solution.
+
+The body is elastic, so where its skin stands depends on the forces at its nodes alone, however they came about. Of forces f,
+
+    u = C f + modes (straight x + g(x) net(x)),   x = R f / scale,   g = tanh(mean(x^2) / AMPLE),
+
+where C f is the linear skin, R its answer in the modes of the pins, and g a gate that goes to zero with the forces: the network adds what
+is of higher order. ``straight`` is what the linear skin, whose softness is that of all contacts, lacks in light ones. So friction holds and
+lets go where the true skin's forces make it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.compiled import compiled
+from twin.store import Layers
+from twin.types import FloatArray
+
+AMPLE = 0.1
+"""Mean square of the inputs at which the network has three quarters of its say."""
+TAKEN = 0.5
+"""Share of a new answer that is taken at once: a skin that bends more bears less, and with the whole answer deep contacts swing."""
+
+
+@dataclass(frozen=True)
+class Bending:
+    """The network of a skin with M nodes, K inputs and O modes.
+
+    Attributes
+    ----------
+    scale : (K,) float32
+        Of the inputs.
+    straight : (O, K) float32
+    layers : tuple of ((o, i), (o,)) float32
+        Three layers: weights and offsets.
+    modes : (O, M, 3) float32
+        Displacements of the nodes, mm.
+    """
+
+    scale: FloatArray
+    straight: FloatArray
+    layers: Layers
+    modes: FloatArray
+
+    def of(self, linear: FloatArray) -> FloatArray:
+        """What the skin moves more than the linear one, (S, M, 3) mm, where that moves the pins by ``linear`` (S, K) in their modes."""
+        x = linear / self.scale
+        out, gates = x, ample(x)
+        for number, (weights, offset) in enumerate(self.layers):
+            out = out @ weights.T + offset
+            if number < len(self.layers) - 1:
+                out = out / (1.0 + np.exp(-out))  # SiLU
+        return np.tensordot(x @ self.straight.T + gates[:, None] * out, self.modes, axes=1)
+
+    def kernel(self, read: FloatArray) -> tuple[FloatArray, ...]:
+        """The arrays that ``bend`` takes, laid out for it; ``read`` (K, 3 M) is the linear skin's answer in the modes of the pins."""
+        seen = (read / self.scale[:, None]).T.reshape(-1, 3, len(read))
+        (first, a), (second, b), (third, c) = self.layers
+        given = seen, first.T, a, second.T, b, third.T, c, self.straight.T, self.modes.transpose(0, 2, 1)
+        return tuple(np.ascontiguousarray(values, np.float32) for values in given)
+
+
+def ample(x: FloatArray) -> FloatArray:
+    """How much the network has to say, (S,), of inputs (S, K)."""
+    return np.tanh((x**2).mean(axis=1) / AMPLE)
+
+
+def unbent(nodes: int) -> tuple[FloatArray, ...]:
+    """What ``bend`` takes for a skin that is linear."""
+    shapes = (nodes, 3, 1), (1, 1), (1,), (1, 1), (1,), (1, 0), (0,), (1, 0), (0, 3, nodes)
+    return tuple(np.zeros(shape, np.float32) for shape in shapes)
+
+
+@compiled(nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+def bend(
+    force: FloatArray,
+    bent: FloatArray,
+    moved: FloatArray,
+    read: FloatArray,
+    first: FloatArray,
+    a: FloatArray,
+    second: FloatArray,
+    b: FloatArray,
+    third: FloatArray,
+    c: FloatArray,
+    straight: FloatArray,
+    modes: FloatArray,
+) -> None:
+    """Bring ``bent`` (3, M) float32 nearer to what forces (M, 3) bend, and move the nodes ``moved`` (M, 3) with it."""
+    count, width = len(c), len(a)
+    if count == 0:
+        return
+    seen = read.shape[2]
+    x = np.zeros(seen, np.float32)
+    for i in range(len(force)):
+        if force[i, 0] == 0 and force[i, 1] == 0 and force[i, 2] == 0:
+            continue
+        f0, f1, f2 = np.float32(force[i, 0]), np.float32(force[i, 1]), np.float32(force[i, 2])
+        r = read[i]
+        for k in range(seen):
+            x[k] += r[0, k] * f0 + r[1, k] * f1 + r[2, k] * f2
+    size = np.float32(0.0)
+    for k in range(seen):
+        size += x[k] * x[k]
+    gate = np.float32(np.tanh(size / seen / AMPLE))
+    one, two, out = a.copy(), b.copy(), c.copy()
+    for k in range(seen):
+        for h in range(width):
+            one[h] += first[k, h] * x[k]
+    for h in range(width):
+        one[h] = one[h] / (np.float32(1.0) + np.exp(-one[h]))
+    for k in range(width):
+        for h in range(len(b)):
+            two[h] += second[k, h] * one[k]
+    for h in range(len(b)):
+        two[h] = two[h] / (np.float32(1.0) + np.exp(-two[h]))
+    for k in range(len(b)):
+        for o in range(count):
+            out[o] += third[k, o] * two[k]
+    for o in range(count):
+        out[o] *= gate
+    for k in range(seen):
+        for o in range(count):
+            out[o] += straight[k, o] * x[k]
+    for p in range(3):
+        row = np.zeros(bent.shape[1], np.float32)
+        for o in range(count):
+            part, share = modes[o, p], out[o]
+            for j in range(len(row)):
+                row[j] += part[j] * share
+        for j in range(len(row)):
+            row[j] = bent[p, j] + np.float32(TAKEN) * (row[j] - bent[p, j])
+            moved[j, p] += row[j] - bent[p, j]
+            bent[p, j] = row[j]

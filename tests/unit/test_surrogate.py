@@ -33,9 +33,10 @@ from twin.types import Form
 SENSOR = "mg400-331"
 COARSE = Resolution(across=8)
 ROW = np.zeros(1, int)
-PINS_BOUND_PX = 1.0  # largest mean error of the contacts below; the stated mean over all is half of it
-FORCE_BOUND = 0.3  # of the force after a reversal of the shear, the hardest (edge: 0.26); over all contacts a quarter of it
-SLIP_BOUND = 0.18  # of the share that slides, on average over these five poses; the worst, the ball, has 0.13
+PINS_BOUND_PX = 0.5  # largest mean error of the contacts below, and of all stated; edges have 0.31
+FORCE_BOUND = 0.15  # of the force after a reversal of the shear, the hardest (edge: 0.10)
+STATED_FORCE = 0.04  # of the force, on average over the paths kept from the training
+SLIP_BOUND = 0.18  # of the share that slides, on average over these five poses; the worst, the edge, has 0.17
 WAY_BOUND = 0.03  # of the force: where the same way is told by more poses, its steps are 0.29 instead of 0.37 mm long
 NO_NODES = np.zeros((2, 3, 0, 3))
 ANSWER_TOLERANCE = 2e-3  # relative: half precision in the file
@@ -308,7 +309,7 @@ def test_the_stated_errors_meet_the_bounds_and_the_files_are_small():
     for name in ("mg400-127", "mg400-331", "ur5-331"):
         found = surrogate_of(load_sensor(name))
         told = found.about["errors"]["all"]
-        assert told["pins_px"] < PINS_BOUND_PX and told["slip"] < 0.15 and told["force_share"] < 0.2
+        assert told["pins_px"] < PINS_BOUND_PX and told["slip"] < 0.12 and told["force_share"] < STATED_FORCE
         assert {"object", "depth_mm", "shear_mm"} <= set(found.about["errors"]["by"])
 
 

@@ -86,11 +86,14 @@ def bend(
     c: FloatArray,
     straight: FloatArray,
     modes: FloatArray,
-) -> None:
-    """Bring ``bent`` (3, M) float32 nearer to what forces (M, 3) bend, and move the nodes ``moved`` (M, 3) with it."""
+) -> float:
+    """Bring ``bent`` (3, M) float32 nearer to what forces (M, 3) bend, and move the nodes ``moved`` (M, 3) with it.
+
+    Gives the largest change along an axis, mm.
+    """
     count, width = len(c), len(a)
     if count == 0:
-        return
+        return 0.0
     seen = read.shape[2]
     x = np.zeros(seen, np.float32)
     for i in range(len(force)):
@@ -106,30 +109,37 @@ def bend(
     gate = np.float32(np.tanh(size / seen / AMPLE))
     one, two, out = a.copy(), b.copy(), c.copy()
     for k in range(seen):
+        row, value = first[k], x[k]
         for h in range(width):
-            one[h] += first[k, h] * x[k]
+            one[h] += row[h] * value
     for h in range(width):
         one[h] = one[h] / (np.float32(1.0) + np.exp(-one[h]))
     for k in range(width):
-        for h in range(len(b)):
-            two[h] += second[k, h] * one[k]
-    for h in range(len(b)):
+        row, value = second[k], one[k]
+        for h in range(width):
+            two[h] += row[h] * value
+    for h in range(width):
         two[h] = two[h] / (np.float32(1.0) + np.exp(-two[h]))
-    for k in range(len(b)):
+    for k in range(width):
+        row, value = third[k], two[k]
         for o in range(count):
-            out[o] += third[k, o] * two[k]
+            out[o] += row[o] * value
     for o in range(count):
         out[o] *= gate
     for k in range(seen):
+        row, value = straight[k], x[k]
         for o in range(count):
-            out[o] += straight[k, o] * x[k]
+            out[o] += row[o] * value
+    most = np.float32(0.0)
     for p in range(3):
-        row = np.zeros(bent.shape[1], np.float32)
+        whole = np.zeros(bent.shape[1], np.float32)
         for o in range(count):
-            part, share = modes[o, p], out[o]
-            for j in range(len(row)):
-                row[j] += part[j] * share
-        for j in range(len(row)):
-            row[j] = bent[p, j] + np.float32(TAKEN) * (row[j] - bent[p, j])
-            moved[j, p] += row[j] - bent[p, j]
-            bent[p, j] = row[j]
+            row, value = modes[o, p], out[o]
+            for j in range(len(whole)):
+                whole[j] += row[j] * value
+        for j in range(len(whole)):
+            change = np.float32(TAKEN) * (whole[j] - bent[p, j])
+            most = max(most, abs(change))
+            moved[j, p] += change
+            bent[p, j] += change
+    return most

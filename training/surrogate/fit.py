@@ -50,11 +50,11 @@ AXIS_MM = 0.9
 """Length of a pin by which changes of its axis count as motion where modes are sought: about that of the shipped sensors."""
 MODES = 64
 """Modes of the pins' motion: what they leave out is 0.01 mm on average."""
-WIDTH = 192
+WIDTH = 256
 """Neurons of each of the network's two hidden layers."""
-BENT_MODES = 48
+BENT_MODES = 64
 """Modes of what the skin bends."""
-BENT_WIDTH = 128
+BENT_WIDTH = 160
 """Neurons of each hidden layer of the network that bends the skin."""
 LIGHT = 0.01
 """Mean square of that network's inputs below which all states tell alike of its linear part."""
@@ -72,7 +72,7 @@ DEEPEST_TAKEN_MM = DEEPEST_MM + 0.5
 """Largest indentation that is taken."""
 POLAR_DEG = 48.0
 """Largest angle of a contact's deepest place from the apex: paths begin within 35 deg and go on from there."""
-OTHERS_SCALE = (*(0.5,) * 3, *(5.0,) * 3, 1.0, 1.0)
+OTHERS_SCALE = (*(0.15,) * 3, *(1.5,) * 3, 1.0, 0.5)
 """Errors of force (N), torque (N mm), area (100 mm2) and sliding share that count as much as a usual one of the modes."""
 LEAST_MOVED_MM = 1.0
 """States count by the square of one over their largest motion of a pin; below this they count alike."""

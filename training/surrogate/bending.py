@@ -142,4 +142,4 @@ def bend(
             most = max(most, abs(change))
             moved[j, p] += change
             bent[p, j] += change
-    return most
+    return float(most)

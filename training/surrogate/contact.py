@@ -214,7 +214,7 @@ def between(start: FloatArray, stop: FloatArray, steps: int) -> FloatArray:
         T[k] = stop
     if steps == 1:
         return T
-    turn = start[:3, :3] @ stop[:3, :3].T.copy()
+    turn = start[:3, :3].copy() @ stop[:3, :3].T.copy()
     cross = (turn - turn.T) / 2  # with the axis, times the sine of the angle (less than a right one)
     sine = np.sqrt(cross[2, 1] ** 2 + cross[0, 2] ** 2 + cross[1, 0] ** 2)
     angle = np.arctan2(sine, (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1) / 2)

@@ -5,13 +5,17 @@ from functools import partial
 from pathlib import Path
 
 import bench_environments
+import bench_surrogate
 import numpy as np
 
-from figures.jobs import Measured, Value, job, run_twin
+from figures.jobs import Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
 from training.surrogate.model import surrogate_of
 
-SENSORS = ("mg400-331", "mg400-127", "ur5-331")
+SENSORS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127", "ur5-331": "ur5-331-surface-3d-tap"}
+"""The recording with whose contacts each sensor's surrogate is compared."""
+DEPTHS = ("pose_2", "pose_3")
+"""Labels in mm; the others are angles."""
 SECONDS = 2.0
 UNITS = {"pins_px": "px"}
 
@@ -25,7 +29,25 @@ def stated_errors(work: Path, *, sensor: str) -> Measured:
     return found
 
 
-for name in SENSORS:
+def on_real_contacts(work: Path, *, sensor: str) -> Measured:
+    """Surrogate and finite elements on recorded contacts: how far their pins are from the frames', and errors of the poses from them."""
+    found = bench_surrogate.measured(sensor, real_folder(SENSORS[sensor]))
+    depth = np.array([name in DEPTHS for name in found.names])
+    values = {"frames": Value(found.frames), "fem_px": Value(found.fem_px, "px"), "pins_px": Value(found.surrogate_px, "px")}
+    for who, errors in (("fem_", found.fem_mae), ("", found.surrogate_mae)):
+        values |= {f"{who}mm": Value(float(errors[depth].mean()), "mm"), f"{who}deg": Value(float(errors[~depth].mean()), "deg")}
+    return values | {"pins_more": Value(found.surrogate_px / found.fem_px - 1)}
+
+
+for name, recording in SENSORS.items():
+    job(
+        f"surrogate.real.{name}",
+        f"tests/bench/bench_surrogate.py --sensor {name} --data {recording}",
+        sensors=(name,),
+        code=("scenes", "twin", "training"),
+        recordings=(recording,),
+        minutes=1,
+    )(partial(on_real_contacts, sensor=name))
     command = f"twin surrogate --sensor {name} --out mine.safetensors"
     job(f"surrogate.{name}", command, sensors=(name,), code=("training.surrogate",), minutes=0.1)(partial(stated_errors, sensor=name))
 
@@ -53,7 +75,7 @@ LEARNT = {
     "EdgeFollow.oracle": ("--observation oracle", 2),
     "EdgeFollow.image": ("--observation image", 20),
     "EdgeFollow.forgetful": ("--randomise moves --no-sight --no-memory --fem 20", 12),
-    "SurfaceFollow.pins": ("", 3),
+    "SurfaceFollow.pins": ("--no-sight --fem 20", 8),
     "SurfaceFollow.oracle": ("--observation oracle", 3),
     "ContourFollow.pins": ("", 5),
     "ObjectRoll.pins": ("--minutes 8", 10),

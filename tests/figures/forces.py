@@ -12,7 +12,7 @@ from scenes import load_sensor
 from twin.fit.sensor_file import write_sensor
 
 CODE = ("scenes", "twin", "training")
-TAUGHT = {"plane": 60, "ball-40": 60, "cylinder": 60, "edge": 60}  # contacts of the objects that are learnt from
+TAUGHT = {"plane": 300, "ball-40": 300, "cylinder": 300, "edge": 300}  # contacts of the objects that are learnt from
 UNSEEN = {"can": 15, "ball-80": 15, "square": 15}
 DRAGS, UNSEEN_DRAGS = 60, 8  # of each object
 ACROSS = 16
@@ -116,7 +116,7 @@ for name in EXPERIMENTS:
         f"twin train --model touch --sensor {name} --data SIMULATED ... --target contact --members 2 --no-kernel --out RUN",
         sensors=(name,),
         code=CODE,
-        minutes=12,
+        minutes=25,
     )(partial(forces, sensor=name))
 job(
     "slip.mg400-331",

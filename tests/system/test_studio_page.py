@@ -219,6 +219,14 @@ def wait_html(client, text):
     return client.html()
 
 
+def until(true):
+    """Wait until a condition is true."""
+    end = time.monotonic() + 2 * WAIT_S
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
 def test_a_recording_is_shown_with_labels_doubts_and_the_twins_picture(client, tmp_path):
     folder = write_recording(tmp_path / "recording", load_sensor(SENSOR), 3)
     client.set("mode", "Recording")
@@ -236,6 +244,7 @@ def test_a_recording_is_shown_with_labels_doubts_and_the_twins_picture(client, t
 
 def test_live_shows_a_source_and_an_arm_that_is_read_only(studio, client, tmp_path):
     folder = write_recording(tmp_path / "recording", load_sensor(SENSOR), 3)
+    until(lambda: studio.modes[3]._twin.contact.model is not None)
     client.set("mode", "Live")
     client.set("camera", str(folder))
     client.set("arm", "simulated")
@@ -248,16 +257,41 @@ def test_live_shows_a_source_and_an_arm_that_is_read_only(studio, client, tmp_pa
         robot.nudge(2, 1.0)
     assert np.array_equal(robot._arm.state().pose, before)
     client.set("armed: the page may move the arm", True)
-    end = time.monotonic() + WAIT_S
-    while not robot.armed and time.monotonic() < end:
-        time.sleep(0.02)
+    until(lambda: robot.armed)
     robot.nudge(2, 1.0)
     assert robot._arm.state().pose[2] == pytest.approx(before[2] + 1.0, abs=0.1)
     client.set("EMERGENCY STOP", True)
-    while robot.armed and time.monotonic() < end:
-        time.sleep(0.02)
-    assert not robot.armed and not robot._arm.state().enabled
+    until(lambda: not robot.armed)
+    assert not robot._arm.state().enabled
     client.set("Disconnect", True)
+    client.set("mode", "Twin")
+
+
+def test_of_feeds_connected_at_the_same_time_one_stays_and_every_other_lets_go_of_its_arm(studio, client, tmp_path, monkeypatch):
+    class Feed(CameraFeed):
+        def start(self, on_shot, on_end):
+            time.sleep(0.2)  # so that each is still connecting when the next is asked for
+            super().start(on_shot, on_end)
+
+    feeds, live = [], studio.modes[3]
+    monkeypatch.setattr(live, "_open_feed", lambda *plan: feeds.append(Feed(*plan)) or feeds[-1])
+    write_recording(tmp_path, load_sensor(SENSOR), 3)
+    client.set("camera", "")
+    until(lambda: not live._camera.value and live._twin.contact.model is not None)
+    client.set("mode", "Live")
+    until(lambda: live._active)
+    live._camera.value, live._arm.value = str(tmp_path), "simulated"
+    threads = [threading.Thread(target=ask) for ask in (live.connect, live.show, live.connect)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(WAIT_S)
+    assert len(feeds) >= 2 and [feed for feed in feeds if not feed._end.is_set()] == [live._feed]
+    kept = live._feed
+    live.show()
+    assert live._feed is kept
+    live.disconnect()
+    assert all(feed._end.is_set() for feed in feeds) and live._feed is None
     client.set("mode", "Twin")
 
 

@@ -3,6 +3,7 @@
 Camera and arm are handed in (``LiveFeed``, ``LiveArm``); this package knows no device.
 """
 
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -98,6 +99,7 @@ class LiveMode(PageMode):
         super().__init__(page)
         self._twin, self._open_feed, self._out = twin, open_feed, out
         self._feed: LiveFeed | None = None
+        self._connecting = threading.RLock()  # the page calls from many threads, and a feed that is forgotten keeps its arm
         self._pipeline: Pipeline | None = None
         self._health: list[str] = []
         self._last: LiveShot | None = None
@@ -133,9 +135,11 @@ class LiveMode(PageMode):
     def show(self) -> None:
         """Show the camera, which is connected now if the command named it."""
         self._page.show_nothing("Give a camera and press 'Connect'.")
-        if self._feed is None and self._camera.value:
-            self._page.guarded(self.connect)(self)
-        elif self._last is not None:  # it came before the mode was entered, or since the mode was left
+        with self._connecting:
+            absent = self._feed is None and bool(self._camera.value)
+            if absent:
+                self._page.guarded(self.connect)(self)
+        if not absent and self._last is not None:  # it came before the mode was entered, or since the mode was left
             self._shots.give(self._last)
 
     def connect(self) -> None:
@@ -146,30 +150,32 @@ class LiveMode(PageMode):
         TwinError
             There is no model, camera or arm of that name.
         """
-        self.disconnect()
-        model = self._twin.contact.model
-        if model is None:
-            raise TwinError("there is no model of this sensor yet; wait until it is loaded, or give one with --model")
-        if not self._camera.value.strip():
-            raise TwinError("give a camera first: a number, /dev/videoN, http://..., a folder or a video")
-        feed = self._open_feed(self._camera.value.strip(), self._arm.value.strip(), model)
-        self._pipeline = Pipeline(feed.model.sensor, feed.model.form, feed.model.pipeline.reference)
-        self._feed = feed
-        feed.start(self._shots.give, self.complain)
-        self._limits.content = "" if feed.robot is None else paragraph(f"{feed.robot.name}: {feed.robot.limits()}", "note")
+        with self._connecting:
+            self.disconnect()
+            model = self._twin.contact.model
+            if model is None:
+                raise TwinError("there is no model of this sensor yet; wait until it is loaded, or give one with --model")
+            if not self._camera.value.strip():
+                raise TwinError("give a camera first: a number, /dev/videoN, http://..., a folder or a video")
+            feed = self._open_feed(self._camera.value.strip(), self._arm.value.strip(), model)
+            self._pipeline = Pipeline(feed.model.sensor, feed.model.form, feed.model.pipeline.reference)
+            self._feed = feed
+            feed.start(self._shots.give, self.complain)
+            self._limits.content = "" if feed.robot is None else paragraph(f"{feed.robot.name}: {feed.robot.limits()}", "note")
 
     def disconnect(self) -> None:
         """Let go of camera and arm."""
-        feed, self._feed, self._last = self._feed, None, None
-        try:
-            if feed is not None and self._record.value:
-                self._page.say(feed.end_record())
-        finally:  # a recording that can't be ended leaves no arm armed
-            for control in (self._record, self._armed):
-                put(control, False)
-            self._nudges.visible = False
-            if feed is not None:
-                feed.stop()
+        with self._connecting:
+            feed, self._feed, self._last = self._feed, None, None
+            try:
+                if feed is not None and self._record.value:
+                    self._page.say(feed.end_record())
+            finally:  # a recording that can't be ended leaves no arm armed
+                for control in (self._record, self._armed):
+                    put(control, False)
+                self._nudges.visible = False
+                if feed is not None:
+                    feed.stop()
 
     def emergency_stop(self) -> None:
         """Stop the arm. It is never refused."""

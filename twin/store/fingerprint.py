@@ -2,8 +2,9 @@
 
 Modules are found by the import statements in their files, including those in functions. A name that a package re-exports is followed to
 the module that defines it, so the package's other modules don't count. The fingerprint of a module is that of its syntax tree without
-docstrings; comments and formatting are not in the tree. Therefore a changed formula changes the fingerprint, and a changed explanation
-does not. The texts of the command line are in ``twin.cli``, which no computing module imports.
+strings that stand alone, which are docstrings and explanations of constants; comments and formatting are not in the tree. Therefore a
+changed formula changes the fingerprint, and a changed explanation does not. The texts of the command line are in ``twin.cli``, which no
+computing module imports.
 """
 
 import ast
@@ -232,14 +233,12 @@ def _imports(tree: ast.Module, module: str, is_package: bool) -> tuple[tuple[_Fr
 
 
 def _flatten(node: ast.AST, lines: list[str]) -> None:
-    """Append a syntax tree as text, without docstrings, line numbers and empty fields."""
+    """Append a syntax tree as text, without strings that stand alone, line numbers and empty fields."""
     lines.append(f"({type(node).__name__}")
-    body = getattr(node, "body", None)
-    docstring = body[0] if isinstance(node, _DOCUMENTED) and body and _is_text(body[0]) else None
     for name in node._fields:
         value = getattr(node, name, None)
         if isinstance(value, list):
-            parts = [part for part in value if part is not docstring]
+            parts = [part for part in value if not _is_text(part)]
             lines += [f" {name}["] if parts else []  # empty lists are left out, because later versions of Python have additional fields
             for part in parts:
                 if isinstance(part, ast.AST):
@@ -255,11 +254,9 @@ def _flatten(node: ast.AST, lines: list[str]) -> None:
     lines.append(")")
 
 
-_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-
-
-def _is_text(statement: ast.stmt) -> bool:
-    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant) and isinstance(statement.value.value, str)
+def _is_text(part: object) -> bool:
+    """Whether a part of a syntax tree is a statement of a string alone: a docstring, or the explanation of a constant above it."""
+    return isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant) and isinstance(part.value.value, str)
 
 
 @cache

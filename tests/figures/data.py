@@ -20,7 +20,7 @@ ACROSS = (20, 16, 12)
     "data.rates.mg400-331",
     "twin dataset --sensor mg400-331 --experiment surface-2d --images none --states all --across N",
     sensors=(SENSOR,),
-    code=("scenes", "twin", "training"),
+    code=("training.generation", "training.simulated"),
     minutes=3,
 )
 def rates(work: Path) -> Measured:

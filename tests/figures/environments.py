@@ -44,15 +44,25 @@ for name, recording in SENSORS.items():
         f"surrogate.real.{name}",
         f"tests/bench/bench_surrogate.py --sensor {name} --data {recording}",
         sensors=(name,),
-        code=("scenes", "twin", "training"),
+        code=("bench_surrogate", "training.surrogate"),
+        shipped=("training/surrogates",),
         recordings=(recording,),
         minutes=1,
     )(partial(on_real_contacts, sensor=name))
     command = f"twin surrogate --sensor {name} --out mine.safetensors"
-    job(f"surrogate.{name}", command, sensors=(name,), code=("training.surrogate",), minutes=0.1)(partial(stated_errors, sensor=name))
+    job(f"surrogate.{name}", command, sensors=(name,), code=("training.surrogate.model",), shipped=("training/surrogates",), minutes=0.1)(
+        partial(stated_errors, sensor=name)
+    )
 
 
-@job("environments.speed", "tests/bench/bench_environments.py", sensors=("mg400-331",), code=("training.environments",), minutes=2)
+@job(
+    "environments.speed",
+    "tests/bench/bench_environments.py",
+    sensors=("mg400-331",),
+    code=("bench_environments", "training.environments"),
+    shipped=("training/surrogates",),
+    minutes=2,
+)
 def speed(work: Path) -> Measured:
     """Steps in a second of one core's time, of the slower task, and on the clock; against a rigid sensor's depth image in the same run."""
     found = bench_environments.measured(SECONDS)
@@ -102,5 +112,11 @@ def learnt(work: Path, *, name: str) -> Measured:
 
 for name, (options, minutes) in LEARNT.items():
     command = f"twin learn --task {name.split('.')[0]} --sensor mg400-331 {options} --out out/learnt".replace("  ", " ")
-    code = ("training.environments", "training.surrogate", "twin.policy")
-    job(f"policies.{name}", command, sensors=("mg400-331",), code=code, minutes=minutes)(partial(learnt, name=name))
+    job(
+        f"policies.{name}",
+        command,
+        sensors=("mg400-331",),
+        code=("training.environments.learn",),
+        shipped=("training/surrogates/mg400-331.safetensors",),
+        minutes=minutes,
+    )(partial(learnt, name=name))

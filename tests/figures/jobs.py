@@ -1,7 +1,7 @@
 """A job measures some figures; ``figures.json`` keeps what it found until its inputs change.
 
-A job's inputs are the sensors' specifications and the code it runs: the packages it names and its own function. ``fingerprint`` is the one
-place that says what code counts.
+A job's inputs are the sensors' specifications, shipped files such as weights, and the code that it runs: its own function, and the modules
+that it names with all that these import. ``fingerprint`` is the one place that says what code counts.
 """
 
 import hashlib
@@ -58,7 +58,9 @@ class Job:
     sensors : tuple of str
         Whose specifications it depends on.
     code : tuple of str
-        Packages whose code it depends on.
+        Modules that compute the figures (a package: all of its modules). All that they import counts, too. Benches are named as well.
+    shipped : tuple of str
+        Files or folders of the packages, such as weights, whose content it depends on.
     recordings : tuple of str
         Folders of ``TACTIP_REAL`` that it needs.
     minutes : float
@@ -72,6 +74,7 @@ class Job:
     code: tuple[str, ...]
     recordings: tuple[str, ...]
     minutes: float
+    shipped: tuple[str, ...] = ()
 
     @property
     def family(self) -> str:
@@ -87,7 +90,8 @@ def job(
     command: str,
     *,
     sensors: tuple[str, ...] = (),
-    code: tuple[str, ...] = ("scenes", "twin"),
+    code: tuple[str, ...],
+    shipped: tuple[str, ...] = (),
     recordings: tuple[str, ...] = (),
     minutes: float = 1.0,
 ) -> Callable:
@@ -96,7 +100,7 @@ def job(
     def register(measure: Callable[[Path], Measured]) -> Callable[[Path], Measured]:
         if name in JOBS:
             raise FiguresError(f"two jobs are called {name!r}")
-        JOBS[name] = Job(name, measure, command, sensors, code, recordings, minutes)
+        JOBS[name] = Job(name, measure, command, sensors, code, recordings, minutes, shipped)
         return measure
 
     return register
@@ -135,8 +139,8 @@ UNMEASURED = ("twin.cli", "twin.report")
 """Packages whose code changes no figure: the command line's words and the pages' looks."""
 
 
-def code_of_packages(*packages: str) -> str:
-    """Fingerprint of all modules of some packages (``training.surrogate``) that may change a figure.
+def modules_of(*names: str) -> dict[str, str]:
+    """Digest of each module that may change a figure of a job which names these modules and packages.
 
     Raises
     ------
@@ -144,21 +148,36 @@ def code_of_packages(*packages: str) -> str:
         There is no such package or module.
     """
     modules: list[str] = []
-    for package in packages:
-        place = ROOT / package.replace(".", "/")
+    for name in names:
+        place = ROOT / name.replace(".", "/")
         files = sorted(place.rglob("*.py")) or [path for path in (place.with_suffix(".py"),) if path.is_file()]
-        if not files:
-            raise FiguresError(f"a figure depends on the code of {package!r}, which is no package; name one such as 'training.surrogate'")
-        modules += [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in files]
-    return store.fingerprint(*(name for name in modules if not name.startswith(UNMEASURED)))
+        if not files and name not in sys.modules:
+            raise FiguresError(f"a figure depends on the code of {name!r}, which is no module; name one such as 'training.surrogate'")
+        found = [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in files]
+        modules += found or [name]  # a bench, which lies outside of the packages
+    found = store.code_of(*modules).modules
+    return {module: digest for module, digest in found.items() if not module.startswith(UNMEASURED)}
+
+
+def shipped_digest(names: tuple[str, ...]) -> str:
+    """Of the content of files, and of all files in folders."""
+    digest = hashlib.sha256()
+    for name in names:
+        place = ROOT / name
+        files = sorted(path for path in place.rglob("*") if path.is_file()) or [place]
+        for path in files:
+            digest.update(f"{path.relative_to(ROOT)}\n".encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def fingerprint(made: Job) -> str:
-    """Of the code that a job runs: its packages, and its own function with what is bound to it."""
+    """Of the code that a job runs: the modules that it names with all that they import, its own function, and what is bound to it."""
     measure, bound = made.measure, ""
     if isinstance(measure, partial):
         measure, bound = measure.func, repr(sorted(measure.keywords.items()))
-    return hashlib.sha256(f"{code_of_packages(*made.code)}\n{inspect.getsource(measure)}\n{bound}".encode()).hexdigest()[:16]
+    modules = "".join(f"{name} {digest}\n" for name, digest in sorted(modules_of(*made.code).items()))
+    shipped = shipped_digest(made.shipped) if made.shipped else ""
+    return hashlib.sha256(f"{modules}\n{inspect.getsource(measure)}\n{bound}\n{shipped}".encode()).hexdigest()[:16]
 
 
 def key_of(made: Job) -> dict[str, str]:

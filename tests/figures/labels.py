@@ -72,7 +72,7 @@ def register() -> None:
             f"labels.{recording}",
             command,
             sensors=(sensor,),
-            code=("scenes", "twin", "training"),
+            code=("training.studies.sim_to_real.worth",),
             recordings=(recording,),
             minutes=minutes,
         )(partial(by_labels, recording=recording))
@@ -80,7 +80,8 @@ def register() -> None:
             f"intervals.{recording}",
             f"shipped weights of {sensor} on frames of {recording} that they did not learn from",
             sensors=(sensor,),
-            code=("scenes", "twin", "training"),
+            code=("training.studies.evaluation",),
+            shipped=(f"training/weights/{sensor}",),
             recordings=(recording,),
             minutes=2.0,
         )(partial(inside, recording=recording))

@@ -15,7 +15,7 @@ SENSOR = ("mg400-331",)
 REPEATS = 3
 
 
-@job("mechanics.calculix", "pytest -m slow -s tests/system/test_calculix.py", sensors=SENSOR, minutes=1)
+@job("mechanics.calculix", "pytest -m slow -s tests/system/test_calculix.py", sensors=SENSOR, code=("against_calculix",), minutes=1)
 def against_calculix(work: Path) -> Measured:
     """At the deepest press (3 mm), default mesh: relative force, and the caps' largest error over the largest displacement."""
     found = {}
@@ -29,7 +29,7 @@ SHORT = {"tilted cylinder": "cylinder", "square rod": "rod"}
 """Names of contacts in figures, where they are not those of ``finer_mesh``."""
 
 
-@job("mechanics.mesh", "pytest -m slow -s tests/system/test_mesh_convergence.py", sensors=SENSOR, minutes=3)
+@job("mechanics.mesh", "pytest -m slow -s tests/system/test_mesh_convergence.py", sensors=SENSOR, code=("finer_mesh",), minutes=3)
 def against_a_finer_mesh(work: Path) -> Measured:
     """Caps on average and at most over the largest displacement, and the force, by contact."""
     solvers, found = finer_mesh.make_solvers(), {}
@@ -39,7 +39,7 @@ def against_a_finer_mesh(work: Path) -> Measured:
     return found | {"force": Value(max(value.value for name, value in found.items() if name.endswith("_force")))}
 
 
-@job("mechanics.hertz", "pytest -m slow -s tests/system/test_hertz.py", minutes=2)
+@job("mechanics.hertz", "pytest -m slow -s tests/system/test_hertz.py", code=("hertz",), minutes=2)
 def against_hertz(work: Path) -> Measured:
     """A rigid sphere on a half space, Poisson's ratio 0.3: relative errors of force and contact radius."""
     spec = material(young_mpa=1.0, poisson=0.3)
@@ -47,7 +47,7 @@ def against_hertz(work: Path) -> Measured:
     return {"force": Value(force), "radius": Value(radius)}
 
 
-@job("mechanics.speed", "tests/bench/bench_mechanics.py", sensors=SENSOR, minutes=5)
+@job("mechanics.speed", "tests/bench/bench_mechanics.py", sensors=SENSOR, code=("twin.mechanics",), minutes=5)
 def speed(work: Path) -> Measured:
     """CPU time of converged states on one thread, and against the first version on the same contacts."""
     now, first = bench_mechanics.in_child(REPEATS), bench_mechanics.first_version(REPEATS)

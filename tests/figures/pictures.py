@@ -26,7 +26,7 @@ FITTED = 6
     "render.realism.ur5-331",
     "twin realism DIR --sensor ur5-331 --fitted 6 --out OUT",
     sensors=("ur5-331",),
-    code=("scenes", "twin", "training"),
+    code=("training.studies.realism",),
     recordings=("ur5-331-raw",),
     minutes=10,
 )
@@ -52,7 +52,7 @@ def judged(work: Path, out: Path, *options: str) -> dict:
     "render.residual.ur5-331",
     "training.residual.calibrate_residual(DIR, load_sensor('ur5-331'), OUT)",
     sensors=("ur5-331",),
-    code=("scenes", "twin", "training"),
+    code=("training.residual",),
     recordings=("ur5-331-raw",),
     minutes=15,
 )
@@ -69,7 +69,7 @@ def residual(work: Path) -> Measured:
     "render.details",
     "twin realism DIR --sensor ur5-331 --fitted 6 --quality drawn --without DETAIL --out OUT",
     sensors=("ur5-331",),
-    code=("scenes", "twin", "training"),
+    code=("training.studies.realism",),
     recordings=("ur5-331-raw",),
     minutes=20,
 )
@@ -84,7 +84,7 @@ def details(work: Path) -> Measured:
     return found
 
 
-@job("render.speed", "tests/bench/bench_render.py", sensors=("mg400-331", "ur5-331"), minutes=8)
+@job("render.speed", "tests/bench/bench_render.py", sensors=("mg400-331", "ur5-331"), code=("bench_render",), minutes=8)
 def speed(work: Path) -> Measured:
     """A frame of a data set, plain path tracing for the same errors in the same run, a large colour picture, and the preview."""
     bench = Bench("mg400-331", REPEATS)
@@ -112,7 +112,12 @@ def speed(work: Path) -> Measured:
 
 
 @job(
-    "render.at_rest", "pytest -m slow -s tests/system/test_real.py", sensors=tuple(RECORDED), recordings=tuple(RECORDED.values()), minutes=1
+    "render.at_rest",
+    "pytest -m slow -s tests/system/test_real.py",
+    sensors=tuple(RECORDED),
+    code=("twin.simulator", "twin.judge.pictures.images"),
+    recordings=tuple(RECORDED.values()),
+    minutes=1,
 )
 def at_rest(work: Path) -> Measured:
     """SSIM of rendered and recorded frames without contact, in the recordings' thresholded form."""

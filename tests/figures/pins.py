@@ -38,13 +38,25 @@ def against_recorded(work: Path, *, sensor: str) -> Measured:
 
 for _sensor in SETS:
     _command = f"twin preprocess DIR --sensor {_sensor} --out OUT"
-    job(f"pins.found.{_sensor}", _command, sensors=(_sensor,), recordings=(SETS[_sensor],), minutes=1)(partial(found_on, sensor=_sensor))
+    job(
+        f"pins.found.{_sensor}",
+        _command,
+        sensors=(_sensor,),
+        code=("twin.pins.batch",),
+        recordings=(SETS[_sensor],),
+        minutes=1,
+    )(partial(found_on, sensor=_sensor))
 for _sensor in ("mg400-331", "mg400-127"):
     _recording = (SETS[_sensor],)
-    job(f"pins.speed.{_sensor}", f"tests/bench/bench_pipeline.py --sensor {_sensor}", sensors=(_sensor,), recordings=_recording, minutes=1)(
-        partial(speed, sensor=_sensor)
-    )
+    job(
+        f"pins.speed.{_sensor}",
+        f"tests/bench/bench_pipeline.py --sensor {_sensor}",
+        sensors=(_sensor,),
+        code=("bench_pipeline",),
+        recordings=_recording,
+        minutes=1,
+    )(partial(speed, sensor=_sensor))
     _command = f"twin validate --sensor {_sensor} --frames DIR --limit {VALIDATED} --friction-frames {OWN_FRICTION} --seed {SEED} --out OUT"
-    job(f"pins.real.{_sensor}", _command, sensors=(_sensor,), code=("scenes", "twin", "training"), recordings=_recording, minutes=8)(
+    job(f"pins.real.{_sensor}", _command, sensors=(_sensor,), code=("training.studies.validation",), recordings=_recording, minutes=8)(
         partial(against_recorded, sensor=_sensor)
     )

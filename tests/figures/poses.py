@@ -19,7 +19,8 @@ from training.studies.evaluation import at_own_rest
 from training.studies.tac_vgnn.models import measure_training
 
 SETS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
-CODE = ("scenes", "twin", "training")
+TRAINED = ("training.train", "training.studies.evaluation")
+SHIPPED = "training/weights"
 UNITS = {"pose_2": "mm", "pose_6": "deg"}
 SPLITS = (0, 1, 2)
 SIMULATED_SEEDS = (0, 1, 2, 3, 4)
@@ -167,7 +168,7 @@ def register() -> None:
     """All jobs of this file."""
     for (model, minutes), sensor in product(MODELS.items(), SETS):
         splits = SPLITS if model == "vgnn" else SPLITS[:1]
-        common = {"sensors": (sensor,), "code": CODE, "recordings": (SETS[sensor],)}
+        common = {"sensors": (sensor,), "code": TRAINED, "recordings": (SETS[sensor],)}
         for split in splits:
             command = f"twin train --model {model} --sensor {sensor} --data DIR --target surface-2d-shear --split {split} --out RUN"
             job(f"training.{model}.{sensor}.split{split}", command, minutes=minutes, **common)(
@@ -177,10 +178,10 @@ def register() -> None:
             job(f"training.{model}.{sensor}.splits", f"mean of the runs of {model}", minutes=minutes + 0.1, **common)(
                 partial(over_splits, model=model, sensor=sensor)
             )
-    real = {"code": CODE, "recordings": (SETS["mg400-331"],), "sensors": ("mg400-331",)}
+    real = {"code": ("training.studies.tac_vgnn",), "recordings": (SETS["mg400-331"],), "sensors": ("mg400-331",)}
     job("training.parts.mg400-331", f"twin study tac-vgnn --labels corrected --models {','.join(PARTS)}", minutes=20, **real)(parts_of_vgnn)
     for sensor in SETS:
-        common = {"sensors": (sensor,), "code": CODE, "recordings": (SETS[sensor],)}
+        common = {"sensors": (sensor,), "code": ("training.studies.sim_to_real",), "recordings": (SETS[sensor],)}
         command = f"twin study sim-to-real --sensor {sensor} --frames DIR --labels {LABELS} --count 300 --seed"
         for seed in SIMULATED_SEEDS:
             job(f"sim_to_real.{sensor}.seed{seed}", f"{command} {seed}", minutes=8, **common)(
@@ -190,22 +191,31 @@ def register() -> None:
             partial(taught_by_the_twin, sensor=sensor, seed=0, extra=("--calibrate",))
         )
     command = "twin study objects --sensor mg400-331 --count 60 --tests 25 --across 12 --seed 1"
-    job("objects.mg400-331", command, sensors=("mg400-331",), code=CODE, minutes=30)(never_touched)
+    job("objects.mg400-331", command, sensors=("mg400-331",), code=("training.studies.objects",), minutes=30)(never_touched)
     command = "tests/bench/bench_training.py --models tac-vgnn vgnn --batches 128 --threads 2"
-    job("training.epoch", command, sensors=tuple(SETS), code=CODE, minutes=2)(seconds_an_epoch)
+    job("training.epoch", command, sensors=tuple(SETS), code=("bench_training", "training.studies.tac_vgnn.models"), minutes=2)(
+        seconds_an_epoch
+    )
     job(
         "training.shipped.ur5-331",
         "twin evaluate ur5-331 --data DIR --rows all",
         sensors=("ur5-331",),
-        code=CODE,
+        code=("training.studies.evaluation",),
+        shipped=(f"{SHIPPED}/ur5-331",),
         recordings=("ur5-331-raw",),
         minutes=1,
     )(shipped_on_frames)
     for sensor in SETS:
         command = f"twin evaluate {sensor} --data DIR --rows all, DIR with init_0.png and without it"
-        job(f"training.withheld.{sensor}", command, sensors=(sensor,), code=CODE, recordings=(SETS[sensor],), minutes=2)(
-            partial(without_no_contact, sensor=sensor)
-        )
+        job(
+            f"training.withheld.{sensor}",
+            command,
+            sensors=(sensor,),
+            code=("training.studies.evaluation",),
+            shipped=(f"{SHIPPED}/{sensor}",),
+            recordings=(SETS[sensor],),
+            minutes=2,
+        )(partial(without_no_contact, sensor=sensor))
 
 
 register()

@@ -6,7 +6,13 @@ from pathlib import Path
 from figures.jobs import Measured, Value, job, run_twin
 
 
-@job("robustness.mg400-331", "twin robustness --sensor mg400-331 --jobs 2 --out OUT", sensors=("mg400-331",), minutes=4)
+@job(
+    "robustness.mg400-331",
+    "twin robustness --sensor mg400-331 --jobs 2 --out OUT",
+    sensors=("mg400-331",),
+    code=("training.studies.degradation",),
+    minutes=4,
+)
 def robustness(work: Path) -> Measured:
     """Conditions in which our pipeline bears as much as the paper's, and twice as much."""
     run_twin(work, "robustness", "--sensor", "mg400-331", "--jobs", 2, "--out", work / "sweep")

@@ -21,7 +21,8 @@ COLUMNS = {
     "servo.mg400-331",
     "twin study servo --model mg400-331 --out OUT",
     sensors=("mg400-331",),
-    code=("scenes", "twin", "training", "hardware"),
+    code=("hardware.servo_study", "training.estimator"),
+    shipped=("training/weights/mg400-331",),
     minutes=15,
 )
 def servo(work: Path) -> Measured:

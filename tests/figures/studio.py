@@ -34,6 +34,6 @@ for name in ("mg400-331", "ur5-331"):
         f"studio.{name}",
         f"python tests/bench/bench_studio.py --sensor {name} --seconds {SECONDS:g}",
         sensors=(name,),
-        code=("scenes", "twin", "training"),
+        code=("bench_studio", "twin.studio"),
         minutes=2,
     )(partial(dragged, sensor=name))

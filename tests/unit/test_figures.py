@@ -39,19 +39,40 @@ def test_what_it_was_made_from_decides_whether_it_counts(counted, tmp_path, monk
     run(job, path, tmp_path)
     other = Job(job.name, job.measure, job.command, ("mg400-331",), job.code, (), 0.0)
     assert not is_kept(other, path), "another specification"
-    monkeypatch.setattr(module, "code_of_packages", lambda *packages: "changed")
+    monkeypatch.setattr(module, "modules_of", lambda *names: {"scenes": "changed"})
     assert not is_kept(job, path), "other code"
     run(job, path, tmp_path)
     assert is_kept(job, path) and values(path)["probe.force.force"].value == 1.0
 
 
-def test_every_jobs_code_is_found():
+def test_every_jobs_code_and_files_are_found():
     """Code that is not found would never make a figure count as old."""
-    assert all(module.code_of_packages(*job.code) for job in JOBS.values())
-    part, module_alone = module.code_of_packages("training.surrogate"), module.code_of_packages("twin.policy")
-    assert len({part, module_alone, module.code_of_packages("training")}) == 3
+    for made in JOBS.values():
+        modules = module.modules_of(*made.code)
+        assert any(name.startswith(("twin.", "training.")) for name in modules), made.name
+        assert all((module.ROOT / name).exists() for name in made.shipped), made.name
     with pytest.raises(FiguresError, match="'training.nowhere'"):
-        module.code_of_packages("training.nowhere")
+        module.modules_of("training.nowhere")
+
+
+def test_only_code_that_a_figure_comes_from_makes_it_old():
+    pins, poses = set(module.modules_of("twin.pins.batch")), set(module.modules_of("training.studies.sim_to_real"))
+    assert "twin.pins.blobs" in pins and "twin.mechanics.solver" not in pins
+    assert {"twin.mechanics.solver", "training.studies.sim_to_real.inverted"} <= poses
+    assert not [name for name in pins | poses if name.startswith(module.UNMEASURED)]
+
+
+def test_another_shipped_file_makes_a_figure_old(tmp_path, monkeypatch):
+    weights = tmp_path / "weights"
+    weights.mkdir()
+    monkeypatch.setattr(module, "ROOT", tmp_path)
+    (weights / "a").write_bytes(b"1")
+    first = module.shipped_digest(("weights",))
+    assert module.shipped_digest(("weights/a",)) == first, "a folder counts by its files"
+    (weights / "a").write_bytes(b"2")
+    second = module.shipped_digest(("weights",))
+    (weights / "b").write_bytes(b"")
+    assert len({first, second, module.shipped_digest(("weights",))}) == 3
 
 
 def test_other_jobs_figures_stay(counted, tmp_path):

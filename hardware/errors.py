@@ -1,7 +1,7 @@
-"""Errors of attached devices, and devices as context managers.
+"""Errors of attached devices, and the base class that makes devices context managers.
 
-The classes of errors are those that users of LeRobot expect. A ``Connection`` is connected when it is entered, and disconnected when it
-is left.
+The error classes are those that users of LeRobot expect. Entering a ``Connection`` connects the device, and leaving it disconnects the
+device.
 """
 
 import errno
@@ -15,7 +15,7 @@ from twin.errors import TwinError
 
 
 class DeviceError(TwinError):
-    """A device does not do what it was told. The message names the device and the remedy."""
+    """A device does not do what was commanded. The message names the device and the remedy."""
 
 
 class DeviceNotConnectedError(DeviceError, ConnectionError):
@@ -23,7 +23,7 @@ class DeviceNotConnectedError(DeviceError, ConnectionError):
 
 
 class DeviceAlreadyConnectedError(DeviceError, ConnectionError):
-    """The device is connected already."""
+    """The device is already connected."""
 
 
 class StaleDataError(DeviceError):
@@ -31,7 +31,7 @@ class StaleDataError(DeviceError):
 
 
 def cannot_listen(who: str, host: str, port: int, error: OSError, *, option: str = "--port") -> DeviceError:
-    """The error to raise where a server can't listen: names address, reason and remedy; ``option`` is that of the port."""
+    """The error of a server that can't listen. It names the address, the reason and the remedy; ``option`` is the option for the port."""
     foreign = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
     remedy = (
         "give an address of this machine with --host, such as 127.0.0.1" if foreign else f"end what uses the port, or give another {option}"
@@ -40,7 +40,7 @@ def cannot_listen(who: str, host: str, port: int, error: OSError, *, option: str
 
 
 class Connection(ABC):
-    """Base of all devices with ``connect()`` and ``disconnect()``."""
+    """Base class of all devices with ``connect()`` and ``disconnect()``."""
 
     @abstractmethod
     def connect(self) -> None: ...
@@ -57,7 +57,7 @@ class Connection(ABC):
 
 
 def leave(disconnect: Callable[[], None], error: BaseException | None) -> None:
-    """Disconnect at the end of a context. A failure becomes a note of the exception that is on its way, if there is one."""
+    """Disconnect at the end of a context. If an exception is being raised already, a failure is added to it as a note."""
     try:
         disconnect()
     except DeviceError as failed:
@@ -67,7 +67,7 @@ def leave(disconnect: Callable[[], None], error: BaseException | None) -> None:
 
 
 def also(error: BaseException, what: str) -> None:
-    """Say in an error what failed after it: at the end of a device's message, else as a note."""
+    """Add to an error what failed after it: at the end of the message of a ``DeviceError``, or as a note to any other error."""
     if isinstance(error, DeviceError) and error.args:
         error.args = (f"{error.args[0]}; {what}", *error.args[1:])
     else:

@@ -22,19 +22,19 @@ from twin.frames.forms import frame_size
 from twin.types import Form, Frame
 
 _POSE = ("x", "y", "z", "rx", "ry", "rz")
-# Age in ms up to which LeRobot's cameras give a picture.
+# Largest age in ms of a picture that LeRobot's cameras return.
 MAX_AGE_MS = 500.0
 
 
 class LeRobotCamera:
-    """A frame source with what LeRobot's cameras have. Its pictures are (H, W, 3), those of a gray camera too.
+    """A frame source with the interface of LeRobot's cameras. Its pictures are (H, W, 3), also those of a gray camera.
 
     Parameters
     ----------
     source : FrameSource
     fps, width, height : int, optional
-        What the pictures are, if it is to be known before the camera is connected. By default it is that of the source's sensor, else it
-        is known from the first picture on.
+        Rate and size of the pictures, for callers that need them before the camera is connected. By default they come from the source and
+        its sensor. Without a sensor the size is known only after the first picture.
     """
 
     def __init__(self, source: FrameSource, *, fps: int | None = None, width: int | None = None, height: int | None = None) -> None:
@@ -72,11 +72,11 @@ class LeRobotCamera:
         return self._picture(self._source.read())
 
     def async_read(self, timeout_ms: float = 200) -> np.ndarray:
-        """The newest image not read yet; ``TimeoutError``."""
+        """The newest image that was not read yet; ``TimeoutError`` if none comes in time."""
         return self._picture(self._source.read(timeout_s=timeout_ms / 1e3))
 
     def read_latest(self, max_age_ms: float = MAX_AGE_MS) -> np.ndarray:
-        """The newest image; ``TimeoutError`` if it is older."""
+        """The newest image; ``TimeoutError`` if it is older than ``max_age_ms``."""
         try:
             return self._picture(self._source.read_latest(max_age_s=max_age_ms / 1e3))
         except StaleDataError as error:
@@ -94,27 +94,27 @@ class LeRobotCamera:
 
 @dataclass(kw_only=True)
 class LeRobotArmConfig:
-    """What LeRobot's scripts know of a robot before it is made.
+    """The configuration from which LeRobot's scripts make a robot.
 
     Attributes
     ----------
     arm : str
         As ``open_arm`` takes it.
     limits : str or None
-        Safety limits, by name or file: actions are clipped to them. None: those of the arm's kind.
+        Name or file of the safety limits to which actions are clipped. None: the limits of this kind of arm.
     cameras : dict of str to str
-        Names, and what ``open_camera`` takes.
+        For each camera its name, and its specification as ``open_camera`` takes it.
     sensor : str or None
-        Name or file of the sensor behind the cameras. LeRobot asks for the size of the pictures before it connects a camera; the sensor
-        tells it.
+        Name or file of the sensor that the cameras belong to. LeRobot asks for the size of the pictures before it connects a camera, and
+        the sensor's specification gives this size.
     max_age_ms : float
-        Age up to which a picture may be part of an observation. LeRobot's own limit is the default; slow cameras need more.
+        Largest age of a picture in an observation. LeRobot's own limit is the default; slow cameras need more.
     linear_mm_s, angular_deg_s : float
         Speed of the arm. The limits may reduce it.
     id : str or None
-        Tells robots of one kind apart.
+        Name that distinguishes robots of the same kind.
     calibration_dir : Path or None
-        LeRobot's; these arms need no calibration.
+        LeRobot expects this attribute. It is not used, because these arms need no calibration.
     """
 
     arm: str = "simulated"
@@ -139,10 +139,10 @@ class LeRobotArm:
     Parameters
     ----------
     arm : Arm or LeRobotArmConfig
-        Give a ``SafeArm`` or a configuration to have actions clipped; ``send_action`` tells what was really sent.
+        With a ``SafeArm`` or a configuration, actions are clipped to the limits. ``send_action`` returns the action that was really sent.
     id : str, optional
     cameras : mapping of str to LeRobotCamera
-        They are connected and read with the arm.
+        Cameras that are connected and read together with the arm.
     linear_mm_s, angular_deg_s : float
         Speed of the arm. The limits of a ``SafeArm`` may reduce it.
     """
@@ -188,13 +188,13 @@ class LeRobotArm:
 
     @property
     def observation_features(self) -> dict[str, Any]:
-        """Types of the numbers, and shapes (H, W, 3) of the cameras' pictures."""
+        """The type of each number, and the shape (H, W, 3) of each camera's pictures."""
         joints: dict[str, Any] = {f"joint_{n}.pos": float for n in range(1, self.arm.axes + 1)}
         return {key: float for key in self._keys} | joints | {name: self._shape(name) for name in self.cameras}
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Names and types of an action's values."""
+        """Name and type of each value of an action."""
         return {key: float for key in self._keys}
 
     @property
@@ -203,7 +203,7 @@ class LeRobotArm:
 
     @property
     def is_calibrated(self) -> bool:
-        """Always true: these arms know their joints' zeros (a Magician after it was homed)."""
+        """Always true: these arms know the zeros of their joints (a Magician after homing)."""
         return True
 
     def calibrate(self) -> None:
@@ -214,7 +214,7 @@ class LeRobotArm:
         self.arm.set_speed(*self._speed)
 
     def connect(self, calibrate: bool = True) -> None:
-        """Connect and enable the arm, and connect the cameras; there is nothing to calibrate."""
+        """Connect and enable the arm, and connect the cameras. ``calibrate`` has no effect."""
         self.arm.connect()
         try:
             self.arm.enable()
@@ -235,11 +235,11 @@ class LeRobotArm:
         return {key: pose[key] for key in self._keys} | joints | pictures
 
     def send_action(self, action: Mapping[str, Any]) -> dict[str, float]:
-        """Send the arm towards a pose and do not wait. A missing key keeps its present value; an observation is an action, too.
+        """Send the arm towards a pose, without waiting. A missing key keeps its present value. An observation can serve as an action.
 
-        The newest action wins: the arm goes in short pieces and turns to a newer action after at most 0.2 s, without replaying older ones.
-        An action beyond the limits of a ``SafeArm`` is clipped to them. Returns what was really sent to the arm: the pose of the action,
-        or the end of the present piece on the way to it.
+        Only the newest action counts. The arm moves in short pieces, and turns to a newer action after at most 0.2 s without executing the
+        older ones. An action beyond the limits of a ``SafeArm`` is clipped to them. Returns the pose that was really sent to the arm: the
+        pose of the action, or the end of the present piece on the way to it.
         """
         unknown = set(action) - set(_POSE) - set(self.observation_features)
         if unknown:

@@ -1,7 +1,8 @@
-"""An arm that follows a stream of targets, of which the newest wins.
+"""Moves an arm towards the newest target of a stream.
 
-The Dobots queue moves and execute all of them: targets that come faster than the arm moves would be replayed long after the stream has
-ended. So the arm gets its next piece only when it is about to end the one before, and each piece is short.
+The Dobots queue all moves and execute every one of them. If targets came faster than the arm moves, the arm would still execute old ones
+long after the stream has ended. So the way to a target is divided into short moves (pieces), and the arm gets the next piece only when it
+has nearly reached the end of the present one.
 """
 
 import threading
@@ -15,27 +16,27 @@ from hardware.arms.motion import between, turn_between_deg
 from hardware.errors import DeviceError
 from hardware.safe_arm import SafeArm
 
-# Longest piece, as the time in s that the arm takes for it. The arm turns to a newer target after this time at the latest.
+# Longest duration of a piece, in s. It is also the longest delay until the arm turns to a newer target.
 PIECE_S = 0.2
-# The next piece is sent when the arm takes this time (s) or less to the end of the one before, so that the arm does not stand in between.
+# The next piece is sent when the arm needs at most this time (s) to reach the end of the present one. So the arm does not stop in between.
 AHEAD_S = 0.06
-# Interval in s at which the arm's state is looked at.
+# Interval in s at which the thread reads the arm's state.
 LOOK_S = 0.01
-# An arm that is not at the end of a piece after this time (s) beyond what the piece takes gets a new one from where it is.
+# Largest delay in s of an arm that should have reached the end of its piece. A later arm gets a new piece that starts where the arm is.
 LATE_S = 0.5
-# A target is reached within this distance, in mm and in deg.
+# A target counts as reached within this distance, in mm and in deg.
 REACHED = 0.02
 
 
 class NewestTarget:
-    """Sends an arm towards the newest of many targets, in a thread between ``start`` and ``end``.
+    """Moves an arm towards the newest of many targets. A thread does this between ``start`` and ``end``.
 
     Parameters
     ----------
     arm : Arm
         Connected and enabled while the thread runs.
     linear_mm_s, angular_deg_s : float
-        Its speed.
+        Speed of the arm.
     """
 
     def __init__(self, arm: Arm, linear_mm_s: float, angular_deg_s: float) -> None:
@@ -45,18 +46,18 @@ class NewestTarget:
         self._thread: threading.Thread | None = None
         self._target: np.ndarray | None = None
         self._sent: np.ndarray | None = None  # end of the newest piece
-        self._due_s = 0.0  # when the arm should be there
+        self._due_s = 0.0  # when the arm should reach the end of the newest piece
         self._error: DeviceError | None = None
 
     def start(self) -> None:
-        """Begin to follow; there is no target yet."""
+        """Start the thread. There is no target yet."""
         self._ended.clear()
         self._target = self._sent = self._error = None
         self._thread = threading.Thread(target=self._run, name="newest target", daemon=True)
         self._thread.start()
 
     def end(self) -> None:
-        """Send nothing any more. A piece that was sent goes on."""
+        """Send no further piece. The arm completes a piece that was sent already."""
         self._ended.set()
         self._wake.set()
         if self._thread is not None:
@@ -66,12 +67,12 @@ class NewestTarget:
     def go(self, target: np.ndarray) -> np.ndarray:
         """Take a new target (6,), clipped to the limits of a ``SafeArm``.
 
-        Returns the end (6,) of the newest piece that was sent to the arm: the target, or a place on the way to it.
+        Returns the end (6,) of the newest piece that was sent to the arm: the target, or a pose on the way to it.
 
         Raises
         ------
         DeviceError
-            The arm failed, now or since the last call; it was stopped.
+            The arm failed, either now or since the last call. It was stopped.
         """
         with self._lock:
             if self._error is not None:
@@ -82,7 +83,7 @@ class NewestTarget:
             try:
                 self._step()
             except BaseException:
-                self._target = None  # after Ctrl-C, too, the thread sends nothing more
+                self._target = None  # the thread must send nothing more, after Ctrl-C either
                 raise
             self._wake.set()
             return self._arm.state().pose if self._sent is None else self._sent
@@ -100,7 +101,7 @@ class NewestTarget:
             self._ended.wait(LOOK_S)
 
     def _step(self) -> None:
-        """Send the next piece if the arm is about to end the one before."""
+        """Send the next piece if the arm has nearly reached the end of the present one."""
         if self._target is None:
             return
         state = self._arm.state()
@@ -121,6 +122,6 @@ class NewestTarget:
         self._due_s = time.monotonic() + self._takes_s(here, self._sent)
 
     def _takes_s(self, start: np.ndarray, end: np.ndarray) -> float:
-        """Time of a straight move at full speed."""
+        """Duration in s of a straight move at full speed."""
         turn_deg = abs(end[5] - start[5]) if self._arm.axes == 4 else turn_between_deg(start, end)
         return max(float(np.linalg.norm(end[:3] - start[:3])) / self._speed[0], turn_deg / self._speed[1])

@@ -1,7 +1,8 @@
-"""The composition root of live work: the one place that decides what is simulated, recorded or real.
+"""The composition root of live work: the only module that decides whether a device is simulated, recorded or real.
 
-``build_rig`` makes a camera and an arm before an object from what a user writes. Also here: which frame without contact a model counts
-pins from (``given_frame``, ``counting_from_first``), and how a signal ends work that moves an arm (``signals_as_ctrl_c``).
+``build_rig`` builds a camera and an arm in front of an object from the user's options. ``given_frame`` and ``counting_from_first`` select
+the no-contact frame relative to which a model measures the pins' displacements. ``signals_as_ctrl_c`` makes signals end work that moves an
+arm as Ctrl-C does.
 """
 
 import signal
@@ -37,19 +38,20 @@ from twin.pins import require_untouched
 from twin.rig.mounting import Mounting
 from twin.types import FIRST, NONE, Form, Frame
 
-# What a user writes after --camera for the twin.
+# Value of the option --camera that selects the twin.
 TWIN = "twin"
-# Longest wait in s for a frame of an arm that stands still.
+# Longest wait in s for a real camera's frame while the arm stands still.
 FRAME_S = 5.0
-# The same for the twin, which may take longer to draw a frame.
+# Longest wait in s for a frame of the twin while the arm stands still. The twin may take longer to draw a frame than a camera.
 TWIN_FRAME_S = 60.0
 
 
 @contextmanager
 def signals_as_ctrl_c() -> Iterator[None]:
-    """Context in which SIGTERM and a closed terminal (SIGHUP) raise ``KeyboardInterrupt``, as Ctrl-C does, so that the arm is let go of.
+    """Context in which SIGTERM and a closed terminal (SIGHUP) raise ``KeyboardInterrupt`` as Ctrl-C does.
 
-    Only for the main thread. A signal that was ignored before (``nohup``) stays ignored. The former handlers are restored at the end.
+    So the arm is stopped, withdrawn and disabled after these signals, too. Use it in the main thread only. A signal that was ignored
+    before (``nohup``) stays ignored. The former handlers are restored at the end.
     """
 
     def interrupt(*_: object) -> None:
@@ -67,7 +69,7 @@ def signals_as_ctrl_c() -> Iterator[None]:
 
 
 def given_frame(at_rest: str, model: SensorModel) -> Frame | None:
-    """The frame without contact from a file or from a recording's folder; None for ``first`` and ``none``.
+    """The no-contact frame from a file or from a recording's folder; None for ``first`` and ``none``.
 
     Raises
     ------
@@ -83,12 +85,12 @@ def given_frame(at_rest: str, model: SensorModel) -> Frame | None:
 
 
 def counting_from_first(model: SensorModel, frame: Frame) -> SensorModel:
-    """The model that counts pins from the first frame that was taken.
+    """The model that uses the first frame as its no-contact frame.
 
     Raises
     ------
     FrameError
-        The sensor seems to be pressed in this frame, or the model can't count from it.
+        The sensor seems to be in contact in this frame, or the model can't use it.
     """
     found = model.at_rest(frame)
     remedy = "move it clear of everything and begin again, or give a frame that was taken without contact: --at-rest FRAME"
@@ -98,7 +100,7 @@ def counting_from_first(model: SensorModel, frame: Frame) -> SensorModel:
 
 @dataclass
 class Rig:
-    """A camera and an arm before an object, not yet connected.
+    """A camera and an arm in front of an object. They are not connected yet.
 
     Attributes
     ----------
@@ -107,7 +109,7 @@ class Rig:
         A real or emulated arm is wrapped in a ``SafeArm``.
     placed : PlacedObject
     knows_truth : bool
-        Whether the object certainly stands where ``placed`` says. This is so in the twin.
+        Whether the object's pose is exactly that of ``placed``. This is true in the twin.
     """
 
     source: FrameSource
@@ -117,16 +119,16 @@ class Rig:
 
     @property
     def mounting(self) -> Mounting:
-        """How the arm holds the sensor."""
+        """Mounting of the sensor on the arm."""
         return self.placed.mounting
 
     @property
     def frame_timeout_s(self) -> float:
-        """Longest wait in s for a frame of an arm that stands still."""
+        """Longest wait in s for a frame while the arm stands still."""
         return TWIN_FRAME_S if self.knows_truth else FRAME_S
 
     def await_frame(self) -> Frame:
-        """Wait for the first frame, as long as a camera of this kind may need for it.
+        """Wait for the first frame, at most as long as a camera of this kind may need.
 
         Raises
         ------
@@ -165,7 +167,7 @@ def build_rig(
     plain_light: bool = False,
     at_once: bool = False,
 ) -> Rig:
-    """A rig from what a user writes.
+    """Build a rig from the user's options.
 
     Parameters
     ----------
@@ -174,14 +176,14 @@ def build_rig(
     arm : str
         As for ``open_arm``.
     form : Form, optional
-        Of the frames; that of the sensor's recordings where it has one.
+        Form of the frames. By default it is the form of the sensor's recordings, or raw if the sensor has none.
     limits : str, optional
-        Name or file; that of the arm's kind by default.
+        Name or file of the safety limits. By default they are the limits of this kind of arm.
     plain_light : bool
-        Draw the twin's frames with the direct light of the lamps alone. No frame is path-traced at the start to add the indirect light.
+        Draw the twin's frames with the lamps' direct light only. Otherwise a frame is path-traced at the start to add the indirect light.
     at_once : bool
-        For callers that wait for a frame at each stop: a simulated arm in front of the twin's camera moves in no time, and a frame is drawn
-        only while a reader waits for it.
+        For callers that wait for a frame at each stop. A simulated arm in front of the twin's camera then moves instantly, and the twin
+        draws a frame only while a reader waits for it.
     """
     form = form or (Form.RECORDING if sensor.recording else Form.RAW)
     placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
@@ -201,12 +203,15 @@ def build_rig(
 
 
 def twin_camera(sensor: SensorSpec, placed: PlacedObject, pose: PoseSource, form: Form, *, fps: float, plain_light: bool) -> TwinCamera:
-    """The twin as a camera on an arm whose pose comes from elsewhere. It waits for an arm that is lost."""
+    """The twin as a camera on an arm that another process runs. If the connection to the arm is lost, the camera waits for it."""
     return TwinCamera(sensor, placed, pose, form, fps=fps, preview=drawn(sensor, form, plain_light), waits_for_arm=True)
 
 
 def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
-    """The preview of a form's window. Its shading comes from a path-traced frame at rest, which is kept between runs."""
+    """The preview of the window that a form needs. Its shading comes from a path-traced no-contact frame, which is kept between runs.
+
+    With ``plain_light`` the preview has no such shading.
+    """
     preview = preview_of(sensor, form)
     if plain_light:
         return preview
@@ -225,7 +230,7 @@ def servo_loop(
     settings: LoopSettings,
     on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None,
 ) -> ServoLoop:
-    """The loop on a connected rig. A ``SafeArm`` is told what the sensor feels, and retreats as its limits allow."""
+    """The servo loop of a connected rig. A ``SafeArm`` gets the estimated contact, and retreats as far as its limits allow."""
     loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, on_step=on_step)
     loop.way = lambda start, clear: way_around(rig.placed, start, clear)
     if isinstance(rig.arm, SafeArm):
@@ -237,16 +242,17 @@ def servo_loop(
 
 
 def _retreat(arm: SafeArm, away: np.ndarray) -> None:
-    """Withdraw an arm in a direction (3,) of the base frame; ``DeviceError`` if its limits allow no way back."""
+    """Withdraw an arm in a direction (3,) of the base frame; ``DeviceError`` if the limits do not allow it."""
     arm.normal = away
     if arm.retreat() is None:
         raise DeviceError(f"the limits allow no way back: {arm.decisions[-1].decision.reason}; free the sensor by hand")
 
 
 def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[int, float]:
-    """The steps that ``rounds`` around the object take, and the way along its outline in mm.
+    """The number of steps for ``rounds`` around the object, and the distance along its outline in mm.
 
-    A tool that stands off the surface of a closed outline goes farther than the outline is long; the steps count this.
+    The tool stands off the surface, so its path around a closed outline is longer than the outline. The number of steps takes this into
+    account.
     """
     outline = placed.outline()
     length_mm = float(np.linalg.norm(np.diff(outline, axis=0), axis=1).sum())

@@ -1,4 +1,4 @@
-"""Where tool, sensor and object are: poses of the arm as matrices, and what a sensor at a pose truly touches."""
+"""Poses of tool, sensor and object as matrices, and the true contact of a sensor at a pose of the arm."""
 
 from dataclasses import fields
 
@@ -20,14 +20,14 @@ def matrix_of(pose: np.ndarray) -> np.ndarray:
 
 
 def pose_of(T: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """The arm's pose (6,) of ``T_base_tool`` (4, 4), its turn about z within half a turn of that of ``near`` (6,)."""
+    """The arm's pose (6,) of ``T_base_tool`` (4, 4). Its turn about z differs from that of ``near`` (6,) by at most half a turn."""
     angles = Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
     angles[2] += 360.0 * np.round((near[5] - angles[2]) / 360.0)
     return np.concatenate([T[:3, 3], angles])
 
 
 def moved(pose: np.ndarray, step_mm: np.ndarray) -> np.ndarray:
-    """The pose (6,) shifted by a step (3,) of the tool's frame."""
+    """The pose (6,) shifted by a step (3,) that is given in the tool's frame."""
     out = np.array(pose, float)
     out[:3] += matrix_of(pose)[:3, :3] @ np.asarray(step_mm, float)
     return out
@@ -59,11 +59,11 @@ class PlacedObject:
         self._surface = Surface(spec)
 
     def seen_from(self, pose: np.ndarray) -> np.ndarray:
-        """``T_sensor_object`` (4, 4) with the arm at a pose (6,)."""
+        """``T_sensor_object`` (4, 4) if the arm is at a pose (6,)."""
         return np.linalg.inv(matrix_of(pose) @ self._T_tool_sensor) @ self.T_base_object
 
     def start_pose(self, indent_mm: float) -> np.ndarray:
-        """The arm's pose (6,) with the sensor normal to the object at the object's origin, ``indent_mm`` deep."""
+        """The arm's pose (6,) at which the sensor stands normal to the object at its origin, with the indentation ``indent_mm``."""
         x, y, z = self.mounting.across, self.mounting.axis, self.mounting.out_of_plane
         T = np.eye(4)  # the tool's across, axis and plane's normal lie along the object's x, z and -y
         T[:3, :3] = self.T_base_object[:3, [0, 2, 1]] * [1, 1, -1] @ np.stack([x, y, z])
@@ -73,12 +73,12 @@ class PlacedObject:
         return pose_of(T, np.zeros(6))
 
     def touch(self, pose: np.ndarray) -> Touch:
-        """What the sensor truly touches with the arm at a pose (6,): a ``Touch`` of this one pose, without the axis of poses."""
+        """The true contact of the sensor if the arm is at a pose (6,), as a ``Touch`` whose arrays have no axis of poses."""
         found = self._surface.touched(self.mounting, self.seen_from(pose)[None])
         return Touch(*(getattr(found, field.name)[0] for field in fields(Touch)))
 
     def distance_mm(self, place_mm: np.ndarray) -> float:
-        """Distance of a place (3,) of the base frame from the surface, in the section through the object's origin; negative inside."""
+        """Distance of a point (3,) of the base frame from the surface, in the section through the object's origin; negative inside."""
         local = (place_mm - self.T_base_object[:3, 3]) @ self.T_base_object[:3, :3] * [1, 0, 1]
         return float(self._surface.field.distance(local[None])[0]) - self._surface.raised_mm
 

@@ -1,4 +1,4 @@
-"""Surface following of several objects with several models, compared."""
+"""Compares models by following the surfaces of several objects."""
 
 import csv
 import re
@@ -16,7 +16,7 @@ from twin.progress import Progress, silent
 from twin.report.charts import save_figure
 from twin.store import text_file, writes
 
-# the measures that are printed, with their headings
+# Measures that are printed, with their headings.
 SHOWN = {
     "smoothness": "S",
     "local_smoothness": "local S",
@@ -30,18 +30,18 @@ SHOWN = {
 
 @dataclass(frozen=True)
 class ServoStudyPlan:
-    """What is compared.
+    """Models, objects and settings of the comparison.
 
     Attributes
     ----------
     models : mapping of str to SensorModel
-        By the name that the results give them.
+        The keys are the models' names in the results.
     objects : tuple of ObjectSpec
     servo : ServoSpec
     steps : int or None
-        For each object; None: once around it.
+        Number of steps for each object. None: once around the object.
     seed : int
-        Of the twin's noise.
+        Seed of the twin's noise.
     plain_light : bool
         See ``build_rig``.
     """
@@ -56,12 +56,12 @@ class ServoStudyPlan:
 
 @dataclass(frozen=True)
 class ServoStudy:
-    """What came of it.
+    """The result of ``study_servo``.
 
     Attributes
     ----------
     found : dict
-        By model and object: a run, or why it did not make a single step.
+        For each model and object: the run, or the reason why it did not make a single step.
     written : list of Path
     """
 
@@ -78,7 +78,7 @@ class ServoStudy:
         ]
 
     def lines(self) -> list[str]:
-        """The comparison as a table for people."""
+        """The comparison as a table in plain text."""
         wide = max((len(model) for model, _ in self.found), default=0)
         lines = [f"{'model':{wide}} {'object':10}" + "".join(f"{head:>11}" for head in SHOWN.values())]
         for (model, name), run in self.found.items():
@@ -88,10 +88,10 @@ class ServoStudy:
 
 @writes("study.csv", "study.png")
 def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent) -> ServoStudy:
-    """Follow each object with each model, in the twin; each run and the comparison are written to ``out``.
+    """Follow each object with each model in the twin, and write each run and the comparison to ``out``.
 
-    Writes a folder for each model and object as ``follow`` writes it, ``study.csv`` and ``study.png``. A run that can't make a single
-    step is a result of the study, too.
+    It writes a folder for each model and object as ``follow`` does, ``study.csv`` and ``study.png``. A run that can't make a single step
+    is also a result of the study.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
 
 
 def folder_name(label: str) -> str:
-    """A model's name as that of a folder: one part of a path, and never the folder above."""
+    """A model's name as a valid name of a folder: one part of a path, and never the parent folder."""
     return re.sub(r"^\.+|[^\w.-]+", "_", label) or "_"
 
 

@@ -1,4 +1,4 @@
-"""What a servo loop takes (estimators, guards, settings), and the record of each of its decisions."""
+"""Settings and guards of a servo loop, and the record of each of its steps."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -9,12 +9,12 @@ import numpy as np
 from hardware.arms.arm import ArmState
 
 Guard = Callable[[ArmState, np.ndarray], np.ndarray]
-"""From the arm's state and a target (6,) to the pose (6,) that may be sent. It raises an error to refuse the move."""
+"""A function from the arm's state and a target (6,) to the pose (6,) that may be sent. It raises an error to refuse a move."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """One decision.
+    """The record of one step.
 
     Attributes
     ----------
@@ -22,13 +22,13 @@ class StepRecord:
     time_s : float
         ``time.monotonic()`` when the command was given.
     sequence : int
-        Sequence number of the frame behind the decision.
+        Sequence number of the frame on which the step was decided.
     frame_s : float
-        Time of its exposure.
+        Time of the frame's exposure.
     age_s : float
-        Its age when the loop received it.
+        Age of the frame when the loop received it.
     fresh : bool
-        Whether the frame was not used before.
+        Whether no earlier step used the frame.
     latency_s : float
         Time from the exposure to the command.
     compute_s : float
@@ -36,9 +36,9 @@ class StepRecord:
     names : tuple of str
         Names of the estimated labels.
     value, low, high : (K,) float
-        The estimate and its interval; NaN if it is not valid.
+        The estimate and the limits of its interval; NaN if the estimate is not valid.
     depth_mm, angle_deg : float
-        Depth of the tool and its angle from the surface's normal, by the estimate.
+        Estimated depth of the tool, and estimated angle between the tool and the surface's normal.
     pose : (6,) float
         The pose from which the step was decided: where the arm is, or the end of its present move.
     exposed_pose : (6,) float
@@ -68,22 +68,23 @@ class StepRecord:
     sent: np.ndarray
 
     def plain(self) -> dict[str, Any]:
-        """The record as a session keeps it."""
+        """The record as a dict, as a session stores it."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How the loop runs.
+    """Settings of the loop.
 
     Attributes
     ----------
     steps : int
     blocking : bool
-        Wait for each move and take a frame that was exposed after it. Else decide every ``period_s`` on the newest frame.
+        If true, the loop waits for the end of each move and takes a frame that was exposed after it. Otherwise it decides on the newest
+        frame every ``period_s``.
     period_s : float
     frame_timeout_s : float
-        Longest wait for a frame, with ``blocking`` and at the start.
+        Longest wait for a frame. It applies with ``blocking``, and to the first frame in any case.
     give_up_s : float
         The loop ends with an error after it has held still for this time.
     """

@@ -1,7 +1,7 @@
-"""Watching an arm while a program works with it: where it was, and that it still answers.
+"""Watches an arm while a program works with it: records its poses, and stops it if it no longer answers.
 
-A thread asks the arm for its state many times a second. When the arm answers no more, the thread stops it and says so at once, whatever the
-program waits for at that moment. It also says what the program waits for if that takes long.
+A thread asks the arm for its state many times a second. If the arm no longer answers, the thread stops it and reports this at once, even
+while the program waits for something else. The thread also reports what the program waits for if the wait takes long.
 """
 
 import logging
@@ -19,26 +19,26 @@ from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from twin.types import Frame
 
 LOG = logging.getLogger(__name__)
-# States of the arm that are kept: 256 states of 20 ms are 5 s, ten times the oldest frame that a servo accepts.
+# Number of the arm's states that are kept. At 20 ms each they cover 5 s, ten times the age of the oldest frame that a servo accepts.
 KEPT_STATES = 256
 # Interval in s at which the thread asks the arm for its state.
 WATCH_S = 0.02
-# The thread leaves a slow connection free for this number of times as long as a state takes.
+# Pause between two requests, as a multiple of the time that a request takes. So other commands get through on a slow connection.
 IDLE_SHARE = 2.0
-# Interval in s at which a wait for a frame looks whether the arm still answers.
+# Interval in s at which a wait for a frame checks whether the arm still answers.
 LOOK_S = 1.0
-# First time in s after which the thread says what the program waits for. Each further time is twice as long.
+# Waiting time in s after which the thread first reports what the program waits for. It reports again whenever that time has doubled.
 WORD_S = 1.5
 
 
 class ArmWatch:
-    """Keeps the newest states of an arm, and stops the arm when it answers no more.
+    """Keeps the newest states of an arm, and stops the arm if it no longer answers.
 
     Parameters
     ----------
     arm : Arm
     tell : callable
-        Called with each line that a person should see at once. By default the line is logged, which writes it to stderr.
+        Called with each message that a person should see at once. By default the message is logged, and so goes to stderr.
     """
 
     def __init__(self, arm: Arm, *, tell: Callable[[str], None] = LOG.warning) -> None:
@@ -48,11 +48,11 @@ class ArmWatch:
         self._doing: tuple[str, float] | None = None  # what the program waits for, and since when
 
     def add(self, state: ArmState) -> None:
-        """Remember a state."""
+        """Keep a state."""
         self._states.append(state)
 
     def pose_at(self, time_s: float) -> np.ndarray:
-        """Pose (6,) of the arm at a ``time.monotonic()``, interpolated between known states. Its turn about z is unwrapped."""
+        """Pose (6,) of the arm at a ``time.monotonic()``, interpolated between the kept states. Its turn about z is unwrapped."""
         states = sorted(self._states.copy(), key=lambda state: state.time_s)
         times = np.array([state.time_s for state in states])
         poses = np.array([state.pose for state in states])
@@ -60,7 +60,7 @@ class ArmWatch:
         return np.array([np.interp(time_s, times, column) for column in poses.T])
 
     def require(self) -> None:
-        """Raise ``DeviceError`` if the arm has been lost. A program that waits for something else calls this from time to time."""
+        """Raise ``DeviceError`` if the arm no longer answers. A program that waits for something else calls this from time to time."""
         if self._lost:
             raise DeviceError(self._lost)
 
@@ -78,7 +78,7 @@ class ArmWatch:
 
     @contextmanager
     def alert(self) -> Iterator[None]:
-        """Context of the work. After an error in it the arm is looked at once more, so that a lost arm is told first."""
+        """Context of the work with the arm. After an error the arm's state is read once more, so that a lost arm is reported first."""
         try:
             yield
         except BaseException:
@@ -87,7 +87,7 @@ class ArmWatch:
 
     @contextmanager
     def doing(self, what: str) -> Iterator[None]:
-        """Context of something that may take long. What it is will be said while it lasts."""
+        """Context of an action that may take long. The thread reports the action while it lasts."""
         around, self._doing = self._doing, (what, time.monotonic())
         try:
             yield
@@ -95,7 +95,7 @@ class ArmWatch:
             self._doing = around
 
     def frame_after(self, source: FrameSource, time_s: float, *, timeout_s: float) -> Frame:
-        """The first frame of a camera that was exposed after a time; ``TimeoutError``. The wait ends when the arm is lost."""
+        """The first frame that a camera exposed after ``time_s``; ``TimeoutError`` if none comes. The wait also ends if the arm is lost."""
         deadline = time.monotonic() + timeout_s
         with self.doing("waiting for a frame"):
             while True:
@@ -108,7 +108,7 @@ class ArmWatch:
                         raise TimeoutError(f"{source.name}: no frame exposed since then within {timeout_s:g} s") from error
 
     def _watch(self, end: threading.Event) -> None:
-        said: tuple[tuple[str, float], float] | None = None  # what was said last, and when to say it again
+        said: tuple[tuple[str, float], float] | None = None  # the newest report, and when to repeat it
         pause_s = WATCH_S
         while not end.wait(pause_s):
             begun_s = time.monotonic()
@@ -125,7 +125,7 @@ class ArmWatch:
                 said = doing, time.monotonic() + waited_s
 
     def _look(self) -> None:
-        """Ask the arm for its state; if it does not answer, stop it and say so, once."""
+        """Ask the arm for its state. If it does not answer, stop it and report this, once only."""
         with self._looking:
             try:
                 if not self._lost:
@@ -136,7 +136,7 @@ class ArmWatch:
                 pass
 
     def _lose(self, error: DeviceError) -> None:
-        """Stop an arm that answers no more. Say it before and after, as a stop may take its time."""
+        """Stop an arm that no longer answers. It is reported before and after the stop, because a stop may take some time."""
         self._lost = str(error)
         self._tell(f"{error}. Stopping the arm: press its emergency stop if it moves")
         try:

@@ -1,4 +1,4 @@
-"""From what a user writes after ``--camera`` to a frame source."""
+"""Makes a frame source from the text that a user gives with ``--camera``."""
 
 import os
 
@@ -23,7 +23,7 @@ def open_camera(
     settings: UvcSettings | None = None,
     twin: FrameSource | None = None,
 ) -> FrameSource:
-    """A frame source, not yet connected.
+    """Make a frame source. It is not connected yet.
 
     Parameters
     ----------
@@ -32,15 +32,16 @@ def open_camera(
         recording, a recorded session or a video.
     spec : SensorSpec, optional
     form : Form, optional
-        Live sources: that of the sensor's recordings, where it has one; else told by the frames.
+        Form of the frames. By default a live source has the form of the sensor's recordings if the sensor has one, otherwise raw. The form
+        of recorded frames is determined from the frames.
     settings : UvcSettings, optional
     twin : FrameSource, optional
-        What ``twin`` stands for.
+        The source that the text ``twin`` selects.
 
     Raises
     ------
     DeviceError, FrameError
-        There is no such thing.
+        There is no such camera, recording or file.
     """
     live_form = form or (Form.RECORDING if spec is not None and spec.recording is not None else Form.RAW)
     if spec is not None:

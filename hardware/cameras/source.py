@@ -1,4 +1,4 @@
-"""What a loop knows of a camera: a source of frames. Times are ``time.monotonic()`` seconds."""
+"""The protocol of all cameras: ``FrameSource``, a source of frames. Times are ``time.monotonic()`` seconds."""
 
 from types import TracebackType
 from typing import Protocol
@@ -10,10 +10,10 @@ from twin.types import Form, Frame
 class FrameSource(Protocol):
     """A live camera, a stream, a recording or the twin.
 
-    A background reader keeps the newest frame. ``Frame.time_s`` is when the frame was exposed as well as can be known (the
-    kernel's buffer time, else the arrival), ``Frame.sequence`` counts frames of the device, lost ones included where
-    the device tells. A live source whose pictures are frozen, black or late, or whose reader has ended after too many failed
-    reads, raises ``DeviceError`` from every read.
+    A background reader keeps the newest frame. ``Frame.time_s`` is the time of the exposure as far as it is known: the kernel's buffer
+    time, or the time of arrival. ``Frame.sequence`` counts the device's frames; it includes lost frames if the device reports them. Every
+    read raises ``DeviceError`` if the pictures of a live source are frozen, black or late, or if its reader has ended after too many
+    failed reads.
     """
 
     name: str
@@ -30,7 +30,7 @@ class FrameSource(Protocol):
 
     @property
     def dropped(self) -> int:
-        """Frames that arrived, or that the device lost, and nobody read."""
+        """Number of frames that nobody read, including those that the device lost."""
 
     @property
     def fault(self) -> str:
@@ -45,7 +45,7 @@ class FrameSource(Protocol):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None: ...
 
     def read(self, *, timeout_s: float = 1.0) -> Frame:
-        """The newest frame that has not been read yet, waiting for one if need be; ``TimeoutError``.
+        """The newest frame that was not read yet. Waits for one if necessary; ``TimeoutError`` if none comes.
 
         Raises
         ------
@@ -54,19 +54,19 @@ class FrameSource(Protocol):
         """
 
     def read_latest(self, *, max_age_s: float = 0.5) -> Frame:
-        """The newest frame, read before or not; ``StaleDataError`` if it is older than ``max_age_s``."""
+        """The newest frame, even if it was read before; ``StaleDataError`` if it is older than ``max_age_s``."""
 
     def read_after(self, time_s: float, *, timeout_s: float = 2.0) -> Frame:
-        """The first frame exposed after ``time_s``; ``TimeoutError``."""
+        """The first frame that was exposed after ``time_s``; ``TimeoutError`` if none comes."""
 
 
 def await_frame(source: FrameSource, *, timeout_s: float | None = None, after_s: float | None = None) -> Frame:
-    """The next frame, or the first one exposed after a time; by default as late as a first frame may come.
+    """The next frame, or the first one that was exposed after ``after_s``. By default the wait lasts at most ``first_frame_s``.
 
     Raises
     ------
     DeviceError
-        None comes.
+        No frame comes.
     """
     timeout_s = source.first_frame_s if timeout_s is None else timeout_s
     try:

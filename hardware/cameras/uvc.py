@@ -12,11 +12,11 @@ from scenes.sensor import SensorSpec
 from twin.frames.images import quiet
 from twin.types import Form
 
-# Value of Video4Linux's setting for the exposure mode: 1 is manual, 3 is automatic.
+# Value of Video4Linux's exposure mode for manual exposure (3 is automatic).
 MANUAL_EXPOSURE = 1
-# A buffer time that differs from now by more than this (s) is not on the monotonic clock and is not used.
+# A buffer time that differs from the present time by more than this (s) does not come from the monotonic clock and is not used.
 CLOCK_SLACK_S = 5.0
-# Pictures that the driver may queue. With 1, the next picture is the newest.
+# Number of pictures that the driver may queue. With 1, the next picture is always the newest.
 BUFFERS = 1
 
 
@@ -41,12 +41,12 @@ class UvcSettings:
 
 
 class UvcCamera(LiveSource):
-    """A camera of this machine.
+    """A USB camera of this machine.
 
     Parameters
     ----------
     node : int or str
-        Number, or device node.
+        Number or device node of the camera.
     spec : SensorSpec, optional
     form : Form
     settings : UvcSettings
@@ -58,7 +58,7 @@ class UvcCamera(LiveSource):
         size = {"width_px": spec.camera.width_px, "height_px": spec.camera.height_px} if spec else {}
         self.settings = settings or UvcSettings(**size)
         self.fps = self.settings.fps
-        self.report: list[tuple[str, float, float]] = []  # what was asked, and what the camera says it does
+        self.report: list[tuple[str, float, float]] = []  # name, requested value and value read back of each setting
         self._device: cv2.VideoCapture | None = None
 
     def _open(self) -> None:
@@ -70,7 +70,7 @@ class UvcCamera(LiveSource):
             )
         self.report = apply_settings(device, self.settings)
         told = next(told for name, _, told in self.report if name == "fps")
-        self.fps = told if told > 0 else self.settings.fps  # a camera may be slower than it was asked to be
+        self.fps = told if told > 0 else self.settings.fps  # a camera may be slower than requested
         self._device = device
 
     def _close(self) -> None:
@@ -99,13 +99,13 @@ class UvcCamera(LiveSource):
 
 
 def exposed_s(position_ms: float) -> float:
-    """Time of exposure in ``time.monotonic()`` seconds: the kernel's buffer time (ms) if it is on that clock, else the present time."""
+    """Time of exposure in ``time.monotonic()`` seconds: the kernel's buffer time (ms) if it is on that clock, or the present time."""
     now_s = time.monotonic()
     return position_ms / 1e3 if 0 <= now_s - position_ms / 1e3 < CLOCK_SLACK_S else now_s
 
 
 def apply_settings(device: cv2.VideoCapture, settings: UvcSettings) -> list[tuple[str, float, float]]:
-    """Set the settings in the order that cameras need. Returns the name, the requested value and the value read back of each."""
+    """Apply the settings in the order that cameras need. Returns the name, the requested value and the value read back of each."""
     asked = [
         ("fourcc", cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")),
         ("width", cv2.CAP_PROP_FRAME_WIDTH, settings.width_px),

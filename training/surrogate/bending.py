@@ -1,12 +1,12 @@
-"""What large deformations add to the linear skin's answer: a small network inside the contact's solution.
+"""Correction of the linear skin for large deformations: a small network that is evaluated while a contact is solved.
 
-The body is elastic, so where its skin stands depends on the forces at its nodes alone, however they came about. Of forces f,
+The body is elastic. So the displacements u of the skin's nodes depend on the present nodal forces f alone, not on their history:
 
-    u = C f + modes (straight x + g(x) net(x)),   x = R f / scale,   g = tanh(mean(x^2) / AMPLE),
+    u = C f + modes (straight x + g(x) net(x)),   x = R f / scale,   g = tanh(mean(x^2) / AMPLE)
 
-where C f is the linear skin, R its answer in the modes of the pins, and g a gate that goes to zero with the forces: the network adds what
-is of higher order. ``straight`` is what the linear skin, whose softness is that of all contacts, lacks in light ones. So friction holds and
-lets go where the true skin's forces make it.
+C f is the linear skin's displacement, and R f its displacement in the modes of the pins. The gate g goes to zero with the forces, so the
+network adds only terms of higher order. The scale of C is fitted to all contacts; the matrix ``straight`` corrects C for light contacts.
+Because the correction acts inside the solution, nodes stick and slip at the forces of the true skin.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from twin.store import Layers
 from twin.types import FloatArray
 
 AMPLE = 0.1
-"""Mean square of the inputs at which the network has three quarters of its say."""
+"""Mean square of the scaled inputs at which the gate of the network is three quarters open."""
 TAKEN = 0.5
-"""Share of a new answer that is taken at once: a skin that bends more bears less, and with the whole answer deep contacts swing."""
+"""Relaxation factor of an update of the bending. With 1, solutions of deep contacts oscillate: a skin that bends more bears less force."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,9 @@ class Bending:
     Attributes
     ----------
     scale : (K,) float32
-        Of the inputs.
+        Scale of each input.
     straight : (O, K) float32
+        Linear part of the correction.
     layers : tuple of ((o, i), (o,)) float32
         Three layers: weights and offsets.
     modes : (O, M, 3) float32
@@ -44,7 +45,7 @@ class Bending:
     modes: FloatArray
 
     def of(self, linear: FloatArray) -> FloatArray:
-        """What the skin moves more than the linear one, (S, M, 3) mm, where that moves the pins by ``linear`` (S, K) in their modes."""
+        """Displacements (S, M, 3) mm to add to the linear skin's. ``linear`` (S, K) is the linear skin's answer in the pins' modes."""
         x = linear / self.scale
         out, gates = x, ample(x)
         for number, (weights, offset) in enumerate(self.layers):
@@ -54,7 +55,7 @@ class Bending:
         return np.tensordot(x @ self.straight.T + gates[:, None] * out, self.modes, axes=1)
 
     def kernel(self, read: FloatArray) -> tuple[FloatArray, ...]:
-        """The arrays that ``bend`` takes, laid out for it; ``read`` (K, 3 M) is the linear skin's answer in the modes of the pins."""
+        """The arrays that ``bend`` takes, in its memory layout; ``read`` (K, 3 M) is the linear skin's answer in the modes of the pins."""
         seen = (read / self.scale[:, None]).T.reshape(-1, 3, len(read))
         (first, a), (second, b), (third, c) = self.layers
         given = seen, first.T, a, second.T, b, third.T, c, self.straight.T, self.modes.transpose(0, 2, 1)
@@ -62,12 +63,12 @@ class Bending:
 
 
 def ample(x: FloatArray) -> FloatArray:
-    """How much the network has to say, (S,), of inputs (S, K)."""
+    """The gate of the network, (S,), from 0 to 1, for scaled inputs (S, K)."""
     return np.tanh((x**2).mean(axis=1) / AMPLE)
 
 
 def unbent(nodes: int) -> tuple[FloatArray, ...]:
-    """What ``bend`` takes for a skin that is linear."""
+    """The arrays that ``bend`` takes for a linear skin: it then adds nothing."""
     shapes = (nodes, 3, 1), (1, 1), (1,), (1, 1), (1,), (1, 0), (0,), (1, 0), (0, 3, nodes)
     return tuple(np.zeros(shape, np.float32) for shape in shapes)
 
@@ -87,9 +88,9 @@ def bend(
     straight: FloatArray,
     modes: FloatArray,
 ) -> float:
-    """Bring ``bent`` (3, M) float32 nearer to what forces (M, 3) bend, and move the nodes ``moved`` (M, 3) with it.
+    """Update the bending ``bent`` (3, M) float32 toward that of the forces (M, 3), and the displacements ``moved`` (M, 3) by the same.
 
-    Gives the largest change along an axis, mm.
+    Returns the largest change along an axis, mm.
     """
     count, width = len(c), len(a)
     if count == 0:

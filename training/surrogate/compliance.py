@@ -1,4 +1,4 @@
-"""The skin at small strain: how its outside and its pins answer to forces on its outside, by the solver's own elements at rest."""
+"""Linear compliance of the skin: displacements of its outside and its pins for small forces, from the solver's own elements at rest."""
 
 from dataclasses import dataclass
 
@@ -14,11 +14,11 @@ from twin.mechanics.material import law_coefficients
 from twin.types import FloatArray
 
 NODE_RINGS = 9
-"""Rings of nodes around the apex: 271 nodes, 2.2 mm apart on a dome of 20 mm. With 12 rings the linear skin is no better."""
+"""Number of rings of nodes around the apex: 271 nodes, 2.2 mm apart on a dome of 20 mm. With 12 rings the linear skin is no better."""
 POLAR_DEG = 58.0
-"""Angle of the outermost ring from the apex: contacts of the domain end before it."""
+"""Angle of the outermost ring from the apex. All contacts of the domain lie inside it."""
 PROBE_MM = 1e-4
-"""Displacement by which the pins' motion is differentiated."""
+"""Step, in displacement of the controls, of the finite difference that gives the pins' motion."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Compliance:
 
 
 def compliance_of(sensor: SensorSpec, *, resolution: Resolution | None = None) -> Compliance:
-    """Small-strain answers of a sensor's body at rest; some seconds."""
+    """The linear compliance of a sensor's body at rest. It takes some seconds."""
     solid = build_solid(sensor.geometry, resolution=resolution)
     free = ~solid.fixed
     matrix = _stiffness(sensor, solid)

@@ -1,13 +1,14 @@
-"""Contact and friction on the skin: exact Coulomb contact at some hundred nodes, with all that friction remembers.
+"""Contact and friction on the skin: exact Coulomb contact at a few hundred nodes, with friction's memory.
 
-The skin's answer to forces f at its nodes is u = C f (see ``compliance``) and what ``bending`` adds. At every pose of the object the
-forces are sought for which each node either is clear of the object, or presses without entering it and sticks to its anchor, or slides at
-Coulomb's bound. Node after node is put right, the others held, until nothing changes (projected Gauss-Seidel: Jourdan, Alart & Jean 1998),
-beginning with the forces of the last pose; then what they bend is looked up anew. Anchors are places of the object: where a node touched it
-first, or where it stopped sliding. So what is remembered neither drifts nor fades, and ends with the contact.
+Forces f at the nodes displace the skin by u = C f (see ``compliance``) plus the correction of ``bending``. At every pose of the object the
+solver looks for forces with which each node is in one of three states: it is clear of the object; it presses and sticks to its anchor; or
+it presses and slides at Coulomb's bound. It starts from the forces of the last pose, corrects one node at a time while it keeps the others
+fixed, and repeats this until no force changes (projected Gauss-Seidel: Jourdan, Alart & Jean 1998). Then it evaluates the bending anew.
+An anchor is a point of the object: where the node first touched it, or where the node stopped sliding. So the memory neither drifts nor
+fades, and it ends with the contact.
 
-A motion is gone in short steps: what friction remembers, and the normals of a sharp edge, depend on the way. In each the arm turns as it
-gives way to the force so far, and at the end until it stands.
+A motion is solved in short load steps, because friction's memory and the normals at a sharp edge depend on the path. In each step the arm
+turns under the force so far; at the end of the motion this is repeated until the arm is at rest.
 """
 
 from collections.abc import Sequence
@@ -24,34 +25,34 @@ from twin.rig.contact import ArmTurning
 from twin.types import BoolArray, FloatArray, IntArray
 
 STEP_MM = 0.4
-"""Largest motion across the dome in one solution: with longer ones the force on an edge is up to a sixth off."""
+"""Largest motion across the dome in one load step. With longer steps the error of the force on an edge is up to a sixth."""
 BENT_MM = 0.02
-"""A last solution ends where what its forces bend changes by less: a tenth of a pixel, and a hundredth of a usual press."""
+"""Convergence threshold of the bending in a motion's last load step: a tenth of a pixel, and a hundredth of a usual indentation."""
 REACH_MM = 0.8
-"""Nodes farther than this from the object are left out of a solution."""
+"""Largest distance from the object at which a node takes part in a solution."""
 SWEEPS = (12, 6, 6)
-"""Most sweeps over the nodes each time that the distances, and what the forces bend, are looked up anew; the first is of
-every step, the others of a motion's last."""
+"""Largest number of sweeps over the nodes after each evaluation of the distances and the bending. Every load step has the first
+evaluation; only the last load step of a motion has the others."""
 TOLERANCE_N = 5e-4
-"""A solution ends when no node's force changes by more in a sweep: a hundredth of a usual contact's force at a node."""
+"""Convergence threshold: largest change of a node's force in a sweep, a hundredth of the force at a node in a usual contact."""
 YIELDING_MM_PER_N = 2e-3
-"""Each node gives way by this beside the skin: it makes nodes on sharp edges well-behaved and costs 0.5 % of the stiffness."""
+"""Additional normal compliance of each node. It makes nodes on sharp edges well-behaved and costs 0.5 % of the stiffness."""
 SLIDES = 0.999
-"""A node slides when it bears this share of Coulomb's bound."""
+"""Share of Coulomb's bound from which a node counts as sliding."""
 STILL_N = 1e-7
-"""Changes of a node's force that count as none."""
+"""Smallest force, and smallest change of a force, that counts as more than zero."""
 ROWS_OF_A_THREAD = 8
-"""Fewer contacts than this are not worth a thread."""
+"""Smallest number of contacts for each thread: with fewer a thread is not worth its cost."""
 MOST_THREADS = 2
-"""More threads than this gain little beside what runs on one core."""
+"""Largest number of threads. More gain little, because the rest of the program runs on one core."""
 NO_TURN = 1e-9
-"""Sine of an angle that is none."""
+"""Sine up to which an angle counts as zero."""
 SIZES = 4
-"""Most numbers that tell a solid's size."""
+"""Largest number of parameters that give a solid's size."""
 SETTLED_MM = 0.02
-"""Most that the dome still has to move where an arm has given way."""
+"""Motion across the dome up to which a compliant arm counts as at rest."""
 MOST_SETTLING = 2
-"""Solutions at the end of a motion until an arm that gives way stands."""
+"""Largest number of extra load steps at the end of a motion, until a compliant arm is at rest."""
 
 
 @dataclass
@@ -61,20 +62,21 @@ class LinearContacts:
     Attributes
     ----------
     node_mm : (M, 3) float
-        At rest.
+        Nodes at rest.
     answer : (M, 3, 3, M) float32
         Displacement (third) of node j (last) for a force along an axis (second) at node i (first), mm/N.
     bending : tuple of float32 arrays
-        Of the network that tells how the skin bends (see ``Bending.kernel``).
+        Arrays of the network that corrects the linear skin (see ``Bending.kernel``).
     kind : (B,) int
-        Of the solids (see ``twin.objects.kernels.solid``).
+        Kinds of the solids (see ``twin.objects.kernels.solid``).
     sizes : (B, SIZES) float
+        Parameters that give the solids' sizes.
     friction, compliance_mm_per_n : (B,) float
-        Coulomb's coefficient; how far object and holder give way along z.
+        Coulomb's coefficient; compliance of object and holder along z.
     turning : (B, 10) float
-        How arms turn (see ``ArmTurning``): across, axis, tool point, and rad/N.
+        Compliance of the arms (see ``ArmTurning``): across, axis, tool point, and rad/N.
     taken : (B, 4, 4) float
-        Where the objects are: their commanded poses, turned as the arms give way.
+        Actual poses of the objects: the commanded poses, turned by the compliance of the arms.
     force_n, moved_mm : (B, M, 3) float
         Forces on the skin and displacements, sensor frame.
     anchor_mm, seen_mm : (B, M, 3) float
@@ -143,13 +145,13 @@ class LinearContacts:
 
     @property
     def radius_mm(self) -> float:
-        """Of the dome."""
+        """Radius of the dome."""
         return float(np.linalg.norm(self.node_mm[0]))
 
     def begin(
         self, row: int, thing: Solid, friction: float, *, compliance_mm_per_n: float = 0.0, turning: ArmTurning | None = None
     ) -> None:
-        """Touch another object, from rest."""
+        """Set the object, friction and compliance of one sensor, and set it to rest."""
         sizes = thing.sizes
         self.kind[row], self.sizes[row, : len(sizes)] = thing.kind, sizes
         self.friction[row], self.compliance_mm_per_n[row] = friction, compliance_mm_per_n
@@ -159,13 +161,13 @@ class LinearContacts:
         self.free(row)
 
     def free(self, row: int | Sequence[int] | IntArray) -> None:
-        """Forget contacts."""
+        """Remove the contacts of some rows with their friction memory."""
         for values in (self.force_n, self.moved_mm, self.bent_mm, self.held, self.slides, self.used):
             values[row] = 0
         self.gap_mm[row] = np.inf
 
     def move(self, rows: IntArray, start: FloatArray, stop: FloatArray) -> None:
-        """Command the objects of some rows (R,) from poses ``start`` (R, 4, 4) to ``stop``; each goes straight and turns about one axis."""
+        """Move the objects of some rows (R,) from poses ``start`` (R, 4, 4) to ``stop``: in a straight line, with a turn about one axis."""
         steps = np.maximum(np.ceil(motion_mm(start, stop, self.radius_mm) / STEP_MM), 1).astype(np.int64)
         state = (self.force_n, self.moved_mm, self.bent_mm, self.anchor_mm, self.seen_mm, self.gap_mm, self.held, self.slides, self.used)
         laws = (self.kind, self.sizes, self.friction, self.compliance_mm_per_n, self.turning, self.taken)
@@ -182,15 +184,15 @@ class LinearContacts:
             list(pool.map(follow, [slice(number, None, threads) for number in range(threads)]))
 
     def distances(self, rows: IntArray, T: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """How far objects at ``T`` (R, 4, 4) are from undeformed domes.
+        """Distances of objects at ``T`` (R, 4, 4) from the undeformed domes.
 
         Returns
         -------
         gap_mm : (R, M) float
-            Of the nodes at rest.
+            Distances of the nodes at rest from the object.
         centre : (R, 2) float
-            Distance of the dome's centre, and the cosine of the angle between the apex and the place nearest to the object. They tell the
-            depth exactly, for places between and beyond the nodes too.
+            Distance of the dome's centre from the object, and the cosine of the angle between the apex and the dome's place nearest to the
+            object. They give the depth exactly, also where the deepest place lies between or beyond the nodes.
         """
         gap, centre = np.empty((len(rows), len(self.node_mm))), np.empty((len(rows), 2))
         _distances(rows, np.ascontiguousarray(T), self.node_mm, self.kind, self.sizes, gap, centre)
@@ -198,7 +200,7 @@ class LinearContacts:
 
 
 def motion_mm(start: FloatArray, stop: FloatArray, radius_mm: float) -> FloatArray:
-    """How far objects move at most over a dome, (R,), between poses (R, 4, 4)."""
+    """Upper bound of objects' motion across a dome, (R,) mm, between poses (R, 4, 4)."""
     turn = stop[:, :3, :3] @ start[:, :3, :3].transpose(0, 2, 1)
     cosine = (turn[:, 0, 0] + turn[:, 1, 1] + turn[:, 2, 2] - 1) / 2
     off = stop[:, :3, 3] - (turn @ start[:, :3, 3:])[:, :, 0]
@@ -208,7 +210,7 @@ def motion_mm(start: FloatArray, stop: FloatArray, radius_mm: float) -> FloatArr
 
 @compiled()
 def between(start: FloatArray, stop: FloatArray, steps: int) -> FloatArray:
-    """Poses (steps, 4, 4) after each of some equal steps of a way: the origin goes straight, the object turns about a fixed axis."""
+    """Poses (steps, 4, 4) after each of equal steps of a path: the origin moves in a straight line, the object turns about a fixed axis."""
     T = np.empty((steps, 4, 4))
     for k in range(steps):
         T[k] = stop
@@ -269,7 +271,10 @@ def _follow(
     slides: BoolArray,
     used: FloatArray,
 ) -> None:
-    """Go each row's way (R, 4, 4) in its steps (R,); the arrays of all B rows are those of ``LinearContacts``."""
+    """Solve each row's motion from ``start`` to ``stop`` (R, 4, 4) in its load steps (R,).
+
+    The arrays of all B rows are those of ``LinearContacts``.
+    """
     here = np.empty_like(node)
     shift = np.empty((3, len(node)), np.float32)
     near = np.empty(len(node), np.int64)
@@ -311,7 +316,7 @@ def _follow(
 
 @compiled()
 def _given_way(T: FloatArray, turning: FloatArray, force: FloatArray) -> FloatArray:
-    """See ``ArmTurning``: the object's pose (4, 4) as an arm turns under the skin's forces (M, 3)."""
+    """The object's pose (4, 4) after an arm has turned under the skin's forces (M, 3); see ``ArmTurning``."""
     if turning[9] == 0:
         return T
     angle = 0.0
@@ -339,7 +344,7 @@ def _given_way(T: FloatArray, turning: FloatArray, force: FloatArray) -> FloatAr
 
 @compiled()
 def _motion(start: FloatArray, stop: FloatArray, radius_mm: float) -> float:
-    """See ``motion_mm``, of one pose (4, 4)."""
+    """``motion_mm`` of one pair of poses (4, 4)."""
     trace, off = 0.0, 0.0
     for p in range(3):
         here = stop[p, 3]
@@ -355,7 +360,7 @@ def _motion(start: FloatArray, stop: FloatArray, radius_mm: float) -> float:
 
 @compiled()
 def _seen_from(node: FloatArray, moved: FloatArray, turn: FloatArray, place: FloatArray, here: FloatArray) -> None:
-    """The nodes in the object's frame."""
+    """Write the nodes' positions in the object's frame to ``here`` (M, 3)."""
     for i in range(len(node)):
         x, y, z = node[i, 0] + moved[i, 0] - place[0], node[i, 1] + moved[i, 1] - place[1], node[i, 2] + moved[i, 2] - place[2]
         for p in range(3):
@@ -364,7 +369,7 @@ def _seen_from(node: FloatArray, moved: FloatArray, turn: FloatArray, place: Flo
 
 @compiled()
 def _anchor(here: FloatArray, gap: float, anchor: FloatArray, seen: FloatArray, before: float) -> None:
-    """Anchor a free node where it stands, or where it met the surface on the way."""
+    """Anchor a free node where it is, or where it crossed the object's surface in this step."""
     share = 1.0
     if gap < 0 < before and before < np.inf:
         share = before / (before - gap)
@@ -389,15 +394,16 @@ def _solve(
     compliance: float,
     part: int,
 ) -> None:
-    """Forces (M, 3) and displacements (M, 3) of the near nodes (q,), whose distances and normals are linearised at ``here`` (M, 3).
+    """Solve for the forces (M, 3) of the near nodes (q,) and the displacements (M, 3) of all nodes.
 
-    ``bent`` (3, M) float32 is added to the linear skin's displacements, for which ``shift`` (3, M) float32 is room.
+    Distances and normals are linearised at ``here`` (M, 3). The displacements are the linear skin's plus ``bent`` (3, M) float32;
+    ``shift`` (3, M) float32 is working memory.
     """
     count = len(near)
     n, lag = np.empty((count, 3)), np.empty((count, 3))
     across, along = np.empty(count), np.empty(count)
     c, moving = np.empty((count, 3, 3, count), np.float32), np.zeros((3, count), np.float32)
-    sunk = 0.0  # of the object, along z
+    sunk = 0.0  # displacement of the compliant object along z
     for a in range(count):
         i = near[a]
         rows = answer[i]
@@ -482,7 +488,10 @@ def _remember(
     held: BoolArray,
     slides: BoolArray,
 ) -> float:
-    """Which nodes press and slide; the anchors of sliding nodes go with them. Gives the share of Coulomb's bound that is borne."""
+    """Record which nodes press and which slide, and move the anchors of sliding nodes with them.
+
+    Returns the ratio of the tangential forces to Coulomb's bound, each summed over the pressing nodes.
+    """
     held[:] = False
     slides[:] = False
     bound, borne = 0.0, 0.0

@@ -1,4 +1,4 @@
-"""The surrogate's contacts: many sensors at once, each with its object and all that friction remembers."""
+"""Contacts on a surrogate: many sensors at once, each with its own object and friction memory."""
 
 from functools import lru_cache
 
@@ -16,9 +16,9 @@ from twin.rig.contact import ArmTurning
 from twin.types import FloatArray, IntArray
 
 LARGEST_MOVE_MM = 30.0
-"""Largest motion between two poses; beyond it the way between them is unknown, and the contact begins anew."""
+"""Largest motion between two poses. Beyond it the path between them is unknown, and the contact begins anew."""
 CLEAR_MM = 0.5
-"""A contact begins this far in front of the object."""
+"""Distance between dome and object at which a contact begins."""
 
 
 class SurrogateContacts:
@@ -28,8 +28,9 @@ class SurrogateContacts:
     ----------
     surrogate : Surrogate
     sensor : SensorSpec
-        Of the same mechanics; its pins at rest are those of ``felt``.
+        A sensor with the surrogate's mechanics. ``felt`` begins with its pins at rest.
     count : int
+        Number of sensors.
     friction_memory : bool
         False: at every pose the contact begins anew.
     """
@@ -52,7 +53,7 @@ class SurrogateContacts:
         self.felt = Felt.at_rest(count, self._caps_rest)
 
     def require(self, contact: Contact) -> None:
-        """See ``Backend``: objects of the drawn family, with one coefficient of friction."""
+        """See ``Backend``: it takes objects of the drawn family, with one coefficient of friction."""
         touched, friction = contact.touched, contact.law.friction
         unlike = unlike_drawn(touched)
         if unlike:
@@ -101,12 +102,12 @@ class SurrogateContacts:
 
     @property
     def caps_at_rest_mm(self) -> FloatArray:
-        """(N, 3) centres of the pins' caps at rest."""
+        """Centres (N, 3) of the pins' caps at rest."""
         return self._caps_rest
 
     @property
     def depth_mm(self) -> FloatArray:
-        """(B,) how deep the objects are inside the undeformed domes."""
+        """Depths (B,) of the objects inside the undeformed domes."""
         return np.maximum(-self._gap.min(axis=1), 0.0)
 
     def _forget(self, rows: IntArray) -> None:
@@ -114,7 +115,7 @@ class SurrogateContacts:
         self._known[rows] = False
 
     def _bring(self, rows: IntArray, T: FloatArray, gap: FloatArray) -> None:
-        """Solve the ways of some rows (R,) to commanded poses (R, 4, 4), where the nodes at rest have distances (R, M)."""
+        """Solve the motions of some rows (R,) to commanded poses (R, 4, 4), at which the nodes at rest have distances (R, M)."""
         linear = self._linear
         deepest = gap.argmin(axis=1)
         depth = -gap[np.arange(len(rows)), deepest]
@@ -146,7 +147,7 @@ class SurrogateContacts:
         return -self._linear.force_n[rows].sum(axis=1)
 
     def _outside(self, distance_mm: float, cosine: float) -> str:
-        """Why a contact of the dome is too deep, or too far from the apex; "" for one that is not."""
+        """The reason why a contact is too deep or too far from the apex; "" for one inside the domain."""
         domain = self._domain
         depth = self._linear.radius_mm - distance_mm
         if depth <= 0:
@@ -159,7 +160,7 @@ class SurrogateContacts:
         return ""
 
     def _answer(self, rows: IntArray) -> None:
-        """What the sensors feel, from the linear skin and the network."""
+        """Write to ``felt`` what the sensors feel, from the linear skin and the network."""
         felt, linear, surrogate = self.felt, self._linear, self._surrogate
         force = linear.force_n[rows]
         wrench = -np.concatenate([force.sum(axis=1), np.cross(surrogate.node_mm, force).sum(axis=1)], axis=1)

@@ -1,4 +1,4 @@
-"""What solves the contacts of several environments at once: the finite elements, or their surrogate."""
+"""Solvers for the contacts of several environments at once: their protocol, and the one with finite elements."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -16,12 +16,12 @@ from twin.mechanics.solver import SkinSolver
 from twin.types import FloatArray, IntArray
 
 _KEPT_SOLVERS = 4
-"""Solvers that are kept: of the sensor as specified, and of a few randomised ones."""
+"""Number of solvers kept in memory: one of the sensor as specified, the others of randomised sensors."""
 
 
 @dataclass(frozen=True)
 class Contact:
-    """One environment's contact: the sensor and object as drawn for the episode, and how the two rub and give way."""
+    """One environment's contact: the sensor and object as drawn for the episode, and their friction and compliance."""
 
     sensor: SensorSpec
     touched: ObjectSpec
@@ -37,15 +37,15 @@ class Felt:
     caps_mm : (B, N, 3) float
         Centres of the pins' caps.
     force_n : (B, 3) float
-        Of the skin on the object.
+        Force of the skin on the object.
     torque_nmm : (B, 3) float
-        About the sensor's origin.
+        Torque of the skin on the object, about the sensor's origin.
     area_mm2 : (B,) float
-        Of the skin at rest that is pressed.
+        Contact area, measured on the skin at rest.
     slip : (B,) float
         Share of that area that slides.
     lost : list of str
-        Why a contact could not be computed ("" where it could); its row then holds the last state that could.
+        Why a contact could not be computed, or "". The row of such a contact keeps its last computed state.
     """
 
     caps_mm: FloatArray
@@ -62,7 +62,7 @@ class Felt:
         return cls(np.tile(caps_mm, (count, 1, 1)), force, torque, np.zeros(count), np.zeros(count), [""] * count)
 
     def rest(self, row: int, caps_mm: FloatArray) -> None:
-        """Let one sensor touch nothing."""
+        """Set one sensor to the state without contact."""
         self.caps_mm[row] = caps_mm
         for values in (self.force_n, self.torque_nmm, self.area_mm2, self.slip):
             values[row] = 0.0
@@ -70,12 +70,12 @@ class Felt:
 
 
 class Backend(Protocol):
-    """Solves contacts with all that they remember, pose after pose."""
+    """A solver of contacts, pose after pose, with the memory of each contact."""
 
     felt: Felt
 
     def require(self, contact: Contact) -> None:
-        """Raise ``ContactError`` where the backend does not know such a sensor, object or friction."""
+        """Raise ``ContactError`` if the backend cannot solve contacts of this sensor and object with this law."""
 
     def begin(self, row: int, contact: Contact) -> None:
         """Begin an environment's episode, the sensor at rest.
@@ -83,11 +83,11 @@ class Backend(Protocol):
         Raises
         ------
         ContactError
-            As of ``require``.
+            For the same reasons as in ``require``.
         """
 
     def move(self, rows: IntArray, T_sensor_object: FloatArray, time_s: FloatArray) -> None:
-        """Bring the objects of some rows (R,) to their poses (R, 4, 4) at times (R,); ``felt`` then holds what the sensors feel."""
+        """Move the objects of some rows (R,) to poses (R, 4, 4) at times (R,), and update ``felt``."""
 
     def attitude(self, row: int) -> PinRest:
         """Feet, axes and caps of one sensor's pins."""
@@ -105,10 +105,10 @@ class FiniteElements:
         self._solver = lru_cache(maxsize=_KEPT_SOLVERS)(SkinSolver)
 
     def require(self, contact: Contact) -> None:
-        """See ``Backend``: any contact can be tried."""
+        """See ``Backend``: no contact is refused before it is solved."""
 
     def begin(self, row: int, contact: Contact) -> None:
-        """See ``Backend``; a sensor that was drawn anew needs a solver of its own, which takes about a second."""
+        """See ``Backend``. A randomised sensor needs its own solver, which takes about a second to build."""
         self._followers[row] = Follower(self._solver(contact.sensor), contact.touched, contact.law)
         self._pins[row] = self._rest if contact.sensor is self._sensor else rest_pins(contact.sensor.geometry)
         self.felt.rest(row, self._pins[row].caps_mm)

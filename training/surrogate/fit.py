@@ -1,4 +1,4 @@
-"""Making a surrogate: the linear skin from the solver's own elements, and a network fitted to solved paths."""
+"""Fit of a surrogate: the linear skin from the solver's own elements, and networks trained on solved paths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -33,69 +33,69 @@ from twin.store import Layers, writes_file
 from twin.types import FloatArray, Form
 
 FAMILY = "mg400-331"
-"""Sensor with whose shipped surrogate the network of every other begins."""
+"""Sensor of the shipped surrogate whose networks are the start of the training for every other sensor."""
 PATHS = 120
-"""Solved paths that a surrogate learns from by default: about 5000 states."""
+"""Default number of solved paths to train a surrogate on: about 5000 states."""
 RADII_MM = (15.0, 25.0)
-"""Radii of domes on which the drawn contacts, of up to 5 mm, are usual ones."""
+"""Smallest and largest radius of a dome. In this range the drawn indentations, of up to 5 mm, are usual ones."""
 LEAST_PATHS = 10
-"""Fewer paths teach nothing."""
+"""Smallest number of paths to train on."""
 JUDGED = 5
-"""Every path of this number is kept out of the training and judged with."""
+"""Every path whose number is a multiple of this is kept out of the training and used to measure the errors."""
 TURNS = 2
-"""Times that each solved path is learnt from, turned by other angles about the axis: its contacts lie elsewhere between the nodes then."""
+"""Number of turns about the sensor's axis at which each solved path is used: its contacts then lie elsewhere between the nodes."""
 MODE_STATES = 3000
-"""States from which the modes are found."""
+"""Approximate number of states from which the modes are computed."""
 AXIS_MM = 0.9
-"""Length of a pin by which changes of its axis count as motion where modes are sought: about that of the shipped sensors."""
+"""Length that converts changes of a pin's axis to motion, for the modes: about the length of a pin of the shipped sensors."""
 MODES = 64
-"""Modes of the pins' motion: what they leave out is 0.01 mm on average."""
+"""Number of modes of the pins' motion. The motion outside them is 0.01 mm on average."""
 WIDTH = 256
-"""Neurons of each of the network's two hidden layers."""
+"""Number of neurons of each of the network's two hidden layers."""
 BENT_MODES = 64
-"""Modes of what the skin bends."""
+"""Number of modes of the skin's bending (see ``bending``)."""
 BENT_WIDTH = 160
-"""Neurons of each hidden layer of the network that bends the skin."""
+"""Number of neurons of each hidden layer of the bending network."""
 LIGHT = 0.01
-"""Mean square of that network's inputs below which all states tell alike of its linear part."""
+"""Mean square of the bending network's inputs below which all states have the same weight in the regression of its linear part."""
 STEADY = 1e-3
-"""Ridge of that part's regression."""
+"""Ridge regularisation of the regression of the bending network's linear part."""
 LOST = 0.02
-"""Share of the force that may lie beyond the nodes in a state to learn the skin's bending from."""
+"""Largest share of a state's force that may lie beyond the nodes, for the state to be used for the skin's bending."""
 EPOCHS = 36
 BATCH = 512
 RATE = 3e-3
-"""Largest rate of Adam, in a cycle; of a network that learns on, a third of it."""
+"""Largest learning rate of Adam in its cycle. For a network that continues from a start it is a third of this."""
 DECAY = 0.005
-"""Decay of the weights."""
+"""Weight decay."""
 DEEPEST_TAKEN_MM = DEEPEST_MM + 0.5
-"""Largest indentation that is taken."""
+"""Largest indentation of the surrogate's domain."""
 POLAR_DEG = 48.0
-"""Largest angle of a contact's deepest place from the apex: paths begin within 35 deg and go on from there."""
+"""Largest angle of a contact's deepest place from the apex. Paths begin within 35 deg and move on from there."""
 OTHERS_SCALE = (*(0.15,) * 3, *(1.5,) * 3, 1.0, 0.5)
-"""Errors of force (N), torque (N mm), area (100 mm2) and sliding share that count as much as a usual one of the modes."""
+"""Errors of force (N), torque (N mm), area (100 mm2) and sliding share that weigh as much as a usual error of the modes."""
 LEAST_MOVED_MM = 1.0
-"""States count by the square of one over their largest motion of a pin; below this they count alike."""
+"""Softening of the states' weights in the loss, 1 / (LEAST_MOVED_MM^2 + m^2), where m is a state's largest motion of a pin or node."""
 SMALL_SCALE = 0.02
-"""No input of the network is scaled by less than this share of the largest."""
+"""Smallest scale of an input of the network, as a share of the largest scale."""
 TOUCHES_MM = 0.05
-"""Contacts shallower than this are not judged."""
+"""Smallest depth of a contact that is used."""
 LARGE_PX = 2.0
-"""The quantile of the errors relative to the largest displacement counts states in which that is at least as large."""
+"""Smallest displacement of a state's largest moved pin for the quantile of errors relative to that displacement."""
 BINS = {"depth_mm": (0.0, 1.5, 3.0, 6.0), "shear_mm": (0.0, 0.5, 1.5, 20.0)}
-"""Ends of the ranges by which errors are told; the shear is the largest sideways motion of a cap."""
+"""Ends of the ranges in which errors are reported. The shear is the largest sideways motion of a cap."""
 
 
 @dataclass(frozen=True)
 class Distilled:
-    """A surrogate that was made, its errors on paths that it has not seen, and the files that were written."""
+    """A fitted surrogate with its errors on paths that it was not trained on, and the files that were written."""
 
     surrogate: Surrogate
     size_bytes: int
     written: list[Path] = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """The result in words."""
+        """The result as lines of text."""
         found = self.surrogate.about["errors"]
         every = found["all"]
         lines = [
@@ -113,22 +113,22 @@ class Distilled:
 
 @dataclass(frozen=True)
 class _Samples:
-    """States S to learn from, on the lattices: the linear skin's answer, and the truth."""
+    """S training states on the lattices: the linear skin's answer, and the truth."""
 
-    force: FloatArray  # (S, M, 3) float32, of the linear skin
-    beside: FloatArray  # (S, FEATURES)
+    force: FloatArray  # (S, M, 3) float32, nodal forces of the linear skin
+    beside: FloatArray  # (S, FEATURES), see ``features``
     depth: FloatArray  # (S,)
     within: FloatArray  # (S, M) float32, see ``within``
     linear: FloatArray  # (S, 6), the linear skin's wrench on the object
     pins: FloatArray  # (S, 2, P, 3), displacements of feet and changes of axes
     wrench: FloatArray  # (S, 6)
     area: FloatArray  # (S,)
-    slip: FloatArray  # (S,), what the linear skin's share of sliding nodes lacks
+    slip: FloatArray  # (S,), true sliding share minus the linear skin's share of sliding nodes
 
 
 @dataclass(frozen=True)
 class _Truths:
-    """States S of the finite elements: what the nodes have moved and bear (S, M, 3), and what the pins have moved (S, 6 P); float32."""
+    """S states of the finite elements: displacements of and forces on the nodes (S, M, 3), and motion of the pins (S, 6 P); float32."""
 
     moved: FloatArray
     force: FloatArray
@@ -141,7 +141,7 @@ class _Truths:
         return _Truths(g.moved(self.moved, NODE_RINGS), g.moved(self.force, NODE_RINGS), pins.reshape(len(pins), -1))
 
     def some(self, first: int, every: int) -> "_Truths":
-        """Each of so many states, from the first on."""
+        """Every ``every``-th state, from ``first`` on."""
         return _Truths(self.moved[first::every], self.force[first::every], self.pins[first::every])
 
 
@@ -154,8 +154,9 @@ def distil(
     Parameters
     ----------
     paths : int
-        Solved with finite elements, some seconds each on one core.
+        Number of paths to solve with finite elements. Each takes some seconds on one core.
     processes : int
+        Number of processes that solve paths.
     seed : int
         Another seed draws other paths.
 
@@ -175,7 +176,7 @@ def distil(
 
 
 def require_dome(sensor: SensorSpec) -> None:
-    """Raise ``OptionError`` for sensors that a surrogate can't stand for."""
+    """Raise ``OptionError`` for a sensor that a surrogate cannot replace."""
     low, high = RADII_MM
     if sensor.skin.shape != "cap" or sensor.skin.rim_z_mm != 0 or not low <= sensor.skin.outer_radius_mm <= high:
         raise OptionError(
@@ -197,10 +198,11 @@ def fit(
     start: Surrogate | None = None,
     progress: Any = lambda *_: None,
 ) -> Surrogate:
-    """The surrogate from solved paths of the sensor's lattice; every fifth path is only judged with, those of ``extra`` never.
+    """Fit a surrogate to solved paths of the sensor's lattice.
 
-    With ``start``, a surrogate of a sensor whose pins are the lattice, its modes are used and its network learns on: sensors of one family
-    lack much the same of their linear skins.
+    Every fifth path of ``solved`` is used only to measure the errors; all paths of ``extra`` are trained on. ``start`` is a surrogate of a
+    sensor whose pins are the lattice. If it is given, its modes are used and the training continues from its networks: the corrections of
+    sensors of one family are similar.
     """
     torch.manual_seed(0)
     torch.set_num_threads(1)
@@ -276,13 +278,13 @@ def fit(
         scale,
         layers,
         out_scale,
-    ).as_kept()  # so that the errors are those of the file, which rounds
+    ).as_kept()  # so that the errors are those of the file, which rounds the arrays
     about["errors"] = judge(made, sensor, kept)
     return made
 
 
 def cut(path: SolvedPath, radius_mm: float) -> SolvedPath:
-    """A path up to where it leaves the domain on a dome of this radius: what comes then, however large, is nothing to learn from."""
+    """A path up to where it leaves the domain on a dome of this radius: later states, which may be very large, are not trained on."""
     thing = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
     inside = len(path.T)
     for number, T in enumerate(path.T):
@@ -297,7 +299,7 @@ def cut(path: SolvedPath, radius_mm: float) -> SolvedPath:
 
 
 def averaged(nodes: FloatArray, phase_deg: float) -> FloatArray:
-    """Answers (M, M, 3, 3), force node first, as a body of revolution gives them: the mesh of squares breaks its symmetry by a little."""
+    """Compliance (M, M, 3, 3), force node first, averaged over the symmetries: the mesh of squares breaks them slightly."""
     answer = nodes.transpose(2, 0, 1, 3)
     total = np.zeros_like(answer)
     group = symmetries(phase_deg)
@@ -315,9 +317,9 @@ def sampled(
     turn_rad: float = 0.0,
     bending: tuple[FloatArray, ...] | None = None,
 ) -> _Samples:
-    """The skin led along a solved path, with the truth beside it, both turned about the sensor's axis.
+    """States of the linear skin along a solved path, and the true states, both turned about the sensor's axis.
 
-    ``bending`` as of ``LinearContacts.at_rest``.
+    ``bending`` is that of ``LinearContacts.at_rest``.
     """
     about = np.eye(4)
     about[:3, :3] = turn = _about_z(turn_rad)
@@ -345,14 +347,14 @@ def sampled(
 
 
 def _main(rows: FloatArray, count: int) -> FloatArray:
-    """The main directions (count, n) of rows (S, n), by their squares."""
+    """The first principal directions (count, n) of rows (S, n), without subtraction of their mean."""
     rows = rows.astype(np.float64)
     found: FloatArray = np.linalg.eigh(rows.T @ rows)[1][:, ::-1][:, :count].T.astype(np.float32)
     return found
 
 
 def _carried(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> FloatArray:
-    """The modes (MODES, 6 P) of another sensor of the family, on this one's lattice."""
+    """The modes (MODES, 6 P) of ``start``, a surrogate of another sensor of the family, on this sensor's lattice."""
     turn = _about_z(np.radians(sensor.pins.phase_deg - start.phase_deg)).astype(np.float32)
     modes = (start.modes @ turn.T).transpose(0, 2, 1, 3) * weights
     return np.ascontiguousarray(modes.reshape(len(modes), -1))
@@ -364,13 +366,13 @@ def _about_z(angle_rad: float) -> FloatArray:
 
 
 def _pins_and_rest(rows: _Samples, flat: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The pins' motion (S, 6 P), and what the linear skin's answers (6 P, 3 M) leave of it."""
+    """The pins' motion (S, 6 P), and its part that the linear skin's compliance (6 P, 3 M) does not explain."""
     truth = rows.pins.reshape(len(rows.pins), -1)
     return truth, truth - rows.force.reshape(len(rows.force), -1) @ flat.T
 
 
 def _truths(sensor: SensorSpec, solved: Sequence[SolvedPath], weights: FloatArray) -> _Truths:
-    """The pressed states of solved paths whose forces the nodes bear."""
+    """The pressed states of solved paths whose force lies within the nodes, up to the share ``LOST``."""
     rest = rest_pins(lattice_sensor(sensor).geometry)
     at_rest = np.stack([rest.base_mm, rest.axis])
     moved, force, pins = [], [], []
@@ -386,7 +388,7 @@ def _truths(sensor: SensorSpec, solved: Sequence[SolvedPath], weights: FloatArra
 
 
 def _bending(turned: Sequence[_Truths], answer: FloatArray, read: FloatArray, start: Surrogate | None, progress: Any) -> Bending:
-    """What the displacements of true states, turned by all symmetries, lack where the linear skin bears the same forces."""
+    """Fit the bending: the true displacements minus those of the linear skin under the same forces. ``turned`` has all symmetries."""
     compliance = answer.transpose(0, 3, 1, 2).reshape(3 * len(answer), -1).astype(np.float32)
     forces = [part.force.reshape(len(part.force), -1) for part in turned]
     lacks = [part.moved.reshape(len(part.moved), -1) - force @ compliance for part, force in zip(turned, forces, strict=True)]
@@ -395,7 +397,7 @@ def _bending(turned: Sequence[_Truths], answer: FloatArray, read: FloatArray, st
     scale = start.bending.scale if start else np.maximum(x.std(axis=0), SMALL_SCALE * x.std(axis=0).max()).astype(np.float32)
     x = x / scale
     counts = np.tile(1.0 / (LEAST_MOVED_MM**2 + (turned[0].moved ** 2).sum(axis=2).max(axis=1)), len(turned))
-    light = (1.0 / (LIGHT + (x**2).mean(axis=1)))[:, None]  # light contacts are those of which the linear part tells
+    light = (1.0 / (LIGHT + (x**2).mean(axis=1)))[:, None]  # the linear part is for light contacts, so they weigh most
     straight = np.linalg.solve((x * light).T @ x + STEADY * len(x) * np.eye(x.shape[1]), (x * light).T @ y).T
     rest, size = y - x @ straight.T, 1.0 if start else float(y.std(axis=0).max())
     given = x, rest / size, ample(x), (counts / counts.mean()).astype(np.float32)
@@ -405,7 +407,7 @@ def _bending(turned: Sequence[_Truths], answer: FloatArray, read: FloatArray, st
 
 
 def judge(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]) -> dict[str, Any]:
-    """Errors against solved paths: pins in px of the sensor's frames, force, share that slides; also by kind of contact."""
+    """Errors on solved paths: pins in px of the sensor's frames, force, sliding share; for all states and by kind of contact."""
     lattice, form = lattice_sensor(sensor), Form.RECORDING if sensor.recording else Form.RAW
     onto, cap_mm = _interpolation(sensor), sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
     rest, lattice_rest = rest_pins(sensor.geometry), rest_pins(lattice.geometry)
@@ -477,7 +479,7 @@ def _turned(rows: _Samples, g: Symmetry) -> _Samples:
 
 
 def _turned_wrench(values: FloatArray, g: Symmetry) -> FloatArray:
-    """Rows whose last six columns are a force and a torque."""
+    """Turn or mirror rows whose last six columns are a force and a torque."""
     out = values.copy()
     out[:, -6:-3] = values[:, -6:-3] @ g.matrix.T
     out[:, -3:] = g.parity * (values[:, -3:] @ g.matrix.T)
@@ -485,9 +487,9 @@ def _turned_wrench(values: FloatArray, g: Symmetry) -> FloatArray:
 
 
 def _trained(x: FloatArray, y: FloatArray, gates: FloatArray, counts: FloatArray, start: Layers, width: int, progress: Any) -> Layers:
-    """Weights and offsets of a network that tells y (S, o) from x (S, i), times the gates (S,); the states count by ``counts`` (S,).
+    """Train a network whose output, times the gates (S,), estimates y (S, o) from x (S, i); return its weights and offsets.
 
-    It begins with the weights and offsets of ``start``, if there are any.
+    ``counts`` (S,) are the states' weights in the loss. Training starts from the weights and offsets of ``start``, if there are any.
     """
     net = torch.nn.Sequential(
         torch.nn.Linear(x.shape[1], width),
@@ -520,7 +522,7 @@ def _trained(x: FloatArray, y: FloatArray, gates: FloatArray, counts: FloatArray
 
 
 def _interpolation(sensor: SensorSpec) -> FloatArray:
-    """(N, P) shares by which motions on the lattice give those of the sensor's pins."""
+    """Matrix (N, P) that interpolates motions on the lattice to the sensor's pins."""
     lattice = ring_directions(PIN_RINGS, sensor.pins.max_polar_deg, sensor.pins.phase_deg)
     places = -rest_pins(sensor.geometry).axis
     if places.shape == lattice.shape and np.allclose(places, lattice, atol=1e-9):

@@ -1,13 +1,13 @@
-"""The surrogate: a skin with exact contact and friction, and two small networks that add what large deformations change.
+"""The surrogate: a linear skin with exact contact and friction, and two small networks that correct it for large deformations.
 
-The first bends the skin while its contact is solved (see ``bending``). Of the forces f at the nodes that are found so,
+The first network corrects the skin while its contact is solved (see ``bending``). This gives the forces f at the nodes. From f follow
 
-    pins = rest + modes (R f + gate(depth) net(R f, V g, features)),   force = -sum f + gate net,
+    pins = rest + modes (R f + gate(depth) net(R f, V g, features)),   force = -sum f + gate net
 
-where R is the linear skin's answer in the modes, V g tells where the object is (its distances from the nodes at rest, in their main
-directions), and the gate goes to zero with the depth: a sensor that touches nothing is exactly at rest. The features are depth, friction,
-nodes that press and slide, the share of Coulomb's bound that is borne, force and torque of the nodes' forces. What happened before is in f
-alone, so the network has no memory of its own that could drift.
+R f is the linear skin's answer in the modes of the pins. V g describes where the object is: the distances g of the nodes at rest from it,
+in their principal directions. The gate goes to zero with the depth, so a sensor without contact is exactly at rest. The features are depth,
+friction, number of pressing nodes, share of sliding nodes, used share of Coulomb's bound, force and torque of the nodal forces. Only f
+depends on the history of the contact, so the network has no memory of its own that could drift.
 """
 
 from collections.abc import Mapping
@@ -29,27 +29,27 @@ from twin.types import FloatArray
 SHIPPED = Path(__file__).parents[1] / "surrogates"
 SUFFIX = ".safetensors"
 GATE_MM = 0.3
-"""Depth at which the network has three quarters of its say."""
+"""Depth at which the gate of the network is three quarters open."""
 MECHANICS = ("skin", "gel", "lens", "pins")
-"""Sections of a specification that a surrogate stands for; camera, light and rig may differ."""
+"""Sections of a specification that a surrogate depends on. Camera, light and rig may differ."""
 OPTICAL = ("refractive_index", "absorption_per_mm", "haze", "haze_sigma_px", "thickness_mm", "diameter_mm", "cap_diameter_mm")
-"""Keys of these sections that only the optics need; the skin's thickness is not among them."""
+"""Keys of the sections ``MECHANICS`` that only the optics need. The skin's thickness is the exception: it decides the mechanics."""
 UNFELT = ("stiffness_factor",)
-"""Keys that say how sure the others are: no contact depends on them."""
+"""Keys that give the uncertainty of others. No contact depends on them."""
 FEATURES = 13
-"""Numbers beside the modes that the network sees."""
+"""Number of the network's inputs besides the modes and the views of the object."""
 VIEWS = 32
-"""Directions of the object's distances that it sees."""
+"""Number of principal directions of the object's distances among the network's inputs."""
 VIEW_MM = 1.0
-"""Parts of an object farther than this from the undeformed skin are not seen."""
+"""Distance from the undeformed skin beyond which the network does not see an object."""
 WRENCH_SCALE = np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
-"""N and N mm that count as 1."""
+"""Scales of force (N) and torque (N mm) as inputs of the network."""
 BESIDE = 8
-"""Numbers beside the modes that it gives: force, torque, area in 100 mm2, share that slides."""
+"""Number of the network's outputs besides the modes: force, torque, area in 100 mm2, sliding share."""
 
 
 class SurrogateError(TwinError):
-    """A surrogate's file can't be used, or no surrogate is known for a sensor."""
+    """A surrogate's file cannot be used, or there is no surrogate for a sensor."""
 
 
 FILE = ArrayFile("surrogate", "twin surrogate", version=3, error=SurrogateError)
@@ -62,7 +62,7 @@ class Surrogate:
     Attributes
     ----------
     about : dict
-        What it was made of, the ends of its domain and its errors (JSON).
+        Its sensor and mechanics, its training data, the limits of its domain and its errors (JSON).
     node_mm : (M, 3) float
         Nodes of the linear skin at rest.
     answer : (M, M, 3, 3) float32
@@ -72,14 +72,15 @@ class Surrogate:
     read : (K, 3 M) float32
         The linear skin's answer in the modes.
     view : (VIEWS, M) float32
-        Directions in which the network sees the object.
+        Principal directions of the object's distances, inputs of the network.
     bending : Bending
-        What large deformations add to the displacements of the nodes.
+        Correction of the nodes' displacements for large deformations.
     mean, scale : (K + FEATURES + VIEWS,) float32
-        Of the network's inputs.
+        Mean and scale of the network's inputs.
     layers : tuple of ((o, i), (o,)) float32
         The network's weights and offsets.
     out_scale : (K + BESIDE,) float32
+        Scale of the network's outputs.
     """
 
     about: dict[str, Any]
@@ -101,13 +102,14 @@ class Surrogate:
 
     @property
     def domain(self) -> dict[str, float]:
-        """Ends of what it was trained on: depth (mm), angle from the apex (deg) and friction."""
+        """Upper limits of its domain: depth (mm), angle from the apex (deg) and friction."""
         return {key: float(value) for key, value in self.about["domain"].items()}
 
     def correct(self, force_n: FloatArray, beside: FloatArray, gap_mm: FloatArray, depth_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coefficients of the modes (R, K), and what is added to the others (R, BESIDE).
+        """Coefficients of the modes (R, K), and corrections of force, torque, area and sliding share (R, BESIDE).
 
-        ``force_n`` (R, M, 3): at the nodes; ``gap_mm`` (R, M): distances of the object from the nodes at rest.
+        ``force_n`` (R, M, 3) are the forces at the nodes, ``beside`` (R, FEATURES) the ``features``, ``gap_mm`` (R, M) the distances of the
+        object from the nodes at rest, and ``depth_mm`` (R,) its depths.
         """
         linear = force_n.reshape(len(force_n), -1).astype(np.float32) @ self.read.T
         x = (np.concatenate([linear, beside.astype(np.float32), within(gap_mm) @ self.view.T], axis=1) - self.mean) / self.scale
@@ -119,11 +121,14 @@ class Surrogate:
         return linear + x[:, : len(self.modes)], x[:, len(self.modes) :]
 
     def save(self, path: Path) -> int:
-        """Write it to a file; its size in bytes. Large arrays have half precision, and the answers of symmetric nodes are left out."""
+        """Write it to a file and return the size in bytes.
+
+        Large arrays are stored in half precision. Of symmetric nodes only one compliance is stored.
+        """
         return FILE.write(path, self._arrays(), self.about)
 
     def as_kept(self) -> "Surrogate":
-        """The surrogate that a file of this one gives back."""
+        """The surrogate as it is read back from a file: rounded to half precision."""
         return _of_arrays(self.about, {key: value.astype(np.float32) for key, value in self._arrays().items()})
 
     def _arrays(self) -> dict[str, FloatArray]:
@@ -146,7 +151,7 @@ class Surrogate:
 def features(
     depth_mm: FloatArray, friction: FloatArray, held: FloatArray, slip: FloatArray, used: FloatArray, wrench: FloatArray
 ) -> FloatArray:
-    """What the network sees beside the modes, (R, FEATURES)."""
+    """Inputs of the network besides the modes and the views of the object, (R, FEATURES)."""
     rub = np.log(np.maximum(friction, 0.01))
     return np.column_stack(
         [depth_mm, depth_mm**2 / 5.0, rub, np.minimum(friction, 1.5) * depth_mm, held / 10.0, slip, used, wrench / WRENCH_SCALE]
@@ -154,22 +159,22 @@ def features(
 
 
 def within(gap_mm: FloatArray) -> FloatArray:
-    """How far the object is within sight of the nodes at rest, (R, M) float32."""
+    """Closeness of the object to the nodes at rest, (R, M) float32: 0 from ``VIEW_MM`` on."""
     return np.maximum(VIEW_MM - gap_mm, 0.0).astype(np.float32)
 
 
 def gate(depth_mm: FloatArray) -> FloatArray:
-    """How much the network has to say, 0 without contact."""
+    """The gate of the network: 0 without contact, 1 in deep contact."""
     return np.tanh(np.maximum(depth_mm, 0.0) / GATE_MM)
 
 
 def representatives(phase_deg: float) -> list[int]:
-    """Nodes from which all others are reached by the lattice's symmetries."""
+    """Nodes from which the lattice's symmetries reach all others."""
     return sorted(set(np.min([g.places(NODE_RINGS) for g in symmetries(phase_deg)], axis=0).tolist()))
 
 
 def unfolded(kept: FloatArray, phase_deg: float) -> FloatArray:
-    """The answers (M, M, 3, 3) of all nodes from those of the representatives."""
+    """The compliance (M, M, 3, 3) of all nodes from that of the representatives."""
     count = kept.shape[1]
     out = np.zeros((count, count, 3, 3), np.float32)
     for g in symmetries(phase_deg):
@@ -181,12 +186,12 @@ def unfolded(kept: FloatArray, phase_deg: float) -> FloatArray:
 
 
 def load_surrogate(path: Path) -> Surrogate:
-    """Read a surrogate.
+    """Read a surrogate from a file.
 
     Raises
     ------
     SurrogateError
-        There is no such file, or it is no surrogate of this version.
+        There is no such file, or it is not a surrogate of this version.
     """
     with FILE.opened(path) as (about, arrays):
         return _of_arrays(about, arrays)
@@ -212,7 +217,7 @@ def _of_arrays(about: dict[str, Any], arrays: Mapping[str, FloatArray]) -> Surro
 
 
 def mechanics_of(sensor: SensorSpec) -> dict[str, Any]:
-    """The sections of a specification that decide its mechanics, without what only the optics need."""
+    """The sections of a specification that decide its mechanics, without the keys that only the optics need."""
     plain = sensor.model_dump(mode="json")
     return {part: {key: value for key, value in plain[part].items() if is_mechanical(part, key)} for part in MECHANICS}
 

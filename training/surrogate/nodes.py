@@ -1,4 +1,4 @@
-"""What finite elements tell at the surrogate's nodes: how the skin has moved there, and which forces it bears."""
+"""Displacements and forces of the finite elements' skin at the surrogate's nodes."""
 
 from dataclasses import dataclass
 
@@ -13,25 +13,26 @@ from twin.mechanics import SkinSolver
 from twin.types import ContactState, FloatArray, IntArray
 
 NEIGHBOURS = 24
-"""Points by which what is known at some is interpolated to others."""
+"""Number of neighbouring points from which a value is interpolated."""
 ON_THE_DOME = 1e-6
-"""Share of the radius by which nodes of the mesh may lie off the dome."""
+"""Tolerance, as a share of the radius, within which a node of the mesh lies on the dome."""
 
 
 @dataclass(frozen=True)
 class AtNodes:
-    """The M nodes among the mesh's nodes of one sensor.
+    """The surrogate's M nodes in relation to the mesh of one sensor.
 
     Attributes
     ----------
     outer : (k,) int
         Nodes of the mesh on the skin's outside.
     rest_mm : (k, 3) float
+        Positions of these nodes at rest.
     shares : (M, k) float
-        By which motions there give those of the surrogate's nodes.
+        Matrix that interpolates displacements of these nodes to the surrogate's nodes.
     shape : SkinShape
     cells : Delaunay
-        Triangles between the surrogate's nodes and one more ring around them, which bears what is pressed beyond.
+        Triangles between the surrogate's nodes and one more ring around them. That ring takes the forces beyond the nodes.
     """
 
     outer: IntArray
@@ -42,7 +43,7 @@ class AtNodes:
 
     @classmethod
     def of(cls, solver: SkinSolver) -> "AtNodes":
-        """Of a solver of a sensor with a dome."""
+        """The surrogate's nodes for the solver of a sensor with a dome."""
         rest, radius = solver.rest().nodes_mm, solver.spec.skin.outer_radius_mm
         outer = np.flatnonzero(np.abs(np.linalg.norm(rest, axis=1) - radius) < ON_THE_DOME * radius)
         outer = outer[np.unique(np.round(laid_flat(rest[outer]), 6), axis=0, return_index=True)[1]]
@@ -52,12 +53,12 @@ class AtNodes:
         return cls(outer, rest[outer], interpolated(rest[outer], nodes), solver.shape, Delaunay(laid_flat(around)))
 
     def moved_mm(self, state: ContactState) -> FloatArray:
-        """Displacements (M, 3) float32."""
+        """Displacements (M, 3) float32 of the surrogate's nodes."""
         found: FloatArray = (self.shares @ (state.nodes_mm[self.outer] - self.rest_mm)).astype(np.float32)
         return found
 
     def force_n(self, state: ContactState) -> FloatArray:
-        """Forces on the skin (M, 3) float32, each place's among the three nodes around it."""
+        """Forces on the skin (M, 3) float32. The force at each contact place is shared among the three nodes around it."""
         out = np.zeros((len(self.cells.points), 3))
         if len(state.normal_n):
             places = laid_flat(self.shape.outside(state.contact_place))
@@ -72,14 +73,14 @@ class AtNodes:
 
 
 def interpolated(start: FloatArray, places: FloatArray) -> FloatArray:
-    """(N, P) shares by which what is known in directions (P, 3) gives what is in others (N, 3)."""
+    """Matrix (N, P) that interpolates values known in directions (P, 3) to other directions (N, 3)."""
     shares = RBFInterpolator(laid_flat(start), np.eye(len(start)), neighbors=NEIGHBOURS, kernel="thin_plate_spline")
     found: FloatArray = shares(laid_flat(places))
     return found
 
 
 def laid_flat(directions: FloatArray) -> FloatArray:
-    """Directions (n, 3), of any length, in a plane (n, 2): their angles from the apex become distances."""
+    """Map directions (n, 3), of any length, to a plane (n, 2): the angle from the apex becomes the distance from the origin."""
     across = np.linalg.norm(directions[:, :2], axis=1, keepdims=True)
     flat: FloatArray = directions[:, :2] * np.arctan2(across, directions[:, 2:]) / np.maximum(across, 1e-12)
     return flat

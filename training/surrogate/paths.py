@@ -1,4 +1,4 @@
-"""Random contacts to learn from: objects of the family, and ways on which they press, shear, twist, roll, leave and return."""
+"""Random contacts to train on: objects of the family, and paths on which they press, shear, twist, roll, leave and return."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,15 @@ from twin.objects import ObjectField, build_field
 from twin.types import FloatArray
 
 LEGS = 7
-"""Straight motions of a path after its first touch."""
+"""Number of straight motions of a path after its first indentation."""
 DEEPEST_MM = 5.0
-"""Largest indentation of the undeformed dome that is drawn."""
+"""Largest drawn indentation of the undeformed dome."""
 SHALLOWEST_MM = 0.3
-"""Smallest indentation of a contact that is drawn."""
+"""Smallest drawn indentation of a contact."""
 POLAR_DEG = 35.0
 """Largest angle of the first touched place from the dome's apex."""
 BESIDE_MM = 9.0
-"""The touched place of the object is drawn up to this far from its origin, so that edges lie within or near the contact."""
+"""Range around the object's origin, along each axis, in which the touched place is drawn: edges then lie within or near the contact."""
 SHEAR_MM = 5.0
 """Largest sideways motion of one leg."""
 TURN_DEG = 15.0
@@ -31,24 +31,24 @@ FRICTION = (0.05, 1.5)
 FREE, STICKING = 0.0, 3.0
 """Coefficients of friction of a skin that slips at once, and of one that hardly ever slips."""
 END_SHARE = 0.08
-"""Share of the paths without friction, and share of those that stick."""
+"""Share of the paths with friction ``FREE``; as many have friction ``STICKING``."""
 LEAVE_SHARE = 0.1
-"""Share of the legs that leave the object and come back elsewhere."""
+"""Share of the legs on which the object leaves the skin and comes back elsewhere."""
 BACK_SHARE = 0.2
-"""Share of the others that go back along the leg before: friction's hysteresis shows there."""
+"""Share of the other legs that go back along the leg before: they show the hysteresis of friction."""
 CLEAR_MM = 0.5
-"""Distance to which such a leg lifts the object off."""
+"""Distance between skin and object on a leg that leaves."""
 LEAST_MM = {"sphere": 4.0, "cylinder": 5.0, "prism": 5.0}
-"""Smallest radii of balls and cylinders, and inradii of prisms, that are drawn. Smaller ones fit between two nodes of a surrogate."""
+"""Smallest drawn radii of balls and cylinders, and smallest drawn inradius of prisms. Smaller objects fit between two surrogate nodes."""
 LEAST_FILLET_MM = 0.45
-"""Smallest rounding of edges that is drawn. Prisms are rounded by at least 1 mm."""
+"""Smallest drawn fillet of edges. Prisms have a fillet of at least 1 mm."""
 _DIRECTIONS = 2000
-"""Directions on the whole sphere in which the object is looked for."""
+"""Number of directions, over the whole sphere, at which the dome is sampled."""
 
 
 @dataclass(frozen=True)
 class DrawnPath:
-    """One path to simulate: the object's shape, its way, and the coefficient of friction."""
+    """One path to simulate: the object's shape, its path, and the coefficient of friction."""
 
     shape: Shape
     path: ContactPath
@@ -56,7 +56,7 @@ class DrawnPath:
 
 
 def draw_shape(rng: np.random.Generator) -> Shape:
-    """A solid of random kind and size, between those of the shipped objects and somewhat beyond."""
+    """A solid of random kind and size, in the range of the shipped objects and somewhat beyond."""
 
     def sized(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
@@ -77,7 +77,10 @@ def draw_shape(rng: np.random.Generator) -> Shape:
 
 
 def unlike_drawn(touched: ObjectSpec) -> str:
-    """Why an object is none of the drawn family; "" for one that is. Larger ones are flatter, and count as drawn."""
+    """The reason why an object does not belong to the drawn family; "" for one that does.
+
+    Objects larger than the drawn ones are flatter, so they count as members of the family.
+    """
     shape = touched.shape
     if touched.texture is not None:
         return f"{touched.name} has a texture, which lies between the surrogate's nodes"
@@ -94,7 +97,7 @@ def unlike_drawn(touched: ObjectSpec) -> str:
 
 
 def draw_path(sensor: SensorSpec, rng: np.random.Generator) -> DrawnPath:
-    """A random object and a random way of it over the sensor's dome."""
+    """A random object, and a random path of it over the sensor's dome."""
     shape = draw_shape(rng)
     field = build_field(ObjectSpec(name="drawn", description="", shape=shape))
     radius = sensor.skin.outer_radius_mm
@@ -121,7 +124,7 @@ def draw_path(sensor: SensorSpec, rng: np.random.Generator) -> DrawnPath:
 
 
 def at_depth(field: ObjectField, dome_mm: FloatArray, T: FloatArray, depth_mm: float) -> FloatArray:
-    """The object moved along the dome's normal at its deepest place until it is ``depth_mm`` inside the undeformed dome."""
+    """The pose at which the object is ``depth_mm`` inside the undeformed dome: it moves along the dome's normal at the deepest place."""
     T = T.copy()
     for _ in range(6):
         deep, where = _deep(field, dome_mm, T)
@@ -130,7 +133,7 @@ def at_depth(field: ObjectField, dome_mm: FloatArray, T: FloatArray, depth_mm: f
 
 
 def _deep(field: ObjectField, dome_mm: FloatArray, T: FloatArray) -> tuple[float, FloatArray]:
-    """How deep the object is inside the undeformed dome, and the direction (3,) in which it is deepest."""
+    """Depth of the object inside the undeformed dome, and the direction (3,) of the deepest place."""
     gap = field.distance((dome_mm - T[:3, 3]) @ T[:3, :3])
     weights = np.exp(-(gap - gap.min()) / 0.2)  # a soft minimum: the direction moves smoothly with the pose
     where = weights @ dome_mm

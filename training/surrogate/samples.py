@@ -1,4 +1,4 @@
-"""Solved paths to learn from and to judge with, kept in one file."""
+"""Paths solved with finite elements, to train a surrogate on and to measure its errors."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,28 +20,30 @@ from twin.types import FloatArray
 from twin.workers import in_processes
 
 PIN_RINGS = 10
-"""Rings of the lattice on which the pins' motion is learnt."""
+"""Number of rings of the lattice on which the pins' motion is learnt."""
 STEP_MM = 0.8
-"""Largest motion across the contact in one load step: as long as the steps of a servo or an agent."""
+"""Largest motion across the contact in one load step: that of a step of a servo loop or an agent."""
 
 
 @dataclass(frozen=True)
 class SolvedPath:
-    """Converged states of one path; S of them, the object free of the skin at the first.
+    """The S converged states of one path. At the first state the object is clear of the skin.
 
     Attributes
     ----------
     shape : Shape
+        Shape of the object.
     friction : float
+        Coefficient of friction.
     T : (S, 4, 4) float
         The object's pose, sensor frame.
     base_mm, axis : (S, N, 3) float32
         Pins' feet and axes.
     force_n, torque_nmm : (S, 3) float
     area_mm2, slip : (S,) float
-        Area of the skin at rest that is pressed, and the share of it that slides.
+        Contact area, measured on the skin at rest, and the share of it that slides.
     node_mm, node_n : (S, M, 3) float32
-        Displacements of the skin at the surrogate's nodes, and the forces on it, each shared among the nodes around its place.
+        Displacements of the skin at the surrogate's nodes, and the forces on the skin, each shared among the nodes around its place.
     """
 
     shape: Shape
@@ -58,14 +60,17 @@ class SolvedPath:
 
 
 def lattice_sensor(sensor: SensorSpec) -> SensorSpec:
-    """The sensor with pins on a lattice of rings: pins do not change the mechanics, and what is learnt on rings has their symmetries."""
+    """The sensor with its pins on a lattice of rings.
+
+    Pins do not change the mechanics. The lattice has symmetries, and each of them gives a further training state.
+    """
     pins = {**sensor.pins.model_dump(mode="json", exclude_defaults=True), "layout": "rings", "rings": PIN_RINGS, "spacing": "polar"}
     kept = {key: value for key, value in pins.items() if key not in ("missing", "positions", "columns", "rows", "row_distance")}
     return sensor.model_copy(update={"pins": PinsSpec.model_validate(kept)})
 
 
 def solve_path(solver: SkinSolver, nodes: AtNodes, drawn: DrawnPath, *, step_mm: float = STEP_MM) -> SolvedPath | None:
-    """Follow a path with the finite elements as far as they converge; None if not even the first step does."""
+    """Solve a path with the finite elements as far as they converge; None if the first step does not converge."""
     field = build_field(ObjectSpec(name="drawn", description="", shape=drawn.shape))
     rest = solver.rest(T_sensor_object=drawn.path.at(0.0))
     states = [rest]
@@ -92,7 +97,7 @@ def solve_path(solver: SkinSolver, nodes: AtNodes, drawn: DrawnPath, *, step_mm:
 
 
 def solve_paths(sensor: SensorSpec, numbers: Sequence[int], *, processes: int, progress: Step) -> list[SolvedPath]:
-    """Solve the paths of these numbers; the same number gives the same path."""
+    """Draw and solve the paths of these numbers. The same number always gives the same path."""
     found: dict[int, SolvedPath] = {}
     for done, (number, solved) in enumerate(in_processes(_begin, (lattice_sensor(sensor),), list(numbers), processes=processes), 1):
         if solved is not None:

@@ -1,7 +1,7 @@
-"""Lattices of rings around the apex, and the twelve turns and mirrorings that leave them as they are.
+"""Lattices of rings around the apex, and their twelve symmetries: turns and mirrorings that map a lattice onto itself.
 
-The body is a body of revolution, so a contact that is turned or mirrored gives the turned or mirrored answer: every solved contact
-teaches twelve.
+The sensor is a body of revolution, so a turned or mirrored contact gives the turned or mirrored answer: every solved contact gives twelve
+training states.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from twin.types import FloatArray, IntArray
 
 
 def ring_directions(rings: int, largest_polar_deg: float, phase_deg: float) -> FloatArray:
-    """(3 rings (rings + 1) + 1, 3) unit vectors: the apex, then ring by ring by increasing azimuth."""
+    """Unit vectors (3 rings (rings + 1) + 1, 3): the apex, then ring by ring by increasing azimuth."""
     out = [np.array([[0.0, 0.0, 1.0]])]
     for ring in range(1, rings + 1):
         polar = np.radians(largest_polar_deg) * ring / rings
@@ -23,15 +23,15 @@ def ring_directions(rings: int, largest_polar_deg: float, phase_deg: float) -> F
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A turn by a multiple of 60 deg about z, after a mirroring at the plane through z and the lattice's phase, or without.
+    """A turn by a multiple of 60 deg about z, with or without a mirroring before it at the plane through z and the lattice's phase.
 
     Attributes
     ----------
     turns : int
-        Of 60 deg.
+        Number of turns by 60 deg.
     mirrored : bool
     matrix : (3, 3) float
-        What it does to vectors; to torques it does the same times ``parity``.
+        Matrix that maps vectors. Torques are mapped by this matrix times ``parity``.
     """
 
     turns: int
@@ -40,11 +40,11 @@ class Symmetry:
 
     @property
     def parity(self) -> float:
-        """-1 for a mirroring: torques are axial vectors."""
+        """Factor for torques: -1 for a mirroring, because torques are axial vectors."""
         return -1.0 if self.mirrored else 1.0
 
     def places(self, rings: int) -> IntArray:
-        """(M,) where each point of a lattice goes."""
+        """Index (M,) of the point to which each point of a lattice is mapped."""
         out, start = [np.zeros(1, int)], 1
         for ring in range(1, rings + 1):
             place = np.arange(6 * ring)
@@ -53,7 +53,7 @@ class Symmetry:
         return np.concatenate(out)
 
     def moved(self, vectors: FloatArray, rings: int) -> FloatArray:
-        """Vectors (S, M, 3) at a lattice's points, turned and mirrored with their places."""
+        """Vectors (S, M, 3) at a lattice's points, turned and mirrored together with the points."""
         out = np.empty_like(vectors)
         out[:, self.places(rings)] = vectors @ self.matrix.T.astype(vectors.dtype)
         return out

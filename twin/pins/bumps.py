@@ -1,8 +1,8 @@
-"""Pin-like bright spots in a frame of which nothing is known: no mask, no threshold, no size.
+"""Detection of pin-like bright spots in a frame without a known mask, threshold or cap size.
 
-A cap is a maximum of the difference of two Gaussians of about its own size. This difference is compared with its usual size nearby, so
-that caps in a dark corner count as much as those in the light. Spots that are much longer than wide (arcs of the housing, scratches) are
-left out.
+A cap is a local maximum of the difference of two Gaussian-filtered images whose widths are similar to the cap's size. This difference is
+compared with its root mean square nearby, so that caps in a dark corner have the same weight as caps in the light. Spots that are much
+longer than wide (arcs of the housing, scratches) are left out.
 """
 
 from dataclasses import dataclass
@@ -12,34 +12,40 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 WORKING_SIGMA_PX = (2.4, 6.0)
-"""Smallest and largest sd, px, with which a frame is looked at. For others it is enlarged by a whole number, or made smaller."""
+"""Smallest and largest standard deviation of the narrower Gaussian, px. For smaller spots the frame is enlarged by a whole number, for
+larger spots it is reduced."""
 LEAST_SIDE_PX = 8
-"""Narrower frames show nothing, px."""
+"""Least width and height of a frame, px. In smaller frames no spot is found."""
 DARK = 8.0
-"""Gray level around which the logarithm of the level begins to bend. There the reflection of an LED is hardly higher than a cap."""
+"""Gray level at which the scale changes from linear to logarithmic: the filters use log(1 + level / DARK). On this scale the reflection of
+an LED is hardly higher than a cap."""
 WIDE = 1.6
-"""Sd of the wider Gaussian, relative to the narrower one: then the difference is close to the Laplacian (Marr and Hildreth 1980)."""
+"""Ratio of the standard deviations of the wider and the narrower Gaussian. With this ratio the difference is close to the Laplacian (Marr
+and Hildreth 1980)."""
 AROUND = 5.0
-"""Sd of the Gaussian over which the usual size of the difference is taken, relative to the narrower one: one pitch or two."""
+"""Standard deviation of the Gaussian that averages the squared difference nearby, in standard deviations of the narrower Gaussian. It is
+one or two spacings."""
 LEAST_RESPONSE = 0.7
 """Least difference at a spot, relative to its root mean square nearby."""
 LEAST_LEVELS = 0.02
-"""Least difference at a spot, in the logarithm of the level: less is noise."""
+"""Least difference at a spot, in the logarithm of the level. Smaller differences are noise."""
 LEAST_ROUNDNESS = 0.2
-"""Least ratio of the smaller curvature at a spot to the larger one. A foreshortened cap at the rim has 0.3, an arc less than 0.1."""
+"""Least ratio of the smaller curvature at a spot to the larger one. A foreshortened cap at the rim has a ratio of 0.3, an arc less than
+0.1."""
 NEAREST, USUAL, FAR_BELOW = 12, 75, 0.3
-"""A spot that is lower than this share (the third) of this percentile of its nearest spots is noise between caps."""
+"""Number of nearest spots that a spot is compared with, percentile of their heights, and least share of this percentile. A lower spot is
+noise between caps."""
 APART = 1.3
-"""Spots are at least this far apart, in sds of the narrower Gaussian."""
+"""Least distance between two spots, in standard deviations of the narrower Gaussian."""
 
 WHITE_LEVEL = 250
-"""Least gray level of a glint: an LED's reflection is saturated."""
+"""Least gray level of a glint. The reflection of an LED is saturated."""
 MOST_GLINTS = 12
-"""With more saturated patches than this the caps themselves are white, and none is a glint."""
+"""Largest number of glints. If more patches are saturated, the caps themselves are white, and no patch counts as a glint."""
 GLINT_SIZE = 1.6
-"""Largest glint: the area of a disc of this many sds of the narrower Gaussian in radius."""
+"""Radius of a disc with the area of the largest glint, in standard deviations of the narrower Gaussian."""
 GLINT_RIM = 0.6
-"""Width of a glint's blurred rim in these sds, which is taken away with it."""
+"""Width of a glint's blurred rim, in standard deviations of the narrower Gaussian. The rim is removed together with the glint."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +55,15 @@ class Bumps:
     Attributes
     ----------
     px : (K, 2) float
-        Places, px of the frame.
+        Positions, px of the frame.
     response : (K,) float
         Height of each spot above its surroundings, in the logarithm of the level.
     sigma_px : float
-        Size that was looked for: sd of the narrower Gaussian, px of the frame.
+        Size of the spots: standard deviation of the narrower Gaussian, px of the frame.
     size_px : (int, int)
         Width and height of the frame.
     hidden : (H, W) bool, optional
-        Pixels in which frames show nothing (see ``twin.pins.extent``).
+        Pixels that a mask or fill hides (see ``twin.pins.extent``).
     """
 
     px: np.ndarray
@@ -68,7 +74,7 @@ class Bumps:
 
 
 def find_bumps(gray: np.ndarray, sigma_px: float) -> Bumps:
-    """Spots of one size, ``sigma_px`` (px of the frame), in a frame (H, W) uint8."""
+    """Find the spots of one size, ``sigma_px`` (px of the frame), in a frame (H, W) uint8."""
     low, high = WORKING_SIGMA_PX
     scale = float(np.ceil(low / sigma_px)) if sigma_px < low else min(high / sigma_px, 1.0)
     level: np.ndarray = without_glints(gray, sigma_px).astype(np.float32)
@@ -95,9 +101,10 @@ def find_bumps(gray: np.ndarray, sigma_px: float) -> Bumps:
 
 
 def without_glints(gray: np.ndarray, sigma_px: float) -> np.ndarray:
-    """A frame (H, W) uint8 in which the few saturated patches of an LED's size are filled with what is around them.
+    """The frame (H, W) uint8 without glints: saturated patches of an LED's size are filled from their surroundings.
 
-    A reflection in the window stands still while a cap moves beneath it; left there, it is taken for the cap.
+    The reflection of an LED in the window does not move while a cap moves behind it. If it stayed in the frame, it would be taken for the
+    cap.
     """
     white = (gray >= WHITE_LEVEL).astype(np.uint8)
     if not white.any():
@@ -112,7 +119,7 @@ def without_glints(gray: np.ndarray, sigma_px: float) -> np.ndarray:
 
 
 def _not_far_below(px: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Which spots (K,) are not far below those around them: between caps noise makes spots too, but low ones."""
+    """(K,) bool: whether each spot is high enough compared with its nearest spots. Noise between caps also makes spots, but low ones."""
     if len(px) <= NEAREST:
         return np.ones(len(px), bool)
     around = cKDTree(px).query(px, k=NEAREST)[1]
@@ -120,7 +127,7 @@ def _not_far_below(px: np.ndarray, height: np.ndarray) -> np.ndarray:
 
 
 def _refined(field: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (K, 2) of maxima below a pixel, by the parabola through their neighbours, and which of them (K,) are round enough."""
+    """Sub-pixel positions (K, 2) of maxima, by a parabola through the neighbours, and whether each maximum (K,) is round enough."""
     here = field[rows, columns]
     left, right, up, down = field[rows, columns - 1], field[rows, columns + 1], field[rows - 1, columns], field[rows + 1, columns]
     xx, yy = left + right - 2 * here, up + down - 2 * here

@@ -1,9 +1,10 @@
-"""Where frames show a sensor at all, and whether they show where its layout ends.
+"""The part of the frames that shows the sensor, and a test of whether the frames show the outer end of its layout.
 
-A frame's edge, or a mask laid over it, may cut outer rings or rows off. What is left looks like a smaller layout that explains everything.
-So a layout's end is only known where the places of the next ring, row and column would be in view, and are empty. Such a place is in view
-if the frames show anything farther out in its direction: the housing, its light, the skin's slow shading. A mask shows nothing but one
-level and the camera's noise. There is no room for such a place where something as bright as a cap stands beside it: the housing too.
+The border of a frame, or a mask laid over the frame, may cut off outer rings or rows of pins. The remaining pins look like a smaller layout
+that explains the whole frame. Therefore the end of a layout is known only where the places of the next ring, row or column are in view and
+empty. A place counts as in view if the frames show something farther out in its direction: the housing, its light, or slow shading of the
+skin. A mask shows only one gray level and the camera's noise. A place also counts as empty if something as bright as a cap, for example the
+housing, stands beside it, because there is no room for a cap.
 """
 
 from collections.abc import Sequence
@@ -19,39 +20,47 @@ from twin.pins.families import HALF_GRID, MOST_RINGS, family
 from twin.pins.growth import seen_places
 
 FLAT_SIDE_PX = 5
-"""Side of the square around a pixel, px, in which no level differs where a frame is filled or masked: a camera's noise differs."""
+"""Side of a square around a pixel, px. If all its gray levels are equal, the frame is filled or masked there: camera noise would differ."""
 FLAT_IN_THE_MIDDLE = 0.03
-"""From this share of flat pixels in the middle of a frame on, the skin itself is flat (drawn or thresholded), and nothing tells a mask."""
+"""Share of flat pixels in the middle of a frame from which on the skin itself is flat (drawn or thresholded). A mask is then not
+recognisable."""
 WHITE_LEVEL, WHITE_IN_THE_MIDDLE = 247, 0.05
-"""With a larger share of pixels of at least this gray level there, the caps are white: thresholded frames, whose skin is flat too."""
+"""Gray level from which on a pixel is white, and share of white pixels in the middle of a frame from which on the frame is thresholded.
+The skin of a thresholded frame is flat, too."""
 MIDDLE = 0.35
-"""The middle of a frame begins at this share of its sides."""
+"""Distance of the middle part of a frame from its border, as a share of the frame's width and height."""
 FILLED_SIGMAS = 4.0
-"""Radius of the smallest disc that fits in a filled area, in sds of a spot: nearly a spacing, so it does not fit between pins."""
+"""Radius of the smallest disc that fits in a filled area, in standard deviations of a spot. It is nearly one spacing, so that the disc does
+not fit between pins."""
 IN_VIEW = 1.0
-"""A pin is in view if it is at least this many sds of its spot inside the frame."""
+"""Least distance of a pin in view from the frame's border, in standard deviations of its spot."""
 CAP_EDGE = 0.3
-"""A cap's edge is this far from its middle, in spacings. What a mask leaves of the next caps reaches less far."""
+"""Distance of a cap's edge from its middle, in spacings. The parts of the next caps that a mask leaves visible are nearer than this."""
 IN_FRAME, FEWEST_IN_FRAME = 0.15, 4
-"""A layout can be seen to end only where at least this share of the next places is in the frame, and at least this many of them,"""
+"""Least share and least number of the places of the next ring, row or column that must be in the frame. With fewer of them the frames do
+not show the end of the layout."""
 SEEN_PAST, FEWEST_SEEN_PAST = 0.25, 3
-"""and where something is seen past at least this share of these places, and at least this many of them."""
+"""Least share and least number of these places in the frame that the frames must show to be empty. With fewer of them the frames do not
+show the end of the layout."""
 SEEN_LEVELS, SEEN_NOISES = 1.0, 6.0
-"""Frames show something where their mean differs from the usual level around the pins by more gray levels than the first, and by more
-standard errors of the mean than the second."""
+"""Thresholds of a visible difference: the mean of the frames differs from the usual level around the pins by more than ``SEEN_LEVELS``
+gray levels, and by more than ``SEEN_NOISES`` standard errors of the mean."""
 SEEN_SIGMAS = 0.5
-"""Sd of the Gaussian with which frames are smoothed for that, in sds of a spot: noise is averaged, a thin ring of light stays."""
+"""Standard deviation of the Gaussian that smooths the frames before this comparison, in standard deviations of a spot. It averages the
+noise and keeps a thin ring of light."""
 SKIN_AND_CAPS = (20, 90)
-"""Percentiles of the levels among the pins that are those of the skin and of the caps: caps cover a quarter or so."""
+"""Percentiles of the gray levels among the pins that are taken as the level of the skin and of the caps. Caps cover about a quarter of
+the area."""
 BESIDE = 0.5
-"""The direction of a place is this wide to each side, in spacings; and from this far beyond the outermost pins on, frames are looked at."""
+"""Half width of the strip beyond a place in which the frames are searched, and distance from the outermost pins at which the search
+begins, in spacings."""
 
 
 def filled_area(images: Sequence[np.ndarray]) -> np.ndarray | None:
-    """Pixels (H, W) bool of gray frames (H, W) uint8 in which no frame shows anything: the fill of a turned frame, or a mask.
+    """Pixels (H, W) bool of gray frames (H, W) uint8 that no frame uses: the fill of a turned frame, or a mask.
 
-    None where there are no such pixels, or nothing tells: where caps are white or the skin has one level, the skin cannot be told from a
-    mask.
+    The result is None if there are no such pixels, or if they cannot be recognised. If the caps are white or the skin has one gray level,
+    the skin looks like a mask.
     """
     flat = _flat(np.maximum.reduce(list(images)), np.minimum.reduce(list(images)))
     height, width = flat.shape
@@ -63,14 +72,14 @@ def filled_area(images: Sequence[np.ndarray]) -> np.ndarray | None:
 
 
 def _flat(high: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) around which the highest and lowest levels of frames are the same."""
+    """Pixels (H, W) in whose neighbourhood all frames have one level; ``high`` and ``low`` are the frames' largest and smallest levels."""
     square = np.ones((FLAT_SIDE_PX, FLAT_SIDE_PX), np.uint8)
     same: np.ndarray = cv2.dilate(high, square) == cv2.erode(low, square)
     return same
 
 
 def with_view(spots: Bumps, filled: np.ndarray | None) -> Bumps:
-    """Spots that also know where pins of their size are in view, from what ``filled_area`` tells."""
+    """The spots with the area in which pins of their size are hidden (``Bumps.hidden``), from the result of ``filled_area``."""
     if filled is None:
         return spots
     reach = max(round(FILLED_SIGMAS * spots.sigma_px), 1)
@@ -81,7 +90,7 @@ def with_view(spots: Bumps, filled: np.ndarray | None) -> Bumps:
 
 
 def in_view(places: np.ndarray, spots: Bumps) -> np.ndarray:
-    """Which places (n, 2), NaN where unknown, a frame shows as a whole."""
+    """(n,) bool: whether the frame shows the whole pin at each place (n, 2). A place of NaN is unknown, and not in view."""
     margin = IN_VIEW * spots.sigma_px
     with np.errstate(invalid="ignore"):
         inside: np.ndarray = np.all((places >= margin) & (places <= np.array(spots.size_px) - 1 - margin), axis=1)
@@ -92,12 +101,12 @@ def in_view(places: np.ndarray, spots: Bumps) -> np.ndarray:
 
 
 def sides(pins: PinsSpec) -> list[np.ndarray]:
-    """Places of a family's lattice at which a layout would go on: the next ring, or the next row or column on each side of a grid.
+    """Places of a family's lattice just outside a layout: the next ring, or the next row or column on each side of a grid.
 
     Returns
     -------
     list of (k,) int
-        Empty for a layout of given positions, and for the largest one that is looked for.
+        One array for each side. The list is empty for a layout of given positions, and for the largest layout that is searched.
     """
     if pins.layout in ("rings", "hexagon"):
         if (pins.rings or 0) >= MOST_RINGS:
@@ -114,7 +123,7 @@ def sides(pins: PinsSpec) -> list[np.ndarray]:
 
 
 def own_places(pins: PinsSpec) -> np.ndarray:
-    """Places (N,) of a family's lattice that a layout's pins have, so that those of ``sides`` lie around them."""
+    """Places (N,) of a layout's pins in a family's lattice. The places of ``sides`` lie around them."""
     places = np.arange(pins.complete_count)
     if pins.layout == "grid":
         columns = pins.columns or 1
@@ -124,14 +133,14 @@ def own_places(pins: PinsSpec) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Beyond:
-    """What gray frames show around a layout: what differs there from the level that most of the picture has.
+    """Visible things around a layout: pixels whose level differs from the usual level there.
 
     Attributes
     ----------
     px : (k, 2) float
         Pixels.
     bright : (k,) bool
-        Which of them are as bright as caps: no skin.
+        Whether each pixel is as bright as a cap, so that it does not show skin.
     """
 
     px: np.ndarray
@@ -139,7 +148,7 @@ class Beyond:
 
 
 def seen_beyond(images: Sequence[np.ndarray], rest_px: np.ndarray, sigma_px: float) -> Beyond:
-    """What gray frames (H, W) uint8 show around a layout with its pins at rest (N, 2), px, beyond the noise of their mean."""
+    """Visible things in gray frames (H, W) uint8 around a layout with pins at rest (N, 2), px, above the noise of the frames' mean."""
     height, width = images[0].shape
     reach = max(round(BESIDE * usual_spacing(rest_px)), 1)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
@@ -160,9 +169,9 @@ def seen_beyond(images: Sequence[np.ndarray], rest_px: np.ndarray, sigma_px: flo
 
 
 def open_sides(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps, beyond: Beyond) -> int:
-    """Number of sides on which frames do not show that a layout with its pins at rest (N, 2), px, ends: more pins may be cut off there.
+    """Number of sides on which the frames do not show the end of a layout with pins at rest (N, 2), px.
 
-    ``beyond`` is what the frames show around the pins (``seen_beyond``).
+    On such a side the frame may cut off more pins. ``beyond`` is the result of ``seen_beyond``.
     """
     around = sides(pins)
     if not around:
@@ -183,7 +192,7 @@ def open_sides(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps, beyond: Beyond
 
 
 def _ended(place: np.ndarray, rest_px: np.ndarray, middle: np.ndarray, beyond: Beyond) -> bool:
-    """Whether frames show that no cap stands at a place (2,): something is seen past it, or something bright that is no cap beside it."""
+    """Whether the frames show that no cap is at a place (2,): something is visible beyond it, or bright beside it."""
     away = place - middle
     far, spacing = float(np.linalg.norm(away)), float(np.linalg.norm(rest_px - place, axis=1).min())
     along = (beyond.px - middle) @ away / far

@@ -1,4 +1,4 @@
-"""Families of layouts, each as one large lattice of which a sensor's layout is a part, and how a frame's spots are labelled by it."""
+"""Families of pin layouts, and the labelling of a frame's spots by them. A family is a large lattice that contains a sensor's layout."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,41 +13,42 @@ from twin.pins.bumps import Bumps
 from twin.pins.growth import NEIGHBOURS, grow
 
 MOST_RINGS = 16
-"""Rings that are looked for; printed TacTips have 3 to 11."""
+"""Largest number of rings that is searched. Printed TacTips have 3 to 11."""
 HALF_GRID = 20
-"""Columns and rows that are looked for on each side of the place from which a grid is grown."""
+"""Largest number of columns and rows that is searched on each side of the place at which a grid starts."""
 SEEDS = {"rings": 40, "hexagon": 12, "grid": 12}
-"""Spots from which labellings start, those nearest to the middle first. Rings have one middle, which contact displaces; a hexagon and a
-grid may start anywhere."""
+"""Number of spots from which a labelling is started, by family. The spots nearest to the middle are tried first. Rings have only one
+centre, which a contact displaces; a hexagon or a grid may start at any pin."""
 NEARLY_ALL = 0.95
-"""No further start is tried after a labelling that holds this share of the spots."""
+"""Share of the spots that a labelling must hold to end the search for a better start."""
 RING_GAPS_DEG, GRID_GAPS_DEG = (25.0, 100.0), (60.0, 120.0)
-"""Smallest and largest angle between neighbouring directions to the nearest six, and four, spots around a start."""
+"""Smallest and largest angle, deg, between the directions to neighbouring spots around a start: among the nearest six spots (rings,
+hexagon), and among the nearest four (grid)."""
 MOST_UNEVEN = 2.0
-"""Largest ratio of the distances of these spots."""
+"""Largest ratio of the distances of these nearest spots from the start."""
 LEAST_GROWN = 12
-"""A labelling of fewer spots than this is none."""
+"""Least number of spots in a labelling."""
 TURNS_DEG = np.arange(0.0, 360.0, 5.0)
-"""Turns in which a layout of given positions is laid over the spots."""
+"""Angles, deg, by which a layout of given positions is turned when it is laid over the spots."""
 LAID_SCALES = (1.0, 0.93, 1.07, 0.86, 1.15)
-"""Sizes in which it is laid over them, relative to that of the spots."""
+"""Sizes of a layout of given positions when it is laid over the spots, relative to the size of the pattern of spots."""
 LAID_GATE = 0.3
-"""Largest distance of a spot from a place laid over it, in spacings, for a first label."""
+"""Largest distance of a spot from a place of the layout laid over it, in spacings, at which the spot gets a first label."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """A lattice to label spots by.
+    """A lattice by which spots are labelled.
 
     Attributes
     ----------
     name : {"rings", "hexagon", "grid", "positions"}
     lattice : (M, 2) float
-        Neighbouring places are about 1 apart.
+        Positions of the places. Neighbouring places are about 1 apart.
     around : (M, k) int
-        Places around each place, the nearest first.
+        Neighbours of each place, the nearest first.
     ring : (M,) int
-        Ring of each place; 0 for all where there are no rings.
+        Ring of each place; 0 for all places of a lattice without rings.
     """
 
     name: str
@@ -74,14 +75,14 @@ def family(name: str) -> Family:
 
 @lru_cache(maxsize=8)
 def family_of_positions(pins: PinsSpec) -> Family:
-    """A layout itself as a lattice, whatever its kind."""
+    """A layout of any kind as a lattice of its own."""
     places = pin_lattice(pins).places
     spacing = usual_spacing(places)
     return _family("positions", places / spacing, np.zeros(len(places), int))
 
 
 def label_spots(found: Bumps, by: Family) -> np.ndarray | None:
-    """The labelling (M,) of a frame's spots that holds most of them: the spot of each place, -1 for none; None if there is none."""
+    """The labelling (M,) that holds most spots of a frame: the spot of each place, -1 for no spot. None if no labelling is found."""
     if len(found.px) < LEAST_GROWN:
         return None
     best, most = None, LEAST_GROWN - 1
@@ -96,7 +97,7 @@ def label_spots(found: Bumps, by: Family) -> np.ndarray | None:
 
 
 def _starts(found: Bumps, by: Family) -> Iterator[tuple[np.ndarray, float]]:
-    """First labels (M,): a spot and those around it, the first of them in the direction nearest to x; and their distance, px."""
+    """First labels (M,) and the spots' distance, px: a spot and its nearest spots, beginning with the one nearest to the x direction."""
     px, corners = found.px, 4 if by.name == "grid" else 6
     least, most = GRID_GAPS_DEG if by.name == "grid" else RING_GAPS_DEG
     middle = len(by.lattice) // 2 if by.name == "grid" else 0
@@ -121,7 +122,7 @@ def _starts(found: Bumps, by: Family) -> Iterator[tuple[np.ndarray, float]]:
 
 
 def _laid(found: Bumps, by: Family) -> Iterator[tuple[np.ndarray, float]]:
-    """First labels (M,) where the lattice, laid over the spots by middle, size and turn, meets them."""
+    """First labels (M,) and the spacing, px: the lattice, laid over the spots by middle, size and turn, labels spots nearby."""
     px = found.px
     tree = cKDTree(px)
     low, high = np.percentile(px, [2, 98], axis=0)

@@ -1,8 +1,8 @@
-"""Label bright spots by the places of a lattice, from a few labels outwards, whatever the view's size, turn and distortion.
+"""Labelling of bright spots by the places of a lattice, from a few labels outwards, for any scale, turn and distortion of the view.
 
-Where the next place of the lattice is seen is predicted by the local affine map of the places around it that are labelled already. So the
-lattice may be foreshortened, bulge or bend slowly; only its topology is known. All limits are relative to the local spacing, and were
-chosen, not derived.
+A local affine map, fitted to the labelled places around the next place, predicts the position of this place in the frame. Therefore the
+lattice may be foreshortened or slowly curved; only its topology must be known. All distances are relative to the local spacing. All limits
+were chosen, not derived.
 """
 
 import numpy as np
@@ -10,26 +10,26 @@ import numpy as np
 from twin.compiled import compiled
 
 NEIGHBOURS = 18
-"""Places around a place that its prediction is made from: two rings of a triangular lattice."""
+"""Number of neighbours that predict the position of a place: two rings of a triangular lattice."""
 NEAR = 8
 """A place is tried when one of this many nearest places is labelled."""
 GATES = (0.25, 0.38)
-"""Largest distance from a prediction to its spot: strict first, then looser."""
+"""Largest distance from a prediction to its spot, in local spacings, during growth: first the strict limit, then the wide one."""
 LEAST_AROUND = (4, 3)
-"""Least number of labelled places for a prediction, with each of these gates."""
+"""Least number of labelled neighbours for a prediction, with each limit of ``GATES``."""
 FINAL_GATE = 0.42
-"""Largest distance of a spot from where all its labelled neighbours predict it."""
+"""Largest distance of a spot from the prediction by all its labelled neighbours, in local spacings. A label beyond it is removed."""
 MOST_STRETCH = 3.0
-"""Largest ratio of the local map's scales in two directions. A cap's surroundings at the rim of a dome have 2."""
+"""Largest ratio of the local map's scales in two directions. Around a cap at the rim of a dome the ratio is 2."""
 ROUNDS = 3
-"""Rounds in which labels that their neighbours do not bear out are taken back, and the labelling grows again."""
+"""Number of rounds. Each round grows the labelling and then removes the labels that contradict their neighbours; the last only grows."""
 
 
 @compiled()
 def predict_place(i: int, lattice: np.ndarray, around: np.ndarray, spot: np.ndarray, px: np.ndarray) -> tuple[float, float, float, int]:
-    """Where place ``i`` is seen, by the labelled places around it: x, y, local spacing (px), and how many there are.
+    """Predict the position of place ``i`` from its labelled neighbours: x, y, local spacing (px), and the number of these neighbours.
 
-    A weighted affine map; 0 places are returned where it is not determined, mirrors the lattice, or stretches it too much.
+    The prediction is a weighted affine map. The number is 0 if the map is not determined, mirrors the lattice, or stretches it too much.
     """
     m = np.zeros((3, 3))
     bx, by = np.zeros(3), np.zeros(3)
@@ -58,7 +58,7 @@ def predict_place(i: int, lattice: np.ndarray, around: np.ndarray, spot: np.ndar
     c11, c12 = m[0, 0] * m[2, 2] - m[0, 2] * m[2, 0], m[0, 1] * m[2, 0] - m[0, 0] * m[2, 1]
     c22 = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
     fx, fy = np.empty(3), np.empty(3)
-    for to, of in ((fx, bx), (fy, by)):  # the inverse of the symmetric matrix m by its cofactors: LAPACK takes longer for so small a matrix
+    for to, of in ((fx, bx), (fy, by)):  # cofactors invert the symmetric matrix m, because LAPACK is slower for such a small matrix
         to[0] = (c00 * of[0] + c01 * of[1] + c02 * of[2]) / det
         to[1] = (c01 * of[0] + c11 * of[1] + c12 * of[2]) / det
         to[2] = (c02 * of[0] + c12 * of[1] + c22 * of[2]) / det
@@ -76,7 +76,7 @@ def predict_place(i: int, lattice: np.ndarray, around: np.ndarray, spot: np.ndar
 def _nearest(
     x: float, y: float, reach: float, px: np.ndarray, head: np.ndarray, after: np.ndarray, grid: np.ndarray, owner: np.ndarray
 ) -> int:
-    """Nearest free spot within reach of (x, y), -1 if there is none."""
+    """The nearest free spot within reach of (x, y); -1 if there is none."""
     x0, y0, cell, columns, rows = grid
     best, best2 = -1, reach * reach
     for cy in range(max(int((y - reach - y0) / cell), 0), min(int((y + reach - y0) / cell), int(rows) - 1) + 1):
@@ -105,20 +105,20 @@ def _cells(px: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 @compiled()
 def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndarray, cell: float) -> np.ndarray:
-    """A labelling: the spot (M,) of each place of a lattice, -1 for none.
+    """Grow a labelling: the spot (M,) of each place of a lattice, -1 for no spot.
 
     Parameters
     ----------
     lattice : (M, 2) float
-        Neighbouring places are about 1 apart.
+        Positions of the places. Neighbouring places are about 1 apart.
     around : (M, k) int
-        Places around each place, the nearest first.
+        Neighbours of each place, the nearest first.
     px : (K, 2) float
         The spots.
     start : (M,) int
         First labels, at least three, not on a line.
     cell : float
-        Side, px, of the cells by which spots are looked up: about their spacing.
+        Side of the square cells in which spots are looked up, px: about their spacing.
     """
     n = len(lattice)
     spot = start.copy()
@@ -180,9 +180,9 @@ def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndar
 
 
 def seen_places(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """Places (M, 2), px, of a labelled lattice: those of the spots, else as predicted from labelled places; NaN where nothing tells.
+    """Positions (M, 2), px, of a lattice's places: of the spots, or predicted from labelled neighbours; NaN without a prediction.
 
-    A predicted place outside the frame is given as well: it tells that the frame cuts a pin off.
+    A predicted position may lie outside the frame. It then shows that the frame cuts a pin off.
     """
     out = np.full((len(lattice), 2), np.nan)
     for i in range(len(lattice)):

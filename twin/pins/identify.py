@@ -1,9 +1,9 @@
-"""Which layout of pins frames show, when nothing is known but the frames.
+"""Identification of the pin layout of an unknown sensor from its frames alone.
 
-Every family of layouts (rings, hexagon, grid) labels the pin-like spots of each frame by its lattice (`twin.pins.families`). The part of
-the lattice that holds them is a candidate. A candidate is judged by what it leaves unexplained: pins that should be in view but are not
-seen, and pin-like spots that are none of its pins, at its rim or just beyond too. So a layout that is one ring too small, or too large,
-explains less than the right one, and is never taken for it.
+Each family of layouts (rings, hexagon, grid) labels the pin-like spots of each frame by its lattice (`twin.pins.families`). The part of
+the lattice that holds the spots is a candidate. A candidate is judged by what it does not explain: pins that should be in view but are not
+seen, and pin-like spots that belong to none of its pins, also at its rim and just outside it. Therefore a layout with one ring too few or
+too many explains less than the right layout, and is not chosen.
 """
 
 from collections.abc import Callable
@@ -27,45 +27,47 @@ from twin.pins.reference import make_reference
 from twin.progress import Step
 
 SIZES = tuple(0.003 * 1.4**k for k in range(8))
-"""Sizes of spots that are looked for: sd of a Gaussian, as a share of the frame's longer side. A cap is about three sds wide."""
+"""Sizes of spots that are tried: standard deviation of a Gaussian, as a share of the frame's longer side. A cap is about three standard
+deviations wide."""
 SIZED_ON = 3
-"""Frames on which the size is found."""
+"""Number of frames from which the size of the spots is determined."""
 FAMILIES = ("rings", "hexagon", "grid")
 FULL_RING = 0.5
-"""A ring, row or column belongs to the layout if at least this share of its places in view are seen."""
+"""Least share of the places in view of a ring, row or column that must be seen, for it to belong to the layout."""
 LIKE_ITS_NEIGHBOURS = 0.45
-"""A spot is pin-like if it is at least this share as high as the pins around it."""
+"""Least height of a pin-like spot, as a share of the median height of the pins around it."""
 BEYOND = 1.25
-"""Spots count as left over up to this many spacings from the nearest pin."""
+"""Largest distance of a left-over spot from the nearest pin, in spacings. Spots farther away are ignored."""
 STEADY = 0.5
-"""A pin is in the rest layout if it was seen in this share of the frames."""
+"""Least share of the frames in which a pin must be seen, for its position at rest to be the median of its seen positions."""
 NEVER_SEEN = 0.1
-"""A pin in view that is seen in less than this share of the frames is missing."""
+"""Share of the frames below which a pin in view counts as missing from the layout."""
 MOST_MISSING = 0.05
 """Largest share of missing pins that a layout may have."""
 SHOWN = 0.9
-"""A frame shows a layout that explains at least this share of what is there."""
+"""Least share of a frame's pins and pin-like spots that a layout must explain, for the frame to show this layout."""
 FOLDED = 0.02
-"""Pins at rest that are nearer to each other than this, in median spacings, stand on each other: the frames do not show such a layout."""
+"""Least distance between two pins at rest, in median spacings. If two pins are nearer to each other, the frames do not show this layout."""
 AROUND = 6
-"""Pins around a spot that it is compared with."""
+"""Number of nearest pins with which a spot is compared."""
 MOST_GUESSES = 3
-"""Layouts that are matched to all frames."""
+"""Largest number of layouts that are matched to all frames."""
 NO_LAYOUT = (
     "check focus and light, crop the frames to the sensor, give frames with less contact, or give the pins' places (layout = 'positions')"
 )
 SURE_EXPLAINED, SURE_AHEAD, SURE_AGREEING = 0.95, 0.04, 0.75
-"""A layout is sure if it explains at least the first share of what is there, as much more as the second than the next layout, and is
-that of at least the third share of the frames."""
+"""Thresholds of a sure layout: least share of the pins and spots that it explains, least lead in this share over the next layout, and least
+share of the frames that show it."""
 SAME_SHAPE = 0.8
-"""Two layouts that explain alike differ in shape: the ratio of their misfits to a smooth view must be below this to be sure."""
+"""Largest ratio of the misfits to a smooth view of two layouts that explain nearly the same share, for the first to be sure."""
 FADED = 0.8
-"""In thresholded frames the light fades where the outermost caps are smaller than this share of the others: caps further out may be black.
-Measured: 0.96 to 1.7 in thresholded frames of three sensors, 0.3 and 0.6 in those of a sensor with dark corners."""
+"""Least size of the outermost caps in thresholded frames, relative to the other caps. If they are smaller, the light fades at the rim, and
+caps farther out may be black. The ratio was measured as 0.96 to 1.7 in thresholded frames of three sensors, and as 0.3 and 0.6 in frames
+of a sensor with dark corners."""
 LEAST_EXPLAINED = 0.6
-"""A candidate that explains less than this is none."""
+"""Least share of the pins and pin-like spots that a candidate must explain."""
 FEWEST_VIEWED = 12
-"""Fewest pins to which a smooth view, which has ten terms, is fitted."""
+"""Least number of pins to which a smooth view is fitted. The view has ten terms."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +77,13 @@ class Seen:
     Attributes
     ----------
     pins_px : (N, 2) float
-        Places of the spots, NaN where there is none.
+        Positions of the pins' spots; NaN for a pin without a spot.
     places_px : (N, 2) float
-        The same, and the predicted places of the others; NaN where nothing tells.
+        Positions of all pins: of the spot, or predicted if the pin has none; NaN without a prediction.
     not_seen : int
-        Pins in view without a spot.
+        Number of pins in view without a spot.
     left_over_px : (k, 2) float
-        Pin-like spots that are none of the pins.
+        Pin-like spots that belong to no pin.
     """
 
     pins_px: np.ndarray
@@ -91,33 +93,33 @@ class Seen:
 
     @property
     def explained(self) -> float:
-        """Of the pins in view and the pin-like spots, the share that belong together."""
+        """Share of the pins in view and pin-like spots that are matched to each other."""
         pins = int(np.isfinite(self.pins_px[:, 0]).sum())
         return pins / max(pins + self.not_seen + len(self.left_over_px), 1)
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A layout that frames may show.
+    """A possible layout of the pins, and how well the frames agree with it.
 
     Attributes
     ----------
     pins : PinsSpec
-        Layout, and pins that are missing; size of pins and caps are the defaults.
+        Layout and missing pins. The sizes of pins and caps are the defaults.
     explained : float
-        Median share of the frames' pins and pin-like spots that it explains.
+        Share of a frame's pins and pin-like spots that the layout explains, median over the frames.
     agreeing : float
-        Share of the frames that show the layout by at least ``SHOWN``.
+        Share of the frames in which the layout explains at least ``SHOWN``.
     not_seen, left_over : float
-        Median number, over the frames, of its pins in view that are not seen, and of pin-like spots that are none of its pins.
+        Number of pins in view that are not seen, and of pin-like spots that belong to no pin, medians over the frames.
     misfit : float
         Rms distance of the pins at rest from the smoothest view of the layout, in spacings.
     rest_px : (N, 2) float
-        Median place of each pin over the frames.
+        Median position of each pin over the frames.
     there : (N,) float
         Share of the frames in which each pin is seen.
     seen : tuple of Seen
-        What each frame shows of it.
+        The layout's pins in each frame.
     """
 
     pins: PinsSpec
@@ -140,17 +142,17 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Identified:
-    """What frames say of their sensor's layout.
+    """Result of the identification of a layout.
 
     Attributes
     ----------
     candidates : tuple of Candidate
-        The likeliest first; at least one.
+        Candidates, the best one first; at least one.
     sure : bool
     doubts : tuple of str
-        Why it is not sure, and what would decide.
+        Reasons why the best candidate is not sure, and the data that would decide.
     sigma_px : float
-        Size of the spots, px of the frame: sd of the Gaussian that fits them best.
+        Size of the spots: standard deviation of the Gaussian that fits them best, px of the frame.
     """
 
     candidates: tuple[Candidate, ...]
@@ -160,19 +162,19 @@ class Identified:
 
     @property
     def best(self) -> Candidate:
-        """The likeliest layout."""
+        """The best candidate."""
         return self.candidates[0]
 
 
 Look = Callable[[Bumps], Seen | None]
-"""What a frame's spots show."""
+"""Function that finds a layout in a frame's spots; None if it finds none."""
 
 
 def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Identified:
-    """The layout that gray frames (H, W) uint8 of one sensor show, in contact or not.
+    """Identify the layout in gray frames (H, W) uint8 of one sensor, with or without contact.
 
-    Each frame is labelled by itself first. The layouts found in most frames are then matched to every frame from where most frames have
-    their pins, so that a frame in which a contact hides the layout's middle counts too.
+    First each frame is labelled by itself. The layouts that are found in most frames are then matched to all frames, starting from the
+    median positions of their pins. In this way a frame in which a contact hides the middle of the layout can be used, too.
 
     Raises
     ------
@@ -203,7 +205,7 @@ def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Ident
 
 
 def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
-    """The layout that frames show whose caps are brighter than the skin."""
+    """Identify the layout in frames whose caps are brighter than the skin."""
     looks: list[Look] = [partial(_family_look, family(name)) for name in FAMILIES]
     sizes = [_best_size(images[k], looks) for k in spread(len(images), SIZED_ON)]
     if not any(sizes):
@@ -241,7 +243,7 @@ def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
 
 
 def _faded(layout: Candidate, images: list[np.ndarray]) -> float:
-    """Size of the outermost caps, relative to the others', in thresholded frames; 1 in others, where caps further out would be seen."""
+    """Size of the outermost caps relative to the others in thresholded frames. 1 for other frames, which would show caps farther out."""
     chosen = [k for k in spread(len(images), SIZED_ON) if is_two_level(images[k])]
     outmost = np.isin(np.arange(layout.pins.count), pin_lattice(layout.pins).outmost)
     white = []
@@ -259,7 +261,7 @@ def _faded(layout: Candidate, images: list[np.ndarray]) -> float:
 
 
 def _end_not_seen(pins: PinsSpec) -> str:
-    """Why a layout that explains everything may yet be too small."""
+    """Message: the frames do not show the end of the layout, so the sensor may have more pins."""
     lines = "rows or columns" if pins.layout == "grid" else "rings"
     return (
         f"the frames show nothing beyond {pins.in_words()}: more {lines} may be cut off or masked; frames that show the sensor's rim "
@@ -268,7 +270,7 @@ def _end_not_seen(pins: PinsSpec) -> str:
 
 
 def _with_larger(candidates: list[Candidate], spots: list[Bumps]) -> list[Candidate]:
-    """The candidates, and behind the first the layout that has one ring more than it."""
+    """The candidates, with the layout that has one ring more than the first candidate inserted after it."""
     first = candidates[0].pins
     if first.rings is None or any((c.pins.layout, c.pins.rings) == (first.layout, first.rings + 1) for c in candidates[1:2]):
         return candidates
@@ -279,7 +281,7 @@ def _with_larger(candidates: list[Candidate], spots: list[Bumps]) -> list[Candid
 
 
 def judge_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
-    """How well a given layout explains gray frames (H, W) uint8; None where no frame shows it. Missing pins are taken as given."""
+    """How well a given layout explains gray frames (H, W) uint8; None if no frame shows it. Its missing pins are not changed."""
     by = family_of_positions(pins) if pins.layout == "positions" or pins.missing else family(pins.layout)
     look = partial(_layout_look, pins, by)
     sizes = [size for k in spread(len(images), SIZED_ON) if (size := _best_size(images[k], [look]))]
@@ -291,7 +293,7 @@ def judge_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
 
 
 def _spots(images: list[np.ndarray], sigma_px: float) -> list[Bumps]:
-    """Each frame's spots of one size, and where the frames show a sensor at all."""
+    """Each frame's spots of one size, with the area that a mask hides in all frames."""
     filled = filled_area(images)
     found = [find_bumps(image, sigma_px) for image in images]
     hidden = with_view(found[0], filled).hidden
@@ -299,7 +301,7 @@ def _spots(images: list[np.ndarray], sigma_px: float) -> list[Bumps]:
 
 
 def _best_size(image: np.ndarray, looks: list[Look]) -> float | None:
-    """The size of spots by which most pins are seen, and fewest are missed or left over; None where nothing is seen."""
+    """The size of spots with the most pins seen, minus pins not seen and left-over spots; None if no layout is seen."""
     best, most = None, 0
     for size in (share * max(image.shape) for share in SIZES):
         spots = find_bumps(image, size)
@@ -313,26 +315,26 @@ def _best_size(image: np.ndarray, looks: list[Look]) -> float | None:
 
 
 def _family_look(by: Family, spots: Bumps) -> Seen | None:
-    """The part of a family's lattice that a frame shows by itself; None if it shows none."""
+    """The part of a family's lattice in one frame, without the other frames; None if there is none."""
     spot = label_spots(spots, by)
     part = None if spot is None else _part(by, spots, spot)
     return None if part is None else part[1]
 
 
 def _layout_look(pins: PinsSpec, by: Family, spots: Bumps) -> Seen | None:
-    """A given layout in a frame by itself; None where it is not seen."""
+    """A given layout in one frame, without the other frames; None if it is not seen."""
     spot = label_spots(spots, by)
     return None if spot is None else _as_layout(pins, by, spots, spot)
 
 
 def _seen(spots: Bumps, spot: np.ndarray, by: Family, nodes: np.ndarray) -> Seen:
-    """What a labelled frame shows of the part ``nodes`` (N,) of a lattice."""
+    """The places ``nodes`` (N,) of a lattice in a labelled frame."""
     places = seen_places(by.lattice, by.around, spots.px, spot, spots.size_px)[nodes]
     return _told(spots, spot[nodes], places)
 
 
 def _told(spots: Bumps, spot: np.ndarray, places: np.ndarray) -> Seen:
-    """What a frame shows: the spot (N,) of each pin, -1 for none, and the pins' places (N, 2)."""
+    """Result for a frame, from the spot (N,) of each pin, -1 for no spot, and the pins' positions (N, 2), px."""
     there, taken = spot >= 0, spot[spot >= 0]
     others = np.setdiff1d(np.arange(len(spots.px)), taken)
     left_over = np.zeros(0, int)
@@ -348,7 +350,7 @@ def _told(spots: Bumps, spot: np.ndarray, places: np.ndarray) -> Seen:
 
 
 def _first_guesses(by: Family, spots: list[Bumps]) -> list[tuple[PinsSpec, list[Seen]]]:
-    """The two layouts of one family that frames, each by itself, show most."""
+    """The two layouts of one family that explain most if each frame is labelled by itself."""
     votes: dict[tuple[int, ...], list[Seen]] = {}
     for one in spots:
         spot = label_spots(one, by)
@@ -366,7 +368,7 @@ def _layout_of(by: Family, size: tuple[int, ...]) -> PinsSpec:
 
 
 def _part(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[tuple[int, ...], Seen] | None:
-    """The part of a lattice that a frame shows: its number of rings, or of columns and rows, and what is seen of it."""
+    """The part of a lattice in a frame: its number of rings, or of columns and rows, and its pins in the frame."""
     if by.name == "grid":
         part = _rectangle(by, spots, spot)
         return None if part is None else (part[0], _seen(spots, spot, by, part[1]))
@@ -375,7 +377,7 @@ def _part(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[tuple[int, ...], 
 
 
 def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> Seen | None:
-    """A given layout of a family in a labelled frame, where it explains most; None where it does not fit in."""
+    """A given layout of a family in a labelled frame, at the position with most labels; None if the lattice is too small for it."""
     if by.name == "positions":
         return _seen(spots, spot, by, np.arange(len(by.lattice)))
     if by.name == "rings":
@@ -388,12 +390,12 @@ def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> Se
 
 
 def _family_in_view(by: Family, spots: Bumps, spot: np.ndarray) -> np.ndarray:
-    """Which places (M,) of a lattice lie in the frame, as far as that can be told."""
+    """(M,) bool: whether each place of a lattice is in view. A place without a prediction counts as not in view."""
     return in_view(seen_places(by.lattice, by.around, spots.px, spot, spots.size_px), spots)
 
 
 def _rings(by: Family, spots: Bumps, spot: np.ndarray) -> int:
-    """Number of rings that are seen, from the middle outwards."""
+    """Number of rings that are seen, counted from the middle outwards."""
     shown = _family_in_view(by, spots, spot)
     rings = 0
     for ring in range(1, int(by.ring.max()) + 1):
@@ -406,7 +408,7 @@ def _rings(by: Family, spots: Bumps, spot: np.ndarray) -> int:
 
 
 def _hexagon(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[int, int]:
-    """Middle place and number of rings of the hexagon that holds most labels and fewest empty places in view."""
+    """Middle place and number of rings of the hexagon with the most labels and the fewest empty places in view."""
     taken = np.flatnonzero(spot >= 0)
     empty = np.flatnonzero((spot < 0) & _family_in_view(by, spots, spot))
     q, labelled, bare = _axial(by.lattice), _axial(by.lattice[taken]), _axial(by.lattice[empty])
@@ -423,7 +425,7 @@ def _hexagon(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[int, int]:
 
 
 def _best_middle(by: Family, spot: np.ndarray, rings: int) -> int | None:
-    """Middle of the hexagon of this many rings that holds most labels; None if it does not fit in the lattice."""
+    """Middle of the hexagon with ``rings`` rings that holds most labels; None if it does not fit in the lattice."""
     taken = np.flatnonzero(spot >= 0)
     q, labelled = _axial(by.lattice), _axial(by.lattice[taken])
     fitting = [m for m in taken if by.ring[m] + rings <= by.ring.max()]
@@ -433,18 +435,18 @@ def _best_middle(by: Family, spot: np.ndarray, rings: int) -> int | None:
 
 
 def _axial(places: np.ndarray) -> np.ndarray:
-    """Whole coordinates (n, 2) of places of a triangular lattice with neighbours at distance 1, the first axis along x."""
+    """Integer coordinates (n, 2) of places in a triangular lattice whose neighbours are 1 apart. The first axis is along x."""
     r = places[:, 1] / (np.sqrt(3) / 2)
     return np.round(np.column_stack([places[:, 0] - r / 2, r])).astype(int)
 
 
 def _steps(axial: np.ndarray) -> np.ndarray:
-    """Distance (n,) in steps over a triangular lattice."""
+    """Distance (n,) from the origin of a triangular lattice, as a number of steps between neighbours."""
     return np.max(np.abs(np.column_stack([axial, axial.sum(axis=1)])), axis=1)
 
 
 def _ring_nodes(by: Family, middle: int, rings: int) -> np.ndarray:
-    """Places of a lattice, in the order of a specification with this many rings about a middle."""
+    """Places of the hexagon with ``rings`` rings around a middle place, in the specification's pin order."""
     count = 1 + 3 * rings * (rings + 1)
     if middle == 0:
         return np.arange(count)
@@ -453,7 +455,7 @@ def _ring_nodes(by: Family, middle: int, rings: int) -> np.ndarray:
 
 
 def _rectangle(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[tuple[int, int], np.ndarray] | None:
-    """Columns and rows of the rectangle that holds most labels and fewest empty places, and its places."""
+    """The rectangle with the most labels and the fewest empty places in view: its columns and rows, and its places."""
     side = int(round(np.sqrt(len(by.lattice))))
     there = (spot >= 0).reshape(side, side)
     gain = np.where(there, 1, np.where(_family_in_view(by, spots, spot).reshape(side, side), -1, 0))
@@ -462,7 +464,7 @@ def _rectangle(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[tuple[int, i
     rows = np.flatnonzero(there.any(axis=1))
     for top in rows:
         for bottom in rows[rows > top]:
-            line = sums[bottom + 1] - sums[top]  # the best run of columns (Kadane)
+            line = sums[bottom + 1] - sums[top]  # the range of columns with the largest sum (Kadane's algorithm)
             run, first = 0, 0
             for column in range(side):
                 if run <= 0:
@@ -478,7 +480,7 @@ def _rectangle(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[tuple[int, i
 
 
 def _best_rectangle(by: Family, spot: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
-    """Places of the rectangle of this size that holds most labels; None if it is larger than the lattice."""
+    """Places of the rectangle of a given size that holds most labels; None if it is larger than the lattice."""
     side = int(round(np.sqrt(len(by.lattice))))
     if max(columns, rows) > side:
         return None
@@ -490,7 +492,7 @@ def _best_rectangle(by: Family, spot: np.ndarray, columns: int, rows: int) -> np
 
 
 def _candidate(pins: PinsSpec, seen: list[Seen], spots: list[Bumps], *, may_miss: bool = True) -> Candidate:
-    """A layout with what all frames show of it, from what some frames, each by itself, show of it."""
+    """Match a layout to all frames. The start is ``seen``: the layout in those frames in which it was found without the others."""
     rest = _rest(pins, _turned_alike(pins, seen))
     again = [_matched(pins, rest, one) for one in spots]
     good = [k for k, one in enumerate(again) if one.explained > LEAST_EXPLAINED]
@@ -519,7 +521,7 @@ def _candidate(pins: PinsSpec, seen: list[Seen], spots: list[Bumps], *, may_miss
 
 
 def _rest(pins: PinsSpec, seen: list[Seen]) -> np.ndarray:
-    """Places (N, 2), px, of the pins as most frames have them; those seen in too few frames as the others let expect."""
+    """Median positions (N, 2), px, of the pins. A pin that is seen in too few frames gets its predicted or smooth-view position."""
     pins_px, places = np.stack([one.pins_px for one in seen]), np.stack([one.places_px for one in seen])
     rest = np.full(places.shape[1:], np.nan)
     anywhere, steady = np.isfinite(places[:, :, 0]).any(axis=0), np.isfinite(pins_px[:, :, 0]).mean(axis=0) >= STEADY
@@ -529,7 +531,7 @@ def _rest(pins: PinsSpec, seen: list[Seen]) -> np.ndarray:
 
 
 def _matched(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps) -> Seen:
-    """What a frame shows of a layout whose pins at rest are known."""
+    """Match a layout with known pins at rest (N, 2), px, to a frame's spots."""
     reference = make_reference(rest_px, pins)
     if reference.spacing_px.min() < FOLDED * np.median(reference.spacing_px):
         return _told(spots, np.full(pins.count, -1), rest_px)
@@ -539,7 +541,7 @@ def _matched(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps) -> Seen:
 
 
 def symmetries(pins: PinsSpec) -> list[np.ndarray]:
-    """Orders (N,) of the pins under which a layout looks the same after a turn, the unchanged one first."""
+    """Orders (N,) of the pins for all turns that map a layout onto itself; the identity comes first."""
     places = pin_lattice(pins).places
     if pins.layout == "grid" and pins.row_distance == 1 and pins.columns == pins.rows:
         turns = 4
@@ -556,7 +558,8 @@ def symmetries(pins: PinsSpec) -> list[np.ndarray]:
 
 
 def _turned_alike(pins: PinsSpec, seen: list[Seen]) -> list[Seen]:
-    """The same with each frame's labels turned as the fullest frame's are: a layout looks the same after a part of a turn."""
+    """The frames' results with consistent labels: a symmetric layout may be labelled in several turns, so each frame gets the turn of the
+    frame that the layout explains best."""
     orders = symmetries(pins)
     guide = max(seen, key=lambda one: one.explained).places_px
     out = []
@@ -569,10 +572,17 @@ def _turned_alike(pins: PinsSpec, seen: list[Seen]) -> list[Seen]:
 
 
 def smooth_view(places: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """The pins (N, 2), px, where a smooth view of the layout's places (N, 2) has them, fitted to pins (N, 2), NaN where unknown.
+    """Fit a smooth view of a layout to its pins, and return the positions (N, 2), px, of all pins in this view.
 
-    The view is a polynomial of the third degree with radial terms of the fifth: it holds a camera's place, turn, tilt and distortion, and
-    the dome's projection.
+    The view is a polynomial of the third degree with radial terms of the fifth degree. It can represent the camera's position, turn, tilt
+    and distortion, and the projection of the dome.
+
+    Parameters
+    ----------
+    places : (N, 2) float
+        Places of the layout.
+    px : (N, 2) float
+        Pins, px; NaN where unknown.
     """
     known = np.isfinite(px[:, 0])
     x, y = places.T
@@ -584,7 +594,7 @@ def smooth_view(places: np.ndarray, px: np.ndarray) -> np.ndarray:
 
 
 def unevenness(places: np.ndarray, pins_px: np.ndarray) -> float:
-    """Rms distance of pins (N, 2), NaN where lost, from the smooth view of their layout (N, 2), in spacings."""
+    """Rms distance of pins (N, 2), px, from the smooth view of their layout's places (N, 2), in spacings; a lost pin is NaN."""
     known = np.isfinite(pins_px[:, 0])
     if known.sum() < FEWEST_VIEWED:
         return float("inf")
@@ -593,12 +603,12 @@ def unevenness(places: np.ndarray, pins_px: np.ndarray) -> float:
 
 
 def _merit(candidate: Candidate) -> float:
-    """How good a candidate is: what it explains, how many frames agree, and how smooth a view it takes."""
+    """Score of a candidate, from the explained share, the share of agreeing frames, and the misfit to a smooth view."""
     return candidate.explained + 0.1 * candidate.agreeing - 0.2 * min(candidate.misfit, 1.0)
 
 
 def _doubts(found: list[Candidate]) -> list[str]:
-    """Why the first candidate is not sure, and what would decide; nothing if it is."""
+    """Reasons why the first candidate is not sure, and the data that would decide; empty if it is sure."""
     best, doubts = found[0], []
     if best.explained < SURE_EXPLAINED:
         doubts.append(

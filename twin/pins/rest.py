@@ -1,4 +1,4 @@
-"""Where a layout's pins are without contact, as frames of a sensor show it: in a no-contact frame, or made from many contacts."""
+"""Positions of the pins at rest, from a no-contact frame or extrapolated from many contact frames."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -11,26 +11,27 @@ from twin.geometry.pins import pin_lattice
 from twin.pins.identify import SHOWN, Candidate, judge_layout, symmetries, unevenness
 
 STILL = 0.035
-"""Largest rms distance of pins without contact from a smooth view of their layout, in spacings. Measured: 0.028 in no-contact frames of
-two sensors; in contacts of 1 mm and more at least 0.042."""
+"""Largest rms distance of pins without contact from the smooth view of their layout, in spacings. It was measured as 0.028 in no-contact
+frames of two sensors, and as at least 0.042 in contacts of 1 mm and more."""
 INNER = 0.5
-"""The pins nearer to the layout's middle than this share of its radius are spread by a contact; the rim hardly moves."""
+"""Radius of the inner pins, as a share of the layout's radius. A contact spreads the inner pins, while the rim hardly moves."""
 FEWEST_CONTACTS = 8
-"""A rest layout is extrapolated from at least this many contacts; from fewer it is their median."""
+"""Least number of contact frames from which the rest layout is extrapolated. With fewer frames it is their median."""
 
 
 @dataclass(frozen=True)
 class Rest:
-    """Pins without contact.
+    """Positions of the pins at rest, and their source.
 
     Attributes
     ----------
     pins_px : (N, 2) float
         NaN where a pin is not in view.
     source : {"given", "found", "made"}
-        A frame that was given or named as the no-contact frame, a frame that shows none though nothing says so, or made from contacts.
+        "given": from a frame that the user gave or named as the no-contact frame. "found": from a frame in which no contact is visible,
+        although it is not named as such. "made": extrapolated from contact frames.
     frame : str
-        Name of the frame; "" if it was made.
+        Name of the frame; "" for "made".
     """
 
     pins_px: np.ndarray
@@ -38,7 +39,7 @@ class Rest:
     frame: str = ""
 
     def line(self) -> str:
-        """Where it comes from, in words."""
+        """The source in words."""
         if self.source == "given":
             return f"no contact: {self.frame}"
         if self.source == "found":
@@ -50,7 +51,7 @@ class Rest:
 
 
 def rest_of(layout: Candidate, names: list[str], given: np.ndarray | None = None, given_name: str = "") -> Rest:
-    """Pins at rest of a layout that was identified in frames with these names; ``given`` is a gray no-contact frame (H, W) uint8.
+    """Pins at rest of a layout that was identified in frames ``names``; ``given`` is a gray no-contact frame (H, W) uint8.
 
     Raises
     ------
@@ -75,10 +76,11 @@ def rest_of(layout: Candidate, names: list[str], given: np.ndarray | None = None
 
 
 def rest_from_contacts(layout: Candidate) -> np.ndarray:
-    """Pins (N, 2), px, extrapolated from contacts to the least one; NaN for a pin that is never seen.
+    """Pins at rest (N, 2), px, extrapolated from contact frames; NaN for a pin that is never seen.
 
-    A contact flattens the dome, which spreads the inner pins and hardly moves the rim. Each pin's place is regressed on this spread (the
-    mean distance of the inner pins from their middle, relative to the rim's), and taken at the least spread of all frames.
+    A contact flattens the dome. This spreads the inner pins and hardly moves the rim. The spread is the mean distance of the inner pins
+    from their mean, divided by that of the rim. A linear regression gives each pin's position as a function of the spread. The result is
+    its value at the smallest spread of all frames.
     """
     pins_px = np.stack([seen.pins_px for seen in layout.seen])
     with np.errstate(invalid="ignore"):
@@ -105,14 +107,14 @@ def _radius(px: np.ndarray) -> float:
 
 
 def _alike(layout: Candidate, pins_px: np.ndarray) -> np.ndarray:
-    """Pins (N, 2) of another frame in the order, of those in which the layout looks the same, that is nearest to the layout's."""
+    """Pins (N, 2) of another frame, in the order that fits the layout's pins at rest best. All symmetries of the layout are tried."""
     orders: list[np.ndarray] = symmetries(layout.pins)
     away = [float(np.nanmedian(np.linalg.norm(pins_px[order] - layout.rest_px, axis=1))) for order in orders]
     return pins_px[orders[int(np.argmin(away))]]
 
 
 def turn_of(pins: PinsSpec, pins_px: np.ndarray) -> float:
-    """Angle, deg, by which a layout must be turned from x towards y to lie as pins (N, 2) do; NaN pins do not count."""
+    """Angle, deg, from x towards y, by which the layout must be turned to fit pins (N, 2); NaN pins are left out."""
     known = np.isfinite(pins_px[:, 0])
     places, seen = pin_lattice(pins).places[known] @ [1, 1j], pins_px[known] @ [1, 1j]
     return float(np.degrees(np.angle(np.vdot(places - places.mean(), seen - seen.mean()))))

@@ -17,7 +17,7 @@ from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, requ
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
-# Longest wait for a reply, in s. A reply usually takes about 10 ms. With all tries it is less than the largest age of feedback.
+# Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take the largest age of feedback.
 REPLY_TIMEOUT_S = 0.2
 # Times that a command is sent until a reply comes. Moves are absolute, so a repeated move does not move the arm.
 TRIES = 4

@@ -87,7 +87,7 @@ class CommandPort:
         )
 
     def send(self, text: str) -> None:
-        """Send one command and return the arm's reply."""
+        """Send one command; its reply is read by ``poll``."""
         with self._lock:
             if self._socket is None:
                 raise DeviceNotConnectedError(f"{self._name}: the connection was lost; disconnect() and connect() again")

@@ -1,1 +1,1 @@
-"""A fast stand-in for the skin's finite elements: friction's memory by bristles, all else by a small network."""
+"""A fast surrogate for the skin's finite elements: Coulomb friction is solved at the contact points, a small network gives the rest."""

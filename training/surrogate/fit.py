@@ -163,7 +163,7 @@ def distil(
     Raises
     ------
     OptionError
-        Too few paths, or a sensor that relaxes or is sealed: the surrogate has no memory of time and volume.
+        There are too few paths, or ``require_dome`` refuses the sensor.
     """
     require_dome(sensor)
     if paths < LEAST_PATHS:

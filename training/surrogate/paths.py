@@ -21,7 +21,8 @@ SHALLOWEST_MM = 0.3
 POLAR_DEG = 35.0
 """Largest angle of the first touched place from the dome's apex."""
 BESIDE_MM = 9.0
-"""Range around the object's origin, along each axis, in which the touched place is drawn: edges then lie within or near the contact."""
+"""Half range along x around the object's origin in which the touched place is drawn; along z it is half as large. Edges then lie within
+or near the contact."""
 SHEAR_MM = 5.0
 """Largest sideways motion of one leg."""
 TURN_DEG = 15.0

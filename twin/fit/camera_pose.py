@@ -51,8 +51,10 @@ class CameraParameter:
         Section of the specification that holds it.
     plausible : float
         Standard deviation of its plausible values, in the parameter's unit; relative to its value if ``relative``.
-        relative : bool
-        bounds : (float, float)
+    relative : bool
+        Whether ``plausible`` is a share of the parameter's value.
+    bounds : (float, float)
+        Smallest and largest value of a fit.
     instead : str
         Data that determine the parameter if the pins do not.
     """

@@ -40,6 +40,7 @@ PINHOLE_MM, FISHEYE_MM = 45.0, 7.5
 FITTED_PINHOLE = ("fx_px", "cx_px", "cy_px", "k1", "tilt_x_deg", "tilt_y_deg", "phase_deg")
 """Parameters that pins at rest may tell (see ``twin.fit.camera_pose``)."""
 FITTED_FISHEYE = (*FITTED_PINHOLE, "k2")
+"""The same for a fisheye lens, whose distortion has a second coefficient."""
 UNTUNED_OFFSET = -12.0
 """Threshold, gray levels above the local mean, for raw frames of a sensor of which only thresholded ones were seen."""
 BETTER = 0.85
@@ -48,9 +49,8 @@ SIZE_SD = 0.05
 """Standard deviation of a cap's diameter from that of the model, as a share: real prints, lit unevenly, in contact."""
 MADE_SD = 0.1
 """Standard deviation of pins at rest that were made from contacts, in spacings (see ``Rest.line``)."""
-GOOD_SHARE = 0.99
-"""From this share of frames with all pins on, a sensor is well seen."""
 FAIR_SHARE = 0.9
+"""Least share of frames with all pins; with a smaller share the report says that pins are lost."""
 STEADILY_LOST = 0.5
 """Share of the frames from which on a pin that should be in view counts as steadily lost."""
 GIVEN_SHOWN = 0.9
@@ -349,7 +349,13 @@ def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
     if detector.form == Form.RAW:
         return tuned
     usual = detector.blob.model_copy(
-        update={"threshold": -12.0, "threshold_block_px": UNKNOWN_BLOCK_PX, "rest_px": (), "rest_origin": "measured", "spot_sigma_px": 0.0}
+        update={
+            "threshold": UNTUNED_OFFSET,
+            "threshold_block_px": UNKNOWN_BLOCK_PX,
+            "rest_px": (),
+            "rest_origin": "measured",
+            "spot_sigma_px": 0.0,
+        }
     )
     return tuned.model_copy(update={"pipeline": tuned.pipeline.model_copy(update={"raw": usual})})
 

@@ -12,7 +12,7 @@ from twin.compiled import compiled
 NEIGHBOURS = 18
 """Number of neighbours that predict the position of a place: two rings of a triangular lattice."""
 NEAR = 8
-"""A place is tried when one of this many nearest places is labelled."""
+"""A place is tried when at least two of this many nearest places are labelled."""
 GATES = (0.25, 0.38)
 """Largest distance from a prediction to its spot, in local spacings, during growth: first the strict limit, then the wide one."""
 LEAST_AROUND = (4, 3)

@@ -33,7 +33,7 @@ SIZED_ON = 3
 """Number of frames from which the size of the spots is determined."""
 FAMILIES = ("rings", "hexagon", "grid")
 FULL_RING = 0.5
-"""Least share of the places in view of a ring, row or column that must be seen, for it to belong to the layout."""
+"""Least share of the places in view of a ring that must be seen, for the ring to belong to the layout."""
 LIKE_ITS_NEIGHBOURS = 0.45
 """Least height of a pin-like spot, as a share of the median height of the pins around it."""
 BEYOND = 1.25

@@ -200,7 +200,7 @@ class TwinMode(PageMode):
         self.ask(replace(self._wish, **{name: value}).within_limits()[0])
 
     def play(self, way: Way) -> None:
-        """Let the object go a way; the contact begins anew in the free."""
+        """Let the object follow a path. A contact begins anew where the path leaves the skin."""
         self._undo = [*self._undo[-MOST_UNDO:], self._wish]
         self._wish = way[-1][1]
         self.worker.play(way)

@@ -38,7 +38,8 @@ class Realism:
         )
         lines.append(f"all pins found in {100 * metrics['pin_aligned']['exact_fraction']:.1f} % of the renders")
         for name, told in metrics["two_sample"].items():
-            lines.append(f"two-sample accuracy, {name}: {100 * told['accuracy']:.1f} % ({100 * told['low']:.1f} to {100 * told['high']:.1f} %)")
+            interval = f"{100 * told['low']:.1f} to {100 * told['high']:.1f} %"
+            lines.append(f"two-sample accuracy, {name}: {100 * told['accuracy']:.1f} % ({interval})")
         if poses := metrics["pose_aligned"]:
             error = poses["pin_error_px"]
             lines.append(

@@ -19,7 +19,7 @@ from torch import nn
 from torch.nn import functional
 
 from scenes.sensor import ResidualSpec, SensorSpec
-from training.two_sample import LEVEL_SCALE, PATCH_PX, TwoSample, patch_corners, patch_network, two_sample
+from training.two_sample import JUDGES, LEVEL_SCALE, PATCH_PX, TwoSample, patch_corners, patch_network, real_halves, two_sample
 from twin.camera.capture import CHROMA_RANGE, LUMA_RANGE, before_stream, expose, luma_weights
 from twin.camera.projection import Disc, lens_disc
 from twin.camera.residual import LEAK, LEVELS, MIDDLE, MOST_LEVELS, STEEPNESS, differences, with_residual
@@ -74,7 +74,10 @@ class TaughtResidual:
         With ``response.residual``, not switched on.
     frames : int
         Number of frames that were judged.
-    before, after : TwoSample
+    before, after : dict of str to TwoSample
+        What each judge of the two-sample test (`JUDGES`) tells of real frames and renders.
+    real : dict of str to TwoSample
+        What it tells of two halves of the real frames, where there is nothing to tell.
     psnr_db : (float, float)
         Over the disc, before and after.
     shift_px : (float, float)
@@ -85,8 +88,9 @@ class TaughtResidual:
 
     spec: SensorSpec
     frames: int
-    before: TwoSample
-    after: TwoSample
+    before: dict[str, TwoSample]
+    after: dict[str, TwoSample]
+    real: dict[str, TwoSample]
     psnr_db: tuple[float, float]
     shift_px: tuple[float, float]
     refused: list[BadFrame]
@@ -95,11 +99,15 @@ class TaughtResidual:
     def lines(self) -> list[str]:
         """The result as lines of text."""
         lines = [f"refused {each['image_name']}: {each['reason']}" for each in self.refused]
-        tests = (self.before, self.after)
-        told = " -> ".join(f"{100 * t.accuracy:.1f} % ({100 * t.low:.1f} to {100 * t.high:.1f} %)" for t in tests)
+        told = [
+            f"two-sample accuracy, {name} judge: {self.before[name].text()} -> {self.after[name].text()}; "
+            f"of two halves of the real frames {self.real[name].text()}"
+            for name in self.before
+        ]
         return [
             *lines,
-            f"{self.frames} frames, each with a network that did not see it: two-sample accuracy {told}",
+            f"{self.frames} frames, each with a network that did not see it",
+            *told,
             f"PSNR over the disc {self.psnr_db[0]:.2f} -> {self.psnr_db[1]:.2f} dB; "
             f"pins moved by {self.shift_px[0]:.3f} px (median), {self.shift_px[1]:.3f} px (95 %)",
             "the network is off: 'twin realism --residual' and 'twin dataset --residual' switch it on",
@@ -152,13 +160,18 @@ def calibrate_residual(
     with stage(progress, "teach the network on all frames") as step:
         residual = teach(real, light, sensor, disc, steps=steps, progress=step)
     with stage(progress, "train the two-sample test") as step:
-        before, after = (two_sample(real, shown, disc.inside, progress=step) for shown in (plain, found))
+        before, after = (
+            {name: two_sample(real, shown, disc.inside, judge=judge, progress=step) for name, judge in JUDGES.items()}
+            for shown in (plain, found)
+        )
+    with stage(progress, "the same for halves of the real frames") as step:
+        halves = {name: real_halves(real, disc.inside, judge=judge, progress=step) for name, judge in JUDGES.items()}
     psnr = [
         float(np.mean([compare_images(a, b, disc.inside).psnr_db for a, b in zip(real, shown, strict=True)])) for shown in (plain, found)
     ]
     spec = revised(sensor, response={"residual": residual.model_dump()})
     write_sensor(out, spec, f"With a residual network that was taught on {len(real)} frames of {frames.name}.")
-    return TaughtResidual(spec, len(real), before, after, (psnr[0], psnr[1]), _shift_px(sensor, plain, found), read.refused, [out])
+    return TaughtResidual(spec, len(real), before, after, halves, (psnr[0], psnr[1]), _shift_px(sensor, plain, found), read.refused, [out])
 
 
 def _shots(sensor: SensorSpec, light: list[FloatArray]) -> list[ImageArray]:

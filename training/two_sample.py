@@ -1,12 +1,16 @@
-"""A classifier two-sample test (Lopez-Paz & Oquab 2017): can a small network distinguish two sets of frames?
+"""A classifier two-sample test (Lopez-Paz & Oquab 2017): can a network distinguish two sets of frames?
 
 The inputs of a fixed network of four convolutions are colour patches of the lens disc. It is trained on some frames and tested on the
 others. Frame k of one set is always held out together with frame k of the other, because both may show the same contact, and a network
 that knew one of them could recognise the other. An accuracy of 50 % means that the network can't distinguish the sets, 100 % that it
 assigns every patch to the right set.
+
+What one network does not see, a stronger one may see. There are two (`JUDGES`), and both can be asked to distinguish two halves of the
+real frames (`real_halves`), which shows what a test says where there is nothing to distinguish.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -20,10 +24,6 @@ from twin.progress import Step
 PATCH_PX = 64
 # Number of patches of each frame, in each epoch and in the test.
 PATCHES = 16
-# Channels of the four convolutions.
-CHANNELS = (16, 32, 64, 64)
-# Number of epochs.
-EPOCHS = 12
 # Number of patches in a batch.
 BATCH = 64
 # Number of parts of the frames; each is held out once.
@@ -34,10 +34,36 @@ RATE = 2e-3
 WEIGHT_DECAY = 1e-2
 # Least share of a patch's area that lies in the lens disc.
 INSIDE = 0.9
+# Number of random divisions of the real frames into halves.
+DIVISIONS = 2
 # Number of bootstrap samples of the frame pairs, from which the interval is computed.
 RESAMPLES = 2000
 # Gray levels that the value 1 of the network's input stands for.
 LEVEL_SCALE = 64.0
+
+
+@dataclass(frozen=True)
+class Judge:
+    """A network of the test, and how long it learns.
+
+    Attributes
+    ----------
+    channels : tuple of int
+        Channels of its convolutions.
+    first_stride : int
+        Step of the first convolution, px; the others have 2. With 1 it sees the texture of single pixels.
+    epochs : int
+    """
+
+    channels: tuple[int, ...]
+    first_stride: int
+    epochs: int
+
+
+SMALL = Judge((16, 32, 64, 64), first_stride=2, epochs=12)
+STRONGER = Judge((24, 48, 96, 96), first_stride=1, epochs=24)
+JUDGES = {"small": SMALL, "stronger": STRONGER}
+"""The networks of a thorough test."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +85,19 @@ class TwoSample:
     high: float
     by_pair: np.ndarray
 
+    def text(self) -> str:
+        """The accuracy and its interval in words."""
+        return f"{100 * self.accuracy:.1f} % ({100 * self.low:.1f} to {100 * self.high:.1f} %)"
+
 
 def two_sample(
-    first: list[np.ndarray], second: list[np.ndarray], inside: np.ndarray, *, seed: int = 0, progress: Step | None = None
+    first: list[np.ndarray],
+    second: list[np.ndarray],
+    inside: np.ndarray,
+    *,
+    judge: Judge = SMALL,
+    seed: int = 0,
+    progress: Step | None = None,
 ) -> TwoSample:
     """Test two sets of equally many frames.
 
@@ -71,6 +107,7 @@ def two_sample(
         M frames each; the k-th frames of both sets are held out together.
     inside : (H, W) bool
         The lens disc.
+    judge : Judge
     seed : int
         Seed of patches, network and folds. The same seed gives the same result.
     progress : callable, optional
@@ -91,13 +128,49 @@ def two_sample(
     correct = np.zeros(pairs)
     for fold in range(folds):
         train, held = np.flatnonzero(fold_of != fold), np.flatnonzero(fold_of == fold)
-        network = _trained(sets, train, corners, np.random.default_rng([seed, fold]), seed + fold)
+        network = _trained(judge, sets, train, corners, np.random.default_rng([seed, fold]), seed + fold)
         for k in held:
             patches, truth = _patches(sets, np.array([k]), corners, rng, turned=False)
             correct[k] = ((network(patches) > 0) == (truth > 0.5)).double().mean().item()
         if progress:
             progress(fold + 1, folds)
-    means = correct[rng.integers(pairs, size=(RESAMPLES, pairs))].mean(axis=1)
+    return _outcome(correct, rng)
+
+
+def real_halves(
+    images: list[np.ndarray], inside: np.ndarray, *, judge: Judge = SMALL, seed: int = 0, progress: Step | None = None
+) -> TwoSample:
+    """Test two halves of one set of frames, for ``DIVISIONS`` random divisions: all pairs of frames together.
+
+    Parameters
+    ----------
+    images : list of (H, W, 3) or (H, W) uint8
+        4 or more frames; of an odd number one is left out of each division.
+    inside, judge, seed, progress
+        As `two_sample` takes them.
+
+    Raises
+    ------
+    FrameError
+        There are fewer than four frames.
+    """
+    rng, half, correct = np.random.default_rng(seed), len(images) // 2, []
+    for division in range(DIVISIONS):
+        order = rng.permutation(len(images))
+        first, second = ([images[k] for k in part] for part in (order[:half], order[half : 2 * half]))
+        step = progress and partial(_part, progress, division, DIVISIONS)
+        correct.append(two_sample(first, second, inside, judge=judge, seed=seed + division, progress=step).by_pair)
+    return _outcome(np.concatenate(correct), rng)
+
+
+def _part(progress: Step, number: int, parts: int, done: int, total: int) -> None:
+    """Tell the progress of one of several equal parts as that of the whole."""
+    progress(number * total + done, parts * total)
+
+
+def _outcome(correct: np.ndarray, rng: np.random.Generator) -> TwoSample:
+    """The result of the accuracies (M,) of pairs of frames."""
+    means = correct[rng.integers(len(correct), size=(RESAMPLES, len(correct)))].mean(axis=1)
     low, high = np.quantile(means, [0.025, 0.975])
     return TwoSample(float(correct.mean()), float(low), float(high), correct)
 
@@ -124,24 +197,26 @@ def patch_corners(inside: np.ndarray) -> np.ndarray:
     return corners
 
 
-def patch_network() -> nn.Module:
+def patch_network(judge: Judge = SMALL) -> nn.Module:
     """A network, not trained, that gives patches (B, 3, p, p) one number each, (B,): the larger, the likelier they are real."""
-    layers, before = [], 3
-    for channels in CHANNELS:
-        layers += [nn.Conv2d(before, channels, 3, stride=2, padding=1), nn.BatchNorm2d(channels), nn.ReLU()]
-        before = channels
+    layers, before, stride = [], 3, judge.first_stride
+    for channels in judge.channels:
+        layers += [nn.Conv2d(before, channels, 3, stride=stride, padding=1), nn.BatchNorm2d(channels), nn.ReLU()]
+        before, stride = channels, 2
     return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(before, 1), nn.Flatten(0))
 
 
-def _trained(sets: list[np.ndarray], frames: np.ndarray, corners: np.ndarray, rng: np.random.Generator, seed: int) -> nn.Module:
+def _trained(
+    judge: Judge, sets: list[np.ndarray], frames: np.ndarray, corners: np.ndarray, rng: np.random.Generator, seed: int
+) -> nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = patch_network()
-    steps = EPOCHS * -(-2 * len(frames) * PATCHES // BATCH)
+        network = patch_network(judge)
+    steps = judge.epochs * -(-2 * len(frames) * PATCHES // BATCH)
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
     network.train()
-    for _ in range(EPOCHS):
+    for _ in range(judge.epochs):
         patches, truth = _patches(sets, frames, corners, rng, turned=True)
         order = torch.from_numpy(rng.permutation(len(truth)))
         for batch in order.split(BATCH):

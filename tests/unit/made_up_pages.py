@@ -220,7 +220,7 @@ def realism_page(out: Path) -> Path:
         "refused": [{"image_name": HOSTILE, "reason": "black"}],
         "pin_aligned": images,
         "statistics": realism.statistics_summary(found),
-        "two_sample": {"accuracy": 0.61, "low": 0.57, "high": 0.65},
+        "two_sample": {"small": {"accuracy": 0.61, "low": 0.57, "high": 0.65}},
         "pose_aligned": {"pin_error_px": {"fitted": 0.9, "test": 1.01, "test_max": 2.2}, "test_images": images},
     }
     rows, poses = realism.write_pictures(out / "pictures", pairs, "pins"), realism.write_pictures(out / "pictures", pairs[:1], "pose")

@@ -2,19 +2,20 @@
 
 import numpy as np
 import pytest
+import torch
 
 from training import two_sample as module
-from training.two_sample import patch_corners, two_sample
+from training.two_sample import JUDGES, Judge, patch_corners, patch_network, real_halves, two_sample
 from twin.errors import FrameError
 
 INSIDE = np.ones((72, 72), bool)
 PAIRS = 10
+QUICK, QUICKER = Judge((16, 32, 64, 64), first_stride=2, epochs=5), Judge((16, 32, 64, 64), first_stride=2, epochs=1)
 CHANCE = 0.2  # few held-out pairs of few patches
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    monkeypatch.setattr(module, "EPOCHS", 5)
     monkeypatch.setattr(module, "BATCH", 16)
     monkeypatch.setattr(module, "PATCHES", 6)
 
@@ -30,20 +31,39 @@ def pictures(count, seed, *, blue=1.0):
 
 
 def test_sets_of_one_distribution_are_not_distinguished():
-    outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1), INSIDE)
+    outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1), INSIDE, judge=QUICK)
     assert outcome.accuracy == pytest.approx(0.5, abs=CHANCE)
     assert outcome.low <= outcome.accuracy <= outcome.high
 
 
 def test_different_sets_are_distinguished_in_unseen_frames():
-    outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1, blue=0.8), INSIDE)
+    outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1, blue=0.8), INSIDE, judge=QUICK)
     assert outcome.accuracy > 0.95
 
 
-def test_the_same_seed_gives_the_same_outcome(monkeypatch):
-    monkeypatch.setattr(module, "EPOCHS", 1)
-    first = two_sample(pictures(6, 0), pictures(6, 1), INSIDE, seed=2)
-    assert (first.by_pair == two_sample(pictures(6, 0), pictures(6, 1), INSIDE, seed=2).by_pair).all()
+def test_the_same_seed_gives_the_same_outcome():
+    first, second = (two_sample(pictures(6, 0), pictures(6, 1), INSIDE, judge=QUICKER, seed=2) for _ in range(2))
+    assert (first.by_pair == second.by_pair).all()
+
+
+def test_halves_of_one_set_are_not_distinguished_however_different_their_frames_are():
+    """Frames of two kinds, as contacts are of many: a half has some of each."""
+    images, steps = pictures(PAIRS, 0) + pictures(PAIRS, 1, blue=0.8), []
+    outcome = real_halves(images, INSIDE, judge=QUICK, progress=lambda done, total: steps.append((done, total)))
+    assert outcome.accuracy == pytest.approx(0.5, abs=CHANCE)
+    assert len(outcome.by_pair) == module.DIVISIONS * PAIRS
+    parts = module.DIVISIONS * module.FOLDS
+    assert steps == [(k + 1, parts) for k in range(parts)]
+
+
+def test_judges_grow_in_strength_and_see_the_patches_of_any_texture():
+    """The stronger judge has more weights and more epochs, and its first convolution has an output for every pixel."""
+    small, stronger = (patch_network(judge) for judge in JUDGES.values())
+    weights = [sum(part.numel() for part in network.parameters()) for network in (small, stronger)]
+    assert weights[1] > 2 * weights[0] and JUDGES["stronger"].epochs > JUDGES["small"].epochs
+    patches = torch.zeros(2, 3, module.PATCH_PX, module.PATCH_PX)
+    assert stronger[0](patches).shape[2:] == patches.shape[2:]
+    assert small(patches).shape == stronger(patches).shape == (2,)
 
 
 def test_patches_lie_in_the_disc():

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from scenes import SensorSpec
-from training.two_sample import TwoSample, two_sample
+from training.two_sample import JUDGES, SMALL, TwoSample, real_halves, two_sample
 from twin.judge.pictures.realism import run_realism
 from twin.optics.render import Quality
 from twin.progress import Progress, Step, silent
@@ -37,10 +37,9 @@ class Realism:
             f"spectra differ by {found['spectrum_db']:.2f} dB; {spots['paired']} of {spots['real']} bright spots have a counterpart"
         )
         lines.append(f"all pins found in {100 * metrics['pin_aligned']['exact_fraction']:.1f} % of the renders")
-        if outcome := metrics["two_sample"]:
-            lines.append(
-                f"two-sample accuracy {100 * outcome['accuracy']:.1f} % ({100 * outcome['low']:.1f} to {100 * outcome['high']:.1f} %)"
-            )
+        for name, told in metrics["two_sample"].items():
+            interval = f"{100 * told['low']:.1f} to {100 * told['high']:.1f} %"
+            lines.append(f"two-sample accuracy, {name}: {100 * told['accuracy']:.1f} % ({interval})")
         if poses := metrics["pose_aligned"]:
             error = poses["pin_error_px"]
             lines.append(
@@ -62,6 +61,7 @@ def compare_with_renders(
     without: Collection[str] = (),
     quality: Quality = "standard",
     test: bool = True,
+    thorough: bool = False,
     progress: Progress = silent,
 ) -> Realism:
     """Compare a folder of real raw frames with their renders, and write the result to a folder.
@@ -77,6 +77,8 @@ def compare_with_renders(
     quality : {"drawn", "preview", "standard", "high"}
     test : bool
         Train the two-sample test (minutes).
+    thorough : bool
+        Also train a stronger network, and both on two halves of the real frames, where there is nothing to tell (ten minutes).
 
     Raises
     ------
@@ -85,7 +87,7 @@ def compare_with_renders(
     RenderError
         Nothing can be rendered here.
     """
-    asked = _two_sample if test else None
+    asked = (_thorough if thorough else _quick) if test else None
     found = run_realism(
         frames,
         sensor,
@@ -101,8 +103,13 @@ def compare_with_renders(
     return Realism(*found)
 
 
-def _two_sample(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> TwoSample:
-    return two_sample(real, rendered, inside, progress=step)
+def _quick(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> dict[str, TwoSample]:
+    return {"small": two_sample(real, rendered, inside, judge=SMALL, progress=step)}
+
+
+def _thorough(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> dict[str, TwoSample]:
+    told = {name: two_sample(real, rendered, inside, judge=judge, progress=step) for name, judge in JUDGES.items()}
+    return told | {f"{name}, real halves": real_halves(real, inside, judge=judge, progress=step) for name, judge in JUDGES.items()}
 
 
 def _image_line(title: str, count: int, images: dict[str, Any]) -> str:

@@ -339,9 +339,11 @@ Writes:
 How to read it: no render can do better than PSNR and SSIM of two real frames
 with the same contact. Two-sample accuracy is the share of patches of unseen
 frames that a small network puts into the right set: at 100 % it always tells
-real from rendered, at 50 % never. --without shows what a measured detail is
-worth: the caps' relief, the skin's grain, the background. --residual adds the
-sensor's residual network; judge it on frames that it was not taught on.
+real from rendered, at 50 % never. --thorough trains a stronger network, too,
+and both on two halves of the real frames, which should give 50 %. --without
+shows what a measured detail is worth: the caps' relief, the skin's grain, the
+background. --residual adds the sensor's residual network; judge it on frames
+that it was not taught on.
 
 \b
 Example:
@@ -366,6 +368,9 @@ def realism(
     residual: Residual = False,
     quality: Annotated[Quality, typer.Option(help=QUALITY)] = "standard",
     two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
+    thorough: Annotated[
+        bool, typer.Option("--thorough", help="test with a stronger network, too, and with halves of the real frames (ten minutes)")
+    ] = False,
     table: Table = None,
     pipeline: Tuning = None,
     force: Force = False,
@@ -386,6 +391,7 @@ def realism(
             without=without or (),
             quality=quality,
             test=two_sample,
+            thorough=thorough,
             progress=progress,
         )
     tell(found)

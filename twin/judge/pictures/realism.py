@@ -1,6 +1,6 @@
 """The complete comparison of a folder of real frames with their renders, with its results in one folder."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -30,19 +30,19 @@ class TwoSample(Protocol):
 
     @property
     def accuracy(self) -> float:
-        """Share of the pictures that were told right."""
+        """Share of the patches that were told right."""
 
     @property
     def low(self) -> float:
-        """Lower end of its 90 % interval."""
+        """Lower end of its 95 % interval."""
 
     @property
     def high(self) -> float:
-        """Upper end of its 90 % interval."""
+        """Upper end of its 95 % interval."""
 
 
-# A two-sample test: ``test(real images, rendered images, inside, progress)``.
-Test = Callable[[list[np.ndarray], list[np.ndarray], np.ndarray, Step], TwoSample]
+# Two-sample tests: ``test(real images, rendered images, inside, progress)`` gives their results by name.
+Test = Callable[[list[np.ndarray], list[np.ndarray], np.ndarray, Step], Mapping[str, TwoSample]]
 
 
 def run_realism(
@@ -76,7 +76,7 @@ def run_realism(
         Details that are not rendered (`twin.optics.relief.without`).
     quality : {"drawn", "preview", "standard", "high"}
     test : callable, optional
-        The two-sample test.
+        The two-sample tests.
     progress : Progress
 
     Returns
@@ -102,7 +102,7 @@ def run_realism(
     poses = pose_aligned(spec, real.frames, disc, quality=quality, bar=bar) if with_poses else None
     with bar("measure caps, skin, noise, spectra") as step:
         found = statistics(pairs, disc, progress=step)
-    outcome = None
+    outcome: Mapping[str, TwoSample] = {}
     if test is not None and len(pairs) > 1:
         with bar("train the two-sample test") as step:
             outcome = test([pair.real.frame.image for pair in pairs], [pair.image for pair in pairs], disc.inside, step)
@@ -116,7 +116,7 @@ def run_realism(
         "disc": {"center_px": disc.center_px.tolist(), "radius_px": disc.radius_px},
         "pin_aligned": image_summary(pairs),
         "statistics": statistics_summary(found),
-        "two_sample": outcome and {"accuracy": outcome.accuracy, "low": outcome.low, "high": outcome.high},
+        "two_sample": {name: {"accuracy": told.accuracy, "low": told.low, "high": told.high} for name, told in outcome.items()},
         "pose_aligned": poses and pose_summary(poses),
     }
     pictures = out / "pictures"

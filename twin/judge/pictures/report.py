@@ -234,12 +234,16 @@ def _detector_text(count: int, metrics: dict) -> str:
         f"The detector, with the parameters of the real frames, finds exactly all {count} pins in "
         f"{percent(metrics['pin_aligned']['exact_fraction'])} % of the renders."
     )
-    test = metrics["two_sample"]
-    if not test:
+    told = metrics["two_sample"]
+    if not told:
         return said
+    shares = "; ".join(
+        f"{name}: {percent(test['accuracy'])} % (95 % interval {percent(test['low'])} to {percent(test['high'])} %)"
+        for name, test in told.items()
+    )
     return (
-        f"{said} A small network assigns {percent(test['accuracy'])} % (95 % interval {percent(test['low'])} to {percent(test['high'])} %) "
-        "of the patches of unseen frames to the right set; 50 % would mean that it cannot tell them apart."
+        f"{said} Networks assign these shares of the patches of unseen frames to the right set, where 50 % would mean that they cannot "
+        f"tell real frames from renders: {shares}."
     )
 
 

@@ -1,4 +1,4 @@
-"""From trained networks to a predictor: the ensemble's average, the Gaussian process averaged with it, and calibrated intervals.
+"""A predictor from trained networks: the ensemble's average, a Gaussian process averaged with it, and calibrated intervals.
 
 Intervals are conformal (Vovk et al. 2005; Barber et al. 2021 for ensembles). Every training row that a network held out is predicted
 without itself. The 90 % quantile of the errors, each divided by its expected scale, then widens or narrows the stated intervals. Such a

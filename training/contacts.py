@@ -1,4 +1,4 @@
-"""Which kind of contact a frame shows: one of those that a sensor's models were trained on (a plate, an edge, ...), or none of them.
+"""Classification of a frame's contact: one of the kinds that a sensor's models were trained on (plate, edge, ...), or none of them.
 
 Kinds are told apart by a small network on the modes of the displacements. Then it is asked whether the frame is one of its kind: within
 a kind the first modes, which follow pose, friction and way of a contact, decide the further ones, by a polynomial that is fitted to the

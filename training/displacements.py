@@ -29,7 +29,7 @@ LEADING, MODES, DEGREE = 6, 40, 3
 """Leading coordinates, modes in all, degree of the polynomials that tell the other modes.
 Of 3,400 frames of 331 pins they leave 0.12 of 3.8 px."""
 FEWEST_FRAMES = 400
-"""With fewer frames displacements are not learnt: the polynomials have 78 terms."""
+"""Least number of frames from which displacements are learnt: the polynomials have 78 terms."""
 MOST_FRAMES = 4000
 """Frames that displacements are learnt from at most."""
 RIDGE = 1e-3
@@ -51,7 +51,7 @@ OTHER_UNIT = (
     "the pins at rest were found from the contacts: they are not where they were measured on the unit that the weights are for, so this is "
     "another unit, or its camera or tip was touched; one frame without contact (init_0.png beside the frames) is more exact"
 )
-"""What is said where contacts tell other rest places than those that are known."""
+"""Note for contacts from which other rest places follow than those that are known."""
 
 
 @dataclass(frozen=True)

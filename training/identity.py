@@ -1,4 +1,4 @@
-"""What a run learnt from, by the names of its frames: told apart from other data, and found again in a table of another order."""
+"""The data that a run learnt from, identified by the names of its frames, in any order of the table."""
 
 import hashlib
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""What the rest of the program knows of a trained model: a frame goes in, an estimate with its interval comes out."""
+"""Interface of a trained model: it takes a frame, and returns an estimate with its interval."""
 
 from collections.abc import Callable
 from typing import Protocol

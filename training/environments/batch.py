@@ -24,7 +24,7 @@ from twin.types import BoolArray, FloatArray, Frame, ImageArray, IntArray
 
 BackendName = Literal["surrogate", "fem"]
 BACKENDS: tuple[str, ...] = get_args(BackendName)
-"""What solves the contacts."""
+"""Names of the contact solvers."""
 PERIOD_S = 0.1
 """Time that a step stands for: an agent decides ten times a second."""
 LARGEST_MM, LARGEST_DEG = 1.0, 5.0

@@ -1,4 +1,4 @@
-"""What an agent sees of a sensor: pins, their graph, pictures, the estimator's pose, or what no real sensor knows."""
+"""Observations of an agent: pins, their graph, pictures, the estimator's pose, or the exact state."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from twin.types import BoolArray, FloatArray, Form, Frame, ImageArray, IntArray,
 
 Kind = Literal["oracle", "pins", "graph", "image", "pose"]
 KINDS: tuple[str, ...] = get_args(Kind)
-"""What can be observed."""
+"""Names of the observations."""
 Pictures = Literal["none", "preview", "traced"]
 PICTURES: tuple[str, ...] = get_args(Pictures)
 """How frames are made: not at all, drawn, or path-traced."""
@@ -35,7 +35,7 @@ IMAGE_PX = 128
 LARGEST = 10.0
 """Observations are clipped to this: no pin moves by ten spacings."""
 POSE_SCALES = {"mm": 1.0, "deg": 10.0, "N": 1.0, "Nmm": 10.0, "mm2": 100.0, "": 1.0}
-"""What counts as 1 in an estimate, by the labels' units."""
+"""Estimates are divided by these numbers, by the labels' units."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from twin.types import FloatArray
 LEVELS = 64.0
 """Gray levels that the value 1 of the network's input stands for."""
 MIDDLE = (1.0, 0.0, 0.0)
-"""What is taken from the input's luma and colour differences, in ``LEVELS``."""
+"""Offsets that are subtracted from the input's luma and colour differences, in ``LEVELS``."""
 LEAK = 0.1
 """Slope of a leaky rectifier below 0."""
 MOST_LEVELS, STEEPNESS = 16.0, 2.0

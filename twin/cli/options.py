@@ -1,4 +1,4 @@
-"""What several commands share: their options, and what they print of a result."""
+"""Options that several commands have, and the printing of results."""
 
 import math
 import os

@@ -1,4 +1,4 @@
-"""What the command line makes of ``twin.progress``: bars on a terminal, else a line every ten seconds. All of it goes to stderr."""
+"""Progress on the command line: bars on a terminal, otherwise a line every ten seconds. All of it goes to stderr."""
 
 import sys
 import threading

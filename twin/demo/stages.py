@@ -1,4 +1,4 @@
-"""What the demo computes: contacts through the whole chain, the three motions, the depth table."""
+"""Computations of the demo: contacts through the whole chain, three motions, and the depth table."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""From a folder of frames to a whole specification: after pins and camera also light from colour frames, and the contact from labels."""
+"""The steps of ``twin new`` after pins and camera: light is fitted to colour frames, and the contact to labels."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""From someone else's frames to a specification: layout, pins at rest, camera and pin detection of a sensor of which nothing is known."""
+"""A specification from the frames of an unknown sensor: layout, pins at rest, camera and pin detection."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -64,14 +64,14 @@ ALWAYS = (
 )
 """Parameters that no set of frames determines."""
 FEW_FRAMES_FITTED = 4
-"""With fewer frames than this the background and the relief of caps can hardly be told apart."""
+"""Least number of frames that separate the background from the relief of the caps."""
 RING_HELD = "ring, LEDs' places and reflections: held; the frames show no bright ring around the disc (a crop, or a sensor without one)"
-"""What is said where frames show no ring."""
+"""Note for frames that show no ring."""
 REST_MADE = (
     "the camera's kind, focal length and distance: held as 'twin new' chose them without a frame without contact; pictures of the same "
     "contact are alike, depths in mm may not be; give --no-contact FRAME"
 )
-"""What is said of a camera that was fitted to rest places which contacts told."""
+"""Note for a camera that was fitted to rest places estimated from contacts."""
 Stage = Callable[[SensorSpec], SensorSpec]
 """One stage of the fit: a function from a specification to a better one."""
 

@@ -20,7 +20,7 @@ from twin.frames.tables import LARGEST_BYTES, called_here
 from twin.frames.videos import open_video
 
 INFO, DATA, EPISODES = Path("meta", "info.json"), "data/chunk-*/*.parquet", "meta/episodes/chunk-*/*.parquet"
-"""What a data set says of itself, its tables of frames, and its tables of episodes."""
+"""Places of a data set's description, its tables of frames and its tables of episodes."""
 RESTS = "rest"
 """Folder of the pictures without contact in records that this program writes, whatever their format."""
 VERSION = "v3."
@@ -28,7 +28,7 @@ VERSION = "v3."
 PICTURES = ("image", "video")
 """Types of features that are pictures."""
 OURS = ("tactip", "tactile", "tacpad")
-"""What the name of a feature with a tactile sensor's pictures may hold; of several cameras the first such counts."""
+"""Words by which the name of a camera's feature shows that it is a tactile sensor. The first such camera is read."""
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 """LeRobot's own columns of whole numbers."""
 NUMBERS = ("float", "int", "uint", "bool")

@@ -1,4 +1,4 @@
-"""What lies beside the frames: the table with their labels, and metadata in JSON."""
+"""Tables of labels and JSON metadata that lie beside the frames."""
 
 import csv
 import json

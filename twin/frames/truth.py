@@ -1,4 +1,4 @@
-"""What is known of the frames of a simulated data set besides their table: the arrays of ``truth.zarr``."""
+"""Exact truth of simulated frames beside their table: the arrays of ``truth.zarr``."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a contact needs to know beside the two shapes and the way: how the pair rubs, and how what holds them gives way."""
+"""Contact parameters beside the two shapes and the path: friction of the pair, and compliance of the arm."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from twin.mechanics.balance import Friction
 FRICTIONLESS = Friction(0.0, 0.0)
 
 GivenWay = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""From ``T_sensor_object`` (4, 4) as commanded, and the force on the object (3,) in N and the sensor frame, to the pose that is taken."""
+"""Function from the commanded ``T_sensor_object`` (4, 4) and the force on the object (3,), N, sensor frame, to the reached pose."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ _SMALLEST_SHIFT_N_MM = 0.01
 _SHIFT_GROWTH = 8
 """Factor from one shift to the next."""
 _LARGEST_SHIFT_N_MM = 50.0
-"""With a shift beyond this (N/mm) the step counts as not solved."""
+"""Largest diagonal shift, N/mm. A step that needs more counts as not solved."""
 _PROVIDED_MM = 1.0
 """Skin that is nearer to the object than this is kept in the elimination, so that it need not be prepared anew in the next load steps."""
 _SKIN_STRAIN = 0.01

@@ -1,4 +1,4 @@
-"""What friction does within a load step.
+"""Friction within a load step.
 
 Friction remembers its way. A point at the front of a growing contact is pressed lightly at first and slips; once the front has passed, it
 sticks. In one long load step it would stick from where it meets the object, and side forces would be up to a tenth too small.

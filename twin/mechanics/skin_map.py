@@ -1,4 +1,4 @@
-"""What a contact does to the skin, on a grid that is the same for every contact of a sensor.
+"""Maps of a contact on the skin, on a grid that is the same for every contact of a sensor.
 
 The solver's contact points lie elsewhere for every contact, because its mesh is fine where the object presses. Here their forces are
 spread over the nodes of a fixed grid over the outer skin at rest. A point's force goes to the four nodes around it by bilinear shares, so

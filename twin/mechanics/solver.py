@@ -1,4 +1,4 @@
-"""From a sensor, an object and a path to converged contact states."""
+"""Solver of contacts: it computes converged states of a sensor along an object's path."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager

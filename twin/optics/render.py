@@ -1,4 +1,4 @@
-"""From a sensor's state to the linear light on its camera's film."""
+"""Rendering: a sensor's state becomes the linear light on its camera's film."""
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property

@@ -35,23 +35,23 @@ NO_REFERENCE = (
     "no no-contact frame was used: the pins at rest are those of the specification, which makes errors of a pose up to four times larger; "
     "record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
 )
-"""What is said where a recording has no usable no-contact frame."""
+"""Note for a recording without a usable no-contact frame."""
 NO_OWN_REFERENCE = (
     "no no-contact frame was used: the pins at rest are those that were measured before on this unit; if the camera or the tip was touched "
     "since, record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
 )
-"""What is said where the specification holds the pins' measured places at rest."""
+"""Note for a specification that holds the pins' measured places at rest."""
 MADE_FROM_CONTACTS = (
     "no no-contact frame was used, and none when the specification was made: the pins' rest places were made from contacts; expect errors "
     "of a tenth of a spacing or so; record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
 )
-"""What is said where the specification's places at rest come from contacts."""
+"""Note for a specification whose places at rest were estimated from contacts."""
 MEASURED_BEFORE = "measured before"
 """Stands in place of a no-contact frame's name where the pins' measured places of the specification are the reference."""
 MADE_OF_CONTACTS = "made from contacts"
 """Stands there where the specification's places at rest come from contacts."""
 FARTHEST_PX = 1e4
-"""What is drawn is at most this far from the frame's origin, px. Farther off, OpenCV's integers would overflow."""
+"""Largest distance of a drawn point from the frame's origin, px. OpenCV's integers would overflow beyond it."""
 HALF, BRIGHTEST, DARKEST = 127.0, 98.0, 24.0
 """In a picture this percentile of a frame's levels (at least the third number) is shown at half white, so that what is drawn is seen."""
 UNMEASURED = "specification"

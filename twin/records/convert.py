@@ -31,9 +31,9 @@ READERS: dict[str, Callable[[Path], Records]] = {
     HuggingFaceWriter.FORMAT: huggingface_records,
     Ros2Writer.FORMAT: ros2_records,
 }
-"""Of each format that says what it is."""
+"""Function that reads the records of each format."""
 WRITERS: dict[str, type[FolderWriter]] = {each.FORMAT: each for each in (RecordingWriter, LeRobotWriter, HuggingFaceWriter, Ros2Writer)}
-"""Of each format."""
+"""Class that writes each format."""
 FORMATS = tuple(READERS)
 """Formats that can be written."""
 ALSO = tuple(name for name in FORMATS if name != RecordingWriter.FORMAT)

@@ -40,7 +40,7 @@ ROWS = 64
 SAMPLED = 100
 """Pictures of an episode from which its statistics are made."""
 PIXEL_STEP = 4
-"""Of these pictures every fourth pixel in each direction counts."""
+"""Statistics of pictures use every fourth pixel in each direction."""
 QUANTILES = {"q01": 1.0, "q10": 10.0, "q50": 50.0, "q90": 90.0, "q99": 99.0}
 """Names of the quantiles that LeRobot's statistics have, in %."""
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")

@@ -1,4 +1,4 @@
-"""What a record is, whatever format it is kept in: episodes of steps, each with a picture and numbers.
+"""Records: episodes of steps, each with a picture and numbers, independent of the file format.
 
 The tables here are the only place that names the numbers, their columns in LeRobot's and Hugging Face's formats and their topics in ROS 2.
 Numbers are kept as 32-bit floats (a pose of 300 mm to 0.00003 mm) and times as 64-bit floats in every format, so a record that is read

@@ -1,4 +1,4 @@
-"""From a label in robot coordinates to the object's way as the sensor sees it.
+"""Kinematics of the rig: a label in robot coordinates becomes the object's path in the sensor's frame.
 
 Work frame of the robot: x, y, z. The sensor, unturned, looks along the approach a0. b0 is the direction across: robot x, or robot y
 where the approach is x. It appears in the image at the azimuth ``image_turn``. c0 is a0 x b0. With R the static xyz rotation by

@@ -1,4 +1,4 @@
-"""What a row of a recording's table means: where the arm was sent, and whether it had made its move when the frame was taken.
+"""Labels of the arm: the commanded pose of each row of a table, and whether the move was executed before the frame was taken.
 
 In the published Tac-VGNN recordings (Apache-2.0) the shear move had not been executed in about a third of the frames when the
 frame was taken. An audit writes which ones into a file beside the table; without that file every move counts as executed.

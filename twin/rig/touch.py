@@ -1,4 +1,4 @@
-"""What a rigid sensor would touch: depth and angle against the surface, the same for objects of any shape.
+"""Depth and angle of a rigid sensor against a surface. They are defined alike for objects of any shape.
 
 The surface is replaced by a flat plate: through its place nearest to the sensor's origin (a dome's centre, the middle of a pad's
 outside), with its normal there. With g the distance of the origin from the surface, w the angle of the tool's axis from the normal,

@@ -1,4 +1,4 @@
-"""What the page's modes share: a folder of controls, threads, and whether the pictures are theirs."""
+"""Base of the page's modes: a folder of controls, threads, and whether the mode shows its pictures."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable

@@ -31,11 +31,11 @@ PORTS_TRIED, MOST_PORT = 100, 65535
 PICTURES_PX, CONTROLS_PX = 330, 350
 """Widths of the panels with the pictures and with the controls."""
 JPEG_QUALITY = 88
-"""Of the pictures in the page."""
+"""Quality of the JPEG pictures in the page."""
 CELLS = "Voronoi cells: blue smaller, red larger"
-"""What the second picture shows as a rule."""
+"""Content of the second picture at the start."""
 SPAN_S = 20.0
-"""What the charts show: the last seconds."""
+"""Time that the charts show, s."""
 CHART_S = 0.25
 """Shortest interval in s between two drawings of the charts."""
 CHART_PX = 165

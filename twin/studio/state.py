@@ -1,4 +1,4 @@
-"""What the studio keeps in files: its whole state, and a way of the object."""
+"""Files of the studio: its whole state, and a path of the object."""
 
 import csv
 import io

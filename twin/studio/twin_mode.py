@@ -28,7 +28,7 @@ from twin.studio.worker import Worker
 from twin.types import Form
 
 ModelOf = Callable[[str], SensorModel | None]
-"""From a sensor's name to a trained model of it, None where there is none."""
+"""Function from a sensor's name to a trained model of it, or None."""
 
 STEPS = {"mm": 0.25, "deg": 1.0}
 """How far a key moves the object."""
@@ -40,7 +40,7 @@ KEYS = {
     "pageup": ("depth_mm", -1),
     "pagedown": ("depth_mm", +1),
 }
-"""What a key with shift moves, and in which direction."""
+"""Keys that move the object together with shift: the number that changes, and its direction."""
 TURN_KEYS = {
     "arrowleft": ("tilt_y_deg", -1),
     "arrowright": ("tilt_y_deg", +1),
@@ -49,7 +49,7 @@ TURN_KEYS = {
     "pageup": ("twist_deg", -1),
     "pagedown": ("twist_deg", +1),
 }
-"""What a key with ctrl (or cmd) and shift turns, and in which direction."""
+"""Keys that turn the object together with ctrl (or cmd) and shift: the angle that changes, and its direction."""
 ONE_GESTURE_S = 0.8
 """Wishes that follow one another faster are one gesture: 'Undo' takes them back together."""
 MOST_UNDO = 100

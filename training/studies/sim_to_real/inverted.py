@@ -28,35 +28,35 @@ from twin.rig.labels import ArmLabel
 BACKWARDS = "twin backwards"
 """Name of the model in the study's table."""
 RIDGE = 1.0
-"""Penalty on the terms of what the twin misses, in labels scaled to -1..1."""
+"""Penalty on the terms of the discrepancy, with labels scaled to -1..1."""
 CONSTANT_RIDGE = 1e-3
-"""Penalty on the constant term in the sensor's frame: next to none."""
+"""Penalty on the constant term in the sensor's frame. It is nearly free."""
 OWN_CONSTANT = 0.3
-"""Of the penalty, on the constant term in the object's frame."""
+"""Penalty on the constant term in the object's frame, as a share of ``RIDGE``."""
 LEAST_SHARE = 0.1
-"""Least share of a frame's residual that the regression left out of itself, by which it is divided."""
+"""Smallest divisor of a leave-one-out residual, 1 minus the frame's own weight in the regression."""
 NOISE_FRAMES = 60.0
-"""Frames that the noise of pins counts for in the covariance of what is left, beside the labelled ones."""
+"""Weight of the pins' noise in the covariance of the residuals, as a number of labelled frames."""
 NOISE_TIMES = 1.5
-"""Times the noise of pins that what is left is expected to have before any frame tells."""
+"""Expected covariance of the residuals before any labelled frame, as a multiple of the pins' noise."""
 WIDTH = 1.5
-"""w above, in half ranges of the labels."""
+"""Width w of the prior on the labels, in half ranges."""
 STARTS = 700
-"""Simulated states that an estimate may begin at."""
+"""Largest number of simulated states that are tried as the start of an estimate."""
 TURN_DEG = 10.0
-"""Between two directions in which each of them is tried."""
+"""Angle between two directions in which each start is tried, deg."""
 STEPS = 7
-"""Gauss-Newton steps; fewer are enough from a near start."""
+"""Number of Gauss-Newton steps."""
 NUDGE = 2e-3
 """Step of the difference quotients, in half ranges."""
 LONGEST = 0.35
 """Longest step of a label, in half ranges."""
 DIRECTION_DEG = 60.0
-"""What counts as the half range of a direction."""
+"""Half range of a direction, deg. It scales steps and difference quotients."""
 BEYOND = 1.15
-"""Times the simulated range in which labels are looked for: the twin's process knows nothing farther out."""
+"""Range in which labels are searched, as a multiple of the simulated range. The Gaussian process knows nothing beyond it."""
 Expected = Callable[[np.ndarray], np.ndarray]
-"""From contacts (B, 12) to their expected waves (B, 2C)."""
+"""Function from contacts (B, 12) to their expected waves (B, 2C)."""
 
 
 class TwinBackwards:

@@ -1,4 +1,4 @@
-"""What the twin is worth: errors by the number of labelled frames, with the twin and without, of models that need no training.
+"""The value of the twin: errors by the number of labelled frames, with and without the twin, of models that need no training.
 
 With the twin: read backwards (``inverted``). Without: quadratic regression. Both with frames drawn at random and with frames nearest to an
 even sequence. A recording of five thousand frames takes as long as its contacts take to be simulated; all models take a minute.

@@ -31,7 +31,7 @@ CASE_DPI = 90
 """Resolution of a condition's chart, dots per inch. It is low, because a page has dozens of them."""
 
 REPORT_FILES = ("index.html", "plots", "envelope.json", "envelope.csv", "curves.csv", "frames.csv", "real-on-rendered.csv")
-"""What a report consists of."""
+"""Parts of a report."""
 
 
 def write_report(out: Path, judged: Judgement, *, source: str, notes: list[str], rendered: Judgement | None = None) -> list[Path]:

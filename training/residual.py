@@ -165,13 +165,15 @@ def calibrate_residual(
             for shown in (plain, found)
         )
     with stage(progress, "the same for halves of the real frames") as step:
-        halves = {name: real_halves(real, disc.inside, judge=judge, progress=step) for name, judge in JUDGES.items()}
+        real_told = {name: real_halves(real, disc.inside, judge=judge, progress=step) for name, judge in JUDGES.items()}
     psnr = [
         float(np.mean([compare_images(a, b, disc.inside).psnr_db for a, b in zip(real, shown, strict=True)])) for shown in (plain, found)
     ]
     spec = revised(sensor, response={"residual": residual.model_dump()})
     write_sensor(out, spec, f"With a residual network that was taught on {len(real)} frames of {frames.name}.")
-    return TaughtResidual(spec, len(real), before, after, halves, (psnr[0], psnr[1]), _shift_px(sensor, plain, found), read.refused, [out])
+    return TaughtResidual(
+        spec, len(real), before, after, real_told, (psnr[0], psnr[1]), _shift_px(sensor, plain, found), read.refused, [out]
+    )
 
 
 def _shots(sensor: SensorSpec, light: list[FloatArray]) -> list[ImageArray]:

@@ -36,7 +36,7 @@ QUALITIES = (0, 95, 90, 80, 70)
 # Residual, gray levels, above which a pixel has a smaller weight (soft L1).
 ROBUST_LEVELS = 10.0
 # Most evaluations of the least-squares fit.
-MOST_TRIES = 10
+MOST_TRIES = 60
 # Most frames that the sharpness is fitted to; one pixel in EVERY is used in each direction.
 MOST_FRAMES, EVERY = 3, 3
 # How exactly the haze is found.

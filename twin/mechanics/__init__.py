@@ -1,4 +1,4 @@
-"""The skin's mechanics: one sensor pressed against one object."""
+"""Contact mechanics: the deformation and the forces of one sensor that is pressed against one object."""
 
 from twin.mechanics.balance import Friction
 from twin.mechanics.batch import ContactJob, ContactOutcome, press_many

@@ -1,4 +1,4 @@
-"""The equations of one load step: elastic forces against contact and friction."""
+"""Equilibrium equations of one load step: elastic forces, contact forces and friction."""
 
 from copy import copy
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from twin.mechanics.elements import Elements, KeptStiffness
 from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
-FORCE_FLOOR_N = 1e-3  # the residual's scale is never less
+FORCE_FLOOR_N = 1e-3  # least force by which a residual is divided; without contact the sum of the contact forces is 0
 
 
 @dataclass(frozen=True)
 class Body:
-    """What a sensor brings to every contact.
+    """Finite-element model of one sensor: elements, contact points and boundary conditions.
 
     Attributes
     ----------
@@ -24,9 +24,9 @@ class Body:
         Skin first, then the gel.
     points : ContactPoints
     free : (n,) bool
-        Controls that move.
+        Controls that are not clamped.
     sealed : bool
-        Whether the gel's volume is held.
+        Whether the gel is enclosed, so that its volume is constant.
     """
 
     kinds: tuple[Elements, ...]
@@ -36,10 +36,11 @@ class Body:
 
     @property
     def volume_force_n_per_mm3(self) -> float:
-        """Force that stands for 1 mm^3 of the gel's volume gained or lost, so that both can be measured in N; 0 for an open gel.
+        """Factor that converts a change of the gel's volume (mm^3) into a force (N); 0 for a gel that is not sealed.
 
-        It is mu A / V with the gel's shear modulus mu (at small strain) and rest volume V and the skin's area A: what a stress mu
-        on the whole skin is for the whole volume. The ratio is the same in any unit of length.
+        With it the volume residual and the force residuals have the same unit. It is mu A / V, with the gel's shear modulus mu (at
+        small strain), the gel's rest volume V and the skin's area A: a change of the whole volume counts as much as a stress mu on the
+        whole skin.
         """
         if not self.sealed:
             return 0.0
@@ -52,7 +53,7 @@ class Body:
 class Friction:
     """Coulomb friction with slip weakening (Ida 1972).
 
-    A point that has slid by s since it last stuck has mu = kinetic + (static - kinetic) exp(-s / weakening_mm).
+    A point that has slid by s since it last stuck has the coefficient mu = kinetic + (static - kinetic) exp(-s / weakening_mm).
     The shear stress never exceeds ``shear_strength_mpa``.
     """
 
@@ -66,32 +67,36 @@ class Friction:
             raise ContactError(f"friction needs 0 <= kinetic <= static, weakening_mm > 0 and shear_strength_mpa > 0, got {self}")
 
     def after(self, slid_mm: FloatArray) -> FloatArray:
-        """Coefficients (q,) of points that have slid so far since they last stuck."""
+        """Coefficients of friction (q,) of points that have slid by ``slid_mm`` (q,) since they last stuck."""
         return self.kinetic + (self.static - self.kinetic) * np.exp(-slid_mm / self.weakening_mm)
 
 
 @dataclass(frozen=True)
 class LoadState:
-    """A converged state.
+    """State of the contact at the end of a converged load step.
 
     Attributes
     ----------
     control_mm : (n, 3) float
+        Positions of the controls.
     border : (2,) float
-        How far the object has given way along z (mm), and the pressure of a sealed gel (MPa).
+        Displacement of the object along z under its compliance (mm), and the pressure of a sealed gel (MPa).
     anchor_mm : (p, 3) float
-        Friction's anchors in the object's frame; meaningful where ``held (p,)``.
+        Friction anchors of the contact points in the object's frame; meaningful where ``held (p,)``.
+    held : (p,) bool
+        Whether the point presses on the object, so that friction acts on it.
     slid_mm : (p,) float
         Slip since the point last stuck.
     limit_n : (p,) float
-        Largest friction force that each point could bear.
+        Largest friction force that each point can bear.
     gap_mm : (p,) float
         Distance of each point from the object, negative inside; 0 before the contact.
     penalty_mpa_mm : float
+        Contact pressure for a unit of penetration, MPa/mm.
     T : (4, 4) float
-        The object's pose before it gave way.
+        The object's pose without the displacement ``border[0]``.
     elastic_nmm, dissipated_nmm : float
-        Energy stored in the body, and lost to friction in the step that led here.
+        Energy stored in the body, and energy lost to friction in the last load step.
     """
 
     control_mm: FloatArray
@@ -109,18 +114,22 @@ class LoadState:
 
 @dataclass(frozen=True)
 class Balance:
-    """The equations at a trial state.
+    """Residuals and forces of the equilibrium equations at a trial state.
 
     Attributes
     ----------
     elastic : (unknowns,) float
-        Elastic force on the free controls; ``residual`` less the contact's.
+        Elastic force on the free controls.
+    residual : (unknowns,) float
+        Elastic force minus contact force on the free controls, N.
     border_residual : (2,) float
-        Of yield / compliance + force = 0 (N) and of the sealed gel's volume (mm^3).
+        Residual of displacement / compliance + force along z = 0 (N), and change of the sealed gel's volume (mm^3).
     contact : ContactForces
-        At the points looked at, in the object's frame; ``point_force_n`` (q, 3) the same forces in the sensor's.
+        Contact at the candidate points, in the object's frame.
+    point_force_n : (q, 3) float
+        The contact forces in the sensor's frame.
     scale_n : float
-        Sum of the contact forces.
+        Sum of the magnitudes of the contact forces, at least ``FORCE_FLOOR_N``.
     elastic_nmm : float
         Energy stored in the body.
     volume_force_n_per_mm3 : float
@@ -138,23 +147,23 @@ class Balance:
 
     @property
     def absolute(self) -> float:
-        """Norm of the residual in N, the gel's change of volume counted as a force."""
+        """Norm of all residuals in N; the gel's change of volume is converted to a force."""
         yielding_n, volume_mm3 = self.border_residual
         return float(np.linalg.norm([np.linalg.norm(self.residual), yielding_n, self.volume_force_n_per_mm3 * volume_mm3]))
 
     @property
     def relative(self) -> float:
-        """Norm of the residual over the sum of the contact forces."""
+        """Norm of all residuals, divided by the sum of the contact forces."""
         return self.absolute / self.scale_n
 
 
 def in_object(points_mm: FloatArray, T: FloatArray, border: FloatArray) -> FloatArray:
-    """Points (k, 3) of the sensor's frame in that of the object at ``T``, which has given way by ``border[0]`` along z."""
+    """Points (k, 3) of the sensor's frame in the frame of the object at ``T``, displaced by ``border[0]`` (mm) along z."""
     return (points_mm - T[:3, 3] - [0, 0, border[0]]) @ T[:3, :3]
 
 
 class Problem:
-    """The equations of one load step. Anchors, penalty, the object's pose and the stress left of the past are held.
+    """The equilibrium equations of one load step. Anchors, penalty, the object's pose and the viscoelastic stress are constant.
 
     Parameters
     ----------
@@ -163,19 +172,19 @@ class Problem:
         The object that presses.
     friction : Friction
     compliance_mm_per_n : float
-        How far the object gives way along z under a force.
+        Displacement of the object along z per N.
     state : LoadState
-        Where the step begins: how far each point has slid decides its coefficient of friction.
+        State at the start of the step. The slip of each point determines its coefficient of friction.
     anchor_mm : (p, 3) float
-        Friction's anchors of all contact points in the object's frame.
+        Friction anchors of all contact points in the object's frame.
     looked : (q,) int
-        Contact points that the equations look at; the others are known to be free.
+        Candidate points: the contact points that the equations include. The other points are assumed to be free.
     penalty : float
         Contact pressure for a unit of penetration, MPa/mm.
     T : (4, 4) float
-        The object's pose before it gives way.
+        The object's pose without its displacement under the compliance.
     given : list of float arrays
-        Stress left of the past, for each kind of elements (see ``Elements.add_forces``).
+        Given viscoelastic stress of each kind of elements (see ``Elements.add_forces``).
     """
 
     def __init__(
@@ -207,17 +216,17 @@ class Problem:
         self.friction = friction.after(self.slid_mm)
 
     def moved(self, T: FloatArray, anchor_mm: FloatArray, slid_mm: FloatArray) -> "Problem":
-        """The same equations with the object at ``T`` (4, 4); anchors (q, 3) and slip (q,) are those of the points looked at."""
+        """The same equations with the object at ``T`` (4, 4), and with anchors (q, 3) and slip (q,) of the candidate points."""
         other = copy(self)
         other.T, other.anchor_mm, other.slid_mm, other.friction = T, anchor_mm, slid_mm, self._law.after(slid_mm)
         return other
 
     def contact(self, at: FloatArray, soften: float = 1.0) -> ContactForces:
-        """Contact with the points looked at in places (q, 3) of the object's frame."""
+        """Contact forces with the candidate points at positions ``at`` (q, 3) in the object's frame."""
         return contact_forces(self._field, at, self.stiff, self.anchor_mm, self.friction, bound_n=self.bound_n, soften=soften)
 
     def balance(self, control: FloatArray, border: FloatArray) -> Balance | None:
-        """The equations; None if an element is inside out."""
+        """The balance at a state; None if an element is inverted (det F <= 0)."""
         body, volume = self.body, 0.0
         residual = np.zeros_like(control)
         elastic_nmm = 0.0
@@ -231,7 +240,10 @@ class Problem:
         return self._with_contact(control, border, residual[body.free].ravel(), volume, elastic_nmm)
 
     def again(self, before: Balance, control: FloatArray, border: FloatArray) -> Balance:
-        """The equations where only contact and friction differ from those whose balance ``before`` is, at the same state."""
+        """The balance at the state of ``before``, which these equations share except for contact and friction.
+
+        The elastic forces of ``before`` are used again.
+        """
         return self._with_contact(control, border, before.elastic, float(before.border_residual[1]), before.elastic_nmm)
 
     def _with_contact(self, control: FloatArray, border: FloatArray, elastic: FloatArray, volume_mm3: float, elastic_nmm: float) -> Balance:
@@ -240,17 +252,17 @@ class Problem:
         pushed = np.zeros_like(control)
         spread_forces(self.controls, self.weights, force, pushed)
         border_residual = np.array([0.0, volume_mm3])
-        if self.compliance:  # the skin pushes the object with -sum f
+        if self.compliance:  # the force of the skin on the object is -sum f
             border_residual[0] = border[0] / self.compliance + float(force[:, 2].sum())
         scale = max(float(np.linalg.norm(force, axis=1).sum()), FORCE_FLOOR_N)
         residual = elastic - pushed[self.body.free].ravel()
         return Balance(elastic, residual, border_residual, contact, force, scale, elastic_nmm, self.volume_force_n_per_mm3)
 
     def stiffness(self, control: FloatArray, border: FloatArray, kept: list[KeptStiffness], *, anew: bool) -> None:
-        """Bring the elements' tangents to a state; ``anew``: leave none as it was."""
+        """Update the elements' tangents to a state; ``anew`` recomputes all of them."""
         for number, (kind, given, blocks) in enumerate(zip(self.body.kinds, self._given, kept, strict=True)):
             blocks.update(kind, control, given, border[1] if number else 0.0, anew=anew)
 
     def volume(self, control: FloatArray, out: FloatArray) -> float:
-        """How much the gel's volume has grown, mm^3; adds its gradient to ``out``."""
+        """Increase of the gel's volume, mm^3; adds its gradient to ``out``."""
         return sum(kind.add_volume(control, out) for kind in self.body.kinds[1:])

@@ -1,4 +1,4 @@
-"""Many contacts of one sensor, in parallel processes."""
+"""Solution of many contacts of one sensor in parallel processes."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from twin.workers import in_processes
 
 @dataclass(frozen=True)
 class ContactJob:
-    """One contact to solve (see ``SkinSolver.path``); ``every_state`` keeps the states on the way, too."""
+    """One contact to solve (see ``SkinSolver.path``); ``every_state`` keeps the states of all load steps, not only the last one."""
 
     touched: ObjectSpec
     pose: ContactPose | ContactPath
@@ -27,16 +27,16 @@ class ContactJob:
 
 @dataclass(frozen=True)
 class ContactOutcome:
-    """What became of a job.
+    """Result of a job.
 
     Attributes
     ----------
     number : int
-        Which of the jobs.
+        Index of the job.
     states : list of ContactState
-        Converged states, the end of the path last; one unless all were wanted, none where it failed.
+        Converged states in the order of the path: all of them with ``every_state``, else the last one; none if the job failed.
     error : str
-        Why it failed ("" if it did not).
+        Message of the failure, "" if the job succeeded.
     """
 
     number: int
@@ -47,23 +47,23 @@ class ContactOutcome:
 def press_many(
     spec: SensorSpec, jobs: Sequence[ContactJob], *, processes: int = 1, resolution: Resolution | None = None
 ) -> Iterator[ContactOutcome]:
-    """Solve contacts, in the order in which they end; the states do not depend on the number of processes.
+    """Solve contacts and yield their outcomes as they finish; the states do not depend on the number of processes.
 
-    A contact that fails does not end the others: its outcome says why.
+    A contact that fails does not stop the others: its outcome contains the message.
 
     Parameters
     ----------
     spec : SensorSpec
     jobs : sequence of ContactJob
     processes : int
-        Of this machine (see ``in_processes``).
+        Number of processes (see ``in_processes``).
 
     Raises
     ------
     ValueError
         ``processes`` is less than 1.
     WorkersError
-        Processes were lost again and again.
+        Processes died repeatedly.
     """
     yield from in_processes(_begin, (spec, resolution), list(enumerate(jobs)), processes=processes)
 

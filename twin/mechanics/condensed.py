@@ -1,4 +1,4 @@
-"""Contact against the eliminated body: small, dense, and solved exactly."""
+"""Contact problem on the condensed body: a small dense system, solved by Newton's method."""
 
 from dataclasses import dataclass, replace
 
@@ -13,29 +13,39 @@ from twin.mechanics.turns import turned, turned_back, turned_matrix
 from twin.types import FloatArray, IntArray
 
 _ITERATIONS = 60
-"""Most iterations of Newton's method on the small problem."""
+"""Largest number of Newton iterations on the small problem."""
 _HASTY_ITERATIONS = 15
-"""Most iterations of the first attempt; where it fails, softened contact is solved first."""
+"""Largest number of Newton iterations of the first attempt. If it does not converge, softened contact is solved first."""
 LARGEST_MOVE_MM = 1.5
-"""A control moves at most this far in one iteration."""
+"""Largest displacement of a control in one iteration (mm)."""
 _HALVINGS = 5
-"""Most times that the line search halves a step."""
+"""Largest number of times that the line search halves a step."""
 _LEAST_GAIN = 0.1
-"""The line search accepts a step of size s that lowers the residual's norm by at least this share of s."""
+"""The line search accepts a step of size s that reduces the residual's norm by at least this factor times s, relative to the norm."""
 _KEEP_FACTORS = 0.2
-"""Old factors of the matrix are used again as long as they lower the residual to this share or less."""
+"""The factors of an earlier matrix are used again as long as a step with them reduces the residual to this share or less."""
 _SOFTENING = 0.1
-"""Factor on the contact's stiffness while the solution is still far."""
+"""Factor on the contact stiffness in the softened problem, which gives the start for the true one."""
 _INEXACT = 0.01
-"""The iteration ends when its residual is this share of the whole problem's: a better answer would not help the outer iteration."""
+"""The inner iteration ends when its residual is this share of the whole problem's residual. A smaller one does not help the outer
+iteration."""
 
 
 @dataclass(frozen=True)
 class Tangent:
-    """The body's tangent, eliminated down to the kept unknowns.
+    """The body's tangent stiffness, condensed to the kept unknowns.
 
-    The sealed gel's pressure is one more unknown: ``volume_column`` (unknowns,) is its eliminated column,
-    ``volume_pivot`` what it leaves on the diagonal. ``strains`` says for which state it was made (see ``Turns.strains``).
+    Attributes
+    ----------
+    eliminated : Eliminated
+    matrix : (k, k) float
+        Condensed matrix of the kept unknowns.
+    volume_column : (unknowns,) float, optional
+        Column of the sealed gel's pressure, which is one more unknown, after elimination. None for a gel that is not sealed.
+    volume_pivot : float
+        Diagonal entry of that pressure after elimination.
+    strains : list of float arrays
+        State at which the tangent was computed (see ``Turns.strains``).
     """
 
     eliminated: Eliminated
@@ -47,27 +57,30 @@ class Tangent:
 
 @dataclass
 class Near:
-    """The tangent once more eliminated, down to the controls that carry the points looked at.
+    """The tangent, condensed further to the controls that carry the candidate points.
 
-    Controls that carry no point which is looked at are "far". The far part of the tangent is L L^T. All arrays are in single precision.
+    Kept controls that carry a candidate point are "near", the other ones are "far" and are eliminated here. The far part of the tangent
+    is L L^T. All arrays are in single precision.
 
     Attributes
     ----------
     near, far : (n,), (f,) int
-        Kept unknowns that stay and go.
+        Near and far ones among the kept unknowns.
     local : (q, 9) int
-        Place of each point's controls among those that stay (their number: none of them).
+        Index of each point's controls among the near controls; the number of near controls where a control is not among them.
     matrix : (n, n) float
-        What is left of the tangent, symmetric; ``column`` (n,) of the volume's column. Both are turned by ``turns``.
+        Condensed tangent of the near unknowns, symmetric, rotated by ``turns``.
+    column : (n,) float
+        Condensed volume column, rotated by ``turns``.
     factor : (f, f) float
         L, Fortran order, lower triangle.
     coupling, far_column : (f, n), (f,) float
-        L^-1 applied to the coupling of far and near, and to the volume's column.
+        L^-1 applied to the coupling of far and near unknowns, and to the far part of the volume column.
     turns : (n / 3, 3, 3) float, optional
-        How the controls that stay have turned since the tangent was made. What concerns the far part, and the residual given to
-        ``SmallContact``, is as before that turn.
+        Rotations of the near controls since the tangent was computed. The arrays of the far part, and the residual given to
+        ``SmallContact``, are not rotated.
     solved : tuple
-        The contact's softening, and the factors of the matrix (n + 2, n + 2) for which Newton's direction was last found.
+        Softening of the contact, and the factors and pivots of the last matrix (n + 2, n + 2) of Newton's method.
     """
 
     near: IntArray
@@ -107,17 +120,21 @@ class Near:
         return cls(near, far, renumber[local], rest, column, factor, coupling, far_column)
 
     def turned(self, turns: FloatArray) -> "Near":
-        """The same, made from a tangent whose kept controls have turned by ``turns`` (k / 3, 3, 3) since."""
+        """The same for a body whose kept controls have rotated by ``turns`` (k / 3, 3, 3) since the tangent was computed."""
         turns = turns[self.near[::3] // 3]
         return replace(self, matrix=turned_matrix(turns, self.matrix), column=turned(turns, self.column), turns=turns)
 
 
 class SmallContact:
-    """Contact against the eliminated body: unknowns are the touched controls' moves, the object's yield and the gel's pressure.
+    """Contact problem on the condensed body.
 
-    S dz + v dp + r = forces of contact,   (w + dw) / c + sum f_z = 0,   k (v . dz + q dp + g) = 0
+    The unknowns are the displacements dz of the near controls, the change dw of the object's displacement w along z, and the change dp of
+    the gel's pressure:
 
-    k turns a volume into a force (``Body.volume_force_n_per_mm3``), so that all residuals are in N and have one norm.
+    S dz + v dp + r = contact forces,   (w + dw) / c + sum f_z = 0,   k (v . dz + q dp + g) = 0
+
+    S is the condensed tangent, v and q are the volume column and its diagonal entry, r and g the residuals, c the compliance. k converts a
+    volume into a force (``Body.volume_force_n_per_mm3``), so that all residuals are in N and have one norm.
     """
 
     def __init__(
@@ -142,10 +159,10 @@ class SmallContact:
         self._q = pivot - near.far_column @ near.far_column
 
     def solve(self, balance: Balance, *, soften: bool, least: float) -> tuple[FloatArray, FloatArray]:
-        """Moves of all kept unknowns (k,), turned back to where the tangent was made, and of the border (2,).
+        """Displacements of all kept unknowns (k,), rotated back to the state of the tangent, and changes of the border unknowns (2,).
 
-        ``soften``: far from the solution; softened contact is solved first, and its answer is the start.
-        ``least``: residual, relative to the contact forces, that is never gone below.
+        ``soften``: solve softened contact first, and start the true problem from its solution.
+        ``least``: residual relative to the contact forces; no smaller one is asked for.
         """
         wanted = max(_INEXACT * (FORCE_FLOOR_N if soften else balance.absolute), least * balance.scale_n)
         start = np.zeros(len(self._near.near) + 2)
@@ -163,15 +180,18 @@ class SmallContact:
         return out, y[-2:]
 
     def newton(self, y: FloatArray, wanted: float, most: int) -> tuple[FloatArray, bool]:
-        """Solve from a start (n + 2,): moves of the near controls and the border. Also whether the residual (N) came below ``wanted``."""
+        """Solve from a start (n + 2,), in at most ``most`` iterations.
+
+        Returns the displacements of the near controls and the border, and whether the residual (N) is at most ``wanted``.
+        """
         return self._newton(y, 1.0, wanted, most)
 
     def contact(self, y: FloatArray) -> ContactForces:
-        """Contact after moves ``y`` (n + 2,)."""
+        """Contact forces after displacements ``y`` (n + 2,)."""
         return self._problem.contact(self.places(y))
 
     def places(self, y: FloatArray) -> FloatArray:
-        """The points looked at after moves ``y`` (n + 2,), in the object's frame, (q, 3)."""
+        """Candidate points (q, 3) after displacements ``y`` (n + 2,), in the object's frame."""
         return _moved(self._near.local, self._problem.weights, self._at, y, self._problem.T, self._border[0] + y[-2])
 
     def _newton(self, y: FloatArray, soften: float, wanted: float, most: int) -> tuple[FloatArray, bool]:
@@ -181,7 +201,8 @@ class SmallContact:
             if norm <= wanted:
                 return y, True
             self.iterations += 1
-            if self._near.solved and self._near.solved[0] == soften:  # perhaps the same points still touch and stick: try the old factors
+            # the earlier factors are nearly right as long as the same points touch and stick
+            if self._near.solved and self._near.solved[0] == soften:
                 trial_y = y - self._solved(residual)
                 trial, trial_contact = self._equations(trial_y, soften)
                 trial_norm = float(np.linalg.norm(trial))
@@ -219,7 +240,7 @@ class SmallContact:
         return out, contact
 
     def _factorise(self, contact: ContactForces, soften: float) -> None:
-        """The matrix of Newton's direction; in single precision, which costs half and no convergence."""
+        """Factorise the matrix of Newton's method, in single precision: that halves the cost and does not harm the convergence."""
         problem, local, count = self._problem, self._near.local, len(self._near.near)
         turn = problem.T[:3, :3]
         stiffness = turn @ contact.stiffness @ turn.T
@@ -227,7 +248,7 @@ class SmallContact:
         matrix[:count, :count] = self._near.matrix
         spread_stiffness(local, problem.weights, stiffness, matrix)
         matrix[count, count] = matrix[count + 1, count + 1] = 1.0
-        if problem.compliance:  # an object moved by w along z is points moved by -w
+        if problem.compliance:  # a displacement w of the object along z acts like a displacement -w of all points
             column, row = np.zeros((2, count // 3 + 1, 3))
             spread_forces(local, problem.weights, np.ascontiguousarray(-stiffness[:, :, 2]), column)
             spread_forces(local, problem.weights, np.ascontiguousarray(-stiffness[:, 2, :]), row)
@@ -241,7 +262,7 @@ class SmallContact:
         self._near.solved = soften, factors, pivots
 
     def _solved(self, right_side: FloatArray) -> FloatArray:
-        """Newton's direction for a right side, with the factors found last."""
+        """Solution for a right side with the latest factors."""
         assert self._near.solved is not None, "factorise first"
         _, factors, pivots = self._near.solved
         return lapack.sgetrs(factors, pivots, right_side.astype(np.float32))[0].astype(float)
@@ -249,7 +270,7 @@ class SmallContact:
 
 @compiled()
 def _moved(local: IntArray, weights: FloatArray, at: FloatArray, y: FloatArray, T: FloatArray, yielded: float) -> FloatArray:
-    """Points (q, 3) in the object's frame after moves ``y`` of their controls."""
+    """Points (q, 3) in the object's frame after displacements ``y`` of their controls."""
     controls = (len(y) - 2) // 3
     out = np.empty_like(at)
     for p in range(len(at)):
@@ -278,7 +299,7 @@ def _residual(
     T: FloatArray,
     out: FloatArray,
 ) -> float:
-    """Forces on the near controls into ``out``; the sum of the contact's along z, all in the sensor's frame."""
+    """Write the residual forces on the near controls into ``out``; returns the sum of the contact forces along z. Sensor frame."""
     count = len(y) - 2
     for r in range(count):
         total = start[r] + column[r] * y[count + 1]

@@ -1,15 +1,15 @@
-"""Contact of the outer skin with an object: penalty against the signed distance, Coulomb friction.
+"""Contact of the outer skin with an object: a penalty on the signed distance, and Coulomb friction.
 
 At contact points of rest area A with signed distance d, outward object normal n and penetration
 g = max(-d, 0), the force on the skin is (Wriggers, "Computational Contact Mechanics", ch. 5)
 
     f = A (p n - min(mu p, tau) phi(|s| / delta) s / |s|),    phi(x) = 2 x - x^2 for x < 1 (stick), else 1 (slip)
 
-p is the pressure k (g - eps / 2); for g < eps it is k g^2 / 2 eps, so that the force begins smoothly. s is the
-tangential travel from the point's anchor. The anchor is fixed to the object: it is the place where the point touched
-the object first, and after a slip it is moved so that |s| = delta. tau bounds the shear stress that the two surfaces
-bear, however hard they are pressed together (as between rubbers; Orowan's friction). A sticking point creeps by less than
-delta, and no point ever leaves Coulomb's cone. Everything here is in the object's frame.
+p is the pressure k (g - eps / 2) with the penalty k; for g < eps it is k g^2 / 2 eps, so that the force begins smoothly. s is the
+tangential travel from the point's anchor. The anchor is fixed to the object: it is the place where the point first
+touched the object, and after a slip it is moved so that |s| = delta. tau is the largest shear stress that the
+interface can bear at any pressure (as between rubbers; Orowan's friction). A sticking point creeps by less than
+delta, and no point leaves Coulomb's cone. Everything here is in the object's frame.
 """
 
 from dataclasses import dataclass
@@ -23,30 +23,34 @@ from twin.objects import ObjectField
 from twin.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 SMOOTH_GAP_MM = 0.006
-"""eps: penetration below which the pressure rises with its square, so that touching is smooth."""
+"""eps: penetration (mm) below which the pressure grows with the square of the penetration, so that contact begins smoothly."""
 STICK_CREEP_MM = 0.01
-"""delta: travel from its anchor at which a sticking point starts to slip; about a hundredth of a usual shear."""
+"""delta: travel (mm) from the anchor at which a sticking point starts to slip; about a hundredth of a usual shear."""
 TOUCHING_MM = 0.05
-"""Skin that is nearer to a pressed object than this counts as touching it. Within a patch the skin lifts by some micrometres where it bears
-almost nothing, so that the area with pressure alone depends on the mesh."""
+"""Distance (mm) below which skin counts as touching a pressed object. Within a contact patch the skin lifts by some micrometres where the
+pressure is almost zero, so an area defined by the pressure alone depends on the mesh."""
 POINTS_PER_ELEMENT = 4
-"""Contact points along each side of an outer element."""
+"""Number of contact points along each side of an outer element."""
 
 
 @dataclass(frozen=True)
 class ContactPoints:
-    """Where the outer skin is tested for contact: 4x4 even points of each outer element.
+    """Points at which the outer skin is tested for contact: a regular grid of 4x4 points on each outer element.
 
-    A point lies on the true outside at rest: it is its place on the spline surface plus a fixed ``lift_mm``.
+    At rest a point lies on the exact outer surface: its position is that of the spline surface plus a constant ``lift_mm``.
 
     Attributes
     ----------
     controls : (p, 9) int
-        Controls of the outer layer that carry a point; ``weights (p, 9)`` their shares (sum 1), ``lift_mm (p, 3)``.
+        Controls of the outer layer that carry a point.
+    weights : (p, 9) float
+        Weights of these controls; they sum to 1.
+    lift_mm : (p, 3) float
+        Offset of the exact outer surface from the spline surface at rest.
     area_mm2 : (p,) float
-        Rest area; together they tile the skin.
+        Rest area of the skin that a point stands for; the areas tile the skin.
     element : (p,) int
-        Element below the point.
+        Element that contains the point.
     place : (p,) complex
         Place on the skin (see ``twin.geometry.shapes``).
     """
@@ -64,7 +68,7 @@ class ContactPoints:
 
 
 def contact_points(solid: Solid, shape: SkinShape) -> ContactPoints:
-    """Contact points of the solid of a skin of a shape."""
+    """Contact points of a solid whose skin has the given shape."""
     basis = solid.basis
     count = basis.elements * POINTS_PER_ELEMENT
     step = (basis.breaks[-1] - basis.breaks[0]) / count
@@ -91,19 +95,19 @@ def contact_points(solid: Solid, shape: SkinShape) -> ContactPoints:
 
 
 def touching_mm2(points: ContactPoints, gap_mm: FloatArray) -> float:
-    """Rest area of the skin whose gap to the object, (p,) at the points, is less than ``TOUCHING_MM``.
+    """Rest area of the skin whose gap to the object is less than ``TOUCHING_MM``; ``gap_mm`` (p,) is the gap at the points.
 
-    Between the points, which form a square grid, the gap is taken as linear, so that the area changes continuously.
+    The points form a square grid. The gap is interpolated linearly between them, so that the area changes continuously.
     """
     side = round(len(gap_mm) ** 0.5)
     along = np.gradient(gap_mm.reshape(side, side))
-    change = np.maximum(np.abs(along[0]) + np.abs(along[1]), 1e-12).ravel()  # of the gap across a point's own cell
+    change = np.maximum(np.abs(along[0]) + np.abs(along[1]), 1e-12).ravel()  # change of the gap across a point's own cell
     return float(np.clip(0.5 + (TOUCHING_MM - gap_mm) / change, 0, 1) @ points.area_mm2)
 
 
 @compiled()
 def positions(controls: IntArray, weights: FloatArray, lift: FloatArray, control: FloatArray) -> FloatArray:
-    """Places (p, 3) of points carried by nine controls each."""
+    """Positions (p, 3) of points that are carried by nine controls each."""
     out = lift.copy()
     for p in range(len(controls)):
         for a in range(9):
@@ -114,7 +118,7 @@ def positions(controls: IntArray, weights: FloatArray, lift: FloatArray, control
 
 @dataclass(frozen=True)
 class ContactForces:
-    """What the object does to the skin, in the object's frame.
+    """Contact forces of the object on the skin, in the object's frame.
 
     Attributes
     ----------
@@ -123,13 +127,14 @@ class ContactForces:
     force_n : (p, 3) float
         Force on the skin at each point.
     normal_n : (p,) float
-        Size of the normal part.
+        Magnitude of the normal component.
     penetration_mm : (p,) float
+        Depth of each point inside the object, 0 outside.
     slipping : (p,) bool
     stiffness : (p, 3, 3) float
-        Minus the force's derivative by the point's position, N/mm.
+        Minus the derivative of the force with respect to the point's position, N/mm.
     anchor_mm : (p, 3) float
-        The anchors of touched points if this state is accepted.
+        New anchors of the points in contact, for the case that this state is accepted.
     """
 
     normal: FloatArray
@@ -151,20 +156,21 @@ def contact_forces(
     bound_n: FloatArray | None = None,
     soften: float = 1.0,
 ) -> ContactForces:
-    """Forces and their stiffness with contact points at ``at_mm`` (p, 3), object frame.
+    """Contact forces and their stiffness with the contact points at ``at_mm`` (p, 3), object frame.
 
     Parameters
     ----------
     stiff : (p,) float
         Penalty times area, N/mm.
     anchor_mm : (p, 3) float
-        Where friction holds each point, if it presses.
+        Friction anchor of each point.
     friction : (p,) float
-        Coefficient at each point.
+        Coefficient of friction at each point.
     bound_n : (p,) float, optional
-        Friction force that a point never exceeds (tau A).
+        Largest friction force of each point (tau A).
     soften : float
-        Below 1 on the way to a solution: the penalty is multiplied by it, the smooth gap and the creep are divided by it.
+        A value below 1 gives softened contact, as an intermediate problem on the way to the solution. The penalty is multiplied by it,
+        ``SMOOTH_GAP_MM`` and ``STICK_CREEP_MM`` are divided by it.
     """
     distance, normal, hessian = field.probe(at_mm)
     scales = SMOOTH_GAP_MM / soften, STICK_CREEP_MM / soften
@@ -236,7 +242,7 @@ def _law(
                 moved[p, i] = at[p, i] - delta * way[i]
             else:
                 moved[p, i] = anchor[p, i]
-        # as the point moves the normal turns: d travel = (I - n n) dx - along dn - n (path . dn), dn = h dx
+        # the normal turns when the point moves: d travel = (I - n n) dx - along dn - n (path . dn), dn = h dx
         for i in range(3):
             for j in range(3):
                 bent = along * h[i, j]
@@ -265,7 +271,7 @@ def spread_forces(controls: IntArray, weights: FloatArray, force: FloatArray, ou
 
 @compiled()
 def spread_stiffness(controls: IntArray, weights: FloatArray, stiffness: FloatArray, out: FloatArray) -> None:
-    """Add point stiffnesses (p, 3, 3) to a matrix of the controls' unknowns, (3 n, 3 n); controls from n on are left out."""
+    """Add point stiffnesses (p, 3, 3) to the matrix (3 n, 3 n) of the controls' unknowns; controls numbered n or more are omitted."""
     count = len(out) // 3
     for p in range(len(controls)):
         k = stiffness[p]

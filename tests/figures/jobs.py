@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from time import perf_counter
 
 from scenes import load_sensor
 from twin import store
+from twin.store.fingerprint import Code
 
 ROOT = Path(__file__).parents[2]
 FIGURES = ROOT / "figures.json"
@@ -139,8 +140,8 @@ UNMEASURED = ("twin.cli", "twin.report")
 """Packages whose code changes no figure: the command line's words and the pages' looks."""
 
 
-def modules_of(*names: str) -> dict[str, str]:
-    """Digest of each module that may change a figure of a job which names these modules and packages.
+def code_behind(*names: str) -> Code:
+    """The code that may change a figure of a job which names these modules and packages: modules, and versions of libraries.
 
     Raises
     ------
@@ -155,8 +156,8 @@ def modules_of(*names: str) -> dict[str, str]:
             raise FiguresError(f"a figure depends on the code of {name!r}, which is no module; name one such as 'training.surrogate'")
         found = [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in files]
         modules += found or [name]  # a bench, which lies outside of the packages
-    found = store.code_of(*modules).modules
-    return {module: digest for module, digest in found.items() if not module.startswith(UNMEASURED)}
+    found = store.code_of(*modules)
+    return replace(found, modules={name: digest for name, digest in found.modules.items() if not name.startswith(UNMEASURED)})
 
 
 def shipped_digest(names: tuple[str, ...]) -> str:
@@ -175,9 +176,8 @@ def fingerprint(made: Job) -> str:
     measure, bound = made.measure, ""
     if isinstance(measure, partial):
         measure, bound = measure.func, repr(sorted(measure.keywords.items()))
-    modules = "".join(f"{name} {digest}\n" for name, digest in sorted(modules_of(*made.code).items()))
-    shipped = shipped_digest(made.shipped) if made.shipped else ""
-    return hashlib.sha256(f"{modules}\n{inspect.getsource(measure)}\n{bound}\n{shipped}".encode()).hexdigest()[:16]
+    code, shipped = code_behind(*made.code).fingerprint, shipped_digest(made.shipped)
+    return hashlib.sha256(f"{code}\n{inspect.getsource(measure)}\n{bound}\n{shipped}".encode()).hexdigest()[:16]
 
 
 def key_of(made: Job) -> dict[str, str]:

@@ -9,6 +9,8 @@ from figures import jobs as module
 from figures import tables
 from figures.jobs import FIGURES, JOBS, FiguresError, Job, Value, is_kept, read, run, values
 
+from twin.store.fingerprint import Code
+
 
 @pytest.fixture
 def counted():
@@ -39,7 +41,7 @@ def test_what_it_was_made_from_decides_whether_it_counts(counted, tmp_path, monk
     run(job, path, tmp_path)
     other = Job(job.name, job.measure, job.command, ("mg400-331",), job.code, (), 0.0)
     assert not is_kept(other, path), "another specification"
-    monkeypatch.setattr(module, "modules_of", lambda *names: {"scenes": "changed"})
+    monkeypatch.setattr(module, "code_behind", lambda *names: Code({"scenes": "changed"}, {}))
     assert not is_kept(job, path), "other code"
     run(job, path, tmp_path)
     assert is_kept(job, path) and values(path)["probe.force.force"].value == 1.0
@@ -48,18 +50,28 @@ def test_what_it_was_made_from_decides_whether_it_counts(counted, tmp_path, monk
 def test_every_jobs_code_and_files_are_found():
     """Code that is not found would never make a figure count as old."""
     for made in JOBS.values():
-        modules = module.modules_of(*made.code)
+        modules = module.code_behind(*made.code).modules
         assert any(name.startswith(("twin.", "training.")) for name in modules), made.name
         assert all((module.ROOT / name).exists() for name in made.shipped), made.name
     with pytest.raises(FiguresError, match="'training.nowhere'"):
-        module.modules_of("training.nowhere")
+        module.code_behind("training.nowhere")
 
 
 def test_only_code_that_a_figure_comes_from_makes_it_old():
-    pins, poses = set(module.modules_of("twin.pins.batch")), set(module.modules_of("training.studies.sim_to_real"))
+    pins, poses = (set(module.code_behind(name).modules) for name in ("twin.pins.batch", "training.studies.sim_to_real"))
     assert "twin.pins.blobs" in pins and "twin.mechanics.solver" not in pins
     assert {"twin.mechanics.solver", "training.studies.sim_to_real.inverted"} <= poses
     assert not [name for name in pins | poses if name.startswith(module.UNMEASURED)]
+
+
+def test_another_version_of_a_library_makes_a_figure_old(counted, monkeypatch):
+    job, _ = counted
+    now, before = module.code_behind("twin.pins.batch"), module.fingerprint(job)
+    assert "numpy" in now.libraries
+    monkeypatch.setattr(module, "code_behind", lambda *names: Code({}, {"numpy": "1.0"}))
+    first = module.fingerprint(job)
+    monkeypatch.setattr(module, "code_behind", lambda *names: Code({}, {"numpy": "2.0"}))
+    assert len({before, first, module.fingerprint(job)}) == 3
 
 
 def test_another_shipped_file_makes_a_figure_old(tmp_path, monkeypatch):

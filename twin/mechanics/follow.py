@@ -1,4 +1,4 @@
-"""The sensor's state while an object is moved about it, pose by pose, as the poses come: with a memory, and without an end."""
+"""Simulation of a sensor that follows an object: one contact state for each new pose, continued from the state before."""
 
 from itertools import pairwise
 
@@ -13,32 +13,33 @@ from twin.mechanics.solver import SkinSolver
 from twin.objects import build_field
 from twin.types import ContactState
 
-STEP_MM = 0.45  # largest motion across the contact in one load step: longer ones often fail, and are then tried again in halves
-LARGEST_MOVE_MM = 30.0  # largest motion between two poses in contact; beyond it the way between them is unknown
-SETTLED_MM = 0.005  # most that the object still has to move where the arm has given way: 0.02 px in the shipped cameras
-_MOST_SETTLING = 8  # load steps until an arm that gives way stands; one or two are usual
-_PLACES = 2000  # places on a whole sphere, at which the object is looked for
-_BACK_MM = 1.0  # stride of the search for a free pose
-_WHERE = "following the object"  # what an error names
+STEP_MM = 0.45  # largest motion of the object at the pressed skin in one load step; longer steps often do not converge and are then halved
+LARGEST_MOVE_MM = 30.0  # largest motion between two poses of one contact; the path between poses farther apart is unknown
+SETTLED_MM = 0.005  # threshold for the motion of the object under the arm's compliance; it is 0.02 px in the shipped cameras
+_MOST_SETTLING = 8  # largest number of load steps until the pose of a compliant arm converges; one or two are usual
+_PLACES = 2000  # points on a whole sphere; the distance of the object is computed at those that lie on the skin
+_BACK_MM = 1.0  # step of the search for a pose without contact
+_WHERE = "following the object"  # name of the load step in error messages
 
 
 class Follower:
     """Follows one object with one sensor.
 
-    A contact begins where the object comes to press the skin. It goes on, with all that friction remembers, until the object has
-    left the undeformed skin. A contact that cannot be carried on is begun anew from the object's retreat along the sensor's axis
-    (``restarts`` counts these).
+    A contact begins when the object enters the undeformed skin, and ends when the object has left it. In between, the contact continues
+    with the history of friction. If a load step does not converge, the contact starts again: the object moves from a pose without contact
+    straight along the sensor's axis to the new pose (``restarts`` counts these cases).
 
-    Poses are those commanded. Where the law lets the arm give way, each move ends where force and giving way balance.
+    All poses are commanded poses. If the law contains the compliance of an arm (``given_way``), each move ends at the pose at which the
+    contact force and the displacement of the arm are in balance.
 
     Parameters
     ----------
     solver : SkinSolver
     touched : ObjectSpec
     law : ContactLaw
-        How the two rub and give way: of an arm from ``twin.rig.contact.contact_law``.
+        Friction and compliance. For a sensor on an arm, ``twin.rig.contact.contact_law`` makes it.
     step_mm : float, optional
-        Largest motion across the contact in one load step; by default what the object's features allow.
+        Largest motion of the object at the pressed skin in one load step. The default is ``STEP_MM``, or less for an object with wires.
     """
 
     def __init__(self, solver: SkinSolver, touched: ObjectSpec, law: ContactLaw, *, step_mm: float | None = None) -> None:
@@ -53,12 +54,12 @@ class Follower:
         self.restarts = 0
 
     def move(self, T: np.ndarray, time_s: float) -> ContactState:
-        """The sensor's state once the object has come to ``T_sensor_object`` (4, 4) at a time (s).
+        """The sensor's state after the object has moved to ``T_sensor_object`` (4, 4) at a time (s).
 
         Raises
         ------
         ContactError
-            Too deep, or no convergence even when begun anew; the follower has then let go of the contact.
+            The object is too deep, or the contact does not converge even from a new start. The follower then has no contact any more.
         """
         gap = self.gap_mm(T)
         if gap >= 0:
@@ -67,13 +68,13 @@ class Follower:
             try:
                 self._press(T, time_s)
             except ContactError:
-                self._contact = self._T = None  # wherever the skin stands now, no pose belongs to it
+                self._contact = self._T = None  # the skin's state belongs to no pose
                 raise
         self._T, self._time_s = T.copy(), time_s
         return self._state
 
     def warm_up(self) -> None:
-        """Press once, shallowly, and forget it: compiled code is loaded, so that a first contact takes no longer than others."""
+        """Make one shallow contact and discard it. This loads the compiled code, so that the first real contact is as fast as others."""
         T = np.eye(4)
         for depth_mm in (-_BACK_MM, _BACK_MM / 2):
             T[2, 3] = self._solver.spec.skin.apex_mm - depth_mm
@@ -85,13 +86,13 @@ class Follower:
         return self.nearest(T)[0]
 
     def nearest(self, T: np.ndarray) -> tuple[float, np.ndarray]:
-        """Smallest distance of the object at ``T`` to the undeformed skin (negative inside), and the skin's place (3,) of it."""
+        """Smallest distance of the object at ``T`` to the undeformed skin (negative inside), and the nearest point (3,) of the skin."""
         gaps = self._gaps(T)
         place = int(gaps.argmin())
         return float(gaps[place]), self._skin_mm[place]
 
     def pressed_mm(self, T: np.ndarray) -> np.ndarray:
-        """Places (k, 3) of the undeformed skin that lie inside the object at ``T``."""
+        """Points (k, 3) of the undeformed skin that lie inside the object at ``T``."""
         return self._skin_mm[self._gaps(T) < 0]
 
     @property
@@ -121,7 +122,7 @@ class Follower:
         self._go(self._retreat(T), T, time_s - 1.0, time_s)
 
     def _retreat(self, T: np.ndarray) -> np.ndarray:
-        """The object moved away along the sensor's axis until it is free."""
+        """Pose (4, 4) of the object after it has moved from ``T`` along the sensor's axis until there is no contact."""
         free = T.copy()
         for _ in range(int(4 * max(self._solver.spec.skin.half_size_mm) / _BACK_MM)):
             free[2, 3] += _BACK_MM
@@ -146,7 +147,7 @@ class Follower:
         self._settle(self._contact, stop)
 
     def _settle(self, contact: OngoingContact, T: np.ndarray) -> None:
-        """Take the pose that the last force gives, until that force no longer changes it; ``T`` (4, 4) is the commanded pose."""
+        """Move the object to the pose under the last contact force, until this pose converges; ``T`` (4, 4) is the commanded pose."""
         for _ in range(_MOST_SETTLING):
             there = self._law.pose(T, self._state.force_n)
             if np.linalg.norm(carried(self._skin_mm, contact.load.T, there), axis=1).max() <= SETTLED_MM:
@@ -158,5 +159,5 @@ class Follower:
 
 
 def _step_of(touched: ObjectSpec) -> float:
-    """Beside wires a longer step would carry skin past a wire's middle, where it then hooks."""
+    """Largest motion in one load step, mm. With wires, a longer step would move skin past the middle of a wire, where it would catch."""
     return STEP_MM * min(1.0, touched.texture.wire_diameter_mm) if touched.texture is not None else STEP_MM

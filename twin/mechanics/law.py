@@ -1,4 +1,4 @@
-"""Contact parameters beside the two shapes and the path: friction of the pair, and compliance of the arm."""
+"""Contact parameters: friction between skin and object, and compliance of object and arm."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,20 +11,21 @@ from twin.mechanics.balance import Friction
 FRICTIONLESS = Friction(0.0, 0.0)
 
 GivenWay = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Function from the commanded ``T_sensor_object`` (4, 4) and the force on the object (3,), N, sensor frame, to the reached pose."""
+"""Function that takes the commanded ``T_sensor_object`` (4, 4) and the force on the object (3,) in N, sensor frame, and returns the reached
+``T_sensor_object`` (4, 4)."""
 
 
 @dataclass(frozen=True)
 class ContactLaw:
-    """Friction between skin and object, and how far both give way under their force.
+    """Friction between skin and object, and compliance of the object and of the arm that holds the sensor.
 
     Attributes
     ----------
     friction : Friction
     compliance_mm_per_n : float
-        How far object and holder give way along the sensor's z, for each N. It is solved with the contact.
+        Displacement of the object along the sensor's z per N of contact force. The solver finds it together with the contact.
     given_way : callable, optional
-        What else the force does to the object's pose (see ``GivenWay``).
+        Any other effect of the contact force on the object's pose (see ``GivenWay``).
     """
 
     friction: Friction = FRICTIONLESS
@@ -33,11 +34,11 @@ class ContactLaw:
 
     @classmethod
     def of_object(cls, touched: ObjectSpec) -> "ContactLaw":
-        """The object's own friction and compliance: the law of a contact that no arm makes."""
+        """The law with the object's own friction and compliance, for a contact without an arm."""
         return cls(friction_of(touched), touched.compliance_mm_per_n)
 
     def override(self, *, friction: float | Friction | None = None, compliance_mm_per_n: float | None = None) -> "ContactLaw":
-        """The same law with what is given in place of its own; a number for ``friction`` is both coefficients."""
+        """The same law with the given values in place of its own. A number for ``friction`` sets the static and the kinetic coefficient."""
         law = self
         if friction is not None:
             law = replace(law, friction=friction if isinstance(friction, Friction) else Friction(friction, friction))
@@ -46,9 +47,9 @@ class ContactLaw:
         return law
 
     def pose(self, T: np.ndarray, force_n: np.ndarray) -> np.ndarray:
-        """``T_sensor_object`` (4, 4) that is taken under a force (3,) on the object where ``T`` (4, 4) was commanded.
+        """Reached ``T_sensor_object`` (4, 4) under a force (3,) on the object, N, if ``T`` (4, 4) is commanded.
 
-        The compliance along z is not in it: the contact's equations have it as an unknown.
+        It does not contain the displacement by ``compliance_mm_per_n``, which is an unknown of the contact's equations.
         """
         return T if self.given_way is None else self.given_way(T, force_n)
 

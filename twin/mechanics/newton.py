@@ -1,10 +1,10 @@
-"""One load step: from a converged state to the next one, the object moved.
+"""Solver of one load step: the object moves, and the equilibrium of the sensor is found by Newton's method.
 
-Two iterations are nested. The outer one is Newton's method on the elastic body. Its tangent is eliminated
-down to the controls of the outer skin that the object may touch, and is kept as long as it converges well enough
-(usually for several iterations, and from one load step into the next); it turns with the body meanwhile (see ``turns``).
-The inner one solves contact and friction exactly on the small dense problem that remains: which points touch, stick or slip
-changes often, and is cheap to find there.
+Two iterations are nested. The outer iteration is Newton's method on the elastic body. Its tangent is condensed to the controls of the
+outer skin that the object may touch. The same tangent is used again as long as the residual decreases fast enough: usually for several
+iterations, and also in the next load step. Meanwhile it is rotated with the body (see ``turns``).
+The inner iteration solves contact and friction exactly on the small condensed system. The points that touch, stick or slip change often,
+and on this system it is cheap to find them.
 """
 
 from dataclasses import replace
@@ -23,47 +23,54 @@ from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
 GAP_BOUND_MM = 0.01
-"""No contact point ends deeper inside the object than this."""
+"""Largest penetration of a contact point into the object at the end of a load step, mm."""
 RESIDUAL_TOLERANCE = 1e-5
-"""A step is solved when the norm of the residual is at most this share of the sum of the contact forces."""
+"""Convergence threshold: norm of the residual relative to the sum of the contact forces."""
 _ROUGH_TOLERANCE = 1e-2
-"""The same where friction within the step is still to be followed: anchors then change the solution by more."""
+"""Convergence threshold, relative in the same way, of the solution before the substeps of friction: these change the anchors, and with them
+the solution by more than this. A tangent is rotated only above this residual."""
 _PENALTY_GROWTH = 4.0
-"""Factor on the penalty when a point ends too deep."""
+"""Factor by which the penalty grows if a point penetrates by more than ``GAP_BOUND_MM``."""
 _PENALTY_RAISES = 5
-"""Most solutions of one step: with a larger penalty, or with more contact points, than the one before."""
+"""Largest number of solutions in one load step. Each of them has a larger penalty or more contact points than the one before."""
 _ITERATIONS = 30
-"""Most outer iterations of one solution."""
+"""Largest number of outer iterations of one solution."""
 _INNER_ITERATIONS = 400
-"""Most inner iterations of one solution, all outer ones together. Where contact flickers for longer, shorter load steps are faster."""
+"""Largest number of inner iterations of one solution, summed over its outer iterations. If the points in contact still change after
+these, shorter load steps are faster."""
 _WORSE = 2.0
-"""A move that makes the residual larger than this many times is refused."""
+"""A move is rejected if it increases the norm of the residual by more than this factor."""
 _KEEP_TANGENT = 0.9
-"""An old tangent is kept as long as it lowers the residual to this share or less."""
+"""An old tangent is used again as long as each move with it reduces the norm of the residual at least by this factor."""
 _SECANTS = 6
-"""Most earlier residuals that the outer iteration combines."""
+"""Largest number of earlier residuals that the outer iteration combines."""
 _SMALLEST_SHIFT_N_MM = 0.01
-"""First shift on the diagonal of a tangent that leads to refused moves, or is not positive definite (N/mm)."""
+"""Smallest shift of the tangent's diagonal, N/mm. The diagonal is shifted if a new tangent leads to rejected moves, or is not positive
+definite."""
 _SHIFT_GROWTH = 8
-"""Factor from one shift to the next."""
+"""Factor from one shift of the diagonal to the next."""
 _LARGEST_SHIFT_N_MM = 50.0
-"""Largest diagonal shift, N/mm. A step that needs more counts as not solved."""
+"""Largest shift of the diagonal, N/mm. A load step that needs a larger one counts as not converged."""
 _PROVIDED_MM = 1.0
-"""Skin that is nearer to the object than this is kept in the elimination, so that it need not be prepared anew in the next load steps."""
+"""Distance to the object, mm, below which the skin's controls are not eliminated from the tangent. They are then available in the next load
+steps without a new symbolic elimination."""
 _SKIN_STRAIN = 0.01
-"""The skin's blocks of a tangent are made anew where F has changed by more than this. With 0.02 the solution takes 5 % more iterations."""
+"""The skin's blocks of a tangent are computed again where an entry of F has changed by more than this. With 0.02 the solution takes 5 %
+more iterations."""
 _GEL_STRAIN = 0.05
-"""The same for the gel, which is so much softer that its tangent may be older."""
+"""The gel's blocks of a tangent are computed again where an entry of F has changed by more than this. The limit is larger than the skin's,
+because the gel is much softer."""
 _LEAST_TURN = 0.005
-"""The tangent is turned when a direction of a control has changed by more than this since it was last turned (rad)."""
+"""The tangent is rotated again when an entry of a control's rotation matrix has changed by more than this since the last time."""
 _REACH_MM = 0.15
-"""Contact points farther than this from the object are left out of the equations; at the end it is checked that none of them touches."""
+"""Distance to the object, mm, beyond which contact points are omitted from the equations. At the end of the step it is checked that none of
+them touches."""
 _SOLVED_REACH_MM = 0.02
-"""The same where the step is solved but for friction within it."""
+"""Distance to the object, mm, beyond which contact points are omitted once the step is solved except for friction within it."""
 
 
 class NoConvergence(Exception):
-    """A load step was not solved; ``relative`` is the relative residual reached."""
+    """A load step did not converge; ``relative`` is the relative residual reached."""
 
     def __init__(self, relative: float) -> None:
         super().__init__(relative)
@@ -71,10 +78,11 @@ class NoConvergence(Exception):
 
 
 class _Secants:
-    """What the outer iteration has learnt about the error of a tangent that it keeps (Anderson 1965).
+    """Anderson acceleration of the outer iteration while it uses an old tangent (Anderson 1965).
 
-    With a tangent K the body is K x + c, and each iteration solves the contact for the last c. At the solution x the elastic force
-    says c + r, r being the residual. The next c is the combination of those seen so far whose residuals, combined alike, are smallest.
+    The tangent K approximates the elastic force by K x + c, and each iteration solves the contact with the latest c. At the solution x the
+    exact elastic force corresponds to the constant c + r, where r is the residual. The next c is a combination of the earlier constants
+    with coefficients that sum to 1; they are the ones with which the combined residual has the smallest norm.
     """
 
     def __init__(self, residual: FloatArray) -> None:
@@ -82,7 +90,7 @@ class _Secants:
         self._seen = [(residual, residual)]
 
     def mend(self, residual: FloatArray) -> FloatArray:
-        """What to add to the elastic force at the present state, whose residual is given, (unknowns,)."""
+        """Correction (unknowns,) to add to the elastic force at the present state, from the residual (unknowns,) there."""
         offset = self._offset + residual
         errors = np.column_stack([residual - old for _, old in self._seen])
         shares = np.linalg.lstsq(errors, residual, rcond=1e-6)[0]
@@ -99,7 +107,7 @@ class LoadStepper:
     ----------
     body : Body
     boxes : list of (m, 4) int
-        Where each element of each kind lies (see ``FrontalSolver``).
+        Place of each element in the grid, for each kind of elements (see ``FrontalSolver``).
     field : ObjectField
     friction : Friction
     compliance_mm_per_n : float
@@ -116,7 +124,7 @@ class LoadStepper:
         self._shift = 0.0
         self._near: tuple[Tangent, IntArray, Near] | None = None
         self._turns = Turns(body)
-        self._turned: FloatArray | None = None  # of each free control since the tangent was made; None where it is new
+        self._turned: FloatArray | None = None  # rotation of each free control since the tangent was computed; None for a new tangent
         self._near_turned: tuple[FloatArray, Near] | None = None
         self._forward: tuple[FloatArray, Tangent, FloatArray | None, FloatArray] | None = None
         self._touch: tuple[FloatArray, FloatArray, FloatArray] | None = None
@@ -124,14 +132,14 @@ class LoadStepper:
         self.iterations, self.inner_iterations, self.eliminations = 0, 0, 0
 
     def follow(self, body: Body) -> None:
-        """Go on with changed elements (a relaxing material's law is scaled by the step's duration)."""
+        """Continue with changed elements: the law of a viscoelastic material is scaled by a factor that depends on the step's duration."""
         self._body = body
 
     def step(self, state: LoadState, T: FloatArray, given: list[FloatArray]) -> tuple[LoadState, Balance, IntArray]:
-        """The converged state with the object at ``T``, no contact point deeper than the bound.
+        """The converged state with the object at ``T`` (4, 4); no contact point penetrates by more than ``GAP_BOUND_MM``.
 
-        ``given``: stress left of the past, for each kind of elements (see ``Elements.add_forces``).
-        Also returns the equations' last balance and which contact points it looked at, (q,) int.
+        ``given`` is the viscoelastic stress from the past, for each kind of elements (see ``Elements.add_forces``).
+        The method also returns the balance of the equations at that state, and the indices (q,) int of the contact points in them.
 
         Raises
         ------
@@ -199,14 +207,14 @@ class LoadStepper:
         return touching_mm2(self._body.points, self._gaps(state)[1])
 
     def _gaps(self, state: LoadState) -> tuple[FloatArray, FloatArray]:
-        """All contact points in the object's frame, (p, 3), and their distances from it, (p,); those of the last state are kept."""
+        """All contact points in the object's frame, (p, 3), and their distances from the object, (p,). The last result is stored."""
         if self._touch is not None and self._touch[0] is state.control_mm:
             return self._touch[1:]
         seen = self._seen(state.control_mm, state.border, state.T)
         return seen, self._field.distance(seen)
 
     def _provide(self, looked: IntArray, gap: FloatArray) -> None:
-        """Prepare the elimination for contact at the points looked at (q,); ``gap`` (p,) in mm are the distances of all points."""
+        """Prepare the elimination for contact at the candidate points (q,); ``gap`` (p,) in mm are the distances of all points."""
         controls, free = self._body.points.controls, self._body.free
         needed = np.zeros(len(free), bool)
         needed[controls[looked]] = True
@@ -221,11 +229,11 @@ class LoadStepper:
         self._tangent = self._near = None
 
     def _extrapolate(self, state: LoadState, T: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Controls and border to start from: the last step continued, or the present state if the object moves another way now.
+        """Initial guess of controls and border: an extrapolation of the last step, or the present state if the direction of motion changed.
 
-        If the continued step turns an element inside out, the load step is not solved; a shorter one then continues less far.
+        If the extrapolation turns an element inside out, the load step does not converge. A shorter step then extrapolates less far.
         """
-        if self._last is None or not self._last.held.any():  # a first contact does not grow in proportion to the motion
+        if self._last is None or not self._last.held.any():  # the first contact does not grow in proportion to the motion
             return state.control_mm, state.border
         old, at = self._last, self._body.points.positions(state.control_mm)[state.held]
         if not len(at):
@@ -240,7 +248,10 @@ class LoadStepper:
     def _accepted(
         self, state: LoadState, problem: Problem, control: FloatArray, border: FloatArray, balance: Balance, gap: FloatArray
     ) -> LoadState:
-        """The state that a solved step ends in. ``state`` says what friction remembers, ``gap`` (p,) in mm where all points are."""
+        """The state at the end of a converged step.
+
+        ``state`` contains the history of friction, ``gap`` (p,) the distances of all contact points from the object in mm.
+        """
         contact, looked, count = balance.contact, problem.looked, len(state.held)
         held, anchor, slid, limit = np.zeros(count, bool), np.zeros((count, 3)), np.zeros(count), np.zeros(count)
         held[looked] = contact.penetration_mm > 0
@@ -251,7 +262,7 @@ class LoadStepper:
         )
 
     def _moved_mm(self, state: LoadState, T: FloatArray, which: BoolArray) -> float:
-        """How far the object moves in a step to ``T`` (4, 4), seen from those of all points (p,)."""
+        """Largest displacement, mm, of the object at the selected contact points (``which``, (p,) bool) in a step to ``T`` (4, 4)."""
         at = self._body.points.positions(state.control_mm)[which]
         return float(np.linalg.norm(carried(at, state.T, T), axis=1).max(initial=0.0))
 
@@ -265,7 +276,7 @@ class LoadStepper:
         balance: Balance,
         count: int,
     ) -> LoadState | None:
-        """What friction did within the step (see ``rubbing.rubbed``)."""
+        """The history of friction within the step (see ``rubbing.rubbed``)."""
         if self._tangent is None:
             self._tangent = self._linearise(problem, control, border, 0.0)
         self._turn(self._tangent, control)
@@ -276,7 +287,7 @@ class LoadStepper:
         )
 
     def _nearest(self, problem: Problem, tangent: Tangent) -> Near:
-        """The tangent eliminated down to the points looked at; the last one is kept."""
+        """The tangent condensed to the candidate points. The last result is stored."""
         if self._near is None or self._near[0] is not tangent or not np.array_equal(self._near[1], problem.looked):
             self._near = tangent, problem.looked, Near.of(tangent, self._local[problem.looked])
             self._near_turned = None
@@ -290,7 +301,7 @@ class LoadStepper:
         return self._near_turned[1]
 
     def _turn(self, tangent: Tangent, control: FloatArray) -> bool:
-        """Turn the tangent with the body to a state; whether that changed it."""
+        """Rotate the tangent with the body to the state ``control``; True if the rotation changed."""
         turns = self._turns.since(tangent.strains, control)
         if np.abs(turns - (np.eye(3) if self._turned is None else self._turned)).max() <= _LEAST_TURN:
             return False
@@ -339,11 +350,11 @@ class LoadStepper:
             new, new_border = control.copy(), border + size * border_move
             new[self._body.free] += size * move.reshape(-1, 3)
             trial = problem.balance(new, new_border)
-            # the first move takes up the object's motion, and its residual may be of any size; no later one may
+            # the first move contains the object's motion, so its residual may have any size; later moves may not increase it much
             if trial is None or size < 1 or (accepted and trial.absolute > _WORSE * balance.absolute):
                 astray, secants = True, None
                 if not fresh:
-                    last = 0.0  # first the old tangent is suspected: make a new one
+                    last = 0.0  # the old tangent may be the cause: this forces a new one before any shift
                 else:
                     shift = max(_SHIFT_GROWTH * shift, _SMALLEST_SHIFT_N_MM)
                     if shift > _LARGEST_SHIFT_N_MM:
@@ -357,10 +368,10 @@ class LoadStepper:
         raise NoConvergence(balance.relative)
 
     def _linearise(self, problem: Problem, control: FloatArray, border: FloatArray, shift: float) -> Tangent:
-        """The body's tangent at a state, plus a shift on the diagonal."""
+        """The body's tangent at a state, with a shift added to its diagonal."""
         assert self._frontal is not None, "provide first"
         self.eliminations += 1
-        self._tangent = self._turned = None  # its memory is overwritten below
+        self._tangent = self._turned = None  # the elimination below overwrites their memory
         problem.stiffness(control, border, self._stiffness, anew=shift > 0)
         blocks = [kept.blocks for kept in self._stiffness]
         while True:
@@ -382,7 +393,7 @@ class LoadStepper:
         return Tangent(eliminated, matrix, column, -float(column[inner] @ column[inner]), strains)
 
     def _eliminated(self, tangent: Tangent, elastic: FloatArray) -> FloatArray:
-        """Elastic force (unknowns,), turned back to where the tangent was made and eliminated; the last one is kept."""
+        """Elastic force (unknowns,), rotated back to the state of the tangent, after forward elimination. The last result is stored."""
         kept, turns = self._forward, self._turned
         if kept is None or kept[0] is not elastic or kept[1] is not tangent or kept[2] is not turns:
             forward = tangent.eliminated.forward(elastic if turns is None else turned_back(turns, elastic))
@@ -399,7 +410,7 @@ class LoadStepper:
         elastic: FloatArray,
         soften: bool,
     ) -> tuple[FloatArray, FloatArray]:
-        """The move (unknowns,) and (2,) that balances the linearised body with the exact contact."""
+        """The move of the controls (unknowns,) and of the border (2,) that balances the linearised body with the exact contact."""
         eliminated = tangent.eliminated
         kept = eliminated.kept
         forward, turns = self._eliminated(tangent, elastic), self._turned

@@ -1,4 +1,4 @@
-"""Where the object goes: a path of poses through which it is moved."""
+"""Paths of the object: the poses through which it moves relative to the sensor."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,38 +13,40 @@ from twin.objects import ObjectField
 from twin.types import FloatArray
 
 _LARGEST_TILT_DEG = 60.0
-"""Largest tilt of a contact pose about each axis: the dome reaches no further."""
+"""Largest tilt of a contact pose about each axis. The dome does not extend further."""
 _LARGEST_TWIST_DEG = 90.0
 """Largest twist of a contact pose: a quarter turn."""
 _TOUCH_TOLERANCE_MM = 1e-6
-"""The object is at first touch when its distance to the dome is at most this."""
+"""Tolerance of the first touch: largest distance between object and dome."""
 _SKIN_POINTS = 20_000
-"""Points on a whole sphere at which the distance of the object is looked for: 0.5 mm apart on a dome of 20 mm."""
+"""Number of points on a whole sphere for the first search of the nearest point: they are 0.5 mm apart on a dome of 20 mm."""
 _NEAR_POINTS = 2000
-"""Points around the nearest of them, 30 times finer, for the second search."""
+"""Number of points for the second search, around the nearest point of the first search, with a 30 times smaller distance."""
 _START_MM = 60.0
-"""Height above the apex from which the object comes down."""
+"""Height above the apex from which the object is lowered."""
 _MOST_DESCENTS = 400
-"""Most steps in which the object is brought down."""
+"""Largest number of steps in which the object is lowered."""
 
 
 @dataclass(frozen=True)
 class ContactPose:
     """One contact, as the object's motion relative to the sensor.
 
-    The object, its origin on the apex and its axes parallel to the sensor's, is turned by
-    R = Ry(tilt_y) Rx(tilt_x) about the apex (right-handed, sensor axes), moved sideways by
-    ``offset_mm``, brought down the sensor's z to first touch, pressed ``indent_mm`` further,
-    then moved by ``shear_mm`` along x, y while it twists about the sensor's z axis.
+    At first the object's origin is at the apex and its axes are parallel to the sensor's. The object is then
+
+    1. rotated by R = Ry(tilt_y) Rx(tilt_x) about the apex (right-handed, sensor axes) and moved sideways by ``offset_mm``,
+    2. lowered along the sensor's z to its first touch,
+    3. pressed further by ``indent_mm``,
+    4. moved by ``shear_mm`` along x and y, while it rotates by ``twist_deg`` about the sensor's z axis.
 
     Attributes
     ----------
     indent_mm : float
-        Beyond first touch; zero or less: no contact.
+        Indentation from the first touch on. Zero or less means no contact.
     tilt_deg, shear_mm, offset_mm : (2,) float
-        About / along the sensor's x and y.
+        Tilt about the sensor's x and y; shear and offset along x and y.
     twist_deg : float
-        About the sensor's z.
+        Rotation about the sensor's z.
     """
 
     indent_mm: float
@@ -66,8 +68,8 @@ class ContactPath:
     poses : (k, 4, 4) float
         ``T_sensor_object``, k >= 2.
     times_s : (k,) float, optional
-        When each is reached, rising; only a viscoelastic sensor cares. Two equal poses hold the object still.
-        Default: one second each.
+        Time at which each pose is reached, in rising order. It matters for viscoelastic sensors only. Between two equal poses the object
+        stands still. Default: one second from pose to pose.
     """
 
     poses: FloatArray
@@ -88,7 +90,7 @@ class ContactPath:
 
     @property
     def _clock(self) -> FloatArray:
-        """``times_s``, which is there once the path is made."""
+        """``times_s``, which is never None after ``__post_init__``."""
         assert self.times_s is not None
         return self.times_s
 
@@ -105,7 +107,7 @@ class ContactPath:
 
     @cached_property
     def _turns(self) -> list[tuple[float, FloatArray, FloatArray]]:
-        """Angle of each leg's turn, the cross product with its axis as a matrix (3, 3), and that matrix' square (Rodrigues' formula)."""
+        """For Rodrigues' formula, for each leg: angle, cross product with the axis as a matrix (3, 3), and this matrix squared."""
         out = []
         for way in Rotation.from_matrix(self.poses[1:, :3, :3] @ self.poses[:-1, :3, :3].transpose(0, 2, 1)).as_rotvec():
             angle = float(np.linalg.norm(way))
@@ -115,32 +117,32 @@ class ContactPath:
         return out
 
     def time_s(self, progress: float) -> float:
-        """Time at a progress."""
+        """Time (s) at a progress from 0 to k - 1."""
         return float(np.interp(progress, np.arange(len(self.poses)), self._clock))
 
     def there_and_back(self) -> "ContactPath":
-        """The path, then the same way back."""
+        """The path, followed by the same path in the opposite direction."""
         clock = self._clock
         span = clock[-1] - clock[::-1]
         return ContactPath(np.concatenate([self.poses, self.poses[-2::-1]]), np.concatenate([clock, clock[-1] + span[1:]]))
 
 
 def carried(points_mm: FloatArray, start: FloatArray, stop: FloatArray) -> FloatArray:
-    """How far points (k, 3) move with an object that goes from one pose (4, 4) to another."""
+    """Displacements (k, 3) of points (k, 3) that move with an object from the pose ``start`` (4, 4) to the pose ``stop`` (4, 4)."""
     return (points_mm - start[:3, 3]) @ start[:3, :3] @ stop[:3, :3].T + stop[:3, 3] - points_mm
 
 
 def deepest_mm(geometry: GeometrySpec) -> float:
-    """Half the gel's depth: no contact goes deeper."""
+    """Largest permitted indentation: half the gel's depth."""
     return 0.5 * (geometry.skin.apex_mm - geometry.skin.thickness_mm - geometry.lens.z_mm)
 
 
 def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> ContactPath:
-    """Check a pose and find its first touch with the undeformed skin: poses at touch, pressed, and (if it moves further) sheared.
+    """Path of a contact pose: the poses at first touch, at full indentation, and (with shear or twist) after the shear.
 
-    The object comes down along z by its smallest distance to the dome, again and again. Where distances are exact this
-    never passes the first touch (sphere tracing, Hart 1996). The dome is sampled evenly at first, then finely around the nearest
-    point.
+    To find the first touch with the undeformed skin, the object is lowered along z again and again by its smallest distance to the dome.
+    If distances are exact, it never passes the first touch (sphere tracing, Hart 1996). The points on the dome are evenly distributed in
+    the first search, and densely around the nearest point in the second.
 
     Raises
     ------
@@ -158,7 +160,7 @@ def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> 
     size_mm = max(skin.half_size_mm)
     places = shape.even(_SKIN_POINTS)
     height, nearest = _bring_down(field, T, shape.outside(places), _START_MM, size_mm)
-    # around the nearest point the sampling is refined 30 times
+
     spread = 3 / np.sqrt(_SKIN_POINTS)
     near = shape.outside(shape.near(complex(places[nearest]), spread, _NEAR_POINTS))
     height, _ = _bring_down(field, T, near, height + spread * size_mm, size_mm)
@@ -193,7 +195,7 @@ def _check(geometry: GeometrySpec, pose: ContactPose) -> None:
 
 
 def _bring_down(field: ObjectField, T: FloatArray, points_mm: FloatArray, height_mm: float, depth_mm: float) -> tuple[float, int]:
-    """Height above ``T`` (mm) where the object just touches the points, and the index of the touched one."""
+    """Height above ``T`` (mm) at which the object just touches the points (k, 3), and the index of the touched point."""
     turn, shift = T[:3, :3], T[:3, 3]
     free_mm = None
     for _ in range(_MOST_DESCENTS):
@@ -206,7 +208,7 @@ def _bring_down(field: ObjectField, T: FloatArray, points_mm: FloatArray, height
             height_mm -= distance[nearest]
         elif free_mm is None:
             raise ContactError("the object is in the skin's way before it comes down; use a smaller tilt or another offset")
-        else:  # the distance was too large, as it can be near wires and far from a mesh: go back half the way
+        else:  # the distance was too large, which happens near wires and far from a mesh: go back half of the step
             height_mm = (height_mm + free_mm) / 2
         if height_mm < -depth_mm:
             break

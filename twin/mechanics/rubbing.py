@@ -1,13 +1,14 @@
-"""Friction within a load step.
+"""Friction within a load step, computed in short substeps.
 
-Friction remembers its way. A point at the front of a growing contact is pressed lightly at first and slips; once the front has passed, it
-sticks. In one long load step it would stick from where it meets the object, and side forces would be up to a tenth too small.
-Therefore a step with friction is gone through once more in short substeps, on the body eliminated at the step's end: its force is taken
-as linear in the controls, plus what makes it right at the step's start,
+Friction depends on the path. A point at the edge of a growing contact first bears a small pressure and slips; when the edge has passed,
+the point sticks. In one long load step it would stick from the moment it touches, and the shear forces would be up to 10 % too small.
+Therefore a load step with friction is computed a second time in short substeps. They use the body's tangent K, condensed at the end of the
+step. The elastic force is linear in the controls x, plus a term that makes it exact at the start of the step (0) as well as at its end (1):
 
     f(x, t) = f_1 + K (x - x_1) + (1 - t) [f_0 - f_1 - K (x_0 - x_1)],    t from 0 to 1
 
-Each substep solves contact and friction exactly on this small problem. What it leaves of anchors and slip decides the step's end.
+Each substep solves contact and friction exactly on this small problem. The anchors and slips after the substeps then enter the equations of
+the whole load step.
 """
 
 from dataclasses import replace
@@ -23,17 +24,18 @@ from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
 SUBSTEP_MM = 0.05
-"""Largest motion of a place of the contact in a substep: half as long ones change side forces by less than 1 %."""
+"""Largest motion of the object at a contact point in one substep, mm. Substeps of half this length change the shear forces by less
+than 1 %."""
 _MOST_SUBSTEPS = 16
-"""Most substeps of a load step."""
+"""Largest number of substeps in a load step."""
 _TOLERANCE = 5e-3
-"""Residual of a substep, relative to the contact forces at the step's end."""
+"""Convergence threshold of a substep: norm of the residual relative to the sum of the contact forces at the end of the load step."""
 _ITERATIONS = 20
-"""Most iterations of a substep; three are usual."""
+"""Largest number of iterations of a substep; three are usual."""
 
 
 def substeps(moved_mm: float) -> int:
-    """Number of substeps of a load step in which a place of the contact moves this far."""
+    """Number of substeps of a load step in which the object moves by ``moved_mm`` at a contact point."""
     return min(int(np.ceil(moved_mm / SUBSTEP_MM)), _MOST_SUBSTEPS)
 
 
@@ -53,30 +55,35 @@ def rubbed(
     *,
     count: int,
 ) -> LoadState | None:
-    """What friction remembers before the last substep of a load step, with the anchors for that one.
+    """The history of friction up to the last substep of a load step, and the anchors for the last substep.
 
     Parameters
     ----------
     problem : Problem
-        The step's.
+        Equations of the load step.
     state : LoadState
-        The step's start.
+        State at the start of the load step.
     anchor_mm : (p, 3) float
-        Anchors of all points, of which those looked at are replaced.
+        Anchors of all contact points. Those of the candidate points are replaced in the result.
+    field : ObjectField
     near, tangent : Near, Tangent
-        The body eliminated near the step's end.
+        The body's condensed tangent, near the end of the load step.
+    turns : (free, 3, 3) float, optional
+        Rotation of each free control since the tangent was computed; None for a new tangent.
+    forward : (unknowns,) float
+        Elastic force at the end of the load step, after forward elimination.
     local : (q, 9) int
-        Place of each looked point's controls among the kept ones.
+        Index of each candidate point's controls among the kept controls.
     control, border, balance
-        The step's end, solved roughly at least.
+        State at the end of the load step, at least approximately solved.
     count : int
-        Substeps.
+        Number of substeps.
 
     Returns
     -------
     LoadState
-        The start's state with ``held``, ``slid_mm``, ``limit_n`` as they are one substep before the end, ``dissipated_nmm`` until there,
-        and ``anchor_mm`` for the last one. None where a substep was not solved.
+        The state at the start, except for ``held``, ``slid_mm``, ``limit_n`` and ``gap_mm``, which are those one substep before the end,
+        ``dissipated_nmm`` up to there, and ``anchor_mm`` for the last substep. None if a substep did not converge.
     """
     looked, kept = problem.looked, tangent.eliminated.kept
     volume = balance.border_residual[1]
@@ -136,9 +143,10 @@ def rubbed(
 
 
 def met(held: BoolArray, anchor: FloatArray, before: FloatArray, after: FloatArray, gap_before: FloatArray, gap: FloatArray) -> FloatArray:
-    """Anchors (q, 3) of a step: of a held point its own; a point that is driven into the object is anchored where it meets the surface.
+    """Anchors (q, 3) for a step. A point in contact keeps its anchor. A point that enters the object is anchored at its place of entry.
 
-    ``before``, ``after`` (q, 3): the points in the object's frame, on a straight way; ``gap_before``, ``gap`` (q,) their distances from it.
+    ``before`` and ``after`` (q, 3) are the points in the object's frame; between them each point moves on a straight line. ``gap_before``
+    and ``gap`` (q,) are the points' distances from the object at both ends.
     """
     driven = (gap_before > 0) & (gap < 0)
     share = np.where(driven, gap_before / np.where(driven, gap_before - gap, 1.0), 0.0)[:, None]
@@ -148,10 +156,11 @@ def met(held: BoolArray, anchor: FloatArray, before: FloatArray, after: FloatArr
 def rub(
     problem: Problem, contact: ContactForces, limit_n: FloatArray, gap_before: FloatArray, gap: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """After a step: anchors (q, 3), slip since the points last stuck (q,), largest friction forces (q,) in N, and the work lost in N mm.
+    """Friction after a step: anchors (q, 3), slip since each point last stuck (q,), limits of friction (q,) in N, dissipated work in N mm.
 
-    A point that slips bears the limit of friction, which changes from ``limit_n`` in the step with its normal force and its slip. A point
-    that slipped and leaves the object bears it until its distance, ``gap_before`` (q,) and then ``gap`` (q,), is 0.
+    The friction force of a slipping point equals its limit. During the step the limit changes from ``limit_n`` (q,) to its new value, with
+    the point's normal force and slip. A point that slipped and leaves the object bears friction until its distance, which goes from
+    ``gap_before`` (q,) to ``gap`` (q,), reaches 0.
     """
     limit = np.minimum(problem.friction * contact.normal_n, problem.bound_n)
     way = contact.anchor_mm - problem.anchor_mm

@@ -27,37 +27,39 @@ from twin.objects import ObjectField, build_field
 from twin.types import ContactState, FloatArray
 
 _STEP_MM = 0.4
-"""Largest motion of the object, seen from any pressed place of the skin, in one load step."""
+"""Default of the largest motion of the object at any pressed point of the skin in one load step, mm."""
 _LOOK_MM = 2.0
-"""Largest motion between two poses of the path at which the solver looks where the object will press."""
+"""Largest motion of the object between two poses at which the solver computes where the object will press, mm."""
 _FOCUS_POINTS = 2000
-"""Places on a whole sphere at which the solver looks where the object will press."""
+"""Points on a whole sphere; where the object will press is computed at those that lie on the skin."""
 _FOCUS_GAP_MM = 0.5
-"""At a first touch a direction counts for the focus with exp(-gap / this): the object's local shape decides, not how deep it will press."""
+"""Decay length of the weights of the focus, mm. With the object at first touch, a direction with a gap g gets the weight exp(-g / this).
+So the object's local shape determines the focus, and not the indentation."""
 
 _KEPT_SOLIDS = 4
-"""Solids that are kept, about 8 MB each: another pose has a focus of its own, and only the same pose or the rest state asks again."""
+"""Number of solids in memory, about 8 MB each. Every other pose has its own focus, so only the same pose or the rest state needs a solid
+again."""
 _GRID_TURN_RAD = np.radians(30.0)
-"""Turn of the grid's rows against the object's x axis. Rows along an edge would all cross it at the same moment."""
+"""Rotation of the grid's rows relative to the object's x axis. If the rows were parallel to an edge, whole rows would reach it at once."""
 _LEAST_FOCUS_RAD = np.radians(28.0)
-"""Least angle around the focus that the grid is fine in."""
+"""Smallest angular radius of the fine part of the grid around the focus."""
 _LARGEST_FOCUS_RAD = np.radians(50.0)
-"""Largest such angle."""
+"""Largest angular radius of the fine part of the grid around the focus."""
 _COARSE_FOCUS_RAD = np.radians(2.4)
-"""On a grid of fewer than 16 elements across the least angle grows by this for each that is missing: the elements at the rim would turn
-inside out."""
+"""On a grid with fewer than 16 elements across, the smallest angular radius grows by this for each missing element. Otherwise the elements
+at the rim would turn inside out."""
 _FOCUS_SPREADS = 1.5
-"""The fine part reaches beyond its least angle by this many root mean square angles of the weights."""
+"""The angular radius of the fine part is its smallest value plus this many root mean square angles of the weights."""
 _TOUCH_MM = 1e-4
-"""The object counts as just touching when its distance to the dome is at most this."""
+"""Tolerance of a first touch: largest distance between object and skin, mm."""
 _MOST_LIFTS = 60
-"""Most steps in which the object is brought to its first touch; it usually takes three."""
+"""Largest number of steps in which the object is moved to its first touch; three are usual."""
 _START_INSIDE_MM = 0.05
-"""A path may begin with the object this deep inside the undeformed dome: rounding of a first touch."""
+"""Largest penetration of the undeformed skin at the start of a path, mm. It allows for the rounding of a first touch."""
 
 
 class SkinSolver:
-    """Presses one sensor; what depends on the sensor alone is computed once.
+    """Solver of the contacts of one sensor. Everything that depends on the sensor alone is computed once.
 
     Parameters
     ----------
@@ -68,7 +70,7 @@ class SkinSolver:
     ----------
     mesh : SensorMesh
     shape : SkinShape
-        Where the skin is at rest.
+        Shape of the undeformed skin.
     """
 
     def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None) -> None:
@@ -118,26 +120,27 @@ class SkinSolver:
         ----------
         touched : ObjectField or ObjectSpec
         law : ContactLaw, optional
-            By default the object's own friction and compliance (``ContactLaw.of_object``), and none of a bare ``ObjectField``. For a
-            contact that an arm makes it comes from ``twin.rig.contact``. ``law.given_way`` gets the force of the load step before.
+            Default: the object's own friction and compliance (``ContactLaw.of_object``); for an ``ObjectField`` no friction and no
+            compliance. For a sensor on an arm, ``twin.rig.contact`` makes the law. ``law.given_way`` receives the contact force of the
+            previous load step.
         friction, compliance_mm_per_n : optional
-            Override the law's.
+            Values that replace those of the law.
         release : bool
-            Afterwards lift the object off again, the way it came.
+            Whether the object then moves back along the same path.
         step_mm : float
-            Largest motion across the contact in one load step.
+            Largest motion of the object at the pressed skin in one load step.
 
         Yields
         ------
         fraction : float
-            Of the path done, rising to 1.
+            Completed fraction of the path; it rises to 1.
         state : ContactState
 
         Raises
         ------
         ContactError
-            Pose out of range, object out of reach or starting inside the skin, or no convergence: names the
-            step and the residual.
+            If a pose is out of range, if the object does not reach the skin or starts inside it, or if a load step does not converge; the
+            message then states the step and the residual.
         """
         spec, field = (touched, build_field(touched)) if isinstance(touched, ObjectSpec) else (None, touched)
         if law is None:
@@ -164,7 +167,7 @@ class SkinSolver:
                 yield float(at / stops[-1]), state
 
     def begin(self, field: ObjectField, law: ContactLaw, T: FloatArray, *, focus: Focus) -> OngoingContact:
-        """A contact at its start, the object at ``T`` (4, 4) and free of the skin; the solid is fine at ``focus``."""
+        """A new contact. The object is at ``T`` (4, 4), without contact; the grid of the solid is fine at ``focus``."""
         with self._one_thread():
             setting = self._setting(focus)
         stepper = LoadStepper(setting.body, list(setting.solid.boxes), field, law.friction, law.compliance_mm_per_n)
@@ -189,7 +192,10 @@ class SkinSolver:
         return Setting(solid, body, NodeView.of(self.mesh, solid), relaxation)
 
     def _reached(self, field: ObjectField, plan: ContactPath) -> FloatArray:
-        """Points (k, 3) of the skin that the object would pass through on its path; ContactError if the path makes no sense."""
+        """Points (k, 3) of the undeformed skin inside the object at some pose of the path, or else the nearest point.
+
+        Raises ContactError if the path goes too deep or starts inside the skin.
+        """
         skin_mm = self.shape.outside(self.shape.even(_FOCUS_POINTS))
         deepest = np.full(len(skin_mm), np.inf)
         limit = deepest_mm(self.spec.geometry)
@@ -207,16 +213,16 @@ class SkinSolver:
         return skin_mm[pressed] if pressed.any() else skin_mm[[deepest.argmin()]]
 
     def focus(self, field: ObjectField, plan: ContactPath) -> Focus:
-        """Where the solid is fine for a path: around the places that the object touches first.
+        """The fine part of the solid's grid for a path: the region that the object touches first.
 
-        At every place of the path the object is brought along the sensor's z to its first touch. A direction of the dome whose gap
-        is g then weighs exp(-g / 0.5 mm) times the depth there over the path's largest depth; its largest weight counts. The rows of
-        the grid turn with the object. So the focus is a continuous function of the poses, it turns with the scene, and it does not
-        depend on how deep the object is pressed.
+        At several poses along the path, the object is moved along the sensor's z to its first touch. There a direction of the dome with a
+        gap g gets the weight exp(-g / 0.5 mm) d / d_max, where d is the object's indentation at this pose and d_max the largest one of the
+        path. The largest weight over the poses counts. The rows of the grid rotate with the object. Therefore the focus is a continuous
+        function of the poses, it rotates with the scene, and it does not depend on the indentation at the end of the path.
         """
         turn = plan.poses[0][:3, :3]
         about_z = float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
-        places = self.shape.even(_FOCUS_POINTS, turn_rad=about_z)  # they turn with the object, too
+        places = self.shape.even(_FOCUS_POINTS, turn_rad=about_z)  # the points rotate with the object, too
         skin_mm, directions = self.shape.outside(places), self.shape.directions(places)
         depths, gaps = [], []
         for at in _stops(plan, skin_mm, _LOOK_MM):
@@ -236,7 +242,7 @@ class SkinSolver:
 
 
 def _gaps_at_touch(field: ObjectField, T: FloatArray, points_mm: FloatArray) -> tuple[float, FloatArray]:
-    """How far the object at ``T`` is inside points (k, 3), and their gaps (k,) where it just touches them, moved along the sensor's z."""
+    """Largest depth of the points (k, 3) inside the object at ``T``, and their gaps (k,) after it has moved along z to its first touch."""
     T = T.copy()
     first = gap = field.distance((points_mm - T[:3, 3]) @ T[:3, :3])
     for _ in range(_MOST_LIFTS):
@@ -248,16 +254,22 @@ def _gaps_at_touch(field: ObjectField, T: FloatArray, points_mm: FloatArray) -> 
 
 
 def _turn(turn: FloatArray, polar: float, azimuth: float) -> float:
-    """Angle in the disc at a direction at which the object's x axis, seen along its z, lies there; ``turn`` (3, 3) is the object's."""
+    """Angle of the object's x axis in the chart's disc, at a direction of the dome (``polar``, ``azimuth``, rad).
+
+    The axis is projected along the object's z axis. ``turn`` (3, 3) is the rotation matrix of the object's pose.
+    """
     to_rim = np.array([np.cos(polar) * np.cos(azimuth), np.cos(polar) * np.sin(azimuth), -np.sin(polar)])
     around = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    stretch = polar / np.sin(polar) if polar > 0 else 1.0  # of the disc's circles against its radii
+    stretch = polar / np.sin(polar) if polar > 0 else 1.0  # ratio of lengths along the disc's circles to lengths along its radii
     along_x, along_y = (axis @ to_rim + 1j * stretch * (axis @ around) for axis in turn.T[:2])
     return float(np.angle((along_x - 1j * along_y) * np.exp(1j * azimuth)))
 
 
 def _stops(plan: ContactPath, points_mm: FloatArray, step_mm: float) -> FloatArray:
-    """Progress at regular load steps: the poses, and between them none of the skin's points (k, 3) sees the object move farther."""
+    """Progress values of the load steps: at each pose, and between poses so often that the object moves by at most ``step_mm`` per step.
+
+    The motion is that of the object at the skin's points (k, 3).
+    """
     out = [np.zeros(1)]
     for leg in range(len(plan.poses) - 1):
         start, stop = plan.poses[leg], plan.poses[leg + 1]

@@ -4,23 +4,23 @@ Energy of an element, with F, J at 2x2x2 Gauss points of rest volume w and the l
 
     W = sum_q w_q [W_distortion(F_q) + S_q : C_q / 2] + V kappa / 2 mean^2 + V kappa_d / 2 difference^2
 
-with the volume strains e = v / V - 1 of the two levels through the depth (V = sum w and v = sum w J over
-a level's four points), their mean (over both) and half their difference. One volume ratio per level frees
-the element from volumetric locking (mean dilatation, Simo & Taylor 1985). ``S`` is a given stress, what
-is left of the past in a viscoelastic body, zero in an elastic one.
+Each element has two levels through its depth, with the volume strains e = v / V - 1 (V = sum w and v = sum w J over the four points of a
+level). ``mean`` is the mean of the two strains, and ``difference`` is half their difference. Because there is only one volume ratio per
+level, the element has no volumetric locking (mean dilatation, Simo & Taylor 1985). ``S`` is a given stress: the stress from the past in a
+viscoelastic body, and zero in an elastic one.
 
-Gel: quadratic splines in all directions. With one coefficient in each direction for each element, a C1
-spline has three unknowns for an element; two volume ratios that are both nearly fixed would be too many
-for them. Therefore the difference is held less: 1 / kappa_d = 1 / kappa + 1 / (9 mu), which is kappa for
-a compressible gel, and bounded for an incompressible one. On finer meshes the difference vanishes, and
-with it the choice. Skin: quadratic splines along it, linear through it. A bent linear layer can't thin
-where it is stretched and thicken where it is compressed, which would make it too stiff; with that
-thickness strain eliminated by zero thickness stress (as in a plate), its bending energy is the plane-
-stress one, which fixes the modulus of the difference: kappa_d = 2 mu nu / (1 - nu) + 2 mu / 3. A
-homogeneous state has no difference and is exact.
+Gel: The splines are quadratic in all directions. A C1 spline has one coefficient per element in each direction, so an element has three
+unknowns. Two volume ratios that are both nearly fixed would be too many constraints for these. Therefore the difference has a smaller
+modulus: 1 / kappa_d = 1 / kappa + 1 / (9 mu). This is nearly kappa for a compressible gel, and it is bounded for an incompressible one. On
+finer meshes the difference vanishes, and kappa_d has no influence.
 
-Two Gauss points per direction under-integrate the quadratic splines just enough to free them from
-membrane and shear locking, and leave no mode without stiffness, since the splines are C1.
+Skin: The splines are quadratic along the skin and linear through it. When a linear layer is bent, it cannot become thinner where it is
+stretched and thicker where it is compressed, so it would be too stiff. The thickness strain is therefore eliminated under the condition of
+zero thickness stress, as in a plate. The bending energy is then that of plane stress, which determines the modulus of the difference:
+kappa_d = 2 mu nu / (1 - nu) + 2 mu / 3. A homogeneous state has no difference, and its energy is exact.
+
+Integration: Two Gauss points per direction are fewer than the quadratic splines need for exact integration. This removes membrane and shear
+locking. No mode loses its stiffness, because the splines are C1.
 """
 
 from dataclasses import dataclass, field
@@ -36,7 +36,7 @@ PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # directions (i, k) of
 _I = np.array([i for i, _ in PAIRS])
 _K = np.array([k for _, k in PAIRS])
 _FAR_STRAIN = 1e9
-"""Stands for an F that no element has: its blocks are made anew."""
+"""Initial value of the entries of the stored F. No element has such an F, so all blocks are computed at the first update."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Elements:
     law : (6,) float
         See ``law_coefficients``.
     difference_mpa : (m,) or (0,) float
-        Given stress that works on half the difference of the two levels' volume strains; none in an elastic body.
+        Given stress that is conjugate to half the difference of the two levels' volume strains; empty for an elastic body.
     """
 
     cells: Cells
@@ -58,16 +58,15 @@ class Elements:
     difference_mpa: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def add_forces(self, control_mm: FloatArray, stress: FloatArray, out: FloatArray, pressure_mpa: float = 0.0) -> float:
-        """Elastic energy in N mm; adds its gradient by the controls to ``out`` (n, 3) in N.
+        """Elastic energy in N mm. The method adds its gradient with respect to the controls, in N, to ``out`` (n, 3).
 
-        ``stress`` (m, 8, 3, 3) is the given stress S in MPa, or (0, 8, 3, 3) for none; ``pressure_mpa`` (positive:
-        tension) adds its work on the change of volume.
-        The energy is infinite (and ``out`` useless) where an element is inside out.
+        ``stress`` (m, 8, 3, 3) is the given stress S in MPa, or (0, 8, 3, 3) for none. ``pressure_mpa`` (positive: tension) adds its work
+        on the change of volume. If an element is inside out, the energy is infinite and ``out`` is not valid.
         """
         return _forces(*self._arrays, control_mm, stress, pressure_mpa, out)
 
     def add_volume(self, control_mm: FloatArray, out: FloatArray) -> float:
-        """Growth of the volume in mm^3; adds its gradient by the controls to ``out`` (n, 3) in mm^2."""
+        """Increase of the volume in mm^3. The method adds its gradient with respect to the controls, in mm^2, to ``out`` (n, 3)."""
         cells = self.cells
         return _forces(
             cells.controls, cells.gradients, cells.weights_mm3, np.zeros(6), np.zeros(0), control_mm, np.zeros((0, 8, 3, 3)), 1.0, out
@@ -91,15 +90,15 @@ class Elements:
     def stiffness(
         self, control_mm: FloatArray, stress: FloatArray, pressure_mpa: float, out: FloatArray, *, which: IntArray | None = None
     ) -> None:
-        """Second derivative of each element's energy into ``out`` (m, 6, b, b), N/mm; in its precision.
+        """Write the second derivative of each element's energy, N/mm, into ``out`` (m, 6, b, b), in the precision of ``out``.
 
-        Block p couples direction ``PAIRS[p][0]`` of the first control with ``PAIRS[p][1]`` of the second;
-        the other three are transposes. ``which`` (k,) int: only these elements' blocks.
+        Block p couples direction ``PAIRS[p][0]`` of the first control with direction ``PAIRS[p][1]`` of the second; the other three blocks
+        are transposes. With ``which`` (k,) int, only the blocks of these elements are computed.
         """
         _stiffness(*self._arrays, np.arange(len(out)) if which is None else which, control_mm, stress, pressure_mpa, out)
 
     def changed(self, control_mm: FloatArray, at: FloatArray, strain: float) -> IntArray:
-        """Elements (k,) in which F differs from ``at`` (m, 8, 3, 3) by more than ``strain`` somewhere; their F is written into ``at``."""
+        """Elements (k,) in which an entry of F differs from ``at`` (m, 8, 3, 3) by more than ``strain``; ``at`` receives their new F."""
         cells = self.cells
         return np.flatnonzero(_changed(cells.controls, cells.gradients, control_mm, strain, at))
 
@@ -109,15 +108,15 @@ class Elements:
 
 
 class KeptStiffness:
-    """Stiffness blocks of one kind of elements that are made anew only where the body has changed, which costs half.
+    """Stiffness blocks of one kind of elements, computed again only where the body has changed. This halves the cost.
 
-    The tangent that is made of the blocks leads to a solution, and does not change it.
+    The blocks form the tangent of Newton's method. An old tangent changes the number of iterations, and not the solution.
 
     Parameters
     ----------
     kind : Elements
     kept_strain : float
-        Blocks are kept while no entry of F has changed by more than this.
+        The blocks of an element are used again as long as no entry of F has changed by more than this.
 
     Attributes
     ----------
@@ -133,7 +132,7 @@ class KeptStiffness:
         self._made_of: tuple[Elements, float] | None = None
 
     def update(self, kind: Elements, control_mm: FloatArray, stress: FloatArray, pressure_mpa: float, *, anew: bool) -> None:
-        """Bring the blocks to a state. ``anew``: make all of them; arguments else as in ``Elements.stiffness``."""
+        """Update the blocks to a state; with ``anew`` all of them are computed. The other arguments are as in ``Elements.stiffness``."""
         same = self._made_of is not None and self._made_of[0] is kind and self._made_of[1] == pressure_mpa
         if anew or len(stress) or not same:
             self._at[:] = _FAR_STRAIN
@@ -144,7 +143,7 @@ class KeptStiffness:
 
 @compiled(fastmath=True)
 def _gradient(x: FloatArray, grad: FloatArray, f: FloatArray) -> None:
-    """F at all points."""
+    """Write F at all Gauss points into ``f``."""
     for q in range(8):
         for j in range(3):
             f0, f1, f2 = 0.0, 0.0, 0.0
@@ -178,7 +177,7 @@ def _changed(elements: IntArray, gradients: FloatArray, control: FloatArray, str
 
 @compiled(fastmath=True)
 def _push(grad: FloatArray, weights: FloatArray, stress: FloatArray, out: FloatArray) -> None:
-    """The first Piola-Kirchhoff stress' work on the controls' moves, into ``out`` (3, b)."""
+    """Write the nodal forces of the first Piola-Kirchhoff stress at the Gauss points into ``out`` (3, b), one column per control."""
     out[:] = 0.0
     for q in range(8):
         w = weights[q]
@@ -194,7 +193,10 @@ def _push(grad: FloatArray, weights: FloatArray, stress: FloatArray, out: FloatA
 
 @compiled(fastmath=True)
 def _kinematics(x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatArray, det: FloatArray) -> tuple[float, float, float, float]:
-    """F and det F at all points; (level volumes at rest, and deformed), or a negative first volume if inside out."""
+    """Write F and det F at all points; returns the volumes of the levels, at rest and deformed.
+
+    The first volume is negative if the element is inside out.
+    """
     v0, v1, r0, r1 = 0.0, 0.0, 0.0, 0.0
     _gradient(x, grad, f)
     for q in range(8):
@@ -212,7 +214,7 @@ def _kinematics(x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatAr
 
 @compiled(fastmath=True)
 def _add_second(c01: float, f: FloatArray, weights: FloatArray, stress: FloatArray) -> float:
-    """Add the c01 part of the law to the first Piola-Kirchhoff stress at all points; its energy."""
+    """Add the c01 part of the law to the first Piola-Kirchhoff stress at all points; returns its energy."""
     energy = 0.0
     for q in range(8):
         energy += weights[q] * add_second_stress(c01, f[q], stress[q])
@@ -221,7 +223,7 @@ def _add_second(c01: float, f: FloatArray, weights: FloatArray, stress: FloatArr
 
 @compiled(fastmath=True)
 def _add_given(given: FloatArray, f: FloatArray, weights: FloatArray, stress: FloatArray) -> float:
-    """Add a given second Piola-Kirchhoff stress to the first at all points; its energy."""
+    """Add a given second Piola-Kirchhoff stress to the first Piola-Kirchhoff stress at all points; returns its energy."""
     energy = 0.0
     for q in range(8):
         for i in range(3):

@@ -1,10 +1,10 @@
 """Direct solution of the assembled equations: multifrontal elimination with nested dissection.
 
-Duff & Reid 1983 (multifrontal method), George 1973 (nested dissection of a grid). The elements stand on a
-square grid, so the dissection is known: cut the longer side in the middle, recurse; a control is
-eliminated in the smallest box that holds all of its elements. All arithmetic is dense LAPACK on the
-fronts; the order is found once per path. Some unknowns can be kept: a dense matrix for them remains
-(static condensation; Guyan 1965). Contact changes from iteration to iteration, and is cheap to solve on this matrix.
+Sources: Duff & Reid 1983 (multifrontal method), George 1973 (nested dissection of a grid). The elements form a square grid, so the
+dissection is simple: the longer side of a box is cut in the middle, and each half is cut in the same way. A control is eliminated in the
+smallest box that contains all of its elements. All arithmetic on the fronts is dense LAPACK. The order of the elimination is computed once
+for each set of kept unknowns. The kept unknowns are not eliminated; a dense matrix remains for them (static condensation; Guyan 1965). The
+contact changes from iteration to iteration, and it is cheap to solve on this matrix.
 """
 
 from dataclasses import dataclass, field
@@ -20,38 +20,38 @@ from twin.types import BoolArray, FloatArray, IntArray
 Box: TypeAlias = tuple[int, int, int, int]  # first row, last row + 1, first column, last column + 1
 
 _LEAF_ELEMENTS = 36
-"""A box of this many elements or fewer is not cut any more."""
+"""Largest number of elements in a box that is not cut further."""
 _I = np.array([i for i, _ in PAIRS])
 _K = np.array([k for _, k in PAIRS])
 
 
 class NotPositiveDefinite(Exception):
-    """The symmetric matrix has a direction of no or negative stiffness."""
+    """The symmetric matrix is not positive definite: in some direction the stiffness is zero or negative."""
 
 
 @dataclass
 class _Front:
-    """A dense part of the elimination.
+    """A front: the dense matrix of one box in the elimination.
 
     Attributes
     ----------
     own : (o,) int
         Unknowns that are eliminated here.
     border : (r,) int
-        Unknowns, eliminated later, to which they are coupled.
+        Unknowns that are coupled to ``own`` and eliminated later.
     controls_left : (r / 3,) int
         Controls of the border.
     assembled : list of (which, rows)
-        For each kind of element: the elements (e,) assembled here, and the front's rows (e, 3 b) of their unknowns,
+        For each kind of element: the elements (e,) that are assembled here, and the rows (e, 3 b) of their unknowns in this front,
         direction by direction; -1 where a control is clamped.
     children : list of (front, runs)
-        Fronts that are added to this one, and the runs of their borders in it (see ``_runs``).
+        Fronts whose ``rest`` is added to this front, and the runs of their borders in it (see ``_runs``).
     head : (o, o) float
         Fortran order, lower triangle; its Cholesky factor overwrites it.
     below : (r, o) float
         Coupling of border and own unknowns.
     rest : (r, r) float
-        What is left for the border. It lies in memory that other fronts use before and after (see ``_make_room``).
+        Matrix that remains for the border. Other fronts use its memory before and after (see ``_make_room``).
     """
 
     own: IntArray
@@ -72,8 +72,9 @@ class FrontalSolver:
     groups : list of (m, b) int
         Controls of each element of each kind.
     boxes : list of (m, 4) int
-        Where each element lies: rows and columns of the grid (first, last + 1).
+        Place of each element: rows and columns of the grid (first, last + 1).
     fixed : (n,) bool
+        Clamped controls.
     keep : (n,) bool
         Controls that are not eliminated.
     """
@@ -90,7 +91,7 @@ class FrontalSolver:
         side = int(max(lying[:, 1].max() for lying in boxes if len(lying)))
         tree: list[tuple[Box, list[int]]] = []
         _dissect((0, side, 0, side), tree)
-        stage = np.full(len(fixed), len(tree))  # box in which a control is eliminated: the smallest one around its support
+        stage = np.full(len(fixed), len(tree))  # number of the box in which a control is eliminated: the smallest box around its support
         for number, (box, _) in enumerate(tree):
             stage[_inside(support, box) & free & ~keep & (stage == len(tree))] = number
 
@@ -128,14 +129,14 @@ class FrontalSolver:
         self.kept = self._fronts[-1].border
 
     def eliminate(self, blocks: list[FloatArray], *, shift: float = 0.0) -> "Eliminated":
-        """Eliminate all but the kept unknowns; the result is valid until the next call.
+        """Eliminate all unknowns except the kept ones. The result is valid until the next call.
 
         Parameters
         ----------
         blocks : list of (m, 6, b, b) float
-            Symmetric blocks of each kind of element, as ``Elements.stiffness`` leaves them.
+            Symmetric blocks of each kind of element, in the order of ``Elements.stiffness``.
         shift : float
-            Added to the diagonal of what is eliminated.
+            Value added to the diagonal of the eliminated unknowns.
 
         Raises
         ------
@@ -163,7 +164,7 @@ class FrontalSolver:
         return Eliminated(self._fronts, self.kept)
 
     def _make_room(self, children: list[list[int]]) -> None:
-        """Give every front the memory of its ``rest``. A rest is needed only until the next front has added it, so fronts share memory."""
+        """Assign memory to the ``rest`` of every front. A rest is needed only until its parent has added it, so fronts share memory."""
         room: list[int] = []
         sizes: list[int] = []
         unused: list[int] = []
@@ -181,14 +182,14 @@ class FrontalSolver:
 
 
 class Eliminated:
-    """A matrix with all but the kept unknowns eliminated.
+    """A matrix after the elimination of all unknowns except the kept ones.
 
     Attributes
     ----------
     kept : (k,) int
         The kept unknowns.
     matrix : (k, k) float
-        What is left for them (Schur complement); lower triangle.
+        Remaining matrix of the kept unknowns (Schur complement); lower triangle.
     """
 
     def __init__(self, fronts: list[_Front], kept: IntArray) -> None:
@@ -196,7 +197,7 @@ class Eliminated:
         self.kept, self.matrix = kept, fronts[-1].rest
 
     def forward(self, right_side: FloatArray) -> FloatArray:
-        """Eliminate in a right side (unknowns,): what is left at ``kept`` is the right side for ``matrix``."""
+        """Forward elimination of a right side (unknowns,). Its entries at ``kept`` are then the right side for ``matrix``."""
         x = np.array(right_side, np.float32)
         for front in self._fronts:
             part = lapack.strtrs(front.head, x[front.own], lower=1)[0]
@@ -205,7 +206,7 @@ class Eliminated:
         return x
 
     def backward(self, eliminated: FloatArray, kept_values: FloatArray) -> FloatArray:
-        """The whole solution (unknowns,) from an eliminated right side and the solution at ``kept``."""
+        """Backward substitution: the whole solution (unknowns,) from the result of ``forward`` and the solution at ``kept``."""
         x = eliminated.astype(np.float32)
         x[self.kept] = kept_values
         for front in reversed(self._fronts):
@@ -214,7 +215,7 @@ class Eliminated:
 
 
 def _dissect(box: Box, tree: list[tuple[Box, list[int]]]) -> int:
-    """Append (box, children) of a box of elements cut in two again and again, children before their parent; its place in the list."""
+    """Append a box and the boxes it is cut into to ``tree``, as (box, children), children before their parent; returns the box's index."""
     row0, row1, column0, column1 = box
     children = []
     if (row1 - row0) * (column1 - column0) > _LEAF_ELEMENTS:
@@ -235,7 +236,7 @@ def _inside(boxes: IntArray, box: Box) -> BoolArray:
 
 @compiled()
 def whole(lower: FloatArray, shift: float) -> FloatArray:
-    """A symmetric matrix from its lower triangle, plus a shift on the diagonal."""
+    """The symmetric matrix of a lower triangle, with a shift added to the diagonal."""
     out = np.empty_like(lower)
     for c in range(len(lower)):
         out[c, c] = lower[c, c] + shift
@@ -263,7 +264,7 @@ def split(matrix: FloatArray, far: IntArray, near: IntArray) -> tuple[FloatArray
 
 
 def _runs(places: IntArray, own: int) -> IntArray:
-    """Runs (k, 3) of rising places: first row, first place and length; none lies across ``own``."""
+    """Runs (k, 3) of consecutive ``places``: index of the first, its place, and the length. A run does not cross the place ``own``."""
     first = np.flatnonzero(np.diff(places, prepend=-2) != 1)
     first = np.union1d(first, np.searchsorted(places, own))
     first = first[first < len(places)]
@@ -272,7 +273,7 @@ def _runs(places: IntArray, own: int) -> IntArray:
 
 @compiled()
 def _assemble(elements: FloatArray, which: IntArray, places: IntArray, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
-    """Add symmetric blocks to a front's lower triangle."""
+    """Add the symmetric blocks of elements to the lower triangle of a front."""
     own, count = len(head), elements.shape[2]
     for e in range(len(which)):
         block = elements[which[e]]
@@ -298,7 +299,7 @@ def _assemble(elements: FloatArray, which: IntArray, places: IntArray, head: Flo
 
 @compiled()
 def _extend(update: FloatArray, runs: IntArray, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
-    """Add what an earlier front leaves, (border, border), to a front; all transposed, so that columns lie in one piece."""
+    """Add the ``rest`` (border, border) of an earlier front to a front. All arrays are transposed, so that columns are contiguous."""
     own = len(head)
     for j in range(len(runs)):
         for shift in range(runs[j, 2]):

@@ -1,12 +1,11 @@
 """Hyperelastic laws: stress and stiffness of a nearly incompressible rubber at one point.
 
-All laws split off the change of volume (Holzapfel, "Nonlinear Solid Mechanics", ch. 6):
+All laws separate the change of volume from the distortion (Holzapfel, "Nonlinear Solid Mechanics", ch. 6):
 
     W = c10 (I1 - 3) + c01 (I2 - 3) + c20 (I1 - 3)^2 + c30 (I1 - 3)^3 + kappa / 2 (J - 1)^2
 
-with I1 = J^(-2/3) tr C and I2 = J^(-4/3) (tr^2 C - tr C^2) / 2. Neo-Hooke has c10 alone, Mooney-Rivlin
-c10 and c01, Yeoh c10, c20 and c30. At small strain the shear modulus is 2 (c10 + c01), the bulk
-modulus kappa.
+with I1 = J^(-2/3) tr C and I2 = J^(-4/3) (tr^2 C - tr C^2) / 2. The neo-Hookean law has c10 alone, Mooney-Rivlin c10 and c01, and Yeoh c10,
+c20 and c30. At small strain the shear modulus is 2 (c10 + c01), and the bulk modulus is kappa.
 """
 
 import numpy as np
@@ -16,15 +15,15 @@ from twin.compiled import compiled
 from twin.types import FloatArray
 
 _LARGEST_DIFFERENCE = 9.0
-"""Limit of kappa_d of an element that is quadratic through its depth, in shear moduli. Measured on planes, balls and edges pressed by a gel
-of Poisson's ratio 0.486: with kappa itself (35 mu) two layers of gel are 2 to 3 % too
-stiff, with 3.5 mu 1 to 2 % too soft."""
+"""Limit of kappa_d of an element that is quadratic through its depth, in units of the shear modulus mu. It was found with planes, balls and
+edges that are pressed into a gel with a Poisson's ratio of 0.486: two layers of gel are 2 to 3 % too stiff with kappa_d = kappa (35 mu),
+and 1 to 2 % too soft with 3.5 mu."""
 
 
 def law_coefficients(spec: MaterialSpec, *, layer: bool) -> FloatArray:
-    """(6,) c10, c01, c20, c30, kappa and kappa_d of a material, MPa.
+    """Coefficients (6,) c10, c01, c20, c30, kappa and kappa_d of a material, MPa.
 
-    ``layer``: for elements that are linear through the depth of a skin (see ``elements``).
+    ``layer`` selects kappa_d for the elements of a skin, which are linear through its depth (see ``elements``).
     """
     mu = spec.young_modulus_mpa / (2 * (1 + spec.poisson_ratio))
     kappa = spec.young_modulus_mpa / (3 * (1 - 2 * spec.poisson_ratio))
@@ -37,7 +36,7 @@ def law_coefficients(spec: MaterialSpec, *, layer: bool) -> FloatArray:
 
 @compiled(inline="always")
 def invariants(f: FloatArray, g: FloatArray) -> float:
-    """det F and, into ``g`` (3, 3), F^-T; det F <= 0 leaves ``g`` alone."""
+    """Return det F, and write F^-T into ``g`` (3, 3) if det F > 0."""
     g00 = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]
     g01 = f[1, 2] * f[2, 0] - f[1, 0] * f[2, 2]
     g02 = f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0]
@@ -65,7 +64,10 @@ def determinant(f: FloatArray) -> float:
 
 @compiled(fastmath=True)
 def first_piola(law: FloatArray, f: FloatArray, det: float, pressure: float, out: FloatArray) -> float:
-    """Energy density of the law without kappa and c01; into ``out`` (3, 3) its derivative by F plus ``pressure`` d det F / dF, MPa."""
+    """Return the energy density of the law without kappa and c01, MPa.
+
+    The function writes its derivative with respect to F, plus ``pressure`` d det F / dF, into ``out`` (3, 3), MPa.
+    """
     f00, f01, f02, f10, f11, f12, f20, f21, f22 = f[0, 0], f[0, 1], f[0, 2], f[1, 0], f[1, 1], f[1, 2], f[2, 0], f[2, 1], f[2, 2]
     trace = f00 * f00 + f01 * f01 + f02 * f02 + f10 * f10 + f11 * f11 + f12 * f12 + f20 * f20 + f21 * f21 + f22 * f22
     scale = det ** (-2 / 3)
@@ -87,7 +89,7 @@ def first_piola(law: FloatArray, f: FloatArray, det: float, pressure: float, out
 
 @compiled(fastmath=True)
 def add_second_stress(c01: float, f: FloatArray, out: FloatArray) -> float:
-    """Add to a first Piola-Kirchhoff stress (3, 3) the c01 part of the law; its energy density."""
+    """Add the c01 part of the law to a first Piola-Kirchhoff stress (3, 3); returns its energy density."""
     g = np.zeros((3, 3))
     scale = invariants(f, g) ** (-4 / 3)
     second, slopes = _second_invariant(f, (f * f).sum())
@@ -99,7 +101,7 @@ def add_second_stress(c01: float, f: FloatArray, out: FloatArray) -> float:
 
 @compiled(fastmath=True)
 def distortion_stiffness(law: FloatArray, f: FloatArray, det: float, g: FloatArray, out: FloatArray) -> None:
-    """Second derivative of that energy density by F into ``out`` (3, 3, 3, 3): out[i, J, k, L], MPa."""
+    """Write the second derivative of the distortion energy density with respect to F into ``out`` (3, 3, 3, 3): out[i, J, k, L], MPa."""
     trace, scale, first = _first_invariant(f, det)
     slope = 2 * scale * (law[0] + first * (2 * law[2] + 3 * law[3] * first))
     bend = 4 * scale * scale * (2 * law[2] + 6 * law[3] * first)
@@ -148,7 +150,7 @@ def _first_invariant(f: FloatArray, det: float) -> tuple[float, float, float]:
 
 @compiled(fastmath=True)
 def _second_invariant(f: FloatArray, trace: float) -> tuple[float, FloatArray]:
-    """I2 of C and its derivative 2 (tr C F - F C) by F."""
+    """I2 of C, and its derivative 2 (tr C F - F C) with respect to F."""
     c = f.T @ f
     second = (trace * trace - (c * c).sum()) / 2
     return second, 2 * (trace * f - f @ c)

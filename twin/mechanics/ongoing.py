@@ -1,4 +1,4 @@
-"""A contact that goes on: its state and memory, and the step to the object's next pose."""
+"""A contact in progress: its state, its history, and the step to the object's next pose."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -16,14 +16,15 @@ from twin.mechanics.relaxation import History
 from twin.types import ContactState, FloatArray, IntArray
 
 _PENALTY_MPA_MM = 30.0
-"""Contact penalty at the start of every contact (MPa per mm of penetration): usual pressures then end within the gap bound."""
+"""Penalty at the start of every contact, MPa per mm of penetration. With it, usual pressures give penetrations below
+``newton.GAP_BOUND_MM``."""
 _SMALLEST_STRIDE = 1 / 64
-"""Smallest share of a regular load step that is tried before a contact counts as not converging."""
+"""Smallest fraction of a regular load step. If a step of this length does not converge, the contact does not converge."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A solid, and what is derived from it.
+    """A solid and the quantities derived from it.
 
     Attributes
     ----------
@@ -31,7 +32,7 @@ class Setting:
     body : Body
     view : NodeView
     relaxation : tuple of tuples of RelaxationTerm
-        For each kind of the body's elements; empty where it is elastic.
+        Relaxation terms for each kind of the body's elements; empty for an elastic material.
     """
 
     solid: Solid
@@ -41,21 +42,21 @@ class Setting:
 
 
 class OngoingContact:
-    """One contact from its first touch on: what friction and relaxation remember, carried from step to step.
+    """One contact from its first touch on, with the history of friction and relaxation from step to step.
 
     Parameters
     ----------
     setting : Setting
     stepper : LoadStepper
     T : (4, 4) float
-        The object's pose at the start, free of contact.
+        The object's pose at the start, without contact.
     one_thread : callable
-        Gives a context in which BLAS keeps to one thread.
+        Returns a context manager that limits BLAS to one thread.
 
     Attributes
     ----------
     load : LoadState
-        The last converged one, of all controls.
+        The last converged state.
     """
 
     def __init__(self, setting: Setting, stepper: LoadStepper, T: FloatArray, one_thread: Callable[[], AbstractContextManager]) -> None:
@@ -77,7 +78,7 @@ class OngoingContact:
         self._past = [History.at_rest(kind, term) for kind, term in zip(body.kinds, self._terms, strict=True)]
 
     def step(self, T: FloatArray, span_s: float) -> ContactState:
-        """The converged state with the object at ``T`` (4, 4), ``span_s`` later; after ``NoConvergence`` the contact is where it was."""
+        """The converged state with the object at ``T`` (4, 4), ``span_s`` after the last one. ``NoConvergence`` changes nothing."""
         kinds = self.setting.body.kinds
         now = [p.before(kind, term, span_s) for p, kind, term in zip(self._past, kinds, self._terms, strict=True)]
         with self._one_thread():
@@ -91,14 +92,14 @@ class OngoingContact:
     def advance(
         self, pose_at: Callable[[float], FloatArray], start: float, stop: float, time_at: Callable[[float], float], where: str
     ) -> Iterator[tuple[float, ContactState]]:
-        """Go through one regular load step, in shorter ones where that does not converge.
+        """Compute one regular load step, or several shorter ones where it does not converge.
 
         Parameters
         ----------
         pose_at, time_at : callable
-            The object's pose (4, 4) and time (s) at a progress from ``start`` to ``stop``.
+            Functions that return the object's pose (4, 4) and the time (s) at a progress from ``start`` to ``stop``.
         where : str
-            The load step, for the error's message.
+            Name of the load step, for the message of an error.
 
         Yields
         ------
@@ -108,7 +109,7 @@ class OngoingContact:
         Raises
         ------
         ContactError
-            No convergence.
+            If the smallest step does not converge.
         """
         done, stride = 0.0, 1.0
         while done < 1:
@@ -131,9 +132,10 @@ class OngoingContact:
 
 
 def contact_state(setting: Setting, state: LoadState, balance: Balance, looked: IntArray, touching_mm2: float) -> ContactState:
-    """What others see of a converged load step; ``looked`` (q,) int are the contact points the balance speaks of.
+    """The public state of a converged load step.
 
-    ``touching_mm2``: skin near the object; it counts where anything presses.
+    ``looked`` (q,) int are the indices of the contact points in ``balance``. ``touching_mm2`` is the area of skin near the object; it is
+    the contact area if any point is in contact.
     """
     contact, points = balance.contact, setting.body.points
     touched = np.flatnonzero(contact.penetration_mm > 0)

@@ -1,12 +1,12 @@
-"""Viscoelastic rubber: stress that relaxes, and so lags behind and loses energy.
+"""Viscoelastic rubber: the stress relaxes with time, which causes hysteresis and loss of energy.
 
-Finite linear viscoelasticity with a Prony series (Simo 1987; Simo & Hughes, "Computational Inelasticity",
-ch. 10): the distortion part S of the second Piola-Kirchhoff stress is followed by Maxwell elements,
+The model is finite linear viscoelasticity with a Prony series (Simo 1987; Simo & Hughes, "Computational Inelasticity",
+ch. 10): Maxwell elements H_i follow the distortion part S of the second Piola-Kirchhoff stress,
 
     S(t) -> (1 - sum g_i) S + sum H_i,    dH_i / dt + H_i / tau_i = g_i dS / dt
 
-integrated over a step h by H_i' = e^(-h / tau_i) H_i + g_i e^(-h / 2 tau_i) (S' - S). Within a step that
-is the elastic law times a factor plus a given stress, so each step still has an energy to minimise.
+They are integrated over a step h by H_i' = e^(-h / tau_i) H_i + g_i e^(-h / 2 tau_i) (S' - S). Within a step the stress is therefore the
+elastic law times a factor, plus a given stress. So each step is still the minimisation of an energy.
 """
 
 from dataclasses import dataclass, replace
@@ -20,14 +20,18 @@ from twin.types import FloatArray
 
 @dataclass(frozen=True)
 class History:
-    """What one kind of elements remembers, in MPa.
+    """Stress history of one kind of elements, MPa.
 
     Attributes
     ----------
     stress : (m, 8, 3, 3) float
-        S at the last state, and ``branches`` H (terms, m, 8, 3, 3).
+        S at the last state.
+    branches : (terms, m, 8, 3, 3) float
+        H at the last state.
     difference : (m,) float
-        The same of the kappa_d part (see ``Elements.difference_stress``), and ``difference_branches`` (terms, m).
+        Stress of the kappa_d part at the last state (see ``Elements.difference_stress``).
+    difference_branches : (terms, m) float
+        Stress in the Maxwell elements of the kappa_d part.
     """
 
     stress: FloatArray
@@ -37,13 +41,13 @@ class History:
 
     @classmethod
     def at_rest(cls, kind: Elements, terms: tuple[RelaxationTerm, ...]) -> "History":
-        """Nothing has happened for a long time."""
+        """The history of an undeformed body: all stresses are 0."""
         count = len(kind.cells.weights_mm3) if terms else 0
         shape = (count, 8, 3, 3)
         return cls(np.zeros(shape), np.zeros((len(terms), *shape)), np.zeros(count), np.zeros((len(terms), count)))
 
     def before(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float) -> tuple[Elements, FloatArray]:
-        """The elements of a step of a duration, their law scaled, and the given stress (see ``Elements.add_forces``)."""
+        """The elements with their law scaled for a step of duration ``step_s``, and the given stress (see ``Elements.add_forces``)."""
         if not terms:
             return kind, self.stress
         share, fade, late = _decay(terms, step_s)
@@ -54,7 +58,7 @@ class History:
         return changed, np.einsum("t,tmqij->mqij", fade, self.branches) - kept * self.stress
 
     def after(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float, control_mm: FloatArray) -> "History":
-        """What is remembered after the step; ``kind`` with the unscaled law."""
+        """The history after a step that ended at ``control_mm`` (n, 3); ``kind`` has the unscaled law."""
         if not terms:
             return self
         share, fade, late = _decay(terms, step_s)

@@ -1,4 +1,4 @@
-"""The pins in space that one frame shows, found without knowing what touched the sensor.
+"""Positions of the pins in space from one frame, without knowledge of the object that touches the sensor.
 
 A frame gives the pixel of each cap, and with it the cap's ray in the gel, but not its depth along the ray. The sensor's body
 gives the depth: skin and gel are in equilibrium under some traction t on the outer skin. With x(t) the body's shape,
@@ -6,12 +6,12 @@ Gauss-Newton minimises
 
     sum_pins |project(cap(x)) - seen|^2 / sigma^2  +  integral over the skin at rest of t_n^2 / s_n^2 + |t_t|^2 / s_t^2
 
-over t and x together. Each step solves the equilibrium that is linearised about the present shape. The scale s_n^2 grows with
-the pressure found in the step before, and s_t^2 with a share of it (iteratively reweighted least squares: Daubechies et al. 2010).
-This states what a touch is like: it presses and does not pull, it is confined to a part of the skin, and friction needs pressure.
-A difference of a fraction of a pixel remains; each pin is moved parallel to the image to remove it.
+over t and x together, with the equilibrium linearised about the present shape in each step. The scale s_n^2 grows with the pressure of the
+previous step, and s_t^2 with a fraction of this pressure (iteratively reweighted least squares: Daubechies et al. 2010). These scales
+express three properties of a contact: it presses and does not pull, it is confined to a part of the skin, and friction needs pressure.
+A discrepancy of a fraction of a pixel remains in the image. Each pin is finally shifted parallel to the image to remove it.
 
-`SoftBody` holds skin and gel as one dense system: forces, and a factor of the stiffness about any shape.
+`SoftBody` treats skin and gel as one dense system: it computes forces, and a factor of the stiffness at any shape.
 """
 
 from dataclasses import dataclass, replace
@@ -32,33 +32,35 @@ from twin.types import BoolArray, FloatArray, IntArray
 NO_STRESS = np.zeros((0, 8, 3, 3))
 """Given stress of an elastic body: none (see ``Elements.add_forces``)."""
 SHIFT_SHARE = 1e-3
-"""A tangent that is not positive definite gets this share of its mean diagonal added, and four times more each time that is too little."""
+"""First shift of the diagonal of a tangent that is not positive definite, relative to the mean of the diagonal. If the shift is too small,
+the next one is four times as large."""
 STEPS = 14
-"""Most steps of Gauss-Newton."""
+"""Largest number of Gauss-Newton steps."""
 SETTLED_MM = 0.01
-"""The fit ends after a step in which no control moves farther than this."""
+"""Convergence threshold: the fit ends after a step in which no coordinate of a control changes by more than this."""
 LARGEST_MOVE_MM = 2.0
-"""No control moves farther than this in one step: the linearised equilibrium is trusted no farther."""
+"""Largest change of a control's coordinate in one step. The linearised equilibrium is not accurate for larger moves."""
 EVEN_STEPS = 2
-"""The first steps take the same s everywhere, because there is no estimate of the pressure yet."""
+"""Number of first steps with the same scale s on the whole skin, because there is no estimate of the pressure yet."""
 OUTLINE_CORNERS = 48
-"""Corners of the polygon that stands for a cap's outline."""
+"""Number of corners of the polygon that represents a cap's outline."""
 PROBE_MM = 1e-4
-"""Step of the difference quotient that gives the derivative of the projection."""
+"""Step of the difference quotient for the derivative of the projection."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is assumed before a frame is seen.
+    """Prior of the fit: the expected error of the pins and the expected traction.
 
     Attributes
     ----------
     sigma_px : float
-        Error of a pin in the image: its detection's, and that of the specification's layout and camera.
+        Standard deviation of a pin's error in the image. It contains the detection's error, and errors of the specification's pin layout
+        and camera.
     traction_mpa : float
-        A usual traction: over 1 mm^2 of skin it counts as much as an error of ``sigma_px`` of one coordinate.
+        Usual traction. On 1 mm^2 of skin it has the same cost as an error of ``sigma_px`` of one coordinate of a pin.
     floor_mpa : float
-        Pressure that counts as none.
+        Pressure that is added to the pressure of the previous step, so that the scales s are never 0.
     friction : float
         Tangential traction relative to the pressure.
     """
@@ -71,16 +73,16 @@ class Prior:
 
 @dataclass(frozen=True)
 class FittedPins:
-    """Pins of a fitted skin, in the sensor frame and the specification's order: a state for the renderer.
+    """Pins of a fitted skin, in the sensor frame and in the specification's order. The renderer accepts them as a state.
 
     Attributes
     ----------
     base_mm, axis, caps_mm : (N, 3) float
         As ``PinRest``.
     remainder_px : (N,) float
-        Distance in the image by which the smooth skin misses each pin; NaN for lost pins.
+        Distance in the image between each pin and its position on the smooth skin; NaN for lost pins.
     force_n : (3,) float
-        Sum of the tractions found, on the skin.
+        Total force on the skin: the integral of the estimated traction.
     """
 
     base_mm: FloatArray
@@ -91,7 +93,7 @@ class FittedPins:
 
 
 def centroid_offset_px(view: ViewSpec, cap_diameter_mm: float, caps_mm: FloatArray, axis: FloatArray) -> FloatArray:
-    """(N, 2) px from the projected centre of each cap's disc to the centroid of its projected outline (polygon area formula)."""
+    """Offset (N, 2) px from the projected centre of each cap's disc to the centroid of its projected outline (polygon area formula)."""
     turn = np.linspace(0, 2 * np.pi, OUTLINE_CORNERS + 1)[:, None, None]
     u = np.cross(axis, np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
@@ -102,7 +104,7 @@ def centroid_offset_px(view: ViewSpec, cap_diameter_mm: float, caps_mm: FloatArr
 
 
 class SkinFit:
-    """Fits pins of one sensor to frames; what depends on the sensor alone is computed once, when it is made.
+    """Fit of one sensor's skin to the pins of frames. Everything that depends on the sensor alone is computed once, in the constructor.
 
     Parameters
     ----------
@@ -133,14 +135,14 @@ class SkinFit:
         Parameters
         ----------
         pins_px : (N, 2) float
-            Raw-frame px, specification's order; NaN where lost: such pins follow the skin.
+            Raw-frame px, specification's order; NaN for lost pins, whose positions follow from the skin.
         centroids : bool
-            ``pins_px`` are centroids of caps as seen, not projections of their centres.
+            Whether ``pins_px`` are centroids of the caps' outlines in the image; otherwise they are projections of the caps' centres.
 
         Raises
         ------
         ValueError
-            Not N pins, or fewer than half of them seen.
+            If the number of pins is not N, or if fewer than half of them are visible.
         """
         pins_px = np.asarray(pins_px, float)
         count = self.spec.pins.count
@@ -162,12 +164,12 @@ class SkinFit:
         return replace(pins, force_n=self._area_mm2 @ traction)
 
     def _offset_px(self, control: FloatArray) -> FloatArray:
-        """Offsets (N, 2) px of the caps' centroids from the projections of their centres, for a shape."""
+        """Offsets (N, 2) px of the caps' centroids from the projections of their centres, for the shape ``control``."""
         _, axis, cap = pin_pose(self._solid, control)
         return centroid_offset_px(self._view, self.spec.pins.cap_diameter_mm, cap, axis)
 
     def _on_rays(self, control: FloatArray, target_px: FloatArray, seen: BoolArray) -> FittedPins:
-        """Pins of a shape, the seen ones shifted parallel to the image onto their rays."""
+        """Pins of the shape ``control``; the visible ones are shifted parallel to the image onto their rays."""
         base, axis, cap = pin_pose(self._solid, control)
         remainder = np.where(seen, np.linalg.norm(project(self._view, cap) - target_px, axis=1), np.nan)
         place, along = pixel_rays(self._view, np.where(seen[:, None], target_px, 0.0))
@@ -178,10 +180,10 @@ class SkinFit:
     def _step(
         self, control: FloatArray, target_px: FloatArray, seen: BoolArray, traction: FloatArray, *, even: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Move (f, 3) of the free controls, and the traction (q, 3) in MPa at the skin's points that goes with it."""
+        """One Gauss-Newton step: the move (f, 3) of the free controls, and the traction (q, 3) in MPa at the skin's points."""
         factor, force = self._body.factor(control), self._body.forces(control)
         seen_px, per_control = self._pin_rows(control, seen)
-        reach = cho_solve(factor, per_control.T)  # (unknowns, 2 pins): how far a force moves the pins
+        reach = cho_solve(factor, per_control.T)  # (unknowns, 2 pins): displacement of the pins in the image per unit force
         rows = np.einsum("ab,bip->pai", self._mass, reach[self._loaded], optimize=True).reshape(len(per_control), -1)
         wanted = (target_px[seen] - seen_px).ravel() + reach.T @ force
         sigma2 = self.prior.sigma_px**2
@@ -192,7 +194,7 @@ class SkinFit:
         return cho_solve(factor, load).reshape(-1, 3), self._value @ coefficients
 
     def _cost(self, control: FloatArray, traction: FloatArray, *, even: bool) -> FloatArray:
-        """Quadratic form (3 m, 3 m) of the traction's coefficients, weighted by the traction (q, 3) of the step before."""
+        """Quadratic form (3 m, 3 m) of the prior of the traction's coefficients, with scales from the previous step's traction (q, 3)."""
         prior = self.prior
         outward = np.cross(*(s @ control[self._outer] for s in self._slopes))
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
@@ -207,7 +209,7 @@ class SkinFit:
         return form.reshape(3 * count, 3 * count)
 
     def _pin_rows(self, control: FloatArray, seen: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Projections (s, 2) of the seen caps, and their derivative (2 s, unknowns) by the free controls."""
+        """Projections (s, 2) of the visible caps, and their derivative (2 s, unknowns) with respect to the free controls."""
         solid, inner = self._solid, control[self._solid.inner]
         _, axis, cap = pin_pose(solid, control)
         slopes = solid.pin_slope_u, solid.pin_slope_v
@@ -217,7 +219,7 @@ class SkinFit:
         per_mm = np.stack([(project(self._view, cap + PROBE_MM * unit) - here) / PROBE_MM for unit in np.eye(3)], axis=2)
         rows = np.zeros((seen.sum(), 2, len(control), 3))
         part = solid.pin_value[seen, None, :, None] * per_mm[seen, :, None, :]
-        for slope, toward in zip(slopes, dual.swapaxes(0, 1), strict=True):  # the axis turns as the normal: d a = -t^c (a . d t_c)
+        for slope, toward in zip(slopes, dual.swapaxes(0, 1), strict=True):  # the axis rotates with the normal: d a = -t^c (a . d t_c)
             lever = -solid.pin_cap_length_mm * np.einsum("pki,pi->pk", per_mm, toward)
             part += slope[seen, None, :, None] * (lever[..., None] * axis[:, None])[seen, :, None, :]
         rows[:, :, solid.inner] = part
@@ -233,7 +235,7 @@ class SoftBody:
     free : (f,) int
         Controls that are not clamped.
     unknown : (n, 3) int
-        Number of each control's unknowns, control by control; -1 where clamped.
+        Indices of each control's three unknowns; -1 where clamped.
     """
 
     def __init__(self, geometry: GeometrySpec, gel: GelSpec) -> None:
@@ -247,14 +249,17 @@ class SoftBody:
         self._entries = [_entries(self.unknown, kind.cells.controls) for kind in self._kinds]
 
     def forces(self, control_mm: FloatArray) -> FloatArray:
-        """Gradient of the elastic energy (3 f,) in N, by the free controls."""
+        """Gradient (3 f,) of the elastic energy with respect to the free controls, N."""
         force = np.zeros_like(control_mm)
         for kind in self._kinds:
             kind.add_forces(control_mm, NO_STRESS, force)
         return force[self.free].ravel()
 
     def factor(self, control_mm: FloatArray) -> tuple[FloatArray, bool]:
-        """Cholesky factor (single precision, as ``scipy.linalg.cho_solve`` takes it) of the tangent, made positive where it is not."""
+        """Cholesky factor of the tangent in single precision, for ``scipy.linalg.cho_solve``.
+
+        If the tangent is not positive definite, its diagonal is shifted until it is.
+        """
         size = 3 * len(self.free)
         total = np.zeros(size * size)
         for kind, (where, from_block) in zip(self._kinds, self._entries, strict=True):
@@ -271,7 +276,7 @@ class SoftBody:
                 matrix[np.diag_indices(size)] += shift
 
     def moved(self, control_mm: FloatArray, move_mm: FloatArray) -> FloatArray:
-        """The shape (n, 3) after a move (f, 3) of the free controls, shortened until no element is inside out."""
+        """The shape (n, 3) after a move (f, 3) of the free controls. The move is halved until no element is inside out."""
         while True:
             moved = control_mm.copy()
             moved[self.free] += move_mm
@@ -281,7 +286,7 @@ class SoftBody:
 
 
 def _entries(unknown: IntArray, controls: IntArray) -> tuple[IntArray, IntArray]:
-    """Where each entry of the elements' stiffness blocks goes: flat places in the lower triangle, and flat places in the blocks."""
+    """Map from the elements' stiffness blocks to the matrix: flat indices in its lower triangle, and the flat indices in the blocks."""
     m, b = controls.shape
     size = unknown.max() + 1
     where = np.empty((m, 6, b, b), np.int64)

@@ -1,8 +1,8 @@
-"""Maps of a contact on the skin, on a grid that is the same for every contact of a sensor.
+"""Force and area maps of a contact, on a grid over the skin that is the same for every contact of a sensor.
 
-The solver's contact points lie elsewhere for every contact, because its mesh is fine where the object presses. Here their forces are
-spread over the nodes of a fixed grid over the outer skin at rest. A point's force goes to the four nodes around it by bilinear shares, so
-the sum over the nodes is the sum over the points. Divided by a node's area the forces are tractions.
+The solver's contact points have different positions in every contact, because its mesh is fine where the object presses. Here their forces
+are distributed over the nodes of a fixed grid on the outer skin at rest. The force of a point goes to the four nodes around it with
+bilinear weights, so the sum over the nodes equals the sum over the points. Divided by the area of a node, the forces become tractions.
 """
 
 from dataclasses import dataclass, replace
@@ -16,13 +16,15 @@ from twin.geometry.shapes import shape_of
 from twin.types import BoolArray, ComplexArray, ContactState, FloatArray
 
 SIDE = 41
-"""Nodes along each side of the grid. Every second one is a node of ``SensorMesh``; on a dome of 20 mm they are about 1.2 mm apart."""
+"""Number of nodes along each side of the grid. Every second node is a node of ``SensorMesh``. On a dome of 20 mm the nodes are about 1.2 mm
+apart."""
 PATCH_SHARE = 0.1
-"""A node belongs to the contact patch if its pressure is at least this share of the largest: skin that hardly presses moves no pin."""
+"""Threshold of the contact patch: smallest pressure of its nodes relative to the largest pressure. Skin with less pressure moves no pin."""
 LEAST_PRESSURE_MPA = 1e-4
-"""Largest pressure below which nothing is in contact: over the whole tip it is a tenth of a newton."""
+"""Smallest pressure that counts as contact. On the whole tip it would be a force of 0.1 N."""
 LEAST_ARM_MM2 = 0.25
-"""Least mean square distance of the pressed nodes from their middle by which a torque is divided: a point bears no torque."""
+"""Lower limit of the mean square distance of the pressed nodes from their centre. A torque is divided by this distance, and a contact at a
+single point cannot bear a torque."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +34,9 @@ class SkinGrid:
     Attributes
     ----------
     nodes_mm : (G, 3) float
-        Places of its ``SIDE``^2 nodes, row by row, sensor frame.
+        Positions of the G = ``SIDE``^2 nodes, row by row, sensor frame.
     area_mm2 : (G,) float
-        Area of the skin that each node stands for; together they are the skin's area.
+        Area of the skin that belongs to each node. The areas sum to the area of the skin.
     """
 
     geometry: GeometrySpec
@@ -42,7 +44,7 @@ class SkinGrid:
     area_mm2: FloatArray
 
     def spread(self, place: ComplexArray, values: FloatArray) -> FloatArray:
-        """Sums (G, k) over the nodes of values (c, k) at places (c,) of the skin (see ``twin.geometry.shapes``)."""
+        """Values (c, k) at places (c,) of the skin (see ``twin.geometry.shapes``), distributed over the nodes and summed there: (G, k)."""
         at = (outer_chart(self.geometry).square(place) + 1) / 2 * (SIDE - 1)
         low = np.clip(np.floor(at).astype(int), 0, SIDE - 2)
         share = np.clip(at - low, 0, 1)
@@ -54,7 +56,7 @@ class SkinGrid:
         return found
 
     def averaged(self, values: FloatArray, sigma_mm: float) -> FloatArray:
-        """Sums (M, G) of nodes, each spread over its neighbours by a Gaussian of the given width; the total stays the same."""
+        """Values (M, G) of the nodes, smoothed with a Gaussian of standard deviation ``sigma_mm``; their sum does not change."""
         apart_mm2 = ((self.nodes_mm[:, None] - self.nodes_mm[None]) ** 2).sum(axis=-1)
         weights = np.exp(-apart_mm2 / (2 * sigma_mm**2)).astype(np.float32)
         return values @ (weights / weights.sum(axis=0)).T
@@ -69,9 +71,9 @@ class SkinMap:
     force_n : (G, 3) float
         Force of the skin on the object, sensor frame; the sum is ``ContactState.force_n``.
     normal_n : (G,) float
-        Magnitude of the part of it that presses.
+        Magnitude of its normal component.
     touched_mm2, slipping_mm2 : (G,) float
-        Area at rest that is pressed, and of it the area that slides.
+        Area in contact, and the part of it that slips, both on the skin at rest.
     """
 
     force_n: FloatArray
@@ -87,9 +89,9 @@ class ContactMaps:
     Attributes
     ----------
     nodes_mm : (G, 3) float
-        Places of the grid's nodes on the deformed outer skin.
+        Positions of the grid's nodes on the deformed outer skin.
     area_mm2 : (G,) float
-        Area of the skin at rest that each node stands for.
+        Area of the skin at rest that belongs to each node.
     force_n : (G, 3) float
         Force of the skin on the object.
     """
@@ -108,31 +110,31 @@ class ContactMaps:
 
     @property
     def pressure_mpa(self) -> FloatArray:
-        """Pressure (G,), N/mm2 of skin at rest; nothing pulls."""
+        """Pressure (G,), N per mm2 of skin at rest; a node that pulls has the pressure 0."""
         pressure: FloatArray = np.maximum((self.force_n * self.normal).sum(axis=1), 0.0) / self.area_mm2
         return pressure
 
     @property
     def traction_mpa(self) -> FloatArray:
-        """Shear traction of the skin on the object (G, 3), along the skin, N/mm2 of skin at rest."""
+        """Shear traction (G, 3) of the skin on the object, tangential to the skin, N per mm2 of skin at rest."""
         along = (self.force_n * self.normal).sum(axis=1, keepdims=True)
         traction: FloatArray = (self.force_n - along * self.normal) / self.area_mm2[:, None]
         return traction
 
     @property
     def least_mpa(self) -> float:
-        """Pressure from which on skin counts as in contact; see ``PATCH_SHARE``."""
+        """Smallest pressure that counts as contact (see ``PATCH_SHARE`` and ``LEAST_PRESSURE_MPA``)."""
         return max(PATCH_SHARE * float(self.pressure_mpa.max()), LEAST_PRESSURE_MPA)
 
     @property
     def patch(self) -> BoolArray:
-        """(G,) bool: the nodes in contact."""
+        """Mask (G,) of the nodes in contact."""
         patch: BoolArray = self.pressure_mpa >= self.least_mpa
         return patch
 
     @property
     def resultant_n(self) -> FloatArray:
-        """(3,) sum of the forces."""
+        """Sum (3,) of the forces."""
         total: FloatArray = self.force_n.sum(axis=0)
         return total
 
@@ -142,10 +144,10 @@ class ContactMaps:
         return float(np.cross(self.nodes_mm, self.force_n)[:, 2].sum())
 
     def with_resultants(self, force_n: FloatArray | None = None, torque_z_nmm: float | None = None) -> "ContactMaps":
-        """The same maps with another total force (3,), and another torque about the sensor's axis if it is given.
+        """The maps, corrected to a given total force (3,) and to a given torque about the sensor's axis.
 
-        What is missing is added where the skin presses, in proportion to the pressure: a force, and a turn about the middle of the
-        pressure. Where nothing presses the maps stay as they are.
+        The missing force is distributed over the nodes in proportion to the pressure. The missing torque is added as forces around the
+        centre of pressure, also in proportion to the pressure. Without any contact the maps do not change.
         """
         share = self.pressure_mpa * self.area_mm2
         if share.max(initial=0.0) <= LEAST_PRESSURE_MPA * self.area_mm2.mean():
@@ -162,19 +164,19 @@ class ContactMaps:
 
 @lru_cache(maxsize=4)
 def skin_grid(geometry: GeometrySpec) -> SkinGrid:
-    """The grid of a sensor: the chart of ``SensorMesh`` at ``SIDE`` x ``SIDE`` even places."""
+    """The grid of a sensor: ``SIDE`` x ``SIDE`` evenly spaced places in the square of the chart of ``SensorMesh``."""
     nodes_mm = _outer_points(geometry, np.linspace(-1, 1, SIDE))
     finer = _outer_points(geometry, np.linspace(-1, 1, 4 * (SIDE - 1) + 1)).reshape(4 * (SIDE - 1) + 1, -1, 3)
     first, second = finer[1:, 1:] - finer[:-1, :-1], finer[1:, :-1] - finer[:-1, 1:]
     quads_mm2 = np.linalg.norm(np.cross(first, second), axis=-1) / 2
-    of_quad = (np.arange(4 * (SIDE - 1)) + 2) // 4  # the node nearest to each quad's middle
+    of_quad = (np.arange(4 * (SIDE - 1)) + 2) // 4  # index of the node nearest to each quad's centre
     area = np.zeros((SIDE, SIDE))
     np.add.at(area, (of_quad[:, None], of_quad[None, :]), quads_mm2)
     return SkinGrid(geometry, nodes_mm, area.ravel())
 
 
 def skin_map(geometry: GeometrySpec, state: ContactState) -> SkinMap:
-    """A contact's forces and areas on the sensor's grid."""
+    """Forces and areas of a contact on the sensor's grid."""
     force_n = state.tangential_n - state.normal_n[:, None] * state.normal
     values = np.column_stack([force_n, state.normal_n, state.point_area_mm2, state.point_area_mm2 * state.slipping])
     found = skin_grid(geometry).spread(state.contact_place, values)
@@ -182,7 +184,7 @@ def skin_map(geometry: GeometrySpec, state: ContactState) -> SkinMap:
 
 
 def between_nodes(coarse: FloatArray) -> FloatArray:
-    """Values (..., G, k) on the grid of values at the outer nodes of ``SensorMesh`` (..., c, k), which are every second node of it."""
+    """Values (..., G, k) on the grid, interpolated from values (..., c, k) at the outer nodes of ``SensorMesh``: every second grid node."""
     side = (SIDE + 1) // 2
     given = coarse.reshape(*coarse.shape[:-2], side, side, coarse.shape[-1])
     found = np.zeros((*coarse.shape[:-2], SIDE, SIDE, coarse.shape[-1]), coarse.dtype)
@@ -193,6 +195,6 @@ def between_nodes(coarse: FloatArray) -> FloatArray:
 
 
 def _outer_points(geometry: GeometrySpec, at: FloatArray) -> FloatArray:
-    """Places (k^2, 3) of the outer skin at k x k places of the chart's square."""
+    """Points (k^2, 3) of the outer skin at k x k places of the chart's square, with coordinates ``at`` (k,)."""
     v, u = np.meshgrid(at, at, indexing="ij")
     return shape_of(geometry.skin).outside(outer_chart(geometry).disc(np.stack([u.ravel(), v.ravel()], axis=1)))

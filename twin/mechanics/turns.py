@@ -1,8 +1,9 @@
-"""How the body has turned since its tangent was made, so that an old tangent is worth nearly as much as a new one.
+"""Rotation of the body since its tangent was computed. With it an old tangent converges nearly as well as a new one.
 
-The skin is much stiffer than the gel, and stiffest along itself. As it turns, the directions in which it is stiff turn with it; that,
-not strain, is what makes a tangent K old. With the rotation R of every control since then, R K R^T is the tangent of the turned body
-(stiffness warping; Mueller et al. 2002). It costs no elimination: what comes in is turned back, and what goes out is turned.
+The skin is much stiffer than the gel, and it is stiffest in its tangential directions. When the skin rotates, its stiff directions rotate
+with it. This rotation, and not the strain, makes an old tangent K inaccurate. With the rotation R of every control since then, R K R^T
+approximates the tangent of the rotated body (stiffness warping; Mueller et al. 2002). This needs no new elimination: a right side is
+rotated back before the solution, and the solution is rotated forward.
 """
 
 import numpy as np
@@ -19,7 +20,7 @@ class Turns:
     Parameters
     ----------
     body : Body
-        Its elements' law only decides how much each counts for a control that several kinds share: by stiffness.
+        The law of its elements is used only as a weight: the rotation of a control is an average over its elements, weighted by stiffness.
     """
 
     def __init__(self, body: Body) -> None:
@@ -30,7 +31,7 @@ class Turns:
         self._free = body.free
 
     def strains(self, control_mm: FloatArray) -> list[FloatArray]:
-        """Inverse of each element's mean deformation gradient, (m, 3, 3) for each kind: what ``since`` asks for."""
+        """Inverse of each element's mean deformation gradient, (m, 3, 3) for each kind of elements; ``since`` takes it."""
         return [np.linalg.inv(_mean_gradient(controls, gradients, control_mm)) for controls, gradients, _ in self._kinds]
 
     def since(self, strains: list[FloatArray], control_mm: FloatArray) -> FloatArray:
@@ -75,7 +76,7 @@ def _add_to_controls(elements: IntArray, values: FloatArray, out: FloatArray) ->
 
 @compiled(fastmath=True)
 def turned(turns: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Vectors (3 n,) of n controls, each turned by its own rotation (n, 3, 3)."""
+    """Vectors (3 n,) of n controls, rotated by one rotation for each control (n, 3, 3)."""
     out = np.empty_like(vectors)
     for n in range(len(turns)):
         r = turns[n]
@@ -91,14 +92,14 @@ def turned_back(turns: FloatArray, vectors: FloatArray) -> FloatArray:
 
 
 def turned_matrix(turns: FloatArray, matrix: FloatArray) -> FloatArray:
-    """R M R^T of a symmetric matrix M (3 n, 3 n), R having the rotations (n, 3, 3) on its diagonal."""
+    """R M R^T for a symmetric matrix M (3 n, 3 n), where R has the rotations (n, 3, 3) as blocks on its diagonal."""
     turns = turns.astype(matrix.dtype)
     return _turned_rows(turns, _turned_rows(turns, matrix).T.copy())  # (R M)^T = M R^T by the symmetry of M
 
 
 @compiled(fastmath=True)
 def _turned_rows(turns: FloatArray, matrix: FloatArray) -> FloatArray:
-    """R M."""
+    """R M (see ``turned_matrix``)."""
     out = np.empty_like(matrix)
     for n in range(len(turns)):
         a, b, c = matrix[3 * n], matrix[3 * n + 1], matrix[3 * n + 2]

@@ -1,1 +1,1 @@
-"""The undeformed sensor: skin, gel, window and pins as meshes and places."""
+"""The undeformed sensor: meshes of skin and gel, and positions of skin, window and pins."""

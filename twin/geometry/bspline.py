@@ -38,17 +38,17 @@ class Basis:
 
     @property
     def greville(self) -> FloatArray:
-        """(count,) Greville points: the means of ``degree`` neighbouring knots. A linear function's coefficients are its values there."""
+        """Greville points (count,): means of ``degree`` neighbouring knots. The coefficients of a linear function are its values there."""
         knots = self._knots
         return np.array([knots[i + 1 : i + 1 + self.degree].mean() for i in range(self.count)])
 
     def values(self, at: FloatArray, *, derivative: int = 0) -> FloatArray:
-        """(k, count) values, or a derivative's, of all functions at points (k,)."""
+        """Values (k, count) of all functions, or of one of their derivatives, at points (k,)."""
         splines = BSpline.construct_fast(self._knots, np.eye(self.count), self.degree)
         return (splines.derivative(derivative) if derivative else splines)(np.clip(at, self.breaks[0], self.breaks[-1]))
 
     def element_of(self, at: FloatArray) -> IntArray:
-        """(k,) index of the element that holds each point."""
+        """Index (k,) of the element that contains each point."""
         return np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, self.elements - 1)
 
     def gauss(self, points: int) -> tuple[FloatArray, FloatArray]:

@@ -1,14 +1,13 @@
-"""Charts of the dome: from a square to a disc to directions, fine where a contact is.
+"""Charts of the skin: maps from a square to the places of a dome or a rectangular pad. The grid of the square is fine around the contact.
 
-A place on the dome is a point w of the unit disc (as a complex number): its radius is the polar angle
-over the largest one, its azimuth the azimuth. A ``Focus`` turns and stretches the square's image:
+A place on the dome is a point w of the unit disc, as a complex number. Its radius is the polar angle divided by the largest polar angle,
+and its angle is the azimuth. A ``Focus`` rotates and stretches the image of the square:
 
     (u, v) -> w1 (squared disc) -> w2 = e^(i turn) w1 s(|w1|) / |w1| -> w = (w2 + a) / (1 + conj(a) w2)
 
-The elliptical map x = u sqrt(1 - v^2 / 2), y = v sqrt(1 - u^2 / 2) makes a disc of the square without
-collapsing an element (Fong, "Analytical methods for squaring the disc", 2015). The function s(r) = c r + (1 - c) r^5
-gathers the lines of the grid at the centre. A Moebius transformation moves the centre to where the contact is and
-keeps the rim on the rim. All three maps are smooth.
+The elliptical map x = u sqrt(1 - v^2 / 2), y = v sqrt(1 - u^2 / 2) maps the square to a disc without degenerate elements (Fong, "Analytical
+methods for squaring the disc", 2015). The function s(r) = c r + (1 - c) r^5 concentrates the lines of the grid at the centre. A Moebius
+transformation moves the centre to the contact, and maps the rim to itself. All three maps are smooth.
 """
 
 from dataclasses import dataclass
@@ -18,30 +17,31 @@ import numpy as np
 from twin.types import ComplexArray, FloatArray
 
 _POWER = 5
-"""Power in s(r) = c r + (1 - c) r^5: the higher it is, the more evenly the lines lie within the focus."""
+"""Power in s(r) = c r + (1 - c) r^5. A higher power makes the spacing of the lines within the focus more uniform."""
 _FINE = 0.75
-"""Share of the square's half side whose image is the focus."""
+"""Radius of the part of the square that is mapped to the focus, relative to half the square's side."""
 _LARGEST_SHIFT = 0.45
-"""Largest shift a of the Moebius transformation. Beyond 0.5 elements at the rim turn inside out for some turns of the grid."""
+"""Largest shift a of the Moebius transformation. With more than 0.5, elements at the rim turn inside out for some rotations of the grid."""
 _LEAST_SLOPE = 0.2
-"""Smallest c: it bounds how small the elements at the centre of the focus get."""
+"""Smallest c on round skins. It limits how small the elements at the centre of the focus become."""
 
 _LEAST_PAD_SLOPE = 0.5
-"""Smallest c on rectangles. Their grid is fine along two whole strips, and coarse elsewhere; elements twice as fine are enough."""
+"""Smallest c on rectangles: elements twice as fine are enough. The grid of a rectangle is fine along two whole strips, and coarse
+elsewhere."""
 
 
 @dataclass(frozen=True)
 class Focus:
-    """The part of the dome over which the grid is fine.
+    """The part of the dome on which the grid is fine.
 
     Attributes
     ----------
     polar_rad, azimuth_rad : float
-        Direction of the centre.
+        Direction of the centre of the fine part.
     radius_rad : float
-        Angle around it that the fine part covers.
+        Angular radius of the fine part.
     turn_rad : float
-        Turn of the grid's rows about the centre; at the apex it is their azimuth.
+        Rotation of the grid's rows about the centre. At the apex it is the azimuth of the rows.
     """
 
     polar_rad: float = 0.0
@@ -52,7 +52,7 @@ class Focus:
 
 @dataclass(frozen=True)
 class Chart:
-    """The map (u, v) in [-1, 1]^2 <-> disc for a focus, on a dome down to ``largest_polar_rad``."""
+    """The map between (u, v) in [-1, 1]^2 and the unit disc, for a focus on a dome that ends at ``largest_polar_rad``."""
 
     focus: Focus
     largest_polar_rad: float
@@ -85,10 +85,10 @@ class Chart:
 
 @dataclass(frozen=True)
 class RectangleChart:
-    """The map (u, v) in [-1, 1]^2 <-> places of a rectangle, for a focus: x + i y in the same square.
+    """The map between (u, v) in [-1, 1]^2 and the places x + i y of a rectangle, in the same square, for a focus.
 
-    Each axis has the one-dimensional maps of ``Chart``: t -> s(t) -> (s + a) / (1 + a s). The lines stay parallel to the sides, so that
-    corners stay corners; the focus' turn does not count.
+    Each axis uses the one-dimensional maps of ``Chart``: t -> s(t) -> (s + a) / (1 + a s). The lines of the grid stay parallel to the
+    sides, so that corners are mapped to corners. The rotation of the focus is ignored.
     """
 
     focus: Focus
@@ -134,7 +134,7 @@ def square_of_disc(disc: ComplexArray) -> FloatArray:
 
 
 def _slope(share: float) -> float:
-    """Slope c at the centre with which the focus, a share of the way to the rim, is the image of the square's inner ``_FINE``."""
+    """Slope c with which s maps ``_FINE`` to ``share``, the radius of the focus relative to the rim; limited to permitted values."""
     return float(np.clip((share - _FINE**_POWER) / (_FINE - _FINE**_POWER), _LEAST_SLOPE, 1.0))
 
 
@@ -144,7 +144,7 @@ def _gathered(r: FloatArray, c: float) -> FloatArray:
 
 
 def _spread(wanted: FloatArray, c: float) -> FloatArray:
-    """Inverse of ``_gathered`` for 0 to 1: Newton's method kept inside a shrinking bracket."""
+    """Inverse of ``_gathered`` for values from 0 to 1, by Newton's method inside a shrinking bracket."""
     r = np.sqrt(wanted)
     low, high = np.zeros_like(r), np.ones_like(r)
     for _ in range(60):

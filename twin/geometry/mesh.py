@@ -1,7 +1,7 @@
-"""The sensor's body as hexahedra, for views, files and the renderer. The mesh is the same for every contact.
+"""Hexahedral mesh of the sensor's body, for views, files and the renderer. The mesh is the same for every contact.
 
-A square grid is bent over the skin (``chart``, ``shapes``). At each of its points a straight column of nodes runs through the skin and
-the gel to the lens. The mechanics are computed with the spline solid (``solid``); `NodeView` gives the nodes' places from it.
+A square grid is mapped to the skin (``chart``, ``shapes``). At each of its points a straight column of nodes passes through the skin and
+the gel to the lens. The mechanics use the spline solid (``solid``); `NodeView` computes the positions of the nodes from it.
 """
 
 from collections.abc import Mapping
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 SKIN, GEL = 0, 1
-"""Materials of an element."""
+"""Codes of an element's material."""
 _ACROSS = 21
-"""Nodes along each side of the square."""
+"""Number of nodes along each side of the square."""
 _SKIN_LAYERS = 1
-"""Layers of elements in the skin."""
+"""Number of layers of elements in the skin."""
 _GEL_LAYERS = 4
-"""Layers of elements in the gel."""
+"""Number of layers of elements in the gel."""
 _FOCUS_SHARE = 0.62
-"""Share of the largest polar angle within which, around the apex, the mesh is fine."""
+"""Radius of the fine part of the mesh around the apex, relative to the largest polar angle."""
 _HEX_CORNERS = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1))
 """Corners of a hexahedron in VTK's order, as steps along the grid."""
 
@@ -52,7 +52,7 @@ class SensorMesh:
         Inside of the skin, one quad for each column of elements. Seen from *outside* the dome the corners run counter-clockwise, so
         normals point away from the dome's centre and the camera sees the back of these quads.
     disc : (k,) complex
-        Place of each column of nodes on the dome (see ``chart``).
+        Place of each column of nodes on the skin (see ``chart``).
     grid : (3,) int
         Number of layers of nodes, and of nodes along each side of the square.
     skin_layers : int
@@ -84,7 +84,7 @@ def build_mesh(geometry: GeometrySpec) -> SensorMesh:
     quads = np.stack([c[0] for c in cells[:4]], axis=-1).reshape(-1, 4)
     return SensorMesh(
         nodes_mm=np.concatenate([body_points(geometry, disc, depth) for depth in depths]),
-        # layers are numbered inwards: the two faces are swapped, so that the first four corners are the inner ones
+        # the two faces are swapped, because the layers are numbered inwards: the first four corners must be the inner ones
         hexes=np.stack(cells[4:] + cells[:4], axis=-1).reshape(-1, 8),
         material=np.repeat(np.where(np.arange(layers) < _SKIN_LAYERS, SKIN, GEL), (side - 1) ** 2),
         inner_quads=quads + _SKIN_LAYERS * side * side,
@@ -95,7 +95,7 @@ def build_mesh(geometry: GeometrySpec) -> SensorMesh:
 
 
 def outer_chart(geometry: GeometrySpec) -> Chart | RectangleChart:
-    """The chart whose even places are the mesh's columns."""
+    """The chart of the mesh: its columns are at evenly spaced points of the chart's square."""
     shape = shape_of(geometry.skin)
     return shape.chart(Focus(radius_rad=_FOCUS_SHARE * shape.largest_rad))
 

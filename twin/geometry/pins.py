@@ -1,4 +1,4 @@
-"""Where the pins of a sensor sit at rest, in the specification's pin order."""
+"""Positions of a sensor's pins at rest, in the specification's pin order."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -15,9 +15,11 @@ from twin.geometry.shapes import shape_of
 from twin.types import FloatArray, IntArray
 
 LEAST_BORDER = 3
-"""A border has at least this many pins; where more of it is missing, it is found anew."""
+"""Smallest number of pins on a border. If fewer pins of a layout's regular border are present, the border is computed from the places of
+all pins."""
 LONGEST_LINK = 1.8
-"""Longest side of a layout's border, in usual distances of neighbours. The diagonal of a square is 1.41."""
+"""Largest length of a side of a computed border, relative to the usual distance of neighbouring pins. The diagonal of a square grid is
+1.41."""
 
 
 @dataclass(frozen=True)
@@ -41,19 +43,19 @@ class PinRest:
 
 @dataclass(frozen=True)
 class Lattice:
-    """A layout laid flat, and how its pins hang together.
+    """A flat layout of pins, with its border and its rings.
 
     Attributes
     ----------
     places : (N, 2) float
-        The outermost pin is at distance 1 from the middle.
+        Positions of the pins. The outermost pin is at distance 1 from the centre.
     outmost : (m,) int
-        The pins on the layout's border, in order around it.
+        Pins on the layout's border, in order around it.
     slots : (S,) int
-        Ring after ring, each in order around the middle: the pin of each place of the complete layout, -1 where it is missing. A layout
-        without rings is one ring.
+        Pin at each place of the complete layout, -1 where it is missing: ring after ring, and in order around the centre within each ring.
+        A layout without rings is one ring.
     ring_ends : (R + 1,) int
-        Ring i's slots are ``ring_ends[i - 1]`` to ``ring_ends[i]``; ``ring_ends[0]`` leaves out a pin in the middle.
+        Ring i has the slots from ``ring_ends[i - 1]`` to ``ring_ends[i]``, the last one excluded. A pin at the centre belongs to no ring.
     """
 
     places: FloatArray
@@ -64,11 +66,11 @@ class Lattice:
 
 @lru_cache(maxsize=32)
 def pin_lattice(pins: PinsSpec) -> Lattice:
-    """The layout of a specification's pins, unturned.
+    """The layout of a specification's pins, without its rotation.
 
-    Order of the pins of rings and hexagons: the middle, then ring by ring, each from its first pin by increasing azimuth (x towards y).
-    A hexagonal ring's sides are divided into equal parts; its corners lie at multiples of 60 deg. Order of a grid: row by row, each from
-    small to large x. Missing pins are left out.
+    Order of the pins in rings and hexagons: first the centre, then ring by ring, each from its first pin by increasing azimuth (x towards
+    y). The sides of a hexagonal ring are divided into equal parts; its corners are at multiples of 60 deg. Order of the pins in a grid: row
+    by row, each from small to large x. Missing pins are omitted.
     """
     places, border, ring_ends = _COMPLETE[pins.layout](pins)
     there = np.setdiff1d(np.arange(len(places)), pins.missing)
@@ -82,7 +84,7 @@ def pin_lattice(pins: PinsSpec) -> Lattice:
 
 
 def _ringed(pins: PinsSpec) -> tuple[FloatArray, IntArray | None, IntArray]:
-    """Places of rings or of a hexagon, their outermost ring, and where the rings end."""
+    """Places of rings or of a hexagon, indices of their outermost ring, and ends of the rings."""
     rings = pins.rings or 0
     points = [0j]
     for ring in range(1, rings + 1):
@@ -99,7 +101,7 @@ def _ringed(pins: PinsSpec) -> tuple[FloatArray, IntArray | None, IntArray]:
 
 
 def _grid(pins: PinsSpec) -> tuple[FloatArray, IntArray | None, IntArray]:
-    """Places of a grid, its border, and its one ring."""
+    """Places of a grid, indices of its border, and ends of its single ring."""
     columns, rows = pins.columns or 0, pins.rows or 0
     y, x = np.mgrid[:rows, :columns]
     number = np.arange(rows * columns).reshape(rows, columns)
@@ -109,7 +111,7 @@ def _grid(pins: PinsSpec) -> tuple[FloatArray, IntArray | None, IntArray]:
 
 
 def _given(pins: PinsSpec) -> tuple[FloatArray, IntArray | None, IntArray]:
-    """Given places, and their one ring."""
+    """Given places, no border, and ends of their single ring."""
     return np.array(pins.positions, float), None, np.array([0, len(pins.positions)])
 
 
@@ -122,16 +124,16 @@ _COMPLETE: dict[str, Callable[[PinsSpec], tuple[FloatArray, IntArray | None, Int
 
 
 def usual_spacing(places: FloatArray) -> float:
-    """Median distance of places (N, 2) or (N, 3) from their nearest neighbours; those that are NaN are left out."""
+    """Median distance of places (N, 2) or (N, 3) from their nearest neighbours. Places that are NaN are ignored."""
     known = places[np.isfinite(places).all(axis=1)]
     return float(np.median(cKDTree(known).query(known, k=2)[0][:, 1]))
 
 
 def border_of(places: FloatArray) -> IntArray:
-    """Indices (m,) of the outermost of some places (N, 2), in order around them: the border of their Delaunay triangles.
+    """Indices (m,) of the outermost places among places (N, 2), in order around them: the border of their Delaunay triangulation.
 
-    From outside, triangles with a side longer than ``LONGEST_LINK`` times the usual distance of neighbours are taken away as long as the
-    border stays one loop.
+    Triangles at the border are removed if their outer side is longer than ``LONGEST_LINK`` times the usual distance of neighbours, and if
+    the border remains one loop.
     """
     triangles = Delaunay(places).simplices
     longest = LONGEST_LINK * usual_spacing(places)
@@ -169,7 +171,7 @@ def border_of(places: FloatArray) -> IntArray:
 
 
 def rest_pins(geometry: GeometrySpec) -> PinRest:
-    """Pins at rest of a sensor: the layout on the inside of its skin, as the skin's shape and ``PinsSpec.spacing`` say."""
+    """Pins of a sensor at rest: the layout, mapped to the inside of its skin by the skin's shape and ``PinsSpec.spacing``."""
     pins = geometry.pins
     base, outward = shape_of(geometry.skin).pins(pin_lattice(pins).places, pins)
     return PinRest(base, -outward, base - (pins.length_mm + pins.cap_height_mm / 2) * outward)

@@ -1,12 +1,12 @@
-"""Shapes of a skin at rest: all that others ask of a cap, a flat round pad and a flat rectangular pad.
+"""Shapes of a skin at rest: a spherical cap, a flat round pad and a flat rectangular pad, with one interface.
 
-A place on a skin is a complex number w. On caps and round pads it is a point of the unit disc: its angle is the azimuth, and its size is
-the share of the way along the skin from the middle to the rim. On a rectangular pad it is a point of the square with corners at
-+-1 +-i. The same w on the outside, on the inside and on the window belong to one straight column through the body.
+A place on a skin is a complex number w. On caps and round pads it is a point of the unit disc: its angle is the azimuth, and its radius is
+the distance along the skin from the centre, relative to the rim. On a rectangular pad it is a point of the square with corners at
++-1 +-i. The points with the same w on the outside, on the inside and on the window form one straight column through the body.
 
-Each place also has a direction, a unit vector: on a hemisphere that from its centre. The places of other skins are spread over a
-hemisphere in the same way, so that the grid's focus (``chart.Focus``) means the same on all of them. A cap that is larger than a hemisphere
-keeps its own directions.
+Each place also has a direction, a unit vector. On a hemisphere it points from the sphere's centre to the place. The places of other skins
+are mapped to a hemisphere in the same way, so that the grid's focus (``chart.Focus``) has the same meaning on all of them. A cap that is
+larger than a hemisphere keeps its own directions.
 """
 
 from abc import ABC, abstractmethod
@@ -21,14 +21,14 @@ from twin.geometry.chart import Chart, Focus, RectangleChart, disc_of_square, sq
 from twin.types import BoolArray, ComplexArray, FloatArray
 
 _GOLDEN_RAD = np.pi * (1 + np.sqrt(5))
-"""Turn from each point of a Fibonacci lattice to the next."""
+"""Angle from each point of a Fibonacci lattice to the next."""
 _PIN_ROUNDING_MM = 1e-6
-"""A pin may stand this far beyond the flat part of a pad: rounding."""
+"""Tolerance for rounding: largest distance of a pin beyond the flat part of a pad."""
 
 
 @dataclass(frozen=True)
 class SkinShape(ABC):
-    """The places of one skin.
+    """Geometry of one skin at rest, as functions of places.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class SkinShape(ABC):
 
     @property
     def largest_rad(self) -> float:
-        """Angle of the rim's direction from the axis."""
+        """Angle between the direction of the rim and the sensor's axis."""
         return float(np.pi / 2)
 
     def chart(self, focus: Focus) -> Chart | RectangleChart:
@@ -56,7 +56,7 @@ class SkinShape(ABC):
 
     @abstractmethod
     def flat(self, place: ComplexArray) -> FloatArray:
-        """x and y (k, 2) mm of the columns' ends on the window."""
+        """x and y (k, 2) mm at which the columns of the places end on the window."""
 
     @abstractmethod
     def place(self, inside_mm: FloatArray) -> ComplexArray:
@@ -64,22 +64,22 @@ class SkinShape(ABC):
 
     @abstractmethod
     def on_outside(self, near_mm: FloatArray) -> FloatArray:
-        """The points (k, 3) of the outside that belong to points (k, 3) close to it."""
+        """Projections (k, 3) onto the outside of points (k, 3) close to it."""
 
     @abstractmethod
     def beneath(self, place: ComplexArray, depth_mm: float) -> FloatArray:
-        """Points (k, 3) mm this deep below the outside: towards a cap's centre, or along z below a pad."""
+        """Points (k, 3) mm at a depth below the outside: towards the centre of a cap, or along z below a pad."""
 
     @abstractmethod
     def pins(self, layout: FloatArray, pins: PinsSpec) -> tuple[FloatArray, FloatArray]:
-        """Feet (N, 3) mm and outward normals (N, 3) of pins, from their layout (N, 2) whose outermost pin is at 1 from the middle."""
+        """Feet (N, 3) mm and outward normals (N, 3) of pins, from their layout (N, 2) with the outermost pin at distance 1."""
 
     @abstractmethod
     def normals(self, inside_mm: FloatArray) -> FloatArray:
         """Outward unit normals (k, 3) at points (k, 3) of the inside."""
 
     def disc(self, place: ComplexArray) -> ComplexArray:
-        """Points (k,) of the unit disc that places are spread over; the rim is at 1."""
+        """Points (k,) of the unit disc to which places are mapped; the rim has the radius 1."""
         return place
 
     def of_disc(self, disc: ComplexArray) -> ComplexArray:
@@ -87,22 +87,25 @@ class SkinShape(ABC):
         return disc
 
     def even(self, count: int, *, turn_rad: float = 0.0) -> ComplexArray:
-        """Places spread evenly over the outside, about ``count`` on a whole sphere; round shapes turn them by ``turn_rad``."""
+        """Places that are evenly distributed over the outside; ``count`` is their number on a whole sphere.
+
+        On round shapes they are rotated by ``turn_rad``.
+        """
         k = np.arange(count // 2) + 0.5
         return np.sqrt(2 * k / count) * np.exp(1j * (_GOLDEN_RAD * k + turn_rad))
 
     def near(self, place: complex, spread: float, count: int) -> ComplexArray:
-        """About ``count`` places within ``spread`` (share of the way to the rim) around one."""
+        """About ``count`` places around ``place``, within a distance of ``spread`` relative to the rim."""
         k = np.arange(count) + 0.5
         around = place + spread * np.sqrt(k / count) * np.exp(1j * _GOLDEN_RAD * k)
         return around[self.rim_share(around) <= 1]
 
     def rim_share(self, place: ComplexArray) -> FloatArray:
-        """(k,) 0 in the middle, 1 at the rim."""
+        """Distance (k,) of places from the centre along the skin: 0 at the centre, 1 at the rim."""
         return np.abs(place)
 
     def rim(self, around: int) -> ComplexArray:
-        """Places (around,) on the rim, once around from x towards y."""
+        """Places (around,) on the rim, one turn from x towards y."""
         return np.exp(2j * np.pi * np.arange(around) / around)
 
     def directions(self, place: ComplexArray) -> FloatArray:
@@ -182,11 +185,11 @@ class Cap(SkinShape):
 
 @dataclass(frozen=True)
 class Pad(SkinShape):
-    """A flat skin whose edge is rounded to a quarter of a circle, so that the rim lies ``edge_mm`` behind the outside."""
+    """A flat skin with an edge that is rounded to a quarter of a circle, so that the rim is ``edge_mm`` behind the outside."""
 
     @property
     def edge_mm(self) -> float:
-        """Radius of the rounded edge, seen from outside; 0: the skin is flat up to its rim."""
+        """Radius of the rounded edge on the outside; 0 for a skin that is flat up to its rim."""
         return -self.skin.rim_z_mm
 
     @property
@@ -194,9 +197,9 @@ class Pad(SkinShape):
         return max(self.edge_mm - self.skin.thickness_mm, 0.0)
 
     def _profile(self, share: FloatArray, half_mm: float, edge_mm: float) -> tuple[FloatArray, FloatArray]:
-        """Distance from the middle (mm), and height (1 on the flat part, 0 at the rim), at a share of the way along the outside.
+        """Distance from the centre (mm), and height (1 on the flat part, 0 at the rim), at a relative distance ``share`` along the outside.
 
-        ``half_mm`` is half the outside's size, ``edge_mm`` the radius of the edge of the surface that is asked for.
+        ``half_mm`` is half the outside's size, and ``edge_mm`` is the radius of the rounded edge of the requested surface.
         """
         size, flat_mm = np.abs(share), half_mm - self.edge_mm
         length_mm = flat_mm + self.edge_mm * np.pi / 2
@@ -206,7 +209,7 @@ class Pad(SkinShape):
         return np.sign(share) * (np.minimum(size * length_mm, flat_mm) + edge_mm * np.sin(angle)), np.cos(np.minimum(angle, np.pi / 2))
 
     def _share(self, at_mm: FloatArray, half_mm: float) -> FloatArray:
-        """Inverse of the profile of the inside, for its distances from the middle."""
+        """Inverse of the inside's profile: the relative distance for distances from the centre in mm."""
         size, flat_mm = np.abs(at_mm), half_mm - self.edge_mm
         if self.edge_mm == 0:
             return at_mm / half_mm
@@ -239,7 +242,7 @@ class Pad(SkinShape):
 
     def normals(self, inside_mm: FloatArray) -> FloatArray:
         step = 1e-6
-        place = self.place(inside_mm) * (1 - 2 * step)  # beyond the rim there is no skin
+        place = self.place(inside_mm) * (1 - 2 * step)  # keeps the difference quotient within the rim
         along_x, along_y = (self.inside(place + d) - self.inside(place - d) for d in (step, 1j * step))
         across = np.cross(along_x, along_y)
         return across / np.linalg.norm(across, axis=1, keepdims=True)
@@ -283,7 +286,7 @@ class RoundPad(Pad):
 
 @dataclass(frozen=True)
 class RectangularPad(Pad):
-    """A flat rectangle. Over its rounded edge the height is the product of those of both directions, which also rounds the corners."""
+    """A flat rectangle. At its rounded edge the height is the product of the heights of both directions, which also rounds the corners."""
 
     def chart(self, focus: Focus) -> RectangleChart:
         return RectangleChart(focus, self.largest_rad)

@@ -1,10 +1,10 @@
-"""The sensor's body as a spline solid, with which the mechanics are computed.
+"""The sensor's body as a solid of splines, for the mechanics.
 
-A square grid of columns is bent over the skin (``chart``, ``shapes``). Each column runs through the skin and the gel to the lens. Shape and
-displacement are splines in u, v and depth (isogeometric analysis: Hughes, Cottrell & Bazilevs 2005): quadratic and C1 over the dome,
-linear through the skin, quadratic through the gel. Because a skin bent by contact is smooth, splines need fewer unknowns than trilinear
-elements. The displacement inside the gel is even smoother: below the gel's surface its grid has half as many lines as the skin's, and is
-nested in it.
+A square grid of columns is mapped to the skin (``chart``, ``shapes``). Each column passes through the skin and the gel to the lens. Shape
+and displacement are splines in u, v and depth (isogeometric analysis: Hughes, Cottrell & Bazilevs 2005): quadratic and C1 over the dome,
+linear through the skin, and quadratic through the gel. A skin that is bent by a contact is smooth, so splines need fewer unknowns than
+trilinear elements. The displacement inside the gel is even smoother. Therefore the gel's grid below its surface has half as many lines as
+the skin's grid, and is nested in it.
 """
 
 from dataclasses import dataclass
@@ -22,11 +22,13 @@ from twin.geometry.shapes import shape_of
 from twin.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _GEL_GRADING = 1.5
-"""Boundary k of n elements through the gel lies at the depth (k / n)^1.5: elements are thin below the skin."""
+"""Exponent of the gel's grading: boundary k of n elements through the gel is at the relative depth (k / n)^1.5, so elements below the skin
+are thin."""
 _MOST_POLAR_ITERATIONS = 50
-"""Most iterations for a rotation; five are usual."""
+"""Largest number of iterations of a polar decomposition; five are usual."""
 _POLAR_CHANGE = 1e-9
-"""The iteration for a rotation ends at a change below this: the next change would be its square."""
+"""Convergence threshold of the polar decomposition: the iteration ends after a smaller change. The convergence is quadratic, so the next
+change would be about its square."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Cells:
     gradients : (m, 8, 3, b) float
         Gradients of the shape functions at rest at 2x2x2 Gauss points, 1/mm. The first four points are the outer ones.
     weights_mm3 : (m, 8) float
-        Volume at rest that each Gauss point stands for.
+        Rest volume of each Gauss point.
     """
 
     controls: IntArray
@@ -70,7 +72,7 @@ class Cells:
 
     @cached_property
     def mean_gradients(self) -> FloatArray:
-        """The gradients on average over an element's points, (m, 3, b)."""
+        """Mean of the gradients over the points of each element, (m, 3, b)."""
         return self.gradients.mean(axis=1)
 
 
@@ -78,8 +80,8 @@ class Cells:
 class Solid:
     """Skin and gel at rest, in the sensor frame.
 
-    The body is given by the coefficients ("controls") of its splines: first ``skin_layers + 1`` layers of ``side^2`` controls from the
-    outside to the inside of the skin, row by row; then the layers of the gel with ``coarse_side^2`` controls each.
+    The coefficients of the splines, the "controls", define the body. The first ``skin_layers + 1`` layers of ``side^2`` controls go from
+    the outside to the inside of the skin, row by row. The layers of the gel with ``coarse_side^2`` controls each follow.
 
     Attributes
     ----------
@@ -87,8 +89,8 @@ class Solid:
     fixed : (n,) bool
         Clamped controls: at the rim, the wall and the lens.
     skin, gel_top, gel_deep : Cells
-        The skin's elements, layer by layer from the outside; the gel's first layer of elements, whose outer side has the skin's grid
-        and whose inner side has the coarse one; the other elements of the gel.
+        The skin's elements, layer by layer from the outside; the gel's first layer of elements, with the skin's grid on its outer side and
+        the coarse grid on its inner side; and the other elements of the gel.
     boxes : tuple of (m, 4) int
         For each kind of cells: first and last row, first and last column (last: exclusive) on the skin's grid.
     chart : Chart or RectangleChart
@@ -97,7 +99,7 @@ class Solid:
     inner : slice
         Controls of the skin's inside.
     pin_value, pin_slope_u, pin_slope_v : (N, side^2) float
-        Coefficients by which the controls of the skin's inside give place and derivatives of the skin's inside at the pins' feet.
+        Matrices that map the controls of the skin's inside to the positions and derivatives of the skin's inside at the pins' feet.
     pin_base_mm, pin_axis : (N, 3) float
         Feet and axes of the pins at rest.
     pin_cap_length_mm : float
@@ -124,12 +126,12 @@ class Solid:
 
     @cached_property
     def pin_operator(self) -> csr_array:
-        """``pin_value``, ``pin_slope_u`` and ``pin_slope_v`` one below the other, (3 N, side^2); nine numbers in a row are not zero."""
+        """``pin_value``, ``pin_slope_u`` and ``pin_slope_v``, stacked vertically: (3 N, side^2). Each row has nine non-zero entries."""
         return csr_array(np.concatenate([self.pin_value, self.pin_slope_u, self.pin_slope_v]))
 
     @cached_property
     def pin_rest(self) -> tuple[FloatArray, FloatArray]:
-        """Foot (N, 3) and inverse frame (N, 3, 3) of the skin's inside under each pin at rest."""
+        """Foot (N, 3) of each pin at rest, and inverse (N, 3, 3) of the frame of the skin's inside there."""
         foot, frame = _surface(self, self.control_mm)
         return foot, np.linalg.inv(frame)
 
@@ -186,7 +188,7 @@ def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None,
 
 
 def surface_operators(basis: Basis, square: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Matrices (k, side^2) by which a layer's controls give its value, d/du and d/dv at points (k, 2) of the square."""
+    """Matrices (k, side^2) that map a layer's controls to its value, d/du and d/dv at points (k, 2) of the square."""
     u, v = square.T
     u0, u1, v0, v1 = basis.values(u), basis.values(u, derivative=1), basis.values(v), basis.values(v, derivative=1)
 
@@ -200,8 +202,8 @@ def pin_pose(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArr
     """Feet, axes and cap centres of the pins on a deformed skin.
 
     With the tangents and the unit normal of the skin's inside at a foot, deformed (t_u, t_v, n) and at rest (T_u, T_v, N), the
-    deformation is F = [t_u t_v n] [T_u T_v N]^-1. The pin turns by the rotation of F's polar decomposition, which maps N to n. At rest
-    the result equals ``rest_pins``, and a rigid motion of the body moves the pins rigidly.
+    deformation gradient is F = [t_u t_v n] [T_u T_v N]^-1. The pin rotates by the rotation of F's polar decomposition, which maps N to n.
+    At rest the result equals ``rest_pins``, and a rigid motion of the body moves the pins rigidly.
 
     Parameters
     ----------
@@ -221,12 +223,12 @@ def pin_pose(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def body_points(geometry: GeometrySpec, disc: ComplexArray, depth: float) -> FloatArray:
-    """Places (k, 3) of the body at rest: depth 0 is the skin's outside, 1 its inside, 2 the lens, with straight lines between them."""
+    """Points (k, 3) of the body at rest. Depth 0 is the skin's outside, 1 its inside and 2 the lens, with straight lines between them."""
     return shape_of(geometry.skin).body(disc, depth, geometry.lens.z_mm)
 
 
 def _fit(basis: Basis, chart: Chart | RectangleChart, geometry: GeometrySpec, depth: float) -> FloatArray:
-    """Controls (side^2, 3) of the spline surface through the body's places at one depth."""
+    """Controls (side^2, 3) of the spline surface that interpolates the body at one depth."""
     v, u = np.meshgrid(basis.greville, basis.greville, indexing="ij")
     places = body_points(geometry, chart.disc(np.column_stack([u.ravel(), v.ravel()])), depth)
     inverse = np.linalg.inv(basis.values(basis.greville))
@@ -234,7 +236,7 @@ def _fit(basis: Basis, chart: Chart | RectangleChart, geometry: GeometrySpec, de
 
 
 def _local(through: Basis, element: int, function: int) -> tuple[FloatArray, FloatArray]:
-    """Value and slope (2,), at an element's two Gauss points, of one of the functions that are not zero there."""
+    """Values (2,) and slopes (2,), at an element's two Gauss points, of one of the functions that are not zero in the element."""
     at = through.gauss(2)[0][element]
     return through.values(at)[:, element + function], through.values(at, derivative=1)[:, element + function]
 
@@ -244,7 +246,7 @@ def spline_cells(
 ) -> Cells:
     """Elements of one layer over the intervals of ``grid``.
 
-    ``parts`` holds for each function through the depth: its controls (side, side), their basis, its values and slopes.
+    ``parts`` contains, for each function through the depth, its controls (side, side), their basis, and the function's values and slopes.
     """
     at, weights = grid.gauss(2)
     shape_parts, control_parts = [], []
@@ -269,20 +271,20 @@ def spline_cells(
 
 
 def joined_cells(parts: list[Cells]) -> Cells:
-    """The elements of several layers as one list. Without layers it has no elements, and the shape for 27 controls, as in the gel."""
+    """The elements of several layers in one ``Cells``. Without layers it is empty, with the array shapes of the gel (27 controls)."""
     if not parts:
         return Cells(np.zeros((0, 27), int), np.zeros((0, 8, 3, 27)), np.zeros((0, 8)))
     return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("controls", "gradients", "weights_mm3")))
 
 
 def _boxes(count: int, size: int) -> IntArray:
-    """(count^2, 4) row and column ranges of even elements of a size on the skin's grid."""
+    """Ranges (count^2, 4) of rows and columns of elements that each cover ``size`` x ``size`` elements of the skin's grid."""
     rows, columns = (g.ravel() * size for g in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
     return np.column_stack([rows, rows + size, columns, columns + size])
 
 
 def _surface(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Foot (N, 3) and frame [t_u t_v n] (N, 3, 3) of the inner surface under each pin."""
+    """Foot (N, 3) of each pin, and frame [t_u t_v n] (N, 3, 3) of the inner surface there."""
     place, along_u, along_v = (solid.pin_operator @ control_mm[solid.inner]).reshape(3, -1, 3)
     normal = np.cross(along_u, along_v)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -293,7 +295,7 @@ def _surface(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArr
 def rotations(matrices: FloatArray) -> FloatArray:
     """The rotations (k, 3, 3) of the polar decompositions of matrices (k, 3, 3) of positive determinant.
 
-    Newton's iteration R -> (R + R^-T) / 2 (Higham 1986), whose convergence is quadratic.
+    They are computed by Newton's iteration R -> (R + R^-T) / 2 (Higham 1986), which converges quadratically.
     """
     out = np.empty_like(matrices)
     cofactor = np.zeros((3, 3))

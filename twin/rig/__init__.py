@@ -1,1 +1,1 @@
-"""A sensor on an arm before an object: labels, kinematics, mounting, touch, and the one contact model that all of these share."""
+"""A sensor on an arm in front of an object: labels, kinematics, mounting, touch, and the contact model that all parts share."""

@@ -1,15 +1,15 @@
-"""The one contact model: for a pose that the arm is sent to, where the object is under its force, and how the pair rubs.
+"""The contact model of a sensor on an arm: the pose of the object under the contact force, and the friction.
 
-Simulated data sets, the validation against labelled frames, the calibration of contacts, renders from labels and the twin that a
-servo follows a surface in all take their contacts from here.
+All parts of the program take their contacts from this module: simulated data sets, the validation against labelled frames, the calibration
+of contacts, renders from labels, and the twin in which a servo follows a surface.
 
-Three things happen where an arm presses a sensor against an object with the force F (on the object, sensor frame):
+When an arm presses a sensor against an object with the force F (on the object, sensor frame), the model contains three effects:
 
-- Friction. A rig's coefficient was fitted to frames of this sensor's skin, so it counts for every object that the rig's arm
-  touches. An object's own friction counts where the sensor has no rig. A caller who knows better gives the friction explicitly.
-- Both give way along the sensor's z by (object's + rig's ``compliance_mm_per_n``) F_z. The solver finds this with the contact.
-- The arm turns about its tool point, in the plane of its approach and the direction across, by
-  ``turn_compliance_deg_per_n`` times the force across. This is ``ArmTurning``.
+- Friction. A rig's coefficient of friction was fitted to frames of this sensor's skin, so it applies to every object that the rig's arm
+  touches. An object's own friction applies if the sensor has no rig. A friction that the caller gives takes precedence over both.
+- Displacement along the sensor's z by (object's + rig's ``compliance_mm_per_n``) F_z. The solver finds it together with the contact.
+- Rotation of the arm about its tool point, in the plane of its approach and the direction across, by ``turn_compliance_deg_per_n`` times
+  the force along the direction across (see ``ArmTurning``).
 """
 
 from collections.abc import Iterator
@@ -34,17 +34,18 @@ from twin.types import ContactState
 
 @dataclass(frozen=True)
 class ArmTurning:
-    """How an arm turns about its tool point under the force across; a ``GivenWay`` of ``ContactLaw``. All in the sensor frame.
+    """Rotation of an arm about its tool point under the force across; a ``GivenWay`` of ``ContactLaw``. Vectors are in the sensor frame.
 
     Attributes
     ----------
     across : (3,) float
-        Unit vector along which the force counts.
+        Unit vector of the direction across. The component of the force along it rotates the arm.
     axis : (3,) float
-        Unit vector about which the tool turns as the angle's label grows.
+        Unit vector about which the tool rotates when the label of its angle increases.
     tool_mm : (3,) float
         The tool point.
     deg_per_n : float
+        Rotation per N.
     """
 
     across: np.ndarray
@@ -54,13 +55,13 @@ class ArmTurning:
 
     @cached_property
     def _cross(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """For Rodrigues' formula the unit matrix (3, 3), the cross product with the axis, and its square."""
+        """Three matrices (3, 3) for Rodrigues' formula: the identity, the cross product with the axis, and its square."""
         x, y, z = self.axis
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         return np.eye(3), cross, cross @ cross
 
     def __call__(self, T: np.ndarray, force_n: np.ndarray) -> np.ndarray:
-        """The object's pose (4, 4) under a force (3,), N: seen from the sensor it turns the other way about the tool point."""
+        """The object's pose (4, 4) under a force (3,), N. In the sensor frame it rotates about the tool point, opposite to the tool."""
         angle = -radians(self.deg_per_n * float(self.across @ force_n))
         one, cross, squared = self._cross
         turn = one + sin(angle) * cross + (1 - cos(angle)) * squared
@@ -71,21 +72,21 @@ class ArmTurning:
 
 
 def friction_between(rig: RigSpec | None, touched: ObjectSpec) -> Friction:
-    """The friction of a sensor's contacts with an object: the rig's single coefficient, or the object's own where there is no rig."""
+    """Friction between sensor and object: the rig's single coefficient, or the object's own friction if there is no rig."""
     return Friction(rig.friction, rig.friction) if rig else friction_of(touched)
 
 
 def contact_law(rig: RigSpec | None, mounting: Mounting, touched: ObjectSpec, *, friction: float | Friction | None = None) -> ContactLaw:
-    """How a mounted sensor and an object rub and give way.
+    """Friction and compliance of a mounted sensor and an object.
 
     Parameters
     ----------
     rig : RigSpec or None
-        The sensor's own; None for a sensor without one.
+        The sensor's rig; None for a sensor without one.
     mounting : Mounting
-        By the same rig.
+        The mounting on this rig.
     friction : optional
-        In place of the rig's or the object's (see ``friction_between``).
+        Friction that replaces the rig's or the object's (see ``friction_between``).
     """
     turning = None
     if rig and rig.turn_compliance_deg_per_n:
@@ -95,16 +96,16 @@ def contact_law(rig: RigSpec | None, mounting: Mounting, touched: ObjectSpec, *,
 
 
 class RigContact:
-    """Contacts of one sensor, held by an arm, with one object, by the arm's labels.
+    """Contacts between one sensor on an arm and one object, from the arm's labels.
 
     Parameters
     ----------
     solver : SkinSolver
-        Of the sensor.
+        Solver of the sensor.
     experiment : ExperimentSpec
     touched : ObjectSpec
     rig : RigSpec, optional
-        In place of the sensor's own, if it is to be another.
+        Rig that replaces the sensor's own.
 
     Attributes
     ----------
@@ -121,11 +122,11 @@ class RigContact:
         self.law = contact_law(self.rig if rig or solver.spec.rig else None, mounting, touched)
 
     def way(self, label: ArmLabel) -> ArmPath:
-        """The object's way as commanded (see ``arm_path``, also for errors)."""
+        """The commanded path of the object (see ``arm_path``, also for errors)."""
         return arm_path(self.rig, self.experiment, self.solver.spec.skin, self.field, label)
 
     def along(self, way: ArmPath, *, friction: float | Friction | None = None) -> Iterator[tuple[float, ContactState]]:
-        """Every converged state on the way, with its fraction of the path; the law's friction unless another is given.
+        """Every converged state along the path, with its fraction of the path. ``friction`` replaces the friction of the law.
 
         Raises
         ------
@@ -135,5 +136,5 @@ class RigContact:
         return self.solver.path(self.field, way.path, law=self.law, friction=friction)
 
     def end(self, label: ArmLabel, *, friction: float | Friction | None = None) -> ContactState:
-        """The state at the end of a label's way. Errors as ``along``."""
+        """The state at the end of the path of a label. Errors as ``along``."""
         return self.solver.press(self.field, self.way(label).path, law=self.law, friction=friction)

@@ -1,16 +1,16 @@
-"""Kinematics of the rig: a label in robot coordinates becomes the object's path in the sensor's frame.
+"""Kinematics of the rig: conversion of a label in robot coordinates to the object's path in the sensor frame.
 
-Work frame of the robot: x, y, z. The sensor, unturned, looks along the approach a0. b0 is the direction across: robot x, or robot y
-where the approach is x. It appears in the image at the azimuth ``image_turn``. c0 is a0 x b0. With R the static xyz rotation by
+The robot's work frame has the axes x, y and z. Without rotation, the sensor looks along the approach a0. b0 is the direction across: robot
+x, or robot y if the approach is x. It appears in the image at the azimuth ``image_turn``. c0 is a0 x b0. With the static xyz rotation R by
 ``turn_sign (pose_4..6 + turn_offset)`` and p = ``pose_1..3``,
 
     origin of the sensor = p + R (tcp_to_dome a0 + tcp_lateral b0 + tcp_aside c0)
 
-The object's frame has z along the approach, is turned about it by ``object_turn``, and leans by ``plate_tilt``. The object stands where
-an unturned sensor at the robot's origin indents it by ``zero + contact_offset``, shifted by ``object_shift`` along b0 and c0.
-An arm taps along a0, then makes the move in one straight line.
+The z axis of the object's frame is along the approach. The frame is rotated about it by ``object_turn``, and tilted by ``plate_tilt``. An
+unrotated sensor at the robot's origin indents the object by ``zero + contact_offset``; the object is shifted by ``object_shift`` along b0
+and c0. The arm taps along a0, and then makes the move in a straight line.
 
-These are poses as commanded. What a force does to them is in ``twin.rig.contact``.
+All poses here are commanded poses. ``twin.rig.contact`` adds the effect of the contact force.
 """
 
 from dataclasses import dataclass, replace
@@ -28,13 +28,13 @@ from twin.mechanics.path import ContactPath
 from twin.objects import ObjectField
 from twin.rig.labels import ArmLabel
 
-MOST_TURN_DEG = 1.0  # largest turn between two poses of the path; straight pieces then miss the arm's arc by a few um
-TOUCH_TOLERANCE_MM = 1e-6  # gap that counts as a touch
-TOUCH_POINTS = 20_000  # places on a whole sphere; a dome bulges by less than 2 um between them
-MOST_MARCHES = 400  # strides of the search for the first touch; some ten are usual
-CLEAR_MM = 10.0  # how far before the tap the search begins; recorded taps of 5 mm begin up to 0.4 mm inside the object
+MOST_TURN_DEG = 1.0  # largest rotation between two poses of the path; its straight legs then differ from the arm's arc by a few um
+TOUCH_TOLERANCE_MM = 1e-6  # tolerance of a first touch: largest distance between object and skin
+TOUCH_POINTS = 20_000  # points on a whole sphere; between them a dome bulges by less than 2 um
+MOST_MARCHES = 400  # largest number of steps in the search for the first touch; about ten are usual
+CLEAR_MM = 10.0  # length by which the search extends the start of the tap; recorded taps of 5 mm begin up to 0.4 mm inside the object
 
-TURNING = {"x": 5, "y": 5, "z": 4}  # by approach: index of the pose's label that turns the tool in the plane of approach and across
+TURNING = {"x": 5, "y": 5, "z": 4}  # by approach: index of the label that rotates the tool in the plane of approach and across
 _UNTURNED = {  # by approach; columns are the sensor's x (across), y and z (approach) in the work frame
     "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
     "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
@@ -44,13 +44,13 @@ _UNTURNED = {  # by approach; columns are the sensor's x (across), y and z (appr
 
 @dataclass(frozen=True)
 class ArmPath:
-    """A contact's way, and what the arm's label would be on it.
+    """Path of the object in one contact, with the arm's labels along it.
 
     Attributes
     ----------
     path : ContactPath
     labels : list of ArmLabel
-        Of each pose of the path.
+        Label of each pose of the path.
     touches : bool
         Whether the tap reaches the object.
     """
@@ -60,7 +60,7 @@ class ArmPath:
     touches: bool
 
     def label(self, fraction: float) -> ArmLabel:
-        """The label of a state at a fraction of the path: the tap or the move, as far as it has gone."""
+        """The label at a fraction of the path, interpolated between the labels of the poses before and after it."""
         progress = fraction * (len(self.labels) - 1)
         leg = int(np.clip(np.floor(progress), 0, len(self.labels) - 2))
         share, start, stop = progress - leg, self.labels[leg], self.labels[leg + 1]
@@ -69,16 +69,16 @@ class ArmPath:
 
 
 def rig_of(sensor: SensorSpec, before: str | None = None) -> RigSpec:
-    """The sensor's rig, as it is before an object of this name (``RigSpec.before``).
+    """The sensor's rig in front of the object with the name ``before`` (see ``RigSpec.before``).
 
-    A sensor without a rig gets the plainest: the tool point is the tip, and nothing gives way.
+    A sensor without a rig gets a default one: its tool point is the tip of the skin, and it has no compliance.
     """
     rig = sensor.rig or RigSpec(tcp_to_dome_mm=-sensor.skin.apex_mm)
     return rig if before is None else rig.before(before)
 
 
 def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, apex_mm: float) -> np.ndarray:
-    """``T_sensor_object`` (4, 4) with the arm at a pose (6,), mm and deg; ``apex_mm`` is that of the skin."""
+    """``T_sensor_object`` (4, 4) for a pose (6,) of the arm in mm and deg; ``apex_mm`` is the z of the skin's apex."""
     unturned = _UNTURNED[experiment.approach]
     turn = tool_turn(rig, pose)
     centre = pose[:3] + turn @ unturned @ [rig.tcp_lateral_mm, rig.tcp_aside_mm, rig.tcp_to_dome_mm]
@@ -95,7 +95,7 @@ def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, apex
 
 
 def tool_turn(rig: RigSpec, pose: np.ndarray) -> np.ndarray:
-    """Rotation (3, 3) of the tool in the work frame with the arm at a pose (6,), mm and deg."""
+    """Rotation (3, 3) of the tool in the work frame for a pose (6,) of the arm in mm and deg."""
     turn: np.ndarray = Rotation.from_euler(
         "xyz", rig.turn_sign * (np.asarray(pose[3:], float) + rig.turn_offset_deg), degrees=True
     ).as_matrix()
@@ -103,17 +103,17 @@ def tool_turn(rig: RigSpec, pose: np.ndarray) -> np.ndarray:
 
 
 def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, field: ObjectField, label: ArmLabel) -> ArmPath:
-    """The object's way relative to the sensor: first touch, tapped, and moved if the move was executed.
+    """Path of the object relative to the sensor: the poses at first touch and at the end of the tap, and of the move if it was executed.
 
     Parameters
     ----------
     field : ObjectField
-        Its origin is a material point of the object, so that the way from pose to pose is also the way that friction sees.
+        Its origin is a material point of the object, so the motion from pose to pose is also the motion for friction.
 
     Raises
     ------
     ContactError
-        The sensor is inside the object long before the tap.
+        If the sensor is inside the object already ``CLEAR_MM`` before the tap.
     """
     shape = shape_of(skin)
 
@@ -136,15 +136,15 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, field: Ob
 
 
 def _first_touch(field: ObjectField, start: np.ndarray, stop: np.ndarray, skin_mm: np.ndarray) -> tuple[float, bool]:
-    """Share of the straight way from one pose to another at which the object touches the skin, and whether it touches at all.
+    """Fraction of the straight path between two poses at which the object first touches the skin, and whether it touches at all.
 
-    The object advances by its smallest distance to the skin, again and again. Where distances are exact, that never passes the first
-    touch (sphere tracing, Hart 1996).
+    The object advances again and again by its smallest distance to the skin. If distances are exact, it never passes the first touch
+    (sphere tracing, Hart 1996).
     """
     turn, way = start[:3, :3], stop[:3, 3] - start[:3, 3]
     length_mm = float(np.linalg.norm(way))
     share = 0.0
-    free: float | None = None  # the largest share known to be free of contact
+    free: float | None = None  # the largest fraction without contact so far
     for _ in range(MOST_MARCHES):
         gap_mm = float(field.distance((skin_mm - start[:3, 3] - share * way) @ turn).min())
         if abs(gap_mm) <= TOUCH_TOLERANCE_MM:
@@ -152,7 +152,7 @@ def _first_touch(field: ObjectField, start: np.ndarray, stop: np.ndarray, skin_m
         if gap_mm < 0:
             if free is None:
                 raise ContactError(f"the object is in the sensor's way {CLEAR_MM:g} mm before the tap; begin it elsewhere")
-            share = (share + free) / 2  # far from wires or a mesh a distance can be too large: go half way back
+            share = (share + free) / 2  # the distance was too large, which happens near wires and far from a mesh: go back half of the step
             continue
         free = share
         share += gap_mm / length_mm

@@ -1,7 +1,7 @@
-"""Labels of the arm: the commanded pose of each row of a table, and whether the move was executed before the frame was taken.
+"""Labels of the arm: the commanded pose in each row of a table, and whether the move was executed before the frame was taken.
 
-In the published Tac-VGNN recordings (Apache-2.0) the shear move had not been executed in about a third of the frames when the
-frame was taken. An audit writes which ones into a file beside the table; without that file every move counts as executed.
+In the published Tac-VGNN recordings (Apache-2.0), about a third of the frames were taken before the shear move was executed. An audit
+writes into a file beside the table which frames these are. Without this file every move counts as executed.
 """
 
 import os
@@ -17,22 +17,22 @@ from twin.errors import FrameError
 from twin.frames import Recording
 from twin.frames.tables import bare_name, counted, numbers, pair_rows, read_table
 
-EXECUTED_FILES = ("labels_corrected.csv", "move_executed.csv")  # in the order in which they are looked for
+EXECUTED_FILES = ("labels_corrected.csv", "move_executed.csv")  # in the order of precedence
 EXECUTED_COLUMNS = ("executed", "executed_estimate")
-HELD = 0.5  # mm or deg within which a label that an experiment does not vary may scatter, as where an arm reports its pose
+HELD = 0.5  # mm or deg; permitted range of a label that the experiment does not vary, because poses that an arm reports scatter
 NOT_USED = "it is not used, and every move counts as executed"
 
 
 @dataclass(frozen=True)
 class ArmLabel:
-    """One contact as a recording's table gives it.
+    """Label of one contact in a recording's table.
 
     Attributes
     ----------
     pose, move : (6,) float
-        x, y, z in mm and Rx, Ry, Rz in deg; the pose is the one after the move.
+        x, y, z in mm and Rx, Ry, Rz in deg. The pose is the pose after the move.
     executed : bool
-        Whether the move had been made when the frame was taken.
+        Whether the move was executed before the frame was taken.
     """
 
     pose: np.ndarray
@@ -41,20 +41,21 @@ class ArmLabel:
 
 
 def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = None) -> list[ArmLabel]:
-    """Label of each of the recording's frames, in its order.
+    """Label of each frame of a recording, in the recording's order.
 
-    A column that is missing counts as zero, because recordings leave out what they never move. A move counts as executed
-    unless a file says otherwise.
+    A missing column counts as zero, because recordings omit the axes that they never move. A move counts as executed unless the audit's
+    file contradicts.
 
     Parameters
     ----------
     experiment : ExperimentSpec, optional
-        How the recording was made: no column of a pose that it varies may be missing.
+        Experiment of the recording. The columns of all poses that it varies must be present.
 
     Raises
     ------
     FrameError
-        There is no table, it has no pose or not those that the experiment varies, or a cell of a pose or move holds no number.
+        If there is no table, if it has no column of a pose or lacks one that the experiment varies, or if a cell of a pose or move is not a
+        number.
     """
     columns = {
         kind: [(axis, recording.labels[f"{kind}_{axis}"]) for axis in range(1, 7) if f"{kind}_{axis}" in recording.labels]
@@ -88,39 +89,42 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
 
 
 def _varied_beyond(experiment: ExperimentSpec, values: dict[str, np.ndarray]) -> list[str]:
-    """Labels that vary in a table, by kind (M, 6), though the experiment holds them."""
+    """Names of the labels that vary in a table (``values``: (M, 6) for each kind), although the experiment keeps them constant."""
     ranges = experiment.ranges()
     named = {f"{kind}_{axis + 1}": each[:, axis] for kind, each in values.items() for axis in range(6)}
     return [name for name, each in named.items() if ranges[name][0] == ranges[name][1] and np.ptp(each) > HELD]
 
 
 def plate_slope(rig: RigSpec | None) -> float:
-    """Depth gained for each mm across on the twin's plate, mm/mm; 0 without a rig. It holds for labels of simulated contacts."""
+    """Increase of depth per mm of motion across on the twin's plate, mm/mm; 0 without a rig. It applies to labels of simulated contacts."""
     return float(np.tan(np.radians(rig.plate_tilt_deg))) if rig else 0.0
 
 
 def label_slope(rig: RigSpec | None) -> float:
-    """The same for labels of recordings: what was measured (``RigSpec.label_depth_per_move``), or else the plate's slope."""
+    """Increase of depth per mm of motion across for labels of recordings, mm/mm.
+
+    It is the measured value (``RigSpec.label_depth_per_move``), or the slope of the twin's plate if there is none.
+    """
     return plate_slope(rig) if rig is None or rig.label_depth_per_move is None else rig.label_depth_per_move
 
 
 def read_executed(folder: Path, names: Sequence[str], problems: list[str]) -> dict[str, float]:
-    """Whether each frame's move was executed, from the audit's file beside the table.
+    """Whether the move of each frame was executed, from the audit's file beside the table.
 
-    The file is read like the table: any separator and encoding that tables may have, names in any case, with or without a path.
+    The file has the same format as the table: any of its separators and encodings, and frames' names in any case, with or without a path.
 
     Parameters
     ----------
     folder : Path
     names : sequence of str
-        Frames' names.
+        Names of the frames.
     problems : list of str
-        Every row that is not used, and every frame without a row, is added here.
+        The function adds messages about rows that it does not use and about frames without a row.
 
     Returns
     -------
     dict of str to float
-        By frame's name: 1 executed, 0 not executed, or an estimate between. Empty without such a file.
+        By frame's name: 1 for executed, 0 for not executed, or an estimate between them. Empty without such a file.
     """
     for name in EXECUTED_FILES:
         path = folder / name
@@ -141,7 +145,7 @@ def read_executed(folder: Path, names: Sequence[str], problems: list[str]) -> di
 
 
 def _paired(file: str, listed: list[str], shares: list[float], names: Sequence[str], problems: list[str]) -> dict[str, float]:
-    """Shares by frame's name; what does not fit is added to ``problems``."""
+    """``shares`` by frame's name. Messages about rows that do not fit are added to ``problems``."""
     pairing = pair_rows(listed, [Path(name) for name in names])
     found = {picture.name: shares[row] for row, picture in pairing.files.items()}
     same = {bare_name(name): name for name in found}
@@ -164,7 +168,7 @@ def _paired(file: str, listed: list[str], shares: list[float], names: Sequence[s
 
 
 def _share(cell: str) -> float:
-    """A cell as a number from 0 (not executed) to 1 (executed); NaN where it says nothing of the kind."""
+    """Value of a cell from 0 (not executed) to 1 (executed); NaN if the cell is not such a value."""
     text = cell.strip().casefold()
     if text in ("true", "yes"):
         return 1.0

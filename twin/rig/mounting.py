@@ -1,4 +1,4 @@
-"""How a sensor sits on an arm's tool, and which labels mean zero depth and zero angle; from a rig and an experiment."""
+"""Mounting of a sensor on an arm's tool, and the labels of zero depth and zero angle; from a rig and an experiment."""
 
 from dataclasses import dataclass
 from typing import TypeVar
@@ -12,7 +12,7 @@ from scenes.sensor import SensorSpec
 from twin.rig.kinematics import TURNING, rig_of
 
 Number = TypeVar("Number", float, np.ndarray)
-_DIRECTIONS = {"x": ((1, 0, 0), (0, 1, 0)), "y": ((0, 1, 0), (1, 0, 0)), "z": ((0, 0, 1), (1, 0, 0))}  # the approach, and across it
+_DIRECTIONS = {"x": ((1, 0, 0), (0, 1, 0)), "y": ((0, 1, 0), (1, 0, 0)), "z": ((0, 0, 1), (1, 0, 0))}  # approach, across
 _SENSOR_AXIS = np.array([0.0, 0.0, 1.0])  # in the sensor frame
 
 
@@ -25,21 +25,21 @@ class Mounting:
     axis : (3,) float
         The sensor's z (out of the skin's apex) in the tool frame.
     across : (3,) float
-        Direction of the tool frame, at right angles to the axis, along which the tool is fed.
+        Direction in the tool frame along which the tool is fed; it is perpendicular to the axis.
     image_turn_deg : float
         Azimuth of ``across`` in the sensor frame, from image x towards image y.
     centre_mm : (3,) float
-        The sensor's origin in the tool frame: a dome's centre, the middle of a pad's outside.
+        The sensor's origin in the tool frame: the centre of a dome, or the centre of a pad's outside.
     skin_apex_mm : float
-        z of the skin's apex in the sensor frame: a dome's radius, a pad's 0.
+        z of the skin's apex in the sensor frame: the radius of a dome, or 0 for a pad.
     skin_reach_mm : float
-        Farthest that the skin reaches from the origin.
+        Largest distance of the skin from the origin.
     depth_label, angle_label : str
-        The labels that tell how deep the tool is, and how far it is turned from the surface's normal.
+        Names of the labels for the depth of the tool, and for its angle from the surface's normal.
     zero_mm, zero_deg : float
-        Indentation at which the depth's label is 0, and the angle's label at which the sensor stands normal to the surface.
+        Indentation at which the label of the depth is 0, and label of the angle at which the sensor is normal to the surface.
     angle_sign : int
-        -1 where the label grows as the tool turns from the axis towards ``across``.
+        -1 if the label increases when the tool rotates from the axis towards ``across``.
     """
 
     axis: np.ndarray
@@ -56,23 +56,23 @@ class Mounting:
 
     @property
     def out_of_plane(self) -> np.ndarray:
-        """(3,) axis of the tool frame about which a positive angle turns it: ``across`` towards ``axis``."""
+        """Axis (3,) in the tool frame of a rotation by a positive angle: from ``across`` towards ``axis``."""
         return np.cross(self.across, self.axis)
 
     @property
     def apex_mm(self) -> np.ndarray:
-        """(3,) the skin's apex in the tool frame."""
+        """The skin's apex (3,) in the tool frame."""
         apex: np.ndarray = self.centre_mm + self.skin_apex_mm * self.axis
         return apex
 
     @property
     def across_in_sensor(self) -> np.ndarray:
-        """(3,) ``across`` in the sensor frame."""
+        """``across`` (3,) in the sensor frame."""
         return np.array([np.cos(np.radians(self.image_turn_deg)), np.sin(np.radians(self.image_turn_deg)), 0.0])
 
     @property
     def tool_point_mm(self) -> np.ndarray:
-        """(3,) the tool point in the sensor frame."""
+        """The tool point (3,) in the sensor frame."""
         frame = np.stack([self.axis, self.across, np.cross(self.axis, self.across)])
         here = np.stack([_SENSOR_AXIS, self.across_in_sensor, np.cross(_SENSOR_AXIS, self.across_in_sensor)])
         point: np.ndarray = -(frame @ self.centre_mm) @ here
@@ -80,14 +80,14 @@ class Mounting:
 
     @property
     def work_axes(self) -> np.ndarray:
-        """(3, 3) axes of the frame in which tasks and policies move a tool, as columns in the tool frame: x ``across``, z ``axis``."""
+        """Axes (3, 3) of the frame in which tasks and policies move a tool, as columns in the tool frame: x ``across``, z ``axis``."""
         return np.column_stack([self.across, np.cross(self.axis, self.across), self.axis])
 
     @property
     def T_tool_sensor(self) -> np.ndarray:
-        """(4, 4) pose of the sensor's frame in the tool's, mm."""
+        """Pose (4, 4) of the sensor frame in the tool frame, mm."""
         turn = np.radians(self.image_turn_deg)
-        side = np.cross(self.axis, self.across)  # where the sensor's azimuth goes on to, a quarter turn after ``across``
+        side = np.cross(self.axis, self.across)  # direction whose azimuth in the sensor frame is 90 deg larger than that of ``across``
         T = np.eye(4)
         T[:3, 0] = np.cos(turn) * self.across - np.sin(turn) * side
         T[:3, 1] = np.sin(turn) * self.across + np.cos(turn) * side
@@ -97,7 +97,7 @@ class Mounting:
 
     @property
     def label_turn(self) -> np.ndarray:
-        """(3,) axis in the sensor frame about which the tool turns, right-handed, while the angle's label grows."""
+        """Axis (3,) in the sensor frame about which the tool rotates, right-handed, when the label of the angle increases."""
         axis: np.ndarray = self.angle_sign * np.cross(self.across_in_sensor, _SENSOR_AXIS)
         return axis
 
@@ -108,7 +108,7 @@ class Mounting:
 
     @classmethod
     def on(cls, rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec) -> "Mounting":
-        """The mounting of a skin that a rig describes, with the experiment's approach and zero."""
+        """The mounting of a skin on a rig, with the experiment's approach and zero."""
         axis, across = (np.array(direction, float) for direction in _DIRECTIONS[experiment.approach])
         turn = np.cross(across, axis)
         about = TURNING[experiment.approach] - 3
@@ -128,13 +128,13 @@ class Mounting:
         )
 
     def depth_mm(self, label: Number) -> Number:
-        """Depth beyond first touch that a label stands for."""
+        """Depth from the first touch on for a label of the depth."""
         return label + self.zero_mm
 
     def angle_deg(self, label: Number) -> Number:
-        """Angle from the surface's normal that a label stands for."""
+        """Angle from the surface's normal for a label of the angle."""
         return self.angle_sign * (label - self.zero_deg)
 
     def labels(self, depth_mm: Number, angle_deg: Number) -> tuple[Number, Number]:
-        """The depth's and the angle's label that a depth and an angle would have."""
+        """Labels of the depth and of the angle for a given depth and angle."""
         return depth_mm - self.zero_mm, self.zero_deg + self.angle_sign * angle_deg

@@ -1,8 +1,9 @@
-"""Depth and angle of a rigid sensor against a surface. They are defined alike for objects of any shape.
+"""Depth and angle of a rigid sensor at a surface, with one definition for objects of any shape.
 
-The surface is replaced by a flat plate: through its place nearest to the sensor's origin (a dome's centre, the middle of a pad's
-outside), with its normal there. With g the distance of the origin from the surface, w the angle of the tool's axis from the normal,
-``apex`` the apex' z (a dome's radius, a pad's 0), and ``tcp``, ``lateral`` the origin from the tool point along the axis and across it,
+The surface is replaced by a flat plate. The plate is tangential to the surface at the point nearest to the sensor's origin (the centre of a
+dome, or the centre of a pad's outside). With the distance g of the origin from the surface, the angle w of the tool's axis from the normal,
+the z ``apex`` of the skin's apex (the radius of a dome, or 0 for a pad), and the position of the origin relative to the tool point, ``tcp``
+along the axis and ``lateral`` across it,
 
     indentation = apex - g,   depth of the tool = apex + tcp - (g + tcp cos w + lateral sin w)
 """
@@ -22,23 +23,24 @@ from twin.rig.mounting import Mounting
 OUTLINE_STEP_MM = 0.5
 """Distance between two points of an outline."""
 LONGEST_OUTLINE_MM = 2000.0
-"""An outline that is not closed after this length ends there: the object has no end."""
+"""Largest length of an outline. An outline that is not closed after this length belongs to an infinite object, and ends there."""
 
 
 @dataclass(frozen=True)
 class Touch:
-    """What a sensor truly touches in M poses of the object, rigid bodies assumed.
+    """True depth and angle of a rigid sensor in M poses of a rigid object.
 
     Attributes
     ----------
     depth_mm : (M,) float
-        Of the tool, along the surface's normal, from where an unturned sensor first touches (what the depth's label less its zero means).
+        Depth of the tool along the surface's normal. It is 0 where a sensor normal to the surface first touches. The label of the depth is
+        this depth minus ``Mounting.zero_mm``.
     angle_deg : (M,) float
-        Of the tool from the surface's normal, in the plane of the mounting's ``axis`` and ``across``.
+        Angle of the tool from the surface's normal, in the plane of the mounting's ``axis`` and ``across``.
     indent_mm : (M,) float
-        Of a dome, or of the middle of a pad.
+        Indentation of a dome, or of the centre of a pad.
     place_mm : (M, 3) float
-        Place of the surface nearest to the sensor's origin, in the object frame.
+        Point of the surface nearest to the sensor's origin, in the object frame.
     """
 
     depth_mm: np.ndarray
@@ -48,7 +50,7 @@ class Touch:
 
 
 class Surface:
-    """An object's surface without its texture, as far out as that lies.
+    """Smooth surface of an object: the object without its texture, moved outwards by the height of the texture.
 
     Parameters
     ----------
@@ -59,7 +61,7 @@ class Surface:
     field : ObjectField
         The object without its texture.
     raised_mm : float
-        How far out the texture lies.
+        Height of the texture.
     """
 
     def __init__(self, spec: ObjectSpec) -> None:
@@ -68,7 +70,7 @@ class Surface:
 
     @cached_property
     def outline(self) -> np.ndarray:
-        """The object's section through its origin: (M, 2), x and z of the object frame in mm, from the origin on along x; read-only."""
+        """Outline of the object in the plane y = 0: x and z (M, 2) in the object frame, mm. It starts at the origin along x. Read-only."""
         at, points = np.zeros(3), [np.zeros(2)]
         while len(points) * OUTLINE_STEP_MM < LONGEST_OUTLINE_MM:
             _, gradient, _ = self.field.probe(at[None])
@@ -87,7 +89,7 @@ class Surface:
         return outline
 
     def touched(self, mounting: Mounting, T_sensor_object: np.ndarray) -> Touch:
-        """What a mounted sensor touches with the object in poses (M, 4, 4)."""
+        """Depth and angle of a mounted sensor for poses (M, 4, 4) of the object."""
         turn, shift = T_sensor_object[:, :3, :3], T_sensor_object[:, :3, 3]
         centre_mm = -np.einsum("mji,mj->mi", turn, shift)
         distance_mm, outward, _ = self.field.probe(centre_mm)
@@ -105,12 +107,12 @@ class Surface:
 
 
 def surface_labels(experiment: ExperimentSpec, mounting: Mounting, surface: Surface, T_sensor_object: np.ndarray) -> dict[str, np.ndarray]:
-    """The labels that tell depth and angle, as an arm would have them that touches a flat plate alike.
+    """Labels of depth and angle that an arm would have for the same contact with a flat plate.
 
     Returns
     -------
     dict of str to (M,) float
-        By the table's columns; mm and deg. Empty if the experiment also turns the tool about other axes, as one angle then does not
+        By column of the table; mm and deg. Empty if the experiment also rotates the tool about other axes, because one angle then does not
         describe the contact.
     """
     ranges = experiment.ranges()
@@ -125,9 +127,9 @@ def surface_labels(experiment: ExperimentSpec, mounting: Mounting, surface: Surf
 def tilted_labels(
     rig: RigSpec, experiment: ExperimentSpec, surface: Surface, apex_mm: float, T_sensor_object: np.ndarray
 ) -> dict[str, float]:
-    """Depth and both tilts, as an arm would have them that touches a flat plate alike: the inverse of ``object_pose`` for one pose (4, 4).
+    """Labels of depth and both tilts that an arm would have for the same contact with a flat plate.
 
-    The arm's other three labels count as zero.
+    The function inverts ``object_pose`` for one pose (4, 4). The arm's other three labels count as zero.
 
     Returns
     -------
@@ -141,7 +143,7 @@ def tilted_labels(
     in_image = Rotation.from_euler("z", -rig.image_turn_deg, degrees=True)
     seen = in_image.apply(
         -turn_of_object @ outward[0]
-    )  # the plate's normal, into the object, seen from the sensor without its image's turn
+    )  # the plate's normal, into the object, in the sensor frame without the rotation of the image
     plate = Rotation.from_euler("y", -rig.plate_tilt_deg, degrees=True).apply([0.0, 0.0, 1.0])
     about_z = Rotation.from_euler("z", rig.turn_sign * rig.turn_offset_deg[2], degrees=True)
     unspun = about_z.inv().apply(plate)

@@ -1,1 +1,1 @@
-"""The TacTip twin: press a skin, render what the camera inside sees, find the pins, build the graph."""
+"""Digital twin of the TacTip: simulate contacts of the skin, render the frames of its camera, find the pins, and build their graph."""

@@ -1,4 +1,4 @@
-"""Numba's compiler, as the whole program uses it: what is compiled is kept on disk where that is possible, and works where it is not."""
+"""Compilation with Numba. The machine code is stored on disk for later processes, if the disk can be written."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,15 +9,15 @@ from twin.errors import warn_once
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator that compiles a function at its first call, and keeps the machine code on disk for later processes.
+    """Decorator that compiles a function at its first call, and stores the machine code on disk for later processes.
 
-    Numba keeps it beside the source, or else in the user's home. Where neither can be written, or the disk is full, one warning in a
-    process says so.
+    Numba stores it beside the source, or else in the user's home. If neither folder can be written, or if the disk is full, the process
+    gives one warning.
 
     Parameters
     ----------
     options
-        Those of ``numba.njit``, without ``cache``.
+        Options of ``numba.njit``, except ``cache``.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -28,7 +28,7 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
                 raise
             _warn("no folder for them can be written")
             return numba.njit(**options)(function)
-        kept = dispatcher._cache  # numba has no public way to go on where it can't save
+        kept = dispatcher._cache  # numba has no public way to continue if it can't save
         save = kept.save_overload
 
         def save_if_possible(signature: object, data: object) -> None:

@@ -1,4 +1,4 @@
-"""Errors and warnings that a user can act on; the command line prints each as one line."""
+"""Errors and warnings for the user. The command line prints each of them as one line."""
 
 import warnings
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ class TwinError(Exception):
 
 
 class OptionError(TwinError):
-    """An option's value, or options together, can't be meant, whatever the files hold. The message names the option."""
+    """The value of an option, or a combination of options, is not valid for any files. The message names the option."""
 
 
 class FrameError(TwinError):
@@ -27,30 +27,30 @@ class MeshError(TwinError):
 
 
 class RenderError(TwinError):
-    """This machine can't render what is asked for."""
+    """This machine can't render the requested picture."""
 
 
 class StoreError(TwinError):
-    """A result can't be written, a folder holds results that were made otherwise, or another run works in it.
+    """A result can't be written, a folder contains results of other code or inputs, or another run is using the folder.
 
     Attributes
     ----------
     unsaved : dict of str to str
-        Texts by the names of their files, where a result that took long could not be written; the command line prints them.
+        Text of each file that could not be written, by file name, if the result took long to compute. The command line prints these texts.
     """
 
     unsaved: Mapping[str, str] = MappingProxyType({})
 
 
 class DatasetError(TwinError):
-    """A data set can't be made or continued."""
+    """A data set can't be generated or continued."""
 
 
 class WorkersError(TwinError):
-    """Processes that share work are lost."""
+    """Processes that share the work ended unexpectedly."""
 
 
 @cache
 def warn_once(message: str) -> None:
-    """Give a ``RuntimeWarning``, each message once in a process."""
+    """Give a ``RuntimeWarning``. Each message is given only once per process."""
     warnings.warn(message, RuntimeWarning, stacklevel=3)

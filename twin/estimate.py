@@ -37,7 +37,7 @@ class Estimate(Protocol):
 
     @property
     def seen(self) -> Observation | None:
-        """The pins that it was made from, as the model's pipeline found them; None if they are not known."""
+        """The pins behind the estimate, as the model's pipeline found them; None if they are not known."""
 
 
 Estimator = Callable[[Frame], Estimate]
@@ -52,20 +52,20 @@ class SensorModel(Protocol):
 
     @property
     def counts_from_rest(self) -> bool:
-        """Whether the model can count pins from a frame without contact."""
+        """Whether the model can measure the pins' displacements from a frame without contact."""
 
     def __call__(self, frame: Frame) -> Estimate: ...
 
     def at_rest(self, frame: Frame) -> "SensorModel":
-        """The same model, counting pins from a frame without contact."""
+        """The same model; it measures the pins' displacements from a frame without contact."""
 
     def seeking_rest(self) -> "SensorModel":
-        """The model for a stream of frames where none is known to show no contact; it may find the pins' rest places by the contacts."""
+        """The model for a stream in which no frame without contact is known. It may estimate the pins' rest positions from the contacts."""
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """Raise an error if the model was not trained on frames of this sensor and form."""
 
 
 def seen_in(frame: Frame, estimate: Estimate | None, pipeline: Pipeline) -> Observation:
-    """The pins that a frame's estimate was made from; a pipeline looks for them only where they are not known."""
+    """The pins behind the estimate of a frame. The pipeline searches for them only if the estimate does not contain them."""
     return pipeline(frame) if estimate is None or estimate.seen is None else estimate.seen

@@ -1,4 +1,4 @@
-"""One contact: it is simulated, rendered, and written to a folder with its exact ground truth."""
+"""Simulation and rendering of one contact, and a folder with its files and its exact ground truth."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,13 +25,13 @@ FILES = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.
 
 
 class Pose(Protocol):
-    """Numbers that tell how an object was pressed (a dataclass), the indentation among them."""
+    """A dataclass of numbers that describe how an object is pressed, with the indentation among them."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def indent_mm(self) -> float:
-        """Beyond first touch."""
+        """Indentation from the first touch on."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ def render_contact(
     Parameters
     ----------
     out : Path
-        The folder to write to; made if missing.
+        Output folder; it is created if missing.
     form : Form
-        The camera's frame, or the form of the sensor's recordings.
+        Form of the frame: the camera's own, or that of the sensor's recordings.
     quality : {"drawn", "preview", "standard", "high"}
         Samples per pixel.
     seed : int
@@ -80,11 +80,11 @@ def render_contact(
     Raises
     ------
     FrameError
-        The sensor has no recordings' form.
+        If the sensor has no form of recordings.
     ContactError
-        The pose is out of reach or above the sensor, or the solver does not converge.
+        If the pose is out of reach or without contact, or if the solver does not converge.
     RenderError
-        The renderer does not work on this machine.
+        If the renderer does not work on this machine.
     """
     if pose.indent_mm < 0:
         raise ContactError(f"--indent-mm {pose.indent_mm:g}: the object would not touch; give 0 for no contact, or more")
@@ -100,7 +100,7 @@ def render_contact(
 
 
 def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: Pose, state: ContactState, shot: Shot) -> list[Path]:
-    """Write everything about one contact into a folder.
+    """Write all files of one contact into a folder.
 
     Returns
     -------
@@ -124,7 +124,7 @@ def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: Po
 
 
 def contact_arrays(state: ContactState) -> dict[str, FloatArray]:
-    """The arrays of a state that have a row for each place in contact, by their names in ``truth.npz`` (see ``ContactState``)."""
+    """Arrays of a state with one row per contact point, by their names in ``truth.npz`` (see ``ContactState``)."""
     names = ("contact_mm", "point_area_mm2", "normal", "normal_n", "tangential_n", "slipping")
     return {f"contact_{name.removeprefix('contact_')}": getattr(state, name) for name in names}
 
@@ -133,7 +133,7 @@ def look_at(simulator: Simulator, shot: Shot) -> Look:
     """Run the pipeline on a shot, and on the frame without contact of the same sensor."""
     form = shot.frame.form
     pipeline = Pipeline(simulator.spec, form)
-    rest = pipeline(simulator.shoot_rest(form).frame)  # first, because this loads compiled code, and would distort the shot's times
+    rest = pipeline(simulator.shoot_rest(form).frame)  # first: it loads compiled code, which must not count in the times of the shot
     return Look(shot.frame, pipeline(shot.frame), rest)
 
 

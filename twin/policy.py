@@ -1,6 +1,6 @@
-"""A trained policy: what it sees of the pins, and the small network that turns it into a motion of the tool.
+"""A trained policy: a small network that computes a motion of the tool from the pins.
 
-A policy's file holds no code. It is run from frames through the real pipeline, on a real arm or in the twin alike.
+A policy's file contains no code. A policy takes frames through the real pipeline, both on a real arm and in the twin.
 """
 
 from dataclasses import dataclass, replace
@@ -17,30 +17,31 @@ from twin.types import FloatArray, Form, Frame, ImageArray, Observation
 
 
 class PolicyError(TwinError):
-    """A policy's file can't be used, or can't be run so."""
+    """A policy's file can't be used, or its policy can't be run on frames."""
 
 
 FILE = ArrayFile("policy", "twin learn", version=1, error=PolicyError)
 PICTURE_CELL_PX = 4
-"""Side of the squares of a picture of which the means are seen: about half the distance of two pins."""
+"""Side of the squares whose means are the inputs from a picture. It is about half the distance between two pins."""
 
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy of one task with one sensor.
+    """A policy for one task and one sensor.
 
     Attributes
     ----------
     about : dict
-        Task, sensor, observation, axes, the motion that an action of 1 is, the task's own feed, goal, and how it was trained (JSON).
+        Task, sensor, observation, axes, the motion for an action of 1, the task's own feed, the goal, and the training (JSON).
     mean : (D,) float
-        Of the flat observations.
+        Mean of the flattened observations.
     basis : (K, D) float
-        What the networks see of them, each about 1 in size.
+        Projection of the centred observations to the K inputs of the networks, each with a size of about 1.
     layers : tuple of ((o, i), (o,)) float
-        Of a network with tanh between them; its inputs are the K numbers, the goal, and what ``sight`` tells of these.
+        Layers of the network of the actions, with tanh between them. Its inputs are the K numbers, the goal, and the outputs of ``sight``.
     sight : tuple of ((o, i), (o,)) float
-        Of a network that tells what no sensor knows (such as place and force) from the K numbers and the goal; empty: there is none.
+        Layers of a network that estimates quantities without a sensor (such as place and force) from the K numbers and the goal; empty
+        without such a network.
     """
 
     about: dict[str, Any]
@@ -50,7 +51,7 @@ class Policy:
     sight: Layers = ()
 
     def reduced(self, tactile: FloatArray, goal: FloatArray) -> FloatArray:
-        """What the network of the actions sees, (B, K + G + S), of observations (B, ...) and goals (B, G)."""
+        """Inputs (B, K + G + S) of the network of the actions, from observations (B, ...) and goals (B, G)."""
         seen = (flattened(tactile) - self.mean) @ self.basis.T
         x = np.concatenate([seen, goal], axis=1).astype(np.float32)
         return np.concatenate([x, _through(self.sight, x)], axis=1) if self.sight else x
@@ -61,18 +62,18 @@ class Policy:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Axes of the work frame that it moves."""
+        """Axes of the work frame along and about which the policy moves the tool."""
         return tuple(self.about["axes"])
 
     def step(self, action: FloatArray) -> FloatArray:
-        """The tool's motion (6,) in the work frame for an action (A,): mm and deg, the task's feed included."""
+        """The tool's motion (6,) in the work frame for an action (A,), in mm and deg, with the task's feed."""
         step = np.array([*self.about["feed_mm"], 0.0, 0.0, 0.0], float)
         for axis, part, size in zip(self.axes, action, self.about["scale"], strict=True):
             step[("x", "y", "z", "Rx", "Ry", "Rz").index(axis)] += part * size
         return step
 
     def save(self, path: Path) -> int:
-        """Write it to a file; its size in bytes."""
+        """Write the policy to a file; returns its size in bytes."""
         arrays = {"mean": self.mean, "basis": self.basis, **layers_to(self.layers), **layers_to(self.sight, "sight")}
         return FILE.write(path, {key: value.astype(np.float32) for key, value in arrays.items()}, self.about)
 
@@ -83,7 +84,7 @@ def load_policy(path: Path) -> Policy:
     Raises
     ------
     PolicyError
-        There is no such file, or it holds no policy of this version.
+        If there is no such file, or if it contains no policy of this version.
     """
     with FILE.opened(path) as (about, arrays):
         SensorSpec.model_validate(about["sensor"])
@@ -91,7 +92,7 @@ def load_policy(path: Path) -> Policy:
 
 
 def flattened(tactile: FloatArray | ImageArray) -> FloatArray:
-    """Observations (B, ...) as vectors (B, D); pictures (B, H, W, k) uint8 as means of squares of ``PICTURE_CELL_PX``, 0 to 1."""
+    """Observations (B, ...) as vectors (B, D). Pictures (B, H, W, k) uint8 become means over squares of ``PICTURE_CELL_PX``, 0 to 1."""
     if tactile.dtype != np.uint8:
         return np.asarray(tactile, float).reshape(len(tactile), -1)
     count, height, width, stack = tactile.shape
@@ -101,7 +102,7 @@ def flattened(tactile: FloatArray | ImageArray) -> FloatArray:
 
 
 def _through(layers: Layers, x: FloatArray) -> FloatArray:
-    """What a network with tanh between its layers answers to inputs (B, i)."""
+    """Output of a network with tanh between its layers for inputs (B, i)."""
     for number, (weights, offset) in enumerate(layers):
         x = x @ weights.T + offset
         if number < len(layers) - 1:
@@ -111,7 +112,7 @@ def _through(layers: Layers, x: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Action:
-    """A policy's answer to a frame, as a loop takes it: an ``Estimate`` whose labels are the axes and whose values are the action."""
+    """Result of a policy for a frame, for a control loop: an ``Estimate`` whose labels are the axes and whose values are the action."""
 
     names: tuple[str, ...]
     value: FloatArray
@@ -121,12 +122,12 @@ class Action:
 
     @property
     def low(self) -> FloatArray:
-        """A policy states no interval."""
+        """NaN, because a policy has no intervals."""
         return np.full(len(self.names), np.nan)
 
     @property
     def high(self) -> FloatArray:
-        """A policy states no interval."""
+        """NaN, because a policy has no intervals."""
         return self.low
 
 
@@ -136,14 +137,14 @@ class PolicyModel:
     Parameters
     ----------
     policy : Policy
-        That sees pins.
+        A policy whose observations are pins.
     goal : (G,) float, optional
-        The policy's own by default.
+        Default: the policy's own goal.
 
     Raises
     ------
     PolicyError
-        The policy does not see pins.
+        If the policy's observations are not pins.
     """
 
     counts_from_rest = True
@@ -162,11 +163,11 @@ class PolicyModel:
         self.pipeline = Pipeline(self.sensor, self.form)
 
     def at_rest(self, frame: Frame) -> "PolicyModel":
-        """The same policy, counting pins from a frame without contact."""
+        """The same policy; it measures the pins' displacements from a frame without contact."""
         return self._counted_from(measure_reference(self.sensor, self.form, frame))
 
     def seeking_rest(self) -> "PolicyModel":
-        """Itself: a policy does not know how contacts displace pins."""
+        """The policy itself, because it has no model of how contacts displace pins."""
         return self
 
     def _counted_from(self, reference: Reference) -> "PolicyModel":
@@ -175,14 +176,14 @@ class PolicyModel:
         return found
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
-        """Refuse frames of another sensor or form."""
+        """Raise ``FrameError`` for frames of another sensor or form."""
         if sensor.name != self.sensor.name or form != self.form:
             raise FrameError(
                 f"the policy was trained for {self.form} frames of '{self.sensor.name}'; these are {form} frames of '{sensor.name}'"
             )
 
     def __call__(self, frame: Frame) -> Action:
-        """The action for a frame; not valid if too few pins are found."""
+        """The action for a frame. It is not valid if too few pins are found."""
         seen = self.pipeline(frame)
         if seen.graph is None:
             return Action(self.policy.axes, np.full(len(self.policy.axes), np.nan), False, seen.reason, seen)

@@ -1,4 +1,4 @@
-"""How a function that takes long reports its progress: one protocol for all of them.
+"""Progress reports of functions that take long, with one protocol for all of them.
 
 Such a function has a keyword option ``progress``, a ``Progress``. Its work has stages, each with a title, and it calls
 ``progress(stage, done, total, note)`` during each stage. The command line draws bars from these calls. A program may give a function of

@@ -30,7 +30,7 @@ class Shot:
     linear : (H, W) or (H, W, 3) float32
         Radiance before the camera's response, of the whole raw frame.
     truth : CapTruth
-        Places of the caps in px of ``frame``.
+        Positions of the caps in px of ``frame``.
     seconds : float
         Time of rendering, s.
     """
@@ -48,11 +48,11 @@ class Simulator:
     ----------
     spec : SensorSpec
     quality : {"drawn", "preview", "standard", "high"}
-        Of the renderer.
+        Quality of the renderer.
     solver : SkinSolver, optional
-        A solver of the same sensor. By default one with the usual resolution is made.
+        A solver of the same sensor. Default: a new one with the usual resolution.
     shading : Shading, optional
-        Of drawn pictures, as a `Renderer` takes it.
+        Shading of drawn pictures (see `Renderer`).
     """
 
     def __init__(
@@ -73,12 +73,12 @@ class Simulator:
         return self._renderer
 
     def press(self, touched: ObjectSpec, pose: ContactPose, *, progress: Callable[[float], object] | None = None) -> ContactState:
-        """Press an object against the sensor along approach and shear.
+        """Press an object against the sensor and shear it, as ``pose`` states.
 
         Raises
         ------
         ContactError
-            The pose is out of reach, or the solver does not converge.
+            If the pose is out of reach, or if the solver does not converge.
         """
         return self.solver.press(touched, pose, progress=None if progress is None else lambda fraction, _: progress(fraction))
 
@@ -115,7 +115,7 @@ class Simulator:
         return replace(raw, frame=frame, truth=cap_truth(self.spec, self.rest, state, Form.RECORDING))
 
     def describe(self) -> dict[str, dict[str, object]]:
-        """Everything besides sensor and object that a result depends on: variant, samples (0: drawn), mesh and tolerances."""
+        """All other parameters of a result besides sensor and object: variant, samples (0 for a drawn picture), mesh and tolerances."""
         return {
             "renderer": {"variant": self.renderer.choice.variant, "samples_per_pixel": self.renderer.spp},
             "solver": {

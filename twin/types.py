@@ -1,4 +1,4 @@
-"""The types that the stages pass to each other. They are frozen; the docstrings state shapes and units."""
+"""Frozen types of the data between the stages, with their shapes and units."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -15,12 +15,12 @@ ImageArray: TypeAlias = NDArray[np.uint8]
 """Gray or RGB levels of a frame."""
 
 FINE = 20
-"""Number of elements across the skin for calibrations and data sets. In the deepest contacts the displacements of the outer pins differ
-from those with 32 elements by 1 %."""
+"""Number of elements across the skin for calibrations and data sets. In the deepest contacts the displacements of the outer pins differ by
+1 % from those with 32 elements."""
 
 
-# Values of the option --at-rest besides a file with a frame without contact: use the first frame that is read, or use none, so that
-# displacements are counted from the specification's layout.
+# Values of the option --at-rest other than a file with a frame without contact. "first" uses the first frame that is read; "none" measures
+# displacements from the specification's layout.
 FIRST, NONE = "first", "none"
 
 
@@ -55,7 +55,7 @@ class Frame:
 
 
 class PinState(Protocol):
-    """Places of the pins of a sensor in the sensor frame: at rest, in a contact, or as fitted to a frame.
+    """Positions of the pins of a sensor in the sensor frame: at rest, in a contact, or fitted to a frame.
 
     Attributes
     ----------
@@ -69,13 +69,13 @@ class PinState(Protocol):
 
     @property
     def base_mm(self) -> FloatArray:
-        """Where the pins stand on the skin (N, 3)."""
+        """Feet of the pins on the inside of the skin (N, 3)."""
 
     @property
     def axis(self) -> FloatArray: ...
     @property
     def caps_mm(self) -> FloatArray:
-        """Middles of the caps (N, 3)."""
+        """Centres of the caps (N, 3)."""
 
 
 @dataclass(frozen=True)
@@ -91,26 +91,26 @@ class ContactState:
     force_n, torque_nmm : (3,) float
         Total contact force of the *skin on the object* and its torque about the sensor's origin.
     area_mm2 : float
-        Area of the outer skin in contact, at rest: skin that is nearer to the object than 0.05 mm. Zero where nothing presses.
+        Contact area on the outer skin at rest: the area of the skin within 0.05 mm of the object. It is 0 if no point is pressed.
     contact_mm : (c, 3) float
-        Places of the outer skin that the object presses. Each represents an area ``point_area_mm2 (c,)`` of the skin at rest.
+        Positions of the contact points on the outer skin. Each represents an area ``point_area_mm2 (c,)`` of the skin at rest.
     contact_place : (c,) complex
-        The same places on the skin (see ``twin.geometry.shapes``).
+        Places of the same points on the skin (see ``twin.geometry.shapes``).
     normal : (c, 3) float
-        The object's outward unit normal at each place.
+        The object's outward unit normal at each contact point.
     normal_n : (c,) float
-        Magnitude of the normal force at each place. ``pressure_mpa`` is the pressure.
+        Magnitude of the normal force at each contact point. Divided by the area it is ``pressure_mpa``.
     tangential_n : (c, 3) float
-        Friction force of the skin on the object at each place; ``traction_mpa`` by area. The sum of ``tangential_n - normal_n normal``
-        is ``force_n``.
+        Friction force of the skin on the object at each contact point. Divided by the area it is ``traction_mpa``. The sum of
+        ``tangential_n - normal_n normal`` is ``force_n``.
     slipping : (c,) bool
-        Whether the place slides; otherwise it sticks.
+        Whether the point slips; otherwise it sticks.
     T_sensor_object : (4, 4) float
         The object's pose.
     elastic_nmm : float
-        Energy stored in skin and gel, N mm (in a relaxing sensor: the potential of its last load step).
+        Energy stored in skin and gel, N mm. For a viscoelastic sensor: the potential of its last load step.
     dissipated_nmm : float
-        Energy that friction took in the load step that ends here, N mm.
+        Energy dissipated by friction in the last load step, N mm.
     residual : float
         Norm of the force residual relative to the contact force (N/N).
     """
@@ -136,24 +136,24 @@ class ContactState:
 
     @property
     def pressure_mpa(self) -> FloatArray:
-        """Normal pressure (c,) at each place that is pressed, by the skin's area at rest."""
+        """Normal pressure (c,) at each contact point, relative to the skin's area at rest."""
         return self.normal_n / self.point_area_mm2
 
     @property
     def traction_mpa(self) -> FloatArray:
-        """Friction of the skin on the object (c, 3) at each place that is pressed, by the skin's area at rest."""
+        """Friction traction (c, 3) of the skin on the object at each contact point, relative to the skin's area at rest."""
         return self.tangential_n / self.point_area_mm2[:, None]
 
     @property
     def slip_share(self) -> float:
-        """Share of the pressed area that slides, 0 to 1; 0 where nothing presses."""
+        """Fraction of the pressed area that slips, 0 to 1; 0 without contact."""
         return float(self.point_area_mm2[self.slipping].sum() / max(self.point_area_mm2.sum(), 1e-9))
 
     @classmethod
     def untouched(
         cls, nodes_mm: FloatArray, base_mm: FloatArray, axis: FloatArray, caps_mm: FloatArray, *, T_sensor_object: FloatArray | None = None
     ) -> "ContactState":
-        """The undeformed sensor, nothing touching it."""
+        """The state of the undeformed sensor without contact."""
         no_vectors, no_numbers = np.zeros((0, 3)), np.zeros(0)
         return cls(
             nodes_mm=nodes_mm,
@@ -202,22 +202,23 @@ class PinGraph:
 
 @dataclass(frozen=True)
 class Observation:
-    """What the pipeline saw in one frame.
+    """Result of the pipeline for one frame.
 
     Attributes
     ----------
     pins_px : (N, 2) float
-        Found pins in px of the input frame, specification's order, NaN where a pin has no blob of its own.
+        Positions of the found pins in px of the input frame, in the specification's order; NaN for a pin without its own blob.
     predicted_px : (N, 2) float
-        The motion model's guess for the lost pins, NaN for the found ones.
+        Predictions of the motion model for the lost pins; NaN for the found pins.
     found : int
+        Number of pins that were found.
     expected : int
-        Pins that should be in view: all but those that the frame's border cuts off.
+        Number of pins that should be visible: all except those that the frame's border cuts off.
     valid : bool
     reason : str
-        Why it is not valid ("" if it is).
+        Reason if the result is not valid, else "".
     graph : PinGraph or None
-        None if not valid.
+        None if the result is not valid.
     extra_px : (K, 2) float
         Rejected blobs (glints, bubbles).
     ms : dict of str to float

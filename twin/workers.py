@@ -1,4 +1,4 @@
-"""Handing out work: in this process, to processes of this machine, or to a cluster's workers (Dask)."""
+"""Distribution of work: in this process, to processes of this machine, or to the workers of a cluster (Dask)."""
 
 import logging
 import os
@@ -22,12 +22,12 @@ from twin.store import fingerprint
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-# Tasks that each worker of a cluster has at a time. With two, a worker that ends one does not wait for the next, and an interruption
-# loses little.
+# Number of tasks that each worker of a cluster has at a time. With two, a worker does not wait after a finished task, and an interruption
+# loses little work.
 AHEAD = 2
-# How often a task is begun. If each time its process is lost, it is given up.
+# Largest number of attempts at a task. If its process is lost in all of them, the task is given up.
 TRIES = 4
-# Longest wait for a result of a cluster, in s, before its workers are counted again.
+# Longest wait for a result of a cluster, in s. After it, the workers are counted again.
 LOOK_S = 1.0
 # Longest wait for the first worker of a scheduler, in s.
 JOIN_S = 60.0
@@ -36,32 +36,33 @@ AGAIN = "what is done is kept, and the same command goes on from there"
 Task = TypeVar("Task")
 Made = TypeVar("Made")
 Begin = Callable[..., Callable[[Task], Made]]
-"""Makes the function that is called for every task. It is a function of a module, so that another process can import it."""
+"""Function that returns the function for all tasks. It is defined in a module, so that another process can import it."""
 
 
 def in_processes(begin: Begin[Task, Made], given: tuple[object, ...], tasks: Sequence[Task], *, processes: int) -> Iterator[Made]:
     """Yield ``begin(*given)(task)`` for each task, in the order in which the calls end.
 
-    The processes end with this one, however it ends. Ctrl-C is left to this process, which ends them at once. A process that is lost
-    is replaced, and its task is begun again after the others. A warning of several processes is given once, by this one.
+    The processes end when this process ends, whatever the cause. Only this process reacts to Ctrl-C, and ends the others at once. A lost
+    process is replaced, and its task is started again after the other tasks. If several processes give the same warning, this process gives
+    it once.
 
     Parameters
     ----------
     begin : callable
-        Makes the function that is called for every task. Each process calls it once.
+        Returns the function for all tasks. Each process calls it once.
     given : tuple
-        Arguments of ``begin``, which can be pickled.
+        Arguments of ``begin``; they must be picklable.
     tasks : sequence
-        Arguments of the function, one for each call, which can be pickled.
+        Arguments of the function, one for each call; they must be picklable.
     processes : int
-        Fresh (spawned) processes of this machine. With 1 everything happens in this process.
+        Number of new (spawned) processes on this machine. With 1, all work is done in this process.
 
     Raises
     ------
     ValueError
-        ``processes`` is less than 1.
+        If ``processes`` is less than 1.
     WorkersError
-        A task lost its process again and again. All other tasks are done.
+        If a task lost its process ``TRIES`` times. All other tasks are done by then.
     """
     if processes < 1:
         raise ValueError(f"processes must be at least 1, got {processes}")
@@ -106,13 +107,13 @@ def in_processes(begin: Begin[Task, Made], given: tuple[object, ...], tasks: Seq
 
 
 class _Process:
-    """A fresh process that does one task at a time.
+    """A new process that does one task at a time.
 
     Parameters
     ----------
     pickled : bytes
-        ``begin`` and ``given`` of ``in_processes``. They are pickled here, as unpickling imports much: so the process can watch
-        its parent before.
+        ``begin`` and ``given`` of ``in_processes``. They are passed as bytes, because unpickling imports many modules: the process can
+        start to watch its parent before that.
     """
 
     def __init__(self, pickled: bytes) -> None:
@@ -130,13 +131,13 @@ class _Process:
         theirs.close()
 
     def give(self, number: int, task: object) -> None:
-        """Hand it the task of this number. If it is lost already, its pipe will tell."""
+        """Send the task with this number. If the process is already lost, reading from its pipe shows it later."""
         self.number = number
         with suppress(OSError):
             self.pipe.send(task)
 
     def end(self) -> None:
-        """End it at once, whatever it does."""
+        """Kill the process."""
         self._process.kill()
         self._process.join()
         self.pipe.close()
@@ -144,10 +145,10 @@ class _Process:
 
 @contextmanager
 def _deaf_to_ctrl_c() -> Iterator[None]:
-    """Context that SIGINT does not interrupt: it is heard at the end. Processes that are started in it never hear it."""
+    """Context in which SIGINT is delayed until its end. Processes that are started in it do not receive SIGINT."""
     heard: list[tuple[int, FrameType | None]] = []
     before = None
-    if threading.current_thread() is threading.main_thread():  # another thread may take the signal, and this one then raises it
+    if threading.current_thread() is threading.main_thread():  # in another thread, the main thread would raise the signal
         before = signal.signal(signal.SIGINT, lambda number, frame: heard.append((number, frame)))
     masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if hasattr(signal, "pthread_sigmask") else None  # not on Windows
     try:
@@ -162,14 +163,14 @@ def _deaf_to_ctrl_c() -> Iterator[None]:
 
 
 def _serve(pipe: Connection, pickled: bytes) -> None:
-    """Do tasks in a process of its own: for each, send what was made, or the error and where it arose, and the warnings."""
+    """Main loop of a separate process: for each task, send the result, or the error and its traceback, and the warnings."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     work: Callable[[Any], Any] | None = None
     while True:
         try:
             task = pipe.recv()
-        except (EOFError, OSError):  # the process that started this one has ended
+        except (EOFError, OSError):  # the parent process has ended
             return
         with warnings.catch_warnings(record=True) as caught:
             try:
@@ -186,7 +187,7 @@ def _serve(pipe: Connection, pickled: bytes) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process as soon as the one that started it has ended."""
+    """End this process as soon as its parent has ended."""
     parent = parent_process()
     assert parent is not None, "this process was not started by another"
     wait([parent.sentinel])
@@ -194,7 +195,7 @@ def _end_with_parent() -> None:
 
 
 def _that_can_be_sent(error: Exception) -> Exception:
-    """The error, or one that says the same where it can't be pickled."""
+    """The error, or another one with the same text if it can't be pickled."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
@@ -210,20 +211,20 @@ def outcomes(make: Callable[[str, int], Made], text: str, todo: list[int], *, wo
     make : callable
         A function of a module, so that another process can import it.
     text : str
-        What every call is given: the whole configuration as text.
+        First argument of every call: the whole configuration as text.
     todo : list of int
-        What tells the calls apart.
+        Second arguments of the calls.
     workers : int
-        Processes of this machine (see ``in_processes``).
+        Number of processes of this machine (see ``in_processes``).
     scheduler : str
         Address of a Dask scheduler whose workers do the work; "" for processes of this machine.
 
     Raises
     ------
     WorkersError
-        Processes of this machine were lost again and again.
+        If a task lost its process on this machine ``TRIES`` times.
     DatasetError
-        The workers of the scheduler, or the scheduler itself, are lost, or they run another version of this program.
+        If the scheduler or its workers are lost, or if the workers run another version of this program.
     """
     if not todo:
         return
@@ -235,7 +236,7 @@ def outcomes(make: Callable[[str, int], Made], text: str, todo: list[int], *, wo
 
 
 def require_scheduler(address: str) -> None:
-    """Raise ``DatasetError`` where no Dask scheduler answers, before anything is written for its workers."""
+    """Raise ``DatasetError`` if no Dask scheduler answers. To be called before any file is written for its workers."""
     with _client(address):
         pass
 
@@ -272,7 +273,7 @@ def _silenced() -> Iterator[None]:
 
 
 def _by_cluster(client: "Client", make: Callable[[str, int], Made], text: str, todo: list[int], scheduler: str) -> Iterator[Made]:
-    """The outcomes of a cluster: no worker is given more than ``AHEAD`` tasks, so that new workers find some, too."""
+    """The outcomes of a cluster. Only ``AHEAD`` tasks per worker are submitted at a time, so that tasks remain for new workers."""
     from distributed import CancelledError
     from distributed import wait as wait_for
 
@@ -302,7 +303,7 @@ def _by_cluster(client: "Client", make: Callable[[str, int], Made], text: str, t
 
 
 def _result(future: "Future[Made]", index: int, where: str) -> Made:
-    """What a call returned; the errors of ``outcomes`` where it did not return."""
+    """Result of a call; raises the errors of ``outcomes`` if the call failed."""
     from distributed.scheduler import KilledWorker
 
     if future.status == "finished":
@@ -318,7 +319,7 @@ def _result(future: "Future[Made]", index: int, where: str) -> Made:
 
 
 def _checked(make: Callable[[str, int], Made], text: str, index: int, expected: str) -> Made:
-    """``make(text, index)`` on a worker, if the worker's code is the same as ours."""
+    """``make(text, index)`` on a worker; ``DatasetError`` if the worker's code differs from that of the client."""
     if fingerprint(make) != expected:
         raise DatasetError("a worker runs another version of this program, so its frames would differ; install the same version there")
     return make(text, index)

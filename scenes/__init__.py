@@ -1,4 +1,4 @@
-"""Specifications: what exists. Sensors, objects, experiments and servo parameters as data, validated where they enter."""
+"""Specifications of sensors, objects, experiments and servo parameters, as data that are validated when they are loaded."""
 
 from scenes.base import SpecError
 from scenes.experiment import ExperimentSpec

@@ -13,7 +13,8 @@ class SpecError(ValueError):
     """
 
 
-# Most characters of a name. File systems allow 255 bytes, a character has up to 4 bytes in UTF-8, and names get prefixes and suffixes.
+# Largest number of characters of a name. File systems allow 255 bytes, a character has up to 4 bytes in UTF-8, and names get prefixes and
+# suffixes.
 LONGEST_NAME = 100
 
 
@@ -42,7 +43,7 @@ PICTURE = "data:image/"
 """Beginning of a picture as text: a data URI (RFC 2397) with base64 content."""
 Picture = Annotated[str, AfterValidator(_data_uri)]
 Name = Annotated[str, AfterValidator(_plain_name)]
-# For a choice of numbers: refuses true and false, which Python (and therefore ``Literal``) takes for 1 and 0.
+# Validator for a choice of numbers. It refuses true and false, which Python (and therefore ``Literal``) accepts as 1 and 0.
 NotTruth = BeforeValidator(_no_truth)
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -53,7 +54,7 @@ Rgb = tuple[Fraction, Fraction, Fraction]
 
 
 class Section(BaseModel):
-    """A frozen section of a specification file. Unknown keys are errors, and so are booleans and texts in the place of numbers."""
+    """A frozen section of a specification file. Unknown keys are errors. Booleans and texts in place of numbers are errors, too."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 

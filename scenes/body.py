@@ -26,7 +26,7 @@ class RelaxationTerm(Section):
     time_s: Positive
 
 
-MOST_POISSON = 0.49999  # measured: contacts converge up to it; closer to 0.5 rounding alone is above the solver's tolerance
+MOST_POISSON = 0.49999  # measured: contacts converge up to this value; closer to 0.5, rounding errors exceed the solver's tolerance
 
 
 def _compressible(poisson_ratio: float) -> float:
@@ -39,20 +39,20 @@ Poisson = Annotated[float, Field(ge=0), AfterValidator(_compressible)]
 
 
 class MaterialSpec(Section):
-    """A nearly incompressible rubber: its stiffness, and how it stiffens and relaxes.
+    """A nearly incompressible rubber: its stiffness, its hyperelastic law and its relaxation.
 
     Attributes
     ----------
     young_modulus_mpa, poisson_ratio : float
-        At small strain. In a rubber that relaxes: before anything has relaxed.
+        Young's modulus and Poisson's ratio at small strain. For a viscoelastic rubber they are the instantaneous values, before relaxation.
     law : {"neo-hookean", "mooney-rivlin", "yeoh"}
-        See ``twin.mechanics.material``.
+        Hyperelastic law (see ``twin.mechanics.material``).
     second_invariant_share : float
         For Mooney-Rivlin: c01 / (c10 + c01).
     c20_c10, c30_c10 : float
         For Yeoh: c20 and c30 relative to c10.
     relaxation : tuple of RelaxationTerm
-        A Prony series; empty: elastic.
+        Terms of a Prony series; empty for an elastic material.
     """
 
     young_modulus_mpa: Positive
@@ -75,7 +75,7 @@ class MaterialSpec(Section):
 
 
 ASSUMED_FACTOR = 1.6
-"""By how much the forces of a specification may be larger or smaller where none was measured: printed skins have 0.4 to 1 MPa."""
+"""Uncertainty factor of the forces of a specification whose stiffness was not measured. Printed skins have a modulus of 0.4 to 1 MPa."""
 
 Shape = Literal["cap", "round-pad", "rectangular-pad"]
 _OWN_KEYS: dict[Shape, tuple[str, ...]] = {
@@ -83,33 +83,34 @@ _OWN_KEYS: dict[Shape, tuple[str, ...]] = {
     "round-pad": ("outer_radius_mm",),
     "rectangular-pad": ("width_mm", "height_mm"),
 }
-"""Keys that give each shape's size; the others must be left out."""
+"""Keys for the size of each shape. Keys of other shapes must be omitted."""
 LEAST_EDGE = 2.0
-"""Least height of a pad's rounded edge in thicknesses of its skin: the edge's inside is rounded, too."""
+"""Smallest height of a pad's rounded edge, relative to the thickness of its skin, because the inside of the edge is rounded, too."""
 
 
 class SkinSpec(MaterialSpec):
     """The skin: its shape, its thickness and its material. It is clamped at its rim, all around.
 
-    Origin of the sensor frame: the centre of a cap's sphere; the middle of a pad's outside. z points out of the tip.
+    The origin of the sensor frame is the centre of a cap's sphere, or the centre of a pad's outside. z points out of the tip.
 
     Attributes
     ----------
     shape : {"cap", "round-pad", "rectangular-pad"}
-        Cap: part of a sphere above the plane ``rim_z_mm``; a dome, a shallow cap or a miniature tip. Pads are flat; where ``rim_z_mm`` is
-        below 0, their edge is rounded with that radius, all around.
+        A cap is the part of a sphere above the plane ``rim_z_mm``: a dome, a shallow cap or a miniature tip. Pads are flat. If ``rim_z_mm``
+        is below 0, the whole edge of a pad is rounded with this radius.
     outer_radius_mm : float
-        Of the outside. Cap: radius of its sphere. Round pad: radius seen along the axis. The default is the radius of the TacTip's
-        makers' simulation CAD.
+        Radius of the outside. For a cap it is the radius of the sphere, for a round pad the radius seen along the axis. The default is the
+        radius in the simulation CAD of the TacTip's makers.
     width_mm, height_mm : float
-        Of a rectangular pad: size of its outside along x and along y.
+        Size of the outside of a rectangular pad along x and along y.
     thickness_mm : float
-        Of the skin.
+        Thickness of the skin.
     rim_z_mm : float
-        Plane of the rim. For a cap of radius R that is open to the radius r it is sqrt(R^2 - r^2).
+        z of the plane of the rim. For a cap of radius R with an opening of radius r it is sqrt(R^2 - r^2).
     stiffness_factor : float
-        Forces of this specification may be this factor larger or smaller (90 %), because its stiffness is known no better. The default is
-        for a stiffness that is assumed; ``twin calibrate contact`` finds it from weighed presses.
+        Uncertainty factor of the forces, because the stiffness is not known exactly: the true forces are larger or smaller by at most this
+        factor with a probability of 90 %. The default is for an assumed stiffness. ``twin calibrate contact`` finds it from weighed
+        presses.
 
     Notes
     -----
@@ -128,17 +129,17 @@ class SkinSpec(MaterialSpec):
 
     @property
     def size_keys(self) -> tuple[str, ...]:
-        """Keys that give the size of the outside."""
+        """Keys for the size of the outside."""
         return _OWN_KEYS[self.shape]
 
     @property
     def apex_mm(self) -> float:
-        """z of the outermost place of the skin, on the axis."""
+        """z of the outermost point of the skin, on the axis."""
         return self.outer_radius_mm if self.shape == "cap" else 0.0
 
     @property
     def half_size_mm(self) -> tuple[float, float]:
-        """How far the skin's outside reaches from the axis, along x and along y."""
+        """Largest distance of the skin's outside from the axis, along x and along y."""
         if self.width_mm and self.height_mm:
             return self.width_mm / 2, self.height_mm / 2
         rim_z_mm = max(self.rim_z_mm, 0.0) if self.shape == "cap" else 0.0
@@ -176,15 +177,15 @@ class GelSpec(MaterialSpec):
     Attributes
     ----------
     sealed : bool
-        Whether the gel's volume as a whole stays exactly constant, whatever its Poisson's ratio.
+        Whether the total volume of the gel is exactly constant, for any Poisson's ratio.
     refractive_index : float
-        The default is that of the silicone gel.
+        Refractive index of the gel. The default is that of the silicone gel.
     absorption_per_mm : three numbers
         Beer-Lambert coefficients for red, green and blue.
     haze : float
-        Share of the light towards the camera that the gel scatters forward.
+        Fraction of the light towards the camera that the gel scatters forward.
     haze_sigma_px : float
-        Sd of the Gaussian over which it is scattered.
+        Standard deviation of the Gaussian of the scattered light.
 
     Notes
     -----

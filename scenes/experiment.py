@@ -1,8 +1,8 @@
-"""The specification of an experiment: which contacts the robot makes, and how, in the robot's coordinates.
+"""Specification of an experiment: the contacts that the robot makes, in the robot's coordinates.
 
-Labels are those of the recordings: ``pose_1..6`` and ``move_1..6`` are x, y, z (mm) and Rx, Ry, Rz (deg) of the tool in
-the work frame. For each contact a pose and a move are drawn evenly from their ranges. The arm goes to
-``pose - move + clear``, taps by ``tap``, moves by ``move`` (the shear), and the frame is taken at ``pose + clear + tap``.
+The labels are those of the recordings: ``pose_1..6`` and ``move_1..6`` are x, y, z (mm) and Rx, Ry, Rz (deg) of the tool in the work frame.
+For each contact a pose and a move are drawn uniformly from their ranges. The arm goes to ``pose - move + clear``, taps by ``tap``, and
+moves by ``move`` (the shear). The frame is taken at ``pose + clear + tap``.
 """
 
 from typing import Annotated, Literal, Self
@@ -45,7 +45,7 @@ class MoveRanges(Section):
     move_1, move_2, move_3 : (lowest, highest)
         Along x, y and z of the work frame, mm.
     move_4, move_5, move_6 : (lowest, highest)
-        Turn about x, y and z, deg.
+        Rotation about x, y and z, deg.
     """
 
     move_1: Range = (0.0, 0.0)
@@ -68,26 +68,27 @@ class ExperimentSpec(Section):
     source : str
         Where the ranges come from.
     object : str
-        The object that is touched by default: a name of ``twin objects`` or a file.
+        Default object of the contacts: a name of ``twin objects`` or a file.
     approach : {"x", "y", "z"}
-        Axis of the work frame along which the sensor approaches the object. An arm of four axes holds the sensor level: "y".
+        Axis of the work frame along which the sensor approaches the object. It is "y" for an arm with four axes, which holds the sensor
+        horizontally.
     zero_mm : float
-        Indentation of an unturned sensor at ``pose + clear + tap`` if the approach's coordinate of the pose is 0.
+        Indentation of an unrotated sensor at ``pose + clear + tap`` if the pose's coordinate along the approach is 0.
     clear, tap : six numbers
-        ``clear`` is added to the pose before the tap, ``tap`` is the tap itself; mm and deg.
+        ``clear`` is added to the pose before the tap, and ``tap`` is the motion of the tap; mm and deg.
     tap_frame : {"work", "tool"}
-        Axes that the tap follows: those of the work frame, or those of the tool, which is turned as the pose says. With "tool" a turned
-        sensor comes down along its own axis, and slides on the object's surface.
+        Axes of the tap: those of the work frame, or those of the tool, which is rotated by the pose. With "tool" a rotated sensor
+        approaches along its own axis, and slides on the object's surface.
     targets : tuple of str
         The labels that a model learns.
     seed : int
         Seed of the random draws.
     wider : str
-        Name of an experiment with slightly larger ranges. In the twin, models for this experiment are trained on that one.
+        Name of an experiment with slightly larger ranges. In the twin, models for this experiment are trained with it.
     pose : PoseRanges
-        Where the contacts are.
+        Ranges of the contacts' poses.
     move : MoveRanges
-        How the sensor is dragged after the tap; none by default.
+        Ranges of the move (the shear) after the tap; no move by default.
     """
 
     name: Name
@@ -116,7 +117,7 @@ class ExperimentSpec(Section):
 
     @property
     def highest_mm(self) -> float:
-        """Largest coordinate along the approach before the move, mm. The tap is deepest there."""
+        """Largest coordinate along the approach before the move, mm. The tap is deepest at this coordinate."""
         return self.ranges()[f"pose_{self.axis + 1}"][1] - self.ranges()[f"move_{self.axis + 1}"][0]
 
     @model_validator(mode="after")

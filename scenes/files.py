@@ -1,4 +1,4 @@
-"""Reading files from anywhere, bounded: any file in size; a TOML file also in depth and numbers, whatever was written into it."""
+"""Reading of files with limits, because their content is not trusted: the size of any file, and the depth and numbers of a TOML file."""
 
 import errno
 import stat
@@ -8,28 +8,28 @@ from pathlib import Path
 
 from scenes.base import SpecError
 
-LARGEST_BYTES = 4_000_000  # of a TOML file; the largest shipped specification, with measured light and caps, has 0.17 MB
-DEEPEST = 16  # tables and arrays within each other; the shipped ones have at most 5
-INT64 = range(-(2**63), 2**63)  # the whole numbers of TOML (v1.0.0, "Integer")
+LARGEST_BYTES = 4_000_000  # largest size of a TOML file; the largest shipped specification, with measured light and caps, has 0.17 MB
+DEEPEST = 16  # largest depth of nested tables and arrays; the shipped files have at most 5
+INT64 = range(-(2**63), 2**63)  # integers of TOML (v1.0.0, "Integer")
 
-LONGEST_SHOWN = 60  # characters of a wrong key or value that a message shows
-LONGEST_PATH = 400  # characters of a path that a message shows
+LONGEST_SHOWN = 60  # largest number of characters of a wrong key or value in a message
+LONGEST_PATH = 400  # largest number of characters of a path in a message
 
 
 def shown(part: object, most: int = LONGEST_SHOWN) -> str:
-    """What a file holds as a part of a one-line message: its beginning, and ``?`` for what would not print."""
+    """A key or value of a file for a one-line message: its first ``most`` characters, with ``?`` for characters that can't be printed."""
     text = str(part)
     text = text if len(text) <= most else f"{text[:most]}..."
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def require_regular(path: Path) -> None:
-    """Refuse what would never end or never begin to be read: named pipes, devices, sockets; and folders.
+    """Refuse everything except a regular file. Reading a named pipe, a device or a socket might never begin or never end.
 
     Raises
     ------
     OSError
-        There is no file, or it is none of these; ``strerror`` says which.
+        If there is no file, or if it is not a regular file; ``strerror`` states the reason.
     """
     mode = path.stat().st_mode
     if stat.S_ISDIR(mode):
@@ -44,7 +44,7 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
     Raises
     ------
     OSError
-        It can't be read, is larger, or is no regular file; ``strerror`` says why.
+        If the file can't be read, is larger, or is not a regular file; ``strerror`` states the reason.
     """
     require_regular(path)
     with path.open("rb") as file:
@@ -55,12 +55,13 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
 
 
 def read_toml(path: Path) -> dict[str, object]:
-    """The content of a TOML file; a byte order mark is no part of it.
+    """The content of a TOML file. A byte order mark is ignored.
 
     Raises
     ------
     SpecError
-        It can't be read, is no TOML, or goes beyond the bounds above; names the file and the remedy, on one line.
+        If the file can't be read, is not TOML, or exceeds the limits of this module. The message names the file and the remedy, on one
+        line.
     """
     try:
         raw = read_regular(path, LARGEST_BYTES)
@@ -86,7 +87,7 @@ _TOO_LONG = "a whole number has more than 64 bits; write it as 1e20 if it is mea
 
 
 def _beyond_bounds(data: dict[str, object]) -> Iterator[tuple[str, str]]:
-    """Keys beyond the bounds, and what is wrong with them; without recursion, whose depth is what may be wrong."""
+    """Keys that exceed the limits, and the reasons. The search is not recursive, because the depth may be too large for a recursion."""
     left: list[tuple[str, int, object]] = [("", 0, data)]
     while left:
         key, depth, value = left.pop()

@@ -19,7 +19,7 @@ from scenes.tables import fill_in_tables
 
 SHIPPED = Path(__file__).parent
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
-# Most problems that a message names; of further ones it states the number.
+# Largest number of problems that a message names. For further problems it states only their number.
 MOST_PROBLEMS = 5
 Spec = TypeVar("Spec", bound=BaseModel)
 
@@ -75,7 +75,7 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
     """
     path = Path(name_or_path)
     if path.suffix.lower() in MESH_SUFFIXES:
-        if not os.path.isfile(path):  # unlike ``Path.is_file`` also False for what is no path at all
+        if not os.path.isfile(path):  # unlike ``Path.is_file`` it is also False for a text that can't be a path
             raise SpecError(f"{shown(path, LONGEST_PATH)}: no such mesh file; give the path of an existing STL, OBJ or PLY")
         mesh = MeshShape(kind="mesh", file=str(path.resolve()), sha256=_digest(path))
         return _checked({"name": path.stem, "description": f"mesh {path.name}", "shape": mesh}, path, ObjectSpec)
@@ -162,12 +162,12 @@ def _find(name_or_path: str | Path, kind: str) -> Path:
 
 
 def read_section(path: Path, model: type[Spec]) -> Spec:
-    """A TOML file as the section that it must be; a section with a ``name`` has the file's stem, if the file gives no other.
+    """Section of the type ``model`` from a TOML file. The default of the key ``name`` is the file's stem.
 
     Raises
     ------
     SpecError
-        The file can't be read, or is wrong: names file, key and remedy, on one line.
+        If the file can't be read or is not valid. The message names the file, the key and the remedy, on one line.
     """
     name = {"name": path.stem} if "name" in model.model_fields else {}
     return _checked(name | read_toml(path), path, model)
@@ -185,7 +185,7 @@ def _checked(data: dict[str, object], path: Path, model: type[Spec]) -> Spec:
 
 
 def explained(error: ValidationError, model: type[BaseModel]) -> str:
-    """What is wrong, key by key, in one line."""
+    """The problems of a validation, key by key, in one line."""
     problems = []
     found = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")  # a misspelt key is missing, too
     for item in found[:MOST_PROBLEMS]:
@@ -205,7 +205,7 @@ def explained(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 def _keys_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
-    """Known keys of the section at ``loc`` (a tagged union's tag is one of its parts)."""
+    """Known keys of the section at ``loc``; the tag of a tagged union is a part of ``loc``."""
     candidates = [model]
     for part in loc:
         stepped = [m for c in candidates if part in c.model_fields for m in _models_in(c.model_fields[part].annotation)]

@@ -1,7 +1,7 @@
 """The specification of an object that the sensor is pressed against.
 
-Object frame: the origin is the point of the surface that the sensor touches first, z points into the object. Before any turn the axes
-are parallel to the sensor's, so the sensor comes from -z.
+Object frame: The origin is the point of the surface that the sensor touches first, and z points into the object. Before any rotation the
+axes are parallel to the sensor's, so the sensor approaches from -z.
 """
 
 from typing import Annotated, Literal, Self
@@ -31,7 +31,7 @@ class SphereShape(Section):
     kind : {"sphere"}
         Names this shape.
     radius_mm : float
-        Of the ball.
+        Radius of the ball.
     """
 
     kind: Literal["sphere"]
@@ -39,14 +39,14 @@ class SphereShape(Section):
 
 
 class CylinderShape(Section):
-    """Cylinder along y, infinitely long, touching the origin from z > 0.
+    """Infinitely long cylinder along y that touches the origin from z > 0.
 
     Attributes
     ----------
     kind : {"cylinder"}
         Names this shape.
     radius_mm : float
-        Of the cylinder.
+        Radius of the cylinder.
     """
 
     kind: Literal["cylinder"]
@@ -54,14 +54,14 @@ class CylinderShape(Section):
 
 
 class EdgeShape(Section):
-    """Quarter space x >= 0, z >= 0. Its edge along y would pass through the origin, but it is rounded and so lies a little behind it.
+    """Quarter space x >= 0, z >= 0. Its sharp edge along y would pass through the origin; the rounded edge is a little behind the origin.
 
     Attributes
     ----------
     kind : {"edge"}
         Names this shape.
     fillet_mm : float
-        Radius by which the edge is rounded.
+        Radius of the rounded edge.
     """
 
     kind: Literal["edge"]
@@ -80,7 +80,7 @@ class PrismShape(Section):
     inradius_mm : float
         Distance from the axis to each side face.
     fillet_mm : float
-        Radius by which the edges along y are rounded.
+        Radius of the rounded edges along y.
     taper_deg : float
         Tilt of the side faces about x (a bevelled prism).
     """
@@ -95,8 +95,8 @@ class PrismShape(Section):
 class MeshShape(Section):
     """Closed triangle mesh (STL, OBJ, PLY).
 
-    The mesh is turned, then moved so that the line through its bounding box's centre along z first meets it at the origin (where the mesh
-    has a hole there: its lowest vertex has z = 0).
+    The mesh is rotated and then moved. The line along z through the centre of its bounding box then first meets the mesh at the origin. If
+    the mesh has a hole there, its lowest vertex has z = 0.
 
     Attributes
     ----------
@@ -107,9 +107,10 @@ class MeshShape(Section):
     unit : {"mm", "cm", "m", "inch"}
         Unit of the lengths in the file.
     rotation_deg : three numbers
-        Turn of the mesh, intrinsic about x, y, z.
+        Rotation of the mesh, intrinsic about x, y, z.
     sha256 : str
-        Digest of the file's content. It is found when the object is loaded; a specification that gives it takes no other content.
+        Digest of the file's content. It is computed when the object is loaded. If a specification states it, a file with another content is
+        refused.
     """
 
     kind: Literal["mesh"]
@@ -126,7 +127,7 @@ Shape = Annotated[
 
 
 class TextureSpec(Section):
-    """A wire mesh lying on the surface, raised by one wire diameter: round wires crossing at a pitch.
+    """A wire mesh on the surface: round wires that cross each other at a constant pitch. Its height is one wire diameter.
 
     Attributes
     ----------
@@ -135,7 +136,7 @@ class TextureSpec(Section):
     pitch_mm : float
         Distance between the axes of neighbouring wires.
     wire_diameter_mm : float
-        Of each wire.
+        Diameter of each wire.
     """
 
     kind: Literal["wire-mesh"]
@@ -146,7 +147,7 @@ class TextureSpec(Section):
 class ObjectSpec(Section):
     """An object, complete.
 
-    The four keys of friction apply to contacts that no arm makes and to sensors without a rig. If a sensor has a rig, the rig's friction
+    The four keys of friction apply to contacts without an arm and to sensors without a rig. If a sensor has a rig, the rig's friction
     applies instead (see ``RigSpec``).
 
     Attributes
@@ -158,19 +159,19 @@ class ObjectSpec(Section):
     source : str
         Where the numbers come from.
     shape : PlaneShape, SphereShape, CylinderShape, EdgeShape, PrismShape or MeshShape
-        The surface; its ``kind`` decides which.
+        The surface. Its key ``kind`` selects the shape.
     texture : TextureSpec, optional
-        What lies on the surface.
+        Texture on the surface.
     friction : float
-        Static coefficient of friction. The default is a plausible one for rubber on a smooth solid.
+        Static coefficient of friction. The default is a plausible value for rubber on a smooth solid.
     kinetic_friction : float, optional
-        Coefficient of friction of a point that slides. Without it: the static one.
+        Coefficient of friction of a slipping point. Default: the static coefficient.
     slip_weakening_mm : float
-        Slid length over which the coefficient falls from the static to the kinetic one.
+        Slip length over which the coefficient decreases from the static to the kinetic value.
     shear_strength_mpa : float, optional
-        Largest friction stress. Without it there is no bound.
+        Largest friction stress. Without it the friction stress has no limit.
     compliance_mm_per_n : float
-        Displacement of the object along the sensor's axis for each N; it is added to the rig's.
+        Displacement of the object along the sensor's axis per N. The rig's compliance is added to it.
     """
 
     name: Name

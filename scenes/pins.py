@@ -13,13 +13,13 @@ MOST_PINS = 5000
 """Largest number of pins. The finest printed sensors have about 3000."""
 
 LARGEST_PLACES = 1_000_000
-"""Bytes of a file of pins' places: of ``MOST_PINS`` in full precision."""
+"""Largest size, in bytes, of a file of pins' positions. ``MOST_PINS`` positions in full precision need less."""
 
 _Place = Annotated[float, Field(ge=-1e9, le=1e9)]
-"""A coordinate of a pin, in any unit: even nanometres stay below the bound."""
+"""A coordinate of a pin, in any unit. The bounds are large enough for nanometres."""
 
 LEAST_WIDTH = 0.01
-"""Places nearer to a line than this share of its length lie on it."""
+"""Tolerance for positions on a line: largest distance from the line, relative to its length."""
 
 Layout = Literal["rings", "hexagon", "grid", "positions"]
 _OWN_KEYS: dict[Layout, tuple[str, ...]] = {
@@ -28,7 +28,7 @@ _OWN_KEYS: dict[Layout, tuple[str, ...]] = {
     "grid": ("columns", "rows", "row_distance"),
     "positions": ("positions",),
 }
-"""Keys that describe each layout, those that it cannot do without first (``row_distance`` has a default)."""
+"""Keys of each layout. All are required, except ``row_distance``, which has a default."""
 
 
 class PinsSpec(Section):
@@ -37,32 +37,32 @@ class PinsSpec(Section):
     Attributes
     ----------
     layout : {"rings", "hexagon", "grid", "positions"}
-        Rings and hexagon: a pin in the middle, and 6 i pins on ring i, which is a circle or a hexagon. Grid: rows and columns. Positions:
-        any other layout, by the place of each pin.
+        "rings" and "hexagon" have a pin at the centre and 6 i pins on ring i, which is a circle or a hexagon. "grid" has rows and columns.
+        "positions" is any other layout, given by the position of each pin.
     rings : int
-        Of ``rings`` and ``hexagon``: number of rings r; there are 1 + 3 r (r + 1) pins.
+        For ``rings`` and ``hexagon``: number of rings r. There are 1 + 3 r (r + 1) pins.
     columns, rows : int
-        Of ``grid``: columns lie along x, rows along y, before ``phase_deg`` turns them.
+        For ``grid``: number of columns (side by side along x) and of rows (along y), before the rotation by ``phase_deg``.
     row_distance : float
-        Of ``grid``: distance of neighbouring rows for a distance 1 of neighbouring columns.
+        For ``grid``: distance of neighbouring rows, relative to the distance of neighbouring columns.
     positions : (N, 2) float
-        Of ``positions``: x and y of each pin seen along the axis, from the axis, in any one unit. The layout is scaled so that the
-        outermost pin lies at ``max_polar_deg``.
+        For ``positions``: x and y of each pin from the axis, seen along the axis, in any unit. The layout is scaled so that the outermost
+        pin is at ``max_polar_deg``.
     missing : tuple of int
-        Pins of the layout that are not there, by their number in the complete layout, from 0. The others keep their order.
+        Missing pins of the layout, by their index in the complete layout, from 0. The other pins keep their order.
     spacing : {"polar", "plan"}
-        What is proportional to the distance from the middle of the layout: the polar angle, or its sine (the layout then keeps its shape
-        seen along the axis).
+        Quantity that is proportional to the distance from the centre of the layout: the polar angle ("polar"), or its sine ("plan"). With
+        "plan" the layout keeps its shape seen along the axis.
     max_polar_deg : float
-        On a cap: polar angle of the outermost pins (of the corner pins of a hexagon or grid).
+        On a cap: polar angle of the outermost pins (the corner pins of a hexagon or grid).
     reach_mm : float, optional
-        Distance of the outermost pins' feet from the axis. A flat pad needs it; on a cap it takes the place of ``max_polar_deg``.
+        Distance of the outermost pins' feet from the axis. It is required on a flat pad. On a cap it replaces ``max_polar_deg``.
     phase_deg : float
-        Turn of the layout from x towards y. At 0 the first pin of each ring lies on x.
+        Rotation of the layout from x towards y. At 0 the first pin of each ring is on x.
     length_mm, diameter_mm : float
-        Of the stem. The defaults of these and of the cap are those found for a printed TacTip of 331 pins.
+        Length and diameter of the stem. The defaults of the stem and of the cap are those of a printed TacTip with 331 pins.
     cap_diameter_mm, cap_height_mm : float
-        Of the white cap at the pin's end.
+        Diameter and height of the white cap at the pin's end.
     """
 
     layout: Layout = "rings"
@@ -97,13 +97,13 @@ class PinsSpec(Section):
         return self.complete_count - len(self.missing)
 
     def largest_polar_rad(self, radius_mm: float) -> float | None:
-        """Polar angle of the outermost pins on the inside of a cap of this radius; None where they reach beyond it."""
+        """Polar angle of the outermost pins on the inside of a cap of this radius; None if ``reach_mm`` is larger than the radius."""
         if self.reach_mm is None:
             return math.radians(self.max_polar_deg)
         return math.asin(self.reach_mm / radius_mm) if self.reach_mm < radius_mm else None
 
     def in_words(self) -> str:
-        """The layout for people: '331 pins in 10 rings'."""
+        """The layout in words, such as '331 pins in 10 rings'."""
         shape = {
             "rings": f"in {self.rings} rings",
             "hexagon": f"in a hexagon of {self.rings} rings",
@@ -144,12 +144,12 @@ class PinsSpec(Section):
 
 
 def layout_from(text: str) -> PinsSpec:
-    """A layout as people write it: ``rings:10``, ``hexagon:6``, ``grid:9x7`` (columns, rows) or ``positions:FILE.csv``.
+    """Layout from a text: ``rings:10``, ``hexagon:6``, ``grid:9x7`` (columns, rows) or ``positions:FILE.csv``.
 
     Raises
     ------
     SpecError
-        It is none of these, or impossible.
+        If the text has another form, or if the layout is impossible.
     """
     kind, _, size = text.partition(":")
     if kind in ("rings", "hexagon") and not size.strip().isdecimal():

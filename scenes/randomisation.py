@@ -1,4 +1,4 @@
-"""The specification of what is drawn at random for each simulated contact."""
+"""Specification of the quantities that are drawn at random for each simulated contact."""
 
 from typing import Annotated, Self
 
@@ -11,16 +11,17 @@ Ends = tuple[float, float]
 
 
 class Spread(Section):
-    """How a number of a specification is drawn; exactly one of three ways.
+    """Distribution of a number of a specification. Exactly one of the three keys is given.
 
     Attributes
     ----------
     scale : (lowest, highest)
-        The specification's number is multiplied by a factor whose logarithm is uniform between those of the two ends.
+        The specification's number is multiplied by a factor between the two ends, whose logarithm is uniformly distributed.
     add : (lowest, highest)
-        A number that is uniform between the ends is added.
+        A number that is uniformly distributed between the ends is added to the specification's number.
     value : (lowest, highest)
-        A number that is uniform between the ends replaces it (rounded if the specification needs an integer).
+        A number that is uniformly distributed between the ends replaces the specification's number. It is rounded if the specification
+        needs an integer.
     """
 
     scale: tuple[Positive, Positive] | None = None
@@ -29,7 +30,7 @@ class Spread(Section):
 
     @property
     def ends(self) -> Ends:
-        """The two ends of the kind that is given."""
+        """The two ends of the key that is given."""
         return next(ends for ends in (self.scale, self.add, self.value) if ends is not None)
 
     @model_validator(mode="after")
@@ -48,13 +49,13 @@ class FrictionSpread(Section):
     Attributes
     ----------
     low, high : float
-        Ends of the coefficient, which is uniform in its logarithm between them.
+        Smallest and largest coefficient of friction. Its logarithm is uniformly distributed between them.
     free_share : float
-        Share of the contacts without friction.
+        Fraction of the contacts without friction.
     stick_share : float
-        Share of the contacts that have the coefficient ``stick`` instead.
+        Fraction of the contacts with the coefficient ``stick``.
     stick : float
-        Coefficient of friction; the default is so large that nothing slides.
+        Coefficient of friction of these contacts. The default is so large that nothing slips.
     """
 
     low: Positive
@@ -73,7 +74,7 @@ class FrictionSpread(Section):
 
 
 class RandomisationSpec(Section):
-    """What is drawn anew for each contact.
+    """Quantities that are drawn at random for each contact.
 
     Attributes
     ----------
@@ -82,13 +83,13 @@ class RandomisationSpec(Section):
     description : str
         One line for ``twin randomisations``.
     executed_share : float
-        Share of the contacts in which the move is executed before the frame is taken.
+        Fraction of the contacts in which the move is executed before the frame is taken.
     pin_noise_px : float
         Standard deviation of the noise that is added to the stored pins. Pictures have the camera's noise instead.
     friction : FrictionSpread, optional
-        Without it every contact has the friction of the rig or of the object.
+        Distribution of the friction. Without it every contact has the friction of the rig or of the object.
     sensor : dict of str to Spread
-        The numbers of the sensor's specification that are drawn, by dotted key: material, geometry, camera, light, rig.
+        Distributions of numbers of the sensor's specification, by dotted key: material, geometry, camera, light, rig.
     """
 
     name: Name

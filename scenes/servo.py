@@ -1,4 +1,4 @@
-"""The specification of following a surface in a plane, and of the object's place."""
+"""Specification of a servo that follows a surface in a plane, and of the object's position."""
 
 from typing import Annotated
 
@@ -10,16 +10,16 @@ Three = tuple[float, float, float]
 
 
 class PlacementSpec(Section):
-    """An object's place in the arm's base frame: its origin, and its turn about the base's z.
+    """Position of an object in the arm's base frame: its origin, and its rotation about the base's z.
 
-    Without a turn the object's outward side looks to -y of the base, its section lies level and its y axis points down.
+    Without rotation the object's outward side faces -y of the base, its section is horizontal, and its y axis points down.
 
     Attributes
     ----------
     position_mm : three numbers
         The object's origin in the base frame.
     turn_deg : float
-        Turn about the base's z, from x towards y.
+        Rotation about the base's z, from x towards y.
     """
 
     position_mm: Three = (300.0, 60.0, 0.0)
@@ -27,7 +27,7 @@ class PlacementSpec(Section):
 
 
 class ServoSpec(Section):
-    """Following a surface: a proportional and integral law on depth and angle with a feed along the surface.
+    """A servo that follows a surface: a proportional-integral law for depth and angle, with a feed along the surface.
 
     The default gains and bounds of the integrals are those of the sensor group's public servo code.
 
@@ -40,30 +40,30 @@ class ServoSpec(Section):
     source : str
         Where the numbers come from.
     experiment : str
-        Experiment whose labels the model estimates: it gives the approach and the zero of the depth.
+        Experiment whose labels the model estimates. It defines the approach and the zero of the depth.
     indent_mm, angle_deg : float
         Reference of the control: indentation, and angle from the surface's normal.
     feed_mm : float
-        Way along the surface in each step.
+        Distance along the surface in each step.
     kp_depth, ki_depth, kp_angle, ki_angle : float
-        Gains: shares of the error (p) and of its sum over the steps (i) that a step corrects.
+        Gains: the fractions of the error (p) and of its sum over the steps (i) that one step corrects.
     integral_mm, integral_deg : float
         Bounds of the sums.
     largest_move_mm, largest_turn_deg : float
-        Bounds of one step's correction.
+        Bounds of the correction in one step.
     clear_mm : float
-        Distance from which the surface is approached, and to which the arm retreats.
+        Distance from the surface at which the approach starts, and to which the arm retreats.
     linear_mm_s, angular_deg_s : float
-        Speeds of every move in following and collecting. They are much slower than the sensor group's practice with an MG400, which is a
-        speed factor of 20 % in following and 50 % in collecting.
+        Speeds of every move in following and collecting. They are much lower than in the sensor group's practice with an MG400, where the
+        speed factor is 20 % in following and 50 % in collecting.
     plausible_mm, plausible_deg : (lowest, highest)
-        Depths and angles that a sensor in contact can have. An estimate outside of them is not used, and the arm holds still.
+        Depths and angles that a sensor in contact can have. An estimate outside of them is not used, and the arm does not move.
     blind_mm : float
-        Largest distance of the tool from the place at which the newest frame was exposed.
+        Largest distance of the tool from its position at the exposure of the newest frame.
     max_frame_age_s : float
-        Largest age of a frame that is used. If there is none so new, the arm stops and holds.
+        Largest age of a frame that is used. If no frame is new enough, the arm stops and holds its position.
     placement : PlacementSpec
-        The object's place.
+        The object's position.
     """
 
     name: Name

@@ -29,10 +29,10 @@ Nested: TypeAlias = "int | float | list[Nested] | tuple[Nested, ...]"
 """A number, or nested lists of numbers, with the same length at each level."""
 
 MOST_INLINE = 120
-"""Most numbers of a list that is written to the TOML file itself, about ten lines. A longer list is written to a CSV file."""
+"""Largest number of numbers in a list that is written to the TOML file itself: about ten lines. A longer list is written to a CSV file."""
 
 DIGITS = 6
-"""Significant digits of a written number: no length or light of a sensor is known more precisely."""
+"""Number of significant digits of a written number. No length or light of a sensor is known more precisely."""
 
 URI = ".uri"
 """Suffix of a text file with a data URI."""
@@ -45,12 +45,12 @@ _PICTURE = {"picture"}
 
 
 def fill_in_tables(section: Mapping[str, object], folder: Path, key: str = "") -> dict[str, object]:
-    """A section as TOML gives it, with every reference replaced by the numbers of its table.
+    """A section from a TOML file, with every reference replaced by the numbers of its table.
 
     Parameters
     ----------
     section : mapping
-        Keys and values; sections within it are filled in, too.
+        Keys and values. References in nested sections are replaced, too.
     folder : Path
         Folder of the TOML file and its tables.
     key : str
@@ -59,7 +59,7 @@ def fill_in_tables(section: Mapping[str, object], folder: Path, key: str = "") -
     Raises
     ------
     ValueError
-        A table is missing, is in another folder, holds something other than numbers, or has another shape than its reference states.
+        If a table is missing, is in another folder, contains anything other than numbers, or has another shape than its reference states.
     """
     filled: dict[str, object] = {}
     for name, value in section.items():

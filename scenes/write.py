@@ -1,4 +1,4 @@
-"""The text of a sensor's specification: a TOML file that a person can read and edit, and tables of its long arrays."""
+"""Text of a sensor's specification: a readable and editable TOML file, and tables of its long arrays."""
 
 from collections.abc import Mapping
 
@@ -8,11 +8,11 @@ from scenes.sensor import SensorSpec
 from scenes.tables import significant, take_out_tables
 
 ROW = 12
-"""Most numbers in a line of a list."""
+"""Largest number of numbers in one line of a list."""
 
 
 def sensor_files(spec: SensorSpec, stem: str, comment: str = "", notes: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The files of a specification. Values that are the defaults are left out; the sensor's name is the file's.
+    """The files of a specification. Default values are omitted, and so is the sensor's name, which is the file's stem.
 
     Parameters
     ----------
@@ -20,9 +20,9 @@ def sensor_files(spec: SensorSpec, stem: str, comment: str = "", notes: Mapping[
     stem : str
         Name of the TOML file without its suffix. Tables are named after it.
     comment : str
-        Lines that stand above everything.
+        Comment lines at the beginning of the file.
     notes : mapping of str to str
-        A comment behind a value, by its dotted key (``pins.max_polar_deg``); keys that are not written are passed over.
+        Comments behind values, by dotted key (``pins.max_polar_deg``). Keys that are not written are ignored.
 
     Returns
     -------
@@ -33,7 +33,7 @@ def sensor_files(spec: SensorSpec, stem: str, comment: str = "", notes: Mapping[
     for line in comment.splitlines():
         document.add(tomlkit.comment(line))
     given = {key: value for key, value in spec.model_dump(exclude_defaults=True).items() if key != "name" and value is not None}
-    given["pins"] = {"layout": spec.pins.layout} | given.get("pins", {})  # said even where it is the default
+    given["pins"] = {"layout": spec.pins.layout} | given.get("pins", {})  # the layout is written even if it is the default
     plain, tables = take_out_tables(given, stem)
     for key in sorted(plain, key=lambda k: isinstance(plain[k], dict)):  # tables come last
         document.add(key, _item(plain[key]))

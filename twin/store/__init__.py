@@ -1,4 +1,4 @@
-"""Storage of results: files written whole or not at all, safe outputs, a cache, resumable work, and records of the code that made them."""
+"""Storage of results: atomic writing of files, protected outputs, a cache, resumable work, and records of the code behind the results."""
 
 from twin.store.arrays import ArrayFile, Layers, layers_from, layers_to
 from twin.store.atomic import (

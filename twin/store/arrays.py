@@ -1,6 +1,6 @@
-"""Files that hold arrays and what is to be said of them, in the safetensors format, which holds no code.
+"""Files of arrays with a description, in the safetensors format, which contains no code.
 
-See https://github.com/huggingface/safetensors. The format has no checksums, so a digest of the arrays is kept with the metadata.
+See https://github.com/huggingface/safetensors. The format has no checksums, so the metadata contain a digest of the arrays.
 """
 
 import hashlib
@@ -22,9 +22,9 @@ from twin.store.output import output_file
 from twin.types import FloatArray
 
 ABOUT = "about"
-"""Name of what is said of the arrays (JSON), in the metadata."""
+"""Key of the arrays' description (JSON) in the metadata."""
 DIGEST = "sha256"
-"""Name of the arrays' digest in the metadata. Files of earlier states have none."""
+"""Key of the arrays' digest in the metadata. Files of earlier versions have none."""
 
 Layers = tuple[tuple[FloatArray, FloatArray], ...]
 """Weights (o, i) and offsets (o,) of a network's layers."""
@@ -32,20 +32,20 @@ Layers = tuple[tuple[FloatArray, FloatArray], ...]
 
 @dataclass(frozen=True)
 class ArrayFile:
-    """A kind of file: what it holds, and what a user is told where it can't be used.
+    """A kind of file: its content, and the error for files that can't be used.
 
     Attributes
     ----------
     thing : str
-        What it holds.
+        Name of the content, for messages.
     command : str
-        What makes it.
+        Command that makes such a file.
     version : int
-        Of what it holds; a file of another version is refused.
+        Version of the content; a file of another version is refused.
     error : type of TwinError
-        Raised where a file can't be used.
+        Type of the error if a file can't be used.
     again : str
-        What to do about a damaged file or one of another version, if not to make it anew with the command.
+        Remedy for a damaged file or a file of another version. Default: to make the file again with the command.
     """
 
     thing: str
@@ -55,7 +55,7 @@ class ArrayFile:
     again: str = ""
 
     def write(self, path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> int:
-        """Write arrays, and what is said of them; the file's size in bytes."""
+        """Write arrays and their description; returns the file's size in bytes."""
         whole = {key: np.ascontiguousarray(value) for key, value in arrays.items()}
         content = save(whole, {ABOUT: json.dumps({**about, "version": self.version}, sort_keys=True), DIGEST: _digest(whole)})
         with output_file(path):
@@ -63,24 +63,26 @@ class ArrayFile:
         return len(content)
 
     def about(self, path: Path) -> dict[str, Any]:
-        """What is said of a file's arrays; the arrays are not read.
+        """The description of a file's arrays. The arrays are not read.
 
         Raises
         ------
         TwinError
-            Of the kind ``error``: there is no such file, or it is none of this kind and version.
+            Of the type ``error``, if there is no such file, or if the file is not of this kind and version.
         """
         with self._told(path), safe_open(path, framework="numpy") as file:
             return self._about(path, file.metadata() or {})
 
     @contextmanager
     def opened(self, path: Path) -> Iterator[tuple[dict[str, Any], dict[str, FloatArray]]]:
-        """What is said of a file's arrays, and the arrays as float32. What the body misses in them is told as damage.
+        """Context that yields the description of a file's arrays, and the arrays as float32.
+
+        If the body of the context does not find a key or array that it needs, the file counts as damaged.
 
         Raises
         ------
         TwinError
-            Of the kind ``error``: as of ``about``, or the file is damaged.
+            Of the type ``error``: as ``about``, and if the file is damaged.
         """
         with self._told(path):
             with safe_open(path, framework="numpy") as file:
@@ -103,7 +105,7 @@ class ArrayFile:
 
     @contextmanager
     def _told(self, path: Path) -> Iterator[None]:
-        """Tell what goes wrong with a file on one line, with the remedy."""
+        """Context that converts the errors of a file to errors of the type ``error``, on one line and with the remedy."""
         try:
             require_regular(path)
             yield
@@ -122,12 +124,12 @@ def layers_to(layers: Layers, name: str = "layers") -> dict[str, np.ndarray]:
 
 
 def layers_from(arrays: Mapping[str, FloatArray], name: str = "layers") -> Layers:
-    """The layers that ``layers_to`` put among arrays under a name; none if there are none.
+    """The layers that ``layers_to`` stored among ``arrays`` under a name; empty if there are none.
 
     Raises
     ------
     KeyError
-        A layer is missing.
+        If a part of a layer is missing.
     """
     count = sum(key.startswith(f"{name}.") and key.endswith(".weights") for key in arrays)
     return tuple((arrays[f"{name}.{n}.weights"], arrays[f"{name}.{n}.offset"]) for n in range(count))

@@ -1,4 +1,4 @@
-"""Writing of results. After any interruption a file is either complete, or as it was before.
+"""Atomic writing of results: after any interruption a file is either complete or unchanged.
 
 The content is written to a temporary file in the same folder, flushed to the disk, and renamed in one step. If the process is killed
 before that, the old file is unchanged, and the temporary file stays until ``remove_parts`` removes it.
@@ -73,20 +73,20 @@ def write_bytes(path: Path, data: bytes) -> Path:
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write text as UTF-8, its line ends as they are; errors as of ``write_with``.
+    """Write text as UTF-8 without a change of its line ends; raises as ``write_with``.
 
-    Names of files that the locale can't decode are written with the bytes that they have on the disk.
+    File names in the text that the locale can't decode are written with their bytes on the disk.
     """
     return write_bytes(path, text.encode(errors="surrogateescape"))
 
 
 def write_result(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write texts by the names of their files, each whole or not at all: a result that took long and is not lost if this fails.
+    """Write texts, given by file name, each file atomically. If a file can't be written, the results are not lost: the error contains them.
 
     Raises
     ------
     StoreError
-        A file cannot be written. ``unsaved`` of the error has all the texts.
+        If a file cannot be written. ``unsaved`` of the error contains all texts.
     """
     try:
         for name, text in texts.items():
@@ -161,7 +161,7 @@ def locked(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     ----------
     folder : Path
     wait_s : float
-        How long to wait for another run that holds it.
+        Longest wait for another run that has reserved the folder.
 
     Raises
     ------

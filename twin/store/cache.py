@@ -88,7 +88,7 @@ def _read(path: Path) -> dict[str, np.ndarray] | None:
             found = {name: file[name] for name in file.files}
     except (FileNotFoundError, NotADirectoryError):
         return None
-    except Exception as error:  # damaged bytes raise whatever zipfile and numpy run into; the file is written anew
+    except Exception as error:  # zipfile and numpy raise exceptions of any type for damaged files; the file is written again
         warn_once(f"{path}: not a readable cache entry ({error}); computed again")
         return None
     with suppress(OSError):

@@ -33,7 +33,7 @@ def inputs_digest(*inputs: object) -> str:
 
 
 def _plain(value: object) -> object:
-    """A value that JSON can hold instead of one that it can't."""
+    """A value that JSON can represent, in place of one that it can't."""
     if isinstance(value, bytes):
         return {"sha256": hashlib.sha256(value).hexdigest()}
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:

@@ -1,8 +1,8 @@
-"""Where a run writes its results: tried before the work, held for this run alone, and without loss of what others wrote there.
+"""Protection of output folders: each is tested before the work, reserved for one run, and no file of others is overwritten.
 
-A folder of results has a list of the files that this program wrote into it, with a digest of each. A file that is not in the list, or
-that was changed since, is not overwritten unless the user asks for it (``overwriting``). While a run is at work, the names that it
-may write are in the list without a digest, so that the same command goes on after a run that was killed.
+A folder of results contains a list of the files that this program wrote into it, with a digest of each. A file that is not in the list, or
+that has changed since, is not overwritten unless the user requests it (``overwriting``). During a run, the list contains the names that the
+run may write without a digest, so that the same command can continue after a run that was killed.
 """
 
 import errno
@@ -24,11 +24,11 @@ from twin.store.atomic import LOCK, PART, locked, unwritten, write_json
 
 WRITTEN = ".written.json"
 """Name of the list of files that this program wrote into a folder."""
-_ANY = ""  # in place of a digest: the content does not count, because the file is being written, or because it is a folder
-_WAIT_S = 10.0  # for another run that enters its file into the same list
-_MOST_NAMED = 3  # files in a message
+_ANY = ""  # replaces a digest if the content does not matter: the file is being written, or it is a folder
+_WAIT_S = 10.0  # longest wait for another run that enters its file into the same list
+_MOST_NAMED = 3  # largest number of files that a message names
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}  # errors that concern the output alone
-_held: ContextVar[frozenset[Path]] = ContextVar("held", default=frozenset())  # folders that are held in this context
+_held: ContextVar[frozenset[Path]] = ContextVar("held", default=frozenset())  # folders that are reserved in this context
 _overwrite: ContextVar[bool] = ContextVar("overwrite", default=False)
 
 Given = ParamSpec("Given")
@@ -37,7 +37,7 @@ Made = TypeVar("Made")
 
 @contextmanager
 def overwriting(wanted: bool = True) -> Iterator[None]:
-    """Context in which outputs may replace files that this program did not write, as with ``--force``; nothing where not ``wanted``."""
+    """Context in which outputs may replace files that this program did not write, as with ``--force``; no effect if not ``wanted``."""
     before = _overwrite.set(wanted or _overwrite.get())
     try:
         yield
@@ -47,24 +47,24 @@ def overwriting(wanted: bool = True) -> Iterator[None]:
 
 @contextmanager
 def output(folder: Path, *names: str, gone_on: tuple[str, ...] = ()) -> Iterator[None]:
-    """Hold a folder (made if missing) for this run, which writes files or folders of some names into it.
+    """Context that reserves a folder for this run, which writes files or folders with the given names into it.
 
-    A run may open a folder that it holds already.
+    The folder is created if missing. A run may open a folder again that it has already reserved.
 
     Parameters
     ----------
     folder : Path
     names : str
-        Of everything that may be written right below the folder, as patterns of ``fnmatch``. A folder among them belongs to the program
-        with all that is in it.
+        Names of all files and folders that may be written directly below the folder, as patterns of ``fnmatch``. A folder with such a name
+        belongs to the program with all its content.
     gone_on : tuple of str
-        Of files that a later run goes on from. That run itself checks what is in them, so a change of theirs is no reason to refuse it.
+        Names of files from which a later run continues. That run checks their content itself, so a changed file is not refused.
 
     Raises
     ------
     StoreError
-        The folder can't be written to, another run is at work in it, it holds a file of these names that this program did not write or
-        that was changed since, or the disk becomes full during the work.
+        If the folder can't be written to, if another run uses it, if it contains a file with one of these names that this program did not
+        write or that has changed since, or if the disk becomes full during the work.
     """
     with _held_once(folder), _told(folder):
         every = (*names, *gone_on)
@@ -79,20 +79,20 @@ def output(folder: Path, *names: str, gone_on: tuple[str, ...] = ()) -> Iterator
 
 @contextmanager
 def output_file(path: Path, *beside: str) -> Iterator[None]:
-    """Make sure that a file can be written, and enter it into the list of its folder (made if missing) after the work.
+    """Context that checks first that a file can be written, and enters it into the list of its folder at the end.
 
-    The folder is not held meanwhile: it may be the one that a user works in.
+    The folder is created if missing. It is not reserved in between, because it may be the user's working folder.
 
     Parameters
     ----------
     path : Path
     beside : str
-        Endings, as patterns of ``fnmatch``, of other files whose names begin with the file's name without its suffix.
+        Endings of other files that are written, as patterns of ``fnmatch``. Their names begin with the file's name without its suffix.
 
     Raises
     ------
     StoreError
-        As of ``output``.
+        As ``output``.
     """
     folder, names = path.parent, [glob.escape(path.name), *(glob.escape(path.stem) + ending for ending in beside)]
     with _told(path):
@@ -106,12 +106,12 @@ def output_file(path: Path, *beside: str) -> Iterator[None]:
 
 
 def writes(*names: str, gone_on: tuple[str, ...] = (), to: str = "out") -> Callable[[Callable[Given, Made]], Callable[Given, Made]]:
-    """Decorator of a function that writes these names into the folder which its parameter ``to`` gives; see ``output``."""
+    """Decorator for a function that writes files with these names into the folder given by its parameter ``to`` (see ``output``)."""
     return _opening(to, lambda path: output(path, *names, gone_on=gone_on))
 
 
 def writes_file(*beside: str, to: str = "out") -> Callable[[Callable[Given, Made]], Callable[Given, Made]]:
-    """Decorator of a function that writes the file which its parameter ``to`` gives, if it is not None; see ``output_file``."""
+    """Decorator for a function that writes the file given by its parameter ``to``, if that is not None (see ``output_file``)."""
     return _opening(to, lambda path: output_file(path, *beside))
 
 
@@ -135,12 +135,12 @@ def _opening(to: str, context: Callable[[Path], AbstractContextManager[None]]) -
 
 
 def contents(folder: Path) -> list[str]:
-    """Sorted names of what lies in a folder, without what the store keeps there for itself.
+    """Sorted names of the files and folders in a folder, without the store's own files.
 
     Raises
     ------
     StoreError
-        The folder can't be read.
+        If the folder can't be read.
     """
     try:
         return sorted(
@@ -155,18 +155,18 @@ def contents(folder: Path) -> list[str]:
 
 
 def written_by_us(folder: Path) -> list[str]:
-    """Sorted names in a folder that this program wrote and that were not changed since."""
+    """Sorted names of the files and folders in a folder that this program wrote and that have not changed since."""
     known = _read_list(folder)
     return [name for name in contents(folder) if _is_ours(folder / name, known)]
 
 
 def _require_ours(folder: Path, names: Iterable[str]) -> dict[str, str]:
-    """The folder's list, once it is sure that the names may be written.
+    """The folder's list, after a check that files with the given names may be written.
 
     Raises
     ------
     StoreError
-        One is there that this program did not write.
+        If there is a file with such a name that this program did not write or that has changed since.
     """
     known = _read_list(folder)
     foreign = [name for name in _there(folder, names) if not _is_ours(folder / name, known)]
@@ -180,13 +180,13 @@ def _require_ours(folder: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def _there(folder: Path, names: Iterable[str]) -> list[str]:
-    """What lies in a folder under these names."""
+    """Names of the files and folders in a folder that match the patterns ``names``."""
     patterns = tuple(names)
     return [name for name in contents(folder) if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
 
 
 def _is_ours(path: Path, known: dict[str, str]) -> bool:
-    """Whether a file is as the list of its folder says, or a folder is in the list or empty."""
+    """Whether a file agrees with the list of its folder; for a folder, whether it is in the list or empty."""
     digest = known.get(path.name)
     if digest is None:
         pattern = any(value == _ANY and fnmatch.fnmatchcase(path.name, name) for name, value in known.items())
@@ -195,14 +195,14 @@ def _is_ours(path: Path, known: dict[str, str]) -> bool:
 
 
 def _enter(folder: Path, names: Sequence[str], gone_on: Sequence[str] = ()) -> None:
-    """Enter what lies there under these names, with its digest if no run goes on from it; names of nothing leave the list."""
+    """Enter the existing files with these names into the list, with their digests except for ``gone_on``; remove names without a file."""
     known = {name: digest for name, digest in _read_list(folder).items() if name not in names}
     found = {name: _ANY if name in gone_on else _digest(folder / name) for name in _there(folder, names)}
     _write_list(folder, {name: digest for name, digest in (known | found).items() if digest != _ANY or (folder / name).exists()})
 
 
 def _digest(path: Path) -> str:
-    """Digest of a file; of anything else none."""
+    """Digest of a regular file; ``_ANY`` for anything else."""
     if path.is_symlink() or not path.is_file():
         return _ANY
     try:
@@ -213,7 +213,7 @@ def _digest(path: Path) -> str:
 
 
 def _read_list(folder: Path) -> dict[str, str]:
-    """The files that this program wrote, with their digests. A list that is damaged names none."""
+    """The files that this program wrote, with their digests; empty if the list is damaged."""
     path = folder / WRITTEN
     if path.is_symlink() or not path.is_file():
         return {}
@@ -228,13 +228,13 @@ def _read_list(folder: Path) -> dict[str, str]:
 
 def _write_list(folder: Path, content: dict[str, str]) -> None:
     path = write_json(folder / WRITTEN, dict(sorted(content.items())))
-    if not content:  # written all the same, because this tries the folder
+    if not content:  # the list was still written, because this tests whether the folder can be written
         path.unlink(missing_ok=True)
 
 
 @contextmanager
 def _held_once(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
-    """Hold a folder as ``locked`` does, unless this context holds it already."""
+    """Context that reserves a folder as ``locked`` does, unless this context has reserved it already."""
     place = Path(os.path.abspath(folder))
     if place in _held.get():
         yield
@@ -249,7 +249,7 @@ def _held_once(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
 
 @contextmanager
 def _told(path: Path) -> Iterator[None]:
-    """Context in which a full disk, or one that became read-only, is told as the store tells it, whoever notices it."""
+    """Context that converts the error of a full or read-only disk to the ``StoreError`` of ``unwritten``."""
     try:
         yield
     except OSError as error:

@@ -64,7 +64,7 @@ def find_arrays(folder: Path, item: Item) -> dict[str, np.ndarray] | None:
     try:
         with np.load(folder / f"{item.file}.npz", allow_pickle=False) as file:
             return {name: file[name] for name in file.files if name != _RECORD}
-    except Exception:  # zipfile and numpy raise exceptions of any type for damaged files; the file is written anew
+    except Exception:  # zipfile and numpy raise exceptions of any type for damaged files; the file is written again
         return None
 
 

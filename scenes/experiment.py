@@ -57,7 +57,7 @@ class MoveRanges(Section):
 
 
 class ExperimentSpec(Section):
-    """An experiment, complete.
+    """The complete specification of an experiment.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class ExperimentSpec(Section):
     description : str
         One line for ``twin experiments``.
     source : str
-        Where the ranges come from.
+        Source of the ranges.
     object : str
         Default object of the contacts: a name of ``twin objects`` or a file.
     approach : {"x", "y", "z"}

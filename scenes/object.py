@@ -145,7 +145,7 @@ class TextureSpec(Section):
 
 
 class ObjectSpec(Section):
-    """An object, complete.
+    """The complete specification of an object.
 
     The four keys of friction apply to contacts without an arm and to sensors without a rig. If a sensor has a rig, the rig's friction
     applies instead (see ``RigSpec``).
@@ -157,7 +157,7 @@ class ObjectSpec(Section):
     description : str
         One line for ``twin objects``.
     source : str
-        Where the numbers come from.
+        Source of the numbers.
     shape : PlaneShape, SphereShape, CylinderShape, EdgeShape, PrismShape or MeshShape
         The surface. Its key ``kind`` selects the shape.
     texture : TextureSpec, optional

@@ -1,9 +1,8 @@
-"""The specification of a TacTip: geometry, material, optics, camera, recording, pipeline, rig.
+"""Specification of a TacTip: geometry, material, optics, camera, recording, pipeline and rig.
 
-Sensor frame: origin at the centre of a cap's sphere or in the middle of a flat pad's outside, z out of the tip
-(apex at ``z = skin.apex_mm``), x and y along the image's x (right) and y (down) of an
-untilted camera. Lengths mm, stiffness MPa (N/mm^2), angles deg (files only), pixels px
-with (0, 0) at the centre of the first pixel of the *raw* camera frame.
+Sensor frame: The origin is the centre of a cap's sphere, or the centre of a flat pad's outside. z points out of the tip (apex at
+``z = skin.apex_mm``). x and y are along the image's x (right) and y (down) of an untilted camera. Lengths are in mm, stiffness in MPa
+(N/mm^2), angles in deg (in files only), and pixels in px with (0, 0) at the centre of the first pixel of the *raw* camera frame.
 """
 
 import math
@@ -17,7 +16,7 @@ from scenes.pins import PinsSpec
 from scenes.rig import RigSpec
 
 ELSEWHERE = "leave it out if it was measured on another layout"
-"""What to do with caps that were measured and do not fit."""
+"""Remedy in the error for measured values of caps that do not fit the layout."""
 
 
 class LensSpec(Section):
@@ -26,13 +25,13 @@ class LensSpec(Section):
     Attributes
     ----------
     z_mm : float
-        Plane of its gel-side face.
+        z of its face on the gel side.
     radius_mm : float
-        Of the window. The default is measured from public CAD of the TacTip.
+        Radius of the window. The default is measured from public CAD of the TacTip.
     thickness_mm : float
-        From face to face.
+        Thickness of the window.
     refractive_index : float
-        The default is that of acrylic.
+        Refractive index of the window. The default is that of acrylic.
     """
 
     z_mm: float = -2.0
@@ -47,7 +46,7 @@ class LensSpec(Section):
 
 
 class CameraSpec(Section):
-    """Camera in the air behind the window. Refraction at the window is not part of these numbers: it comes on top.
+    """Camera in the air behind the window. These numbers do not include the refraction at the window, which is computed separately.
 
     Attributes
     ----------
@@ -56,27 +55,27 @@ class CameraSpec(Section):
     channels : {"color", "mono"}
         Whether frames are in colour or gray.
     projection : {"perspective", "fisheye"}
-        Perspective: Brown-Conrady distortion k1, k2, p1, p2 of the tangents. Fisheye: theta (1 + k1 theta^2 + k2 theta^4)
-        (Kannala and Brandt 2006).
+        Projection model. "perspective": Brown-Conrady distortion k1, k2, p1, p2 of the tangents. "fisheye":
+        theta (1 + k1 theta^2 + k2 theta^4) (Kannala and Brandt 2006).
     fx_px, fy_px, cx_px, cy_px : float
         Focal lengths and principal point.
     distance_mm : float
-        From the entrance pupil to the origin (a cap's centre, a pad's outside): the pupil is at z = -distance. Negative where a shallow
-        cap's centre lies behind the pupil.
+        Distance from the entrance pupil to the origin (the centre of a cap, or the outside of a pad): the pupil is at z = -distance. It is
+        negative if the centre of a shallow cap is behind the pupil.
     tilt_x_deg, tilt_y_deg : float
-        The camera is turned about its pupil.
+        Rotation of the camera about its pupil.
     k1, k2, p1, p2 : float
-        Distortion: radial (k) and tangential (p), as ``projection`` says.
+        Coefficients of the radial (k) and tangential (p) distortion of the ``projection``.
     aperture_mm : float
-        The pupil's diameter; 0: everything is sharp.
+        Diameter of the entrance pupil. With 0 the image is sharp everywhere.
     focus_mm : float
-        Distance in air, from the pupil, of what is sharp, where ``aperture_mm`` is above 0. The default is near a TacTip's caps.
+        Distance in air from the pupil to the plane of focus, if ``aperture_mm`` is above 0. The default is near a TacTip's caps.
     vignetting : float
-        Share of light that is lost at the corners; it rises with the square of the distance from the image's middle.
+        Fraction of the light that is lost at the corners. The loss increases with the square of the distance from the image's centre.
     red_scale, blue_scale : float
-        Size of these colours' images about the principal point, relative to green's.
+        Size of the red and of the blue image about the principal point, relative to the green image.
     red_shift_px, blue_shift_px : (x, y)
-        How far these images are shifted.
+        Shift of the red and of the blue image, relative to the green image.
     """
 
     width_px: Annotated[int, Field(ge=16, le=8192)]
@@ -110,32 +109,32 @@ class CameraSpec(Section):
 
 
 class LedRingSpec(Section):
-    """LEDs in the air behind the window, shining along +z. Each is a square that is turned to face the axis.
+    """LEDs in the air behind the window. They shine along +z. Each is a square with one side towards the axis.
 
     The defaults are a ring of six like that of the UR5's TacTip; 'twin calibrate optics' finds a sensor's own.
 
     Attributes
     ----------
     azimuth_deg : tuple of float
-        One for each LED, sensor frame.
+        Azimuth of each LED in the sensor frame.
     radius_mm, z_mm : float
-        Distance from the axis, and plane.
+        Distance of the LEDs from the axis, and z of their plane.
     size_mm : float
         Side of the square.
     power : float
-        Light of one LED, whatever its size.
+        Light of one LED, independent of its size.
     balance : tuple of float
-        Factor on each LED's power; empty: all 1.
+        Factor on each LED's power. If empty, all factors are 1.
     color : three numbers
-        Linear RGB.
+        Colour of the light, linear RGB.
     off : tuple of int
-        Indices of dead LEDs.
+        Indices of LEDs that do not work.
     mirror_share : float
-        Share of an LED's light that shows in its reflection in the window; the housing hides the rest from there.
+        Fraction of an LED's light that is visible in its reflection in the window. The housing hides the rest.
     core_share : float
-        Share of that light in the middle of the LED.
+        Fraction of this light that comes from the core of the LED.
     core_mm : float
-        Sd of the Gaussian that stands for the middle.
+        Standard deviation of the Gaussian that represents the core.
     """
 
     azimuth_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=64)] = (0.0, 60.0, 120.0, 180.0, 240.0, 300.0)
@@ -158,15 +157,15 @@ class LedRingSpec(Section):
 
 
 class RimSpec(Section):
-    """Measured light where the housing meets the window, on top of the formulas: glue, burrs, glare.
+    """Measured light at the rim between housing and window, which is added to the formulas: glue, burrs, glare.
 
     Attributes
     ----------
     inner_mm, outer_mm : float
         Radii about the housing's centre, in its plane, between which the light was measured.
     light : (A, R, 3) int
-        Added linear red, green and blue in thousandths of saturation, may be negative. Row j is at azimuth 2 pi j / A, column k at
-        the k-th of R evenly spaced radii; linear between them.
+        Added linear red, green and blue light in thousandths of saturation; it may be negative. Row j is at azimuth 2 pi j / A, column k at
+        the k-th of R evenly spaced radii. The light is linear between them.
     """
 
     inner_mm: Positive
@@ -183,16 +182,16 @@ class RimSpec(Section):
 
 
 class BackgroundSpec(Section):
-    """Measured light of everything that contacts do not change, on top of the formulas: housing, flare, glints, bubbles.
+    """Measured light that contacts do not change, which is added to the formulas: housing, flare, glints, bubbles.
 
     The default of ``span`` is that of 'twin calibrate optics'.
 
     Attributes
     ----------
     light : picture of the camera's whole frame, red, green and blue; of another size it is scaled to the frame
-        Added linear light, which may be negative. A level v stands for ``sign(v - 128) span (|v - 128| / 127)^2.2``.
+        Added linear light, which may be negative. A level v means ``sign(v - 128) span (|v - 128| / 127)^2.2``.
     span : float
-        Light of the levels 255 and (negative) 1, as a share of saturation.
+        Light of the level 255, relative to saturation. The level 1 has the same light with a negative sign.
     """
 
     light: Picture
@@ -202,35 +201,36 @@ class BackgroundSpec(Section):
 class HousingSpec(Section):
     """The bright ring and wall around the disc that the camera sees: a flat annulus in the air.
 
-    The defaults are those of the UR5's TacTip, without what was measured of its rim.
+    The defaults are those of the UR5's TacTip, without the measured light of its rim.
 
     Its light is relative to the LEDs' power (formula: ``twin.optics.static_layer.housing_light``).
 
     Attributes
     ----------
     aperture_radius_mm, outer_radius_mm : float
-        Of the annulus.
+        Inner and outer radius of the annulus.
     aperture_mm : (width, height), optional
-        Of a rectangular opening, along x and y, instead of the round one.
+        Size of a rectangular opening along x and y. It replaces the round opening.
     z_mm, center_mm : float, (x, y)
-        Its plane and its centre.
+        z of its plane, and its centre.
     albedo : three numbers
-        Linear RGB.
+        Reflectance, linear RGB.
     ambient : float
         Light at the inner edge.
     ambient_falloff_mm : float
-        Length over which that light falls off outwards.
+        Length over which this light decreases outwards.
     glow, glow_radius_mm, glow_height_mm, glow_exponent : float
-        Each LED adds ``glow (1 + d^2 / h^2)^-n`` at the distance d from its place at ``glow_radius_mm``, with h the
-        ``glow_height_mm`` and n the ``glow_exponent``. n = 1.5: a small source at the height h above matt material; higher: glossy.
+        Each LED adds the light ``glow (1 + d^2 / h^2)^-n`` at the distance d from its position at ``glow_radius_mm``, with the height h
+        (``glow_height_mm``) and the exponent n (``glow_exponent``). n = 1.5 is a small source at the height h above a matt material; a
+        larger n is a glossy material.
     lip_width_mm, wall_fraction : float
-        Farther out than the lip's width the wall shows only this share of the light.
+        Width of the lip, and fraction of the light that the wall beyond the lip shows.
     fill, fill_width_mm : float
-        Radiance with which the innermost ``fill_width_mm`` of the ring light the gel.
+        Radiance with which the inner part of the ring illuminates the gel, and width of this part.
     rim : RimSpec, optional
-        Light measured on top of all that.
+        Measured light that is added to these formulas.
     background : BackgroundSpec, optional
-        Light measured on top of the rim's, at each pixel of the frame.
+        Measured light that is added to the light of the rim, at each pixel of the frame.
     """
 
     aperture_radius_mm: Positive = 16.6
@@ -265,13 +265,13 @@ class SpeckSpec(Section):
     Attributes
     ----------
     x_mm, y_mm : float
-        Its middle in the sensor frame.
+        Its centre in the sensor frame.
     radius_mm : float
-        Of the disc.
+        Radius of the disc.
     opacity : float
-        Share of the light from behind it that it hides.
+        Fraction of the light from behind that it hides.
     light : float
-        Radiance that it sends itself, as a share of saturation.
+        Radiance that it adds, relative to saturation.
     """
 
     x_mm: float
@@ -282,32 +282,31 @@ class SpeckSpec(Section):
 
 
 class ReliefSpec(Section):
-    """What was measured of caps and of the skin around them: light added to the smooth model's, at places fixed to each cap.
+    """Measured details of caps and of the skin around them: light that is added to the smooth model, at positions fixed to each cap.
 
-    Each pin has a square tile of cells in the plane of its cap. The tile moves and turns with the cap, and the lights that light
-    the cap light it: the added light is the tile's value times the light of the smooth cap, so that a darker cap or lamp makes it darker.
-    A place belongs to the nearest cap.
-    The defaults are a tile of both caps and skin as it was measured.
+    Each pin has a square tile of cells in the plane of its cap. The tile moves and rotates with the cap. The added light is the tile's
+    value times the light of the smooth cap, so it decreases with the light of the cap and of the lamps. A point belongs to the nearest cap.
+    The defaults use a tile on both caps and skin, as it was measured.
 
     Attributes
     ----------
     tiles : picture
-        Red, green and blue of all tiles, row by row, as many in a row as fit the picture's width. A level v stands for the
-        share ``sign(v - 128) span (|v - 128| / 127)^1.5`` of the smooth cap's light, which may be negative.
+        Red, green and blue of all tiles, row by row, with as many tiles in a row as fit into the picture's width. A level v means the
+        fraction ``sign(v - 128) span (|v - 128| / 127)^1.5`` of the smooth cap's light, which may be negative.
     count : int
         Number of tiles.
     span : float
-        Share of the levels 255 and (negative) 1.
+        Fraction of the smooth cap's light for the level 255. The level 1 has the same fraction with a negative sign.
     cells : int
-        Cells along a tile's side; between their centres the value is bilinear.
+        Number of cells along a tile's side. Between the centres of cells the value is bilinear.
     reach : float
-        Distance of a tile's outermost cell centres from its middle along the sides, cap radii. One side is along the projection of the
+        Distance of a tile's outermost cell centres from its centre along the sides, in cap radii. One side is along the projection of the
         sensor's x.
     caps, skin : bool
         Whether the tiles are used on the caps with their edges (up to ``SKIN_FROM`` cap radii), and on the skin around.
     pattern : int
-        0: each pin has its own tile. Another number is another print of the sensor: each pin's tile is drawn at random, with the mean
-        and the covariance of all measured tiles.
+        With 0 each pin has its own tile. Another number stands for another print of the sensor: each pin's tile is drawn at random, with
+        the mean and the covariance of all measured tiles.
     """
 
     tiles: Picture
@@ -321,9 +320,9 @@ class ReliefSpec(Section):
 
 
 class AppearanceSpec(Section):
-    """Reflectances (linear RGB, 0 to 1) of what the camera sees in the gel.
+    """Reflectances (linear RGB, 0 to 1) of the surfaces in the gel.
 
-    The defaults of skin, pins and caps are those fitted to the UR5's TacTip.
+    The defaults of skin, pins and caps were fitted to the UR5's TacTip.
 
     Attributes
     ----------
@@ -332,23 +331,24 @@ class AppearanceSpec(Section):
     skin_gloss, cap_gloss : float
         Weight of a rough specular lobe.
     skin_roughness, cap_roughness : float
-        Roughness of that lobe.
+        Roughness of this lobe.
     cap_bump : float
-        Share of the light that a cap takes as a small ball does, from any direction, and not as a flat disc: printed caps are
-        round and translucent.
+        Fraction of the light that a cap receives like a small ball, from any direction. The cap receives the rest like a flat disc. Printed
+        caps are round and translucent.
     cap_levels : tuple of float
-        Reflectance of each cap relative to ``cap_albedo``, in pin order, where it was measured.
+        Measured reflectance of each cap relative to ``cap_albedo``, in pin order.
     cap_variation, cap_pattern : float, int
-        Where no levels were measured: relative sd, and number, of a random pattern. Another number is another print of the sensor.
+        Relative standard deviation and number of a random pattern of reflectances, if no levels were measured. Another number stands for
+        another print of the sensor.
     cap_shapes : (N, 1 + 2 n) float
-        Measured outline of each cap relative to a circle: a_0, a_2, b_2, a_3, b_3, ... of ``1 + a_0 + sum a_m cos(m t) + b_m sin(m t)``,
-        t turning from the sensor's x towards y.
+        Measured outline of each cap relative to a circle: a_0, a_2, b_2, a_3, b_3, ... of ``1 + a_0 + sum a_m cos(m t) + b_m sin(m t)``.
+        The angle t goes from the sensor's x towards y.
     cap_offsets : (N, 2) float
-        a_1 and b_1: how far the outline's middle lies beside the pin's, in cap radii.
+        a_1 and b_1: offset of the outline's centre from the pin's centre, in cap radii.
     specks : tuple of SpeckSpec
         Bubbles and grains on the window.
     relief : ReliefSpec, optional
-        What was measured of each cap and of the skin around it.
+        Measured details of each cap and of the skin around it.
     """
 
     skin_albedo: Rgb = (0.0006, 0.00048, 0.0055)
@@ -369,21 +369,21 @@ class AppearanceSpec(Section):
 
 
 class ResidualSpec(Section):
-    """A small network that adds to a colour frame what the models of light and camera leave out, before the stream rounds it.
+    """A small network that corrects the discrepancy of the light and camera models in a colour frame, before the stream rounds the frame.
 
-    It makes frames look like the camera's. Pins do not need it: it moves their centroids by a few hundredths of a pixel. It is off unless
-    ``used`` is set, and belongs to the calibration that it was taught with.
+    It makes frames look like those of the camera. The pins do not need it: it moves their centroids by a few hundredths of a pixel. It is
+    off unless ``used`` is set. It is valid only with the calibration with which it was trained.
 
     Attributes
     ----------
     weights : tuple of float
         Kernels and biases of its four convolutions, one after the other.
     channels, noises : int
-        Number of channels within, and of random numbers at each pixel.
+        Number of channels in the hidden layers, and number of random values at each pixel.
     center_px, radius_px : two numbers, float
-        It acts within this circle of the full frame: the lens disc.
+        Circle of the full frame in which the network acts: the lens disc.
     used : bool
-        Whether frames get it.
+        Whether the network is applied to frames.
     """
 
     weights: tuple[float, ...]
@@ -408,38 +408,39 @@ class ResidualSpec(Section):
 
 
 class ResponseSpec(Section):
-    """From linear light to 8-bit gray levels. The steps follow one another in this order.
+    """The camera's response: from linear light to 8-bit gray levels. The steps are in the order of the keys.
 
     The defaults are plausible numbers for a USB camera; 'twin calibrate optics' finds a sensor's own.
 
     Attributes
     ----------
     blur_sigma_px : float
-        Blur of the optics.
+        Standard deviation of the optics' blur.
     exposure, white_balance : float, three numbers
-        Gain, and gain of each colour.
+        Gain of all colours, and gain of each colour.
     brightness_drift : float
-        Relative sd of a gain that is drawn for each frame.
+        Relative standard deviation of a gain that is drawn for each frame.
     read_noise, shot_noise : float
         The noise has the variance ``read_noise^2 + shot_noise * light``; light 1 is saturation.
     noise_sigma_px : float
-        The camera smooths the luma's noise by this.
+        Standard deviation of the Gaussian with which the camera smooths the luma's noise.
     sharpening, sharpening_sigma_px : float
-        Weight and sd of the unsharp mask that the camera applies to the luma, not to its noise.
+        Weight and standard deviation of the unsharp mask that the camera applies to the luma, but not to its noise.
     gamma, black_level : float
-        The curve is ``black + (255 - black) light^(1 / gamma)``.
+        Parameters of the response curve ``black + (255 - black) light^(1 / gamma)``.
     chroma_sigma_px : float
-        Blur of the colour differences, in gray levels.
+        Standard deviation of the blur of the colour differences, which are in gray levels.
     chroma_median_px : {0, 3, 5}
-        Side of the square over which the camera then takes their median, which keeps edges (0: none).
+        Side of the square of the median filter that the camera then applies to the colour differences, and which preserves edges. 0 means
+        no filter.
     chroma_columns : {1, 2}
-        This many neighbouring columns share the colour differences of the first one (2: a 4:2:2 stream).
+        Number of neighbouring columns that share the colour differences of the first one (2 for a 4:2:2 stream).
     stream : {"rgb", "bt601", "bt709"}
-        The frame comes as whole numbers of luma and colour differences (ITU-R BT.601 or BT.709, studio range), or as RGB.
+        Format of the stream: integers of luma and colour differences (ITU-R BT.601 or BT.709, studio range), or RGB.
     jpeg_quality : int
-        Of the stream; 0: not compressed.
+        JPEG quality of the stream. 0 means no compression.
     residual : ResidualSpec, optional
-        A small network that comes before the stream, if it is switched on.
+        A small network that acts before the stream, if it is switched on.
     """
 
     exposure: Positive = 1.0
@@ -462,23 +463,23 @@ class ResponseSpec(Section):
 
 
 class RecordingSpec(Section):
-    """The capture side of the sensor's recordings: crop, gray, median, adaptive threshold, resize.
+    """Processing of raw frames in the sensor's recordings: crop, gray, median, adaptive threshold, resize.
 
     Attributes
     ----------
     crop_px : (x0, y0, x1, y1)
-        End exclusive.
+        Part of the raw frame, end exclusive.
     width_px, height_px : int
         Size of the stored image.
     resized : {"after", "before"}
-        Whether the picture is resized after its threshold, as the MG400's recorder does, or before it, as the UR5's does. Resized after
-        it, a picture has gray edges.
+        Whether the picture is resized after the threshold, as in the MG400's recorder, or before it, as in the UR5's. A picture that is
+        resized after the threshold has gray edges.
     median_px : {0, 3, 5}
-        Width of the median filter before the threshold; 0: none.
+        Width of the median filter before the threshold; 0 means no filter.
     threshold_weights : {"gaussian", "mean"}
-        How the threshold's block is averaged.
+        Weights of the mean over the threshold's block.
     threshold_block_px, threshold_offset : int, float
-        As OpenCV's ``adaptiveThreshold`` takes them; the block is one of the picture that the threshold sees.
+        Arguments of OpenCV's ``adaptiveThreshold``. The block is in pixels of the picture to which the threshold is applied.
     """
 
     crop_px: tuple[int, int, int, int]
@@ -501,27 +502,28 @@ class RecordingSpec(Section):
 
 
 class BlobSpec(Section):
-    """How pins are found in one form of the sensor's frames. All lengths are in px of that form's own frame.
+    """Detection of pins in one form of the sensor's frames. All lengths are in px of a frame of this form.
 
     Attributes
     ----------
     threshold : float
-        A fixed gray level (0 to 255) if ``threshold_block_px`` is 0, else the offset of an adaptive mean threshold over that block.
+        A fixed gray level (0 to 255) if ``threshold_block_px`` is 0, else the offset of an adaptive mean threshold with this block.
     threshold_block_px : int
-        Side of the square over which the mean is taken; 0: one fixed threshold.
+        Side of the square block of the mean; 0 means one fixed threshold.
     erosion_px : int
-        Size of the square erosion kernel; 1: no erosion.
+        Size of the square erosion kernel; 1 means no erosion.
     mask_center_px, mask_radius_px : (x, y), float
-        Disc within which pins are looked for.
+        Centre and radius of the disc in which pins are searched for.
     min_area_px2 : float
-        Smaller blobs are left out.
+        Smallest area of a blob. Smaller blobs are ignored.
     spot_sigma_px : float
-        If above 0, pins are not found by a threshold but as bright spots of this size (sd of a Gaussian; a cap is about three wide), each
-        compared with its surroundings. It takes caps with a pattern, of uneven light, and near reflections.
+        If above 0, pins are detected as bright spots of this size instead of with a threshold. The size is the standard deviation of a
+        Gaussian; a cap is about three times as wide. Each spot is compared with its surroundings, so this detection also finds caps that
+        have a pattern, are unevenly lit, or are near reflections.
     rest_px : (N, 2) float
-        Where the pins were measured without contact, in this form's frames; empty: where the camera sees them by the specification.
+        Measured positions of the pins without contact, in frames of this form. If empty, they are the projections by the specification.
     rest_origin : {"measured", "contacts"}
-        Whether ``rest_px`` was measured in a frame without contact, or made from contacts, which is less exact.
+        Whether ``rest_px`` was measured in a frame without contact, or estimated from contacts, which is less accurate.
     """
 
     threshold: float
@@ -536,16 +538,16 @@ class BlobSpec(Section):
 
 
 class UsualCapsSpec(Section):
-    """Light and focus of a unit, as its raw frames showed them when its specification was made; 'twin check' compares with them.
+    """Light and focus in the raw frames of a unit when its specification was made. 'twin check' compares new frames with these values.
 
     Attributes
     ----------
     contrast : float
-        Gray levels of the caps above the skin around them, median.
+        Median difference between the caps and the skin around them, in gray levels.
     edge_px : float
-        Width of the caps' edges, median: the distance in which the level falls from 90 to 10 % of the contrast.
+        Median width of the caps' edges: the distance over which the level decreases from 90 to 10 % of the contrast.
     unevenness : float
-        Gray levels by which the brightest part of the skin is brighter than most of it.
+        Difference between the brightest part of the skin and most of the skin, in gray levels.
     """
 
     contrast: Positive
@@ -559,11 +561,11 @@ class PipelineSpec(Section):
     Attributes
     ----------
     raw : BlobSpec
-        For the camera's own frames.
+        Detection in the camera's own frames.
     recording : BlobSpec, optional
-        For the recordings' cropped and thresholded form.
+        Detection in the recordings' cropped and thresholded frames.
     usual_caps : UsualCapsSpec, optional
-        What the unit's raw frames showed; without it 'twin check' expects what the twin draws.
+        Light and focus of the unit's raw frames. Without it 'twin check' uses the values of a frame that the twin draws.
     """
 
     raw: BlobSpec
@@ -572,7 +574,7 @@ class PipelineSpec(Section):
 
 
 class GeometrySpec(Section):
-    """Where skin, window and pins are: what the meshes of a sensor are made from (``SensorSpec.geometry``).
+    """Geometry of skin, window and pins, from which the meshes of a sensor are made (``SensorSpec.geometry``).
 
     Attributes
     ----------
@@ -586,7 +588,7 @@ class GeometrySpec(Section):
 
 
 class ViewSpec(Section):
-    """What decides where the camera sees a place in the gel: the camera, the window and the gel's index (``SensorSpec.view``).
+    """Parameters of the projection of points in the gel to the image: camera, window and the gel's index (``SensorSpec.view``).
 
     Attributes
     ----------
@@ -602,7 +604,7 @@ class ViewSpec(Section):
 
 
 class CaptureSpec(Section):
-    """What makes a frame from the light on the film: the gel's haze, the camera's optics and its response (``SensorSpec.capture``).
+    """Parameters that turn the light on the film into a frame: the gel's haze, the camera's optics and response (``SensorSpec.capture``).
 
     Attributes
     ----------
@@ -616,9 +618,9 @@ class CaptureSpec(Section):
 
 
 class SensorSpec(Section):
-    """A TacTip, complete.
+    """The complete specification of a TacTip.
 
-    A file needs only [pins], [camera] and [pipeline.raw]; all other sections have defaults, those of a printed TacTip.
+    A file needs only [pins], [camera] and [pipeline.raw]. All other sections have the defaults of a printed TacTip.
 
     Attributes
     ----------
@@ -627,31 +629,31 @@ class SensorSpec(Section):
     description : str
         One line for ``twin sensors``.
     source : str
-        Where the numbers come from.
+        Source of the numbers.
     skin : SkinSpec
         The soft skin.
     gel : GelSpec
-        What fills it.
+        The gel in the skin.
     lens : LensSpec
         The window behind the gel.
     pins : PinsSpec
-        The pins' layout and size.
+        Layout and size of the pins.
     camera : CameraSpec
-        Where the camera is, and how it projects.
+        Position and projection of the camera.
     leds : LedRingSpec
-        The light.
+        The LEDs.
     housing : HousingSpec
-        What the camera sees around the window.
+        The housing that the camera sees around the window.
     appearance : AppearanceSpec
         Reflectances of skin, pins and caps.
     response : ResponseSpec
-        From light to gray levels.
+        The camera's response, from light to gray levels.
     recording : RecordingSpec, optional
-        How the sensor's recordings were made from raw frames.
+        Processing of raw frames in the sensor's recordings.
     pipeline : PipelineSpec
-        How pins are found.
+        Detection of the pins.
     rig : RigSpec, optional
-        The robot that holds the sensor, where its contacts were calibrated.
+        The robot that holds the sensor, if its contacts were calibrated.
     """
 
     name: Name
@@ -722,7 +724,7 @@ class SensorSpec(Section):
         return self
 
     def _check_reach(self) -> None:
-        """The outermost pins must stand on the skin: before a cap's rim, on a pad's flat part."""
+        """Check that the outermost pins are on the skin: inside a cap's rim, or on the flat part of a pad."""
         skin, reach_mm = self.skin, self.pins.reach_mm
         if skin.shape == "cap":
             polar_rad = self.pins.largest_polar_rad(skin.apex_mm - skin.thickness_mm)

@@ -38,7 +38,7 @@ class ServoSpec(Section):
     description : str
         What the file is for.
     source : str
-        Where the numbers come from.
+        Source of the numbers.
     experiment : str
         Experiment whose labels the model estimates. It defines the approach and the zero of the depth.
     indent_mm, angle_deg : float

@@ -1,1 +1,1 @@
-"""How good it is: pictures against real frames, pins against labelled frames, and how far a sensor may degrade."""
+"""Evaluation of the twin: pictures compared with real frames, pins compared with labelled frames, and robustness to degradations."""

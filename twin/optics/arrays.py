@@ -2,9 +2,9 @@
 
 Dr.Jit's vectorised variants use the memory of a NumPy array without a copy, and their kernels read it in whole packets: up to one packet
 beyond the last element. If that is beyond the end of a mapped page, the process is killed (drjit 1.5, `arr + 1` on such an array).
-Embree also reads beyond the last vertex. Therefore every array that is handed over has unused memory behind its end.
+Embree also reads beyond the last vertex. Therefore every array that is given to them has unused memory behind its end.
 
-A kernel is compiled anew for arrays that do not begin at a multiple of a packet's size. Therefore they all do.
+A kernel is compiled again for arrays that do not begin at a multiple of a packet's size. Therefore all copies begin at such a multiple.
 """
 
 from typing import TypeVar

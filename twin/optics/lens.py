@@ -17,7 +17,8 @@ from twin.optics.window import Window
 from twin.types import FloatArray
 
 FIELD_MARGIN = 0.97
-"""Share of the radius of the distortion's fold up to which the distortion model is used. Beyond it the table is extrapolated linearly."""
+"""Largest radius at which the distortion model is used, relative to the radius at which it folds back. Beyond it the table is extrapolated
+linearly."""
 WIDEST_FIELD = 6.0
 """Largest tangent of a perspective camera (80 deg off its axis)."""
 WIDEST_FISHEYE = 57.0

@@ -201,7 +201,7 @@ class Preview:
         drawing = self._drawing(self._rest)
         known = self._known(self._rest)
         gel = traced - known
-        # weights by the drawn light: those by the noisy traced light would favour samples that are too dark; light below 0 was cut off
+        # the weights depend on the drawn light: with the noisy traced light, samples that are too dark would get too much weight
         drawn = known + self._through * self._gel(drawing, Shading())
         weight = np.where(traced > 0, (np.maximum(drawn, 0) + DARK) ** -0.5, 0)
         alone = np.eye(8).reshape(8, 2, 4, 1)  # shadings in which one gain, or one offset, is 1 and all others are 0

@@ -13,11 +13,11 @@ from twin.optics.surfaces import CAP_BEVEL, STEM_SIDES, cap_outlines
 from twin.types import BoolArray, FloatArray, IntArray
 
 SIDES = 16
-"""Corners of an outline's polygon."""
+"""Number of corners of an outline's polygon."""
 RIM_PLACES = 6
 """Number of places of a cap's rim that are projected. The image of the rim is smooth, so these places determine it."""
 EVENLY = np.sqrt(2 * np.pi / SIDES / np.sin(2 * np.pi / SIDES))
-"""Factor on the radius with which the polygon has the area of the round outline that it approximates."""
+"""Factor on the radius of a polygon that gives it the same area as the round outline."""
 STEM_WIDTH = STEM_SIDES / np.pi * np.sin(np.pi / STEM_SIDES)
 """Mean width of the traced stems, which are prisms, relative to their diameter."""
 TURN = np.arange(SIDES) * 2 * np.pi / SIDES

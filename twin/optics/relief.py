@@ -23,7 +23,8 @@ from twin.types import BoolArray, FloatArray, IntArray, PinState
 POWER = 1.5
 """Power of a tile's levels (see ``ReliefSpec.tiles``)."""
 SKIN_FROM = 1.3
-"""Distance from a cap's middle, cap radii, from which a place counts as skin: the edge of a cap is blurred up to there."""
+"""Distance from a cap's centre, in cap radii, beyond which a point counts as skin. The blurred edge of a cap extends up to this
+distance."""
 
 
 DETAILS = ("relief", "grain", "background")

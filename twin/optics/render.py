@@ -1,4 +1,4 @@
-"""Rendering: a sensor's state becomes the linear light on its camera's film."""
+"""Renderer: it computes the linear light on the camera's film for a state of the sensor."""
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -28,19 +28,19 @@ from twin.store import cached_arrays, write_bytes
 from twin.types import FloatArray, IntArray, PinState
 
 Quality = Literal["drawn", "preview", "standard", "high"]
-"""How a render is made: drawn with exact edges and without noise (`Preview`), or path-traced with ever more samples."""
+"""Quality of a render: drawn with exact edges and without noise (`Preview`), or path-traced with an increasing number of samples."""
 SAMPLES = {"drawn": 0, "preview": 4, "standard": 16, "high": 64}
-"""Samples per pixel, by quality."""
+"""Number of samples per pixel, by quality."""
 SCALAR_SAMPLES = {"drawn": 0, "preview": 1, "standard": 4, "high": 16}
-"""Samples per pixel of the scalar variant, which is several times slower."""
+"""Number of samples per pixel of the scalar variant, which is several times slower."""
 SHADING_QUALITY: Quality = "standard"
-"""Quality of the path-traced frame to which a kept shading is fitted."""
+"""Quality of the path-traced frame to which a stored shading is fitted."""
 BOUNCES = 2
 """Number of scatterings of a light path after the first. Because the skin is dark, a third one changes no gray level."""
 PASS_SEED = 0x10000
-"""Step of the seed from one pass of a picture to the next, larger than the numbers by which callers tell pictures apart."""
+"""Increment of the seed from one pass of a picture to the next. It is larger than the seeds that callers give to different pictures."""
 MOST_SAMPLES_AT_ONCE = 6_000_000
-"""Most samples of one pass. The number bounds the memory that a pass needs."""
+"""Largest number of samples in one pass. It limits the memory of a pass."""
 
 
 class Renderer:
@@ -50,7 +50,7 @@ class Renderer:
     ----------
     spec : SensorSpec
     variant : str or VariantChoice, optional
-        As `twin.optics.variant.choose_variant` takes it; by default the best variant that works.
+        Variant for `twin.optics.variant.choose_variant`. Default: the fastest variant that works.
     quality : {"drawn", "preview", "standard", "high"}
         A drawn picture costs a small part of a traced one. Its light is the lamps' direct light, with the shading of a traced frame.
     mesh : SensorMesh, optional
@@ -59,11 +59,12 @@ class Renderer:
     window_px : (x0, y0, x1, y1), optional
         Part of the raw frame to render, end exclusive; the whole frame by default.
     spp : int, optional
-        Samples of a pixel that shows a pin, instead of the quality's number. Pixels of bare skin get a quarter (`twin.optics.sampling`).
+        Number of samples of a pixel that shows a pin. It replaces the quality's number. Pixels of bare skin get a quarter of it
+        (`twin.optics.sampling`).
     bounces : int
         Number of scatterings of a light path after the first.
     shading : Shading, optional
-        Of drawn pictures; by default that of the frame at rest (`traced_shading`).
+        Shading of drawn pictures. Default: the shading of the frame at rest (`traced_shading`).
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class Renderer:
 
     @cached_property
     def preview(self) -> Preview:
-        """What draws the pictures of the quality ``drawn``."""
+        """The `Preview` that draws pictures of the quality ``drawn``."""
         preview = Preview(self.spec, window_px=self.window_px)
         preview.shading = traced_shading(preview) if self._shading is None else self._shading
         return preview
@@ -145,14 +146,14 @@ class Renderer:
         return image
 
     def refine(self, state: PinState | None = None, seed: int = 0, *, samples: Sequence[int]) -> Iterator[FloatArray]:
-        """Linear light on the film, better from pass to pass: after each pass the mean of all samples so far.
+        """Linear light on the film, with less noise after each pass: yields the mean of all samples so far.
 
         Parameters
         ----------
         state, seed
-            As ``render`` takes them.
+            As in ``render``.
         samples : sequence of int
-            For each pass, its samples of a pixel that shows a pin. A power of two is most uniform.
+            Number of samples in each pass, for a pixel that shows a pin. Samples are most uniform if it is a power of two.
 
         Notes
         -----
@@ -206,12 +207,12 @@ class Renderer:
 
 
 def traced_shading(preview: Preview) -> Shading:
-    """The shading that ``Preview.calibrate`` fits to a path-traced frame at rest. It is kept between runs.
+    """The shading that ``Preview.calibrate`` fits to a path-traced frame at rest. It is stored between runs.
 
     Raises
     ------
     RenderError
-        Nothing can be path-traced here.
+        If path tracing does not work on this machine.
     """
 
     def trace() -> dict[str, np.ndarray]:

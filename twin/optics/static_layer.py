@@ -23,19 +23,20 @@ ACROSS = 4
 EVEN = 0.02
 """Relative difference of a pixel's corners up to which their mean is the pixel's value."""
 RIM_UNIT = 1000.0
-"""Value in ``RimSpec.light`` that stands for the light 1: its numbers are thousandths."""
+"""Value in ``RimSpec.light`` for the light 1, because its numbers are thousandths of saturation."""
 BACKGROUND_POWER = 2.2
 """Power of a background's levels (see ``BackgroundSpec.light``)."""
 KEPT = 4
-"""Number of layers that are kept in memory: those of the frame and of a window of it, before and after a change."""
+"""Number of layers in memory: those of the frame and of a window of it, before and after a change."""
 SMALL = 1e-3
-"""Least light or cover to which a difference within a pixel is compared. Smaller values need no relative precision."""
+"""Smallest reference for the relative difference of light or cover within a pixel. Smaller values need no relative precision."""
 
 
 def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tuple[FloatArray, FloatArray]:
     """Light and cover of a window of the raw frame.
 
-    The last few layers are kept: what they do not depend on, as the gel's haze and the caps, may change between calls.
+    The last few layers are stored. They are used again if only parameters change that do not affect them, such as the gel's haze and the
+    caps.
 
     Returns
     -------

@@ -15,21 +15,21 @@ from twin.geometry.shapes import shape_of
 from twin.types import FloatArray, IntArray
 
 SKIN_CIRCLES = 40
-"""Circles of the skin's grid between apex and rim (squares on a rectangular pad)."""
+"""Number of circles of the skin's grid between apex and rim (squares on a rectangular pad)."""
 SKIN_PLACES = 80
-"""Vertices on each circle; a multiple of 8, so that a rectangle's corners are among them."""
+"""Number of vertices on each circle. It is a multiple of 8, so that a rectangle's corners are among them."""
 RIM_APART_RAD = 0.02
-"""Points of the rim that are nearer to a control point than this are left out: two sites at one place have no spline."""
+"""Smallest distance of a fixed point of the rim from a control point. Nearer points are omitted, because a spline needs distinct points."""
 STEM_SIDES = 8
 """Number of sides of a stem."""
 CAP_SIDES = 16
 """Number of sides of a cap."""
 CAP_BEVEL = 0.25
-"""Bevel of a cap's edge as a share of the cap's height, because printed edges are not sharp."""
+"""Bevel of a cap's edge, relative to the cap's height. Printed edges are not sharp."""
 STEM_ROOT_MM = 0.3
 """Depth inside the skin at which stems start, so that there is no gap where the skin bends."""
 MOST_CONTROL_POINTS = 1200
-"""Most control points that are used. The interpolation solves a dense linear system of this size once."""
+"""Largest number of control points. The interpolation solves a dense linear system of this size once."""
 
 
 @dataclass(frozen=True)

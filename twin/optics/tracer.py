@@ -20,9 +20,9 @@ from twin.types import FloatArray
 SURVIVAL_GAIN = 4.0
 """Ratio of the probability that a path continues to the path's weight (Russian roulette). The probability is at most 1."""
 LEAST_SURVIVAL = 0.05
-"""Least probability that a path continues."""
+"""Smallest probability that a path continues."""
 NEVER = 1e-12
-"""Probability below which it counts as 0."""
+"""Threshold below which a probability counts as 0."""
 
 
 @dataclass(frozen=True)

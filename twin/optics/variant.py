@@ -1,4 +1,4 @@
-"""The only module that chooses and sets Mitsuba variants, and the LLVM library that they use.
+"""Choice of the Mitsuba variant and of the LLVM library that it uses. Only this module chooses and sets them.
 
 Dr.Jit loads the first libLLVM that it finds. LLVM 15 and older abort the whole process at the first kernel (they have no instruction for
 IEEE fminimum). Therefore a library is chosen and tested here, before Dr.Jit searches for one. Nothing is imported or set before
@@ -100,7 +100,7 @@ def find_cuda() -> tuple[bool, str]:
 
 
 def choose_variant(channels: str = "color", prefer: str | None = None, *, llvm_search: Sequence[Path] | None = None) -> VariantChoice:
-    """The fastest Mitsuba variant that works on this machine, as tests show.
+    """The fastest Mitsuba variant that works on this machine, according to tests.
 
     Parameters
     ----------

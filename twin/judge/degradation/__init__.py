@@ -1,1 +1,1 @@
-"""Measurement of how far a sensor may degrade before its pins are lost, by known degradations of growing severity and known truth."""
+"""Robustness of the pin detection: known degradations of increasing severity, applied to frames with known pins."""

@@ -27,7 +27,7 @@ class View:
     ----------
     spec : SensorSpec
         The rendered specification, including its degradations.
-        center_px : (2,) float
+    center_px : (2,) float
     radius_px : float
         Centre and radius of the disc through which the gel is seen.
     px_per_mm : float

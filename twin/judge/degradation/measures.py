@@ -10,8 +10,8 @@ from twin.judge.degradation.shots import DegradedShot
 from twin.pins.detector import Detector, Found, named
 from twin.types import PinGraph
 
-# Largest distance of a claimed place from a pin that it counts for, as a share of the distance to that pin's nearest neighbour. It was
-# chosen below one half, so that a claim counts for one pin at most.
+# Largest distance between a detected position (a claim) and its pin, relative to the distance of the pin's nearest neighbour. It was chosen
+# below one half, so that a claim counts for one pin at most.
 GATE = 0.35
 # Cost of a pair outside the gate, px. It is far above any distance in a picture.
 OUT_OF_REACH = 1e6

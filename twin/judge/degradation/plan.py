@@ -21,9 +21,10 @@ class ConditionPlan(Section):
     Attributes
     ----------
     name : str
-        Of a condition; ``twin robustness --list`` names all.
+        Name of a condition; ``twin robustness --list`` lists all of them.
     severe : float, optional
-        Value at severity 1, in the unit of the condition's parameter. The default is the condition's own value, which is the largest.
+        Value at severity 1, in the unit of the condition's parameter. The default is the condition's own value, which is the most severe
+        one.
     """
 
     name: str
@@ -54,11 +55,11 @@ class SweepPlan(Section):
     Attributes
     ----------
     steps : tuple of float
-        Increasing severities between 0 and 1 (0 is always included). The defaults lie closer together where they are small.
+        Increasing severities between 0 and 1 (0 is always included). The defaults have smaller steps at small severities.
     condition : tuple of ConditionPlan
-        The conditions to sweep; empty: all.
+        The conditions to sweep; if empty, all of them.
     pairs : tuple of (str, str)
-        Two names each; both conditions have the same severity.
+        Pairs of names. Both conditions of a pair act together, with the same severity.
     """
 
     steps: Annotated[tuple[Annotated[float, Field(gt=0, le=1)], ...], Field(min_length=1)] = SEVERITIES[1:]

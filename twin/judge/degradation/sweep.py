@@ -34,8 +34,8 @@ class Plan:
     ----------
     source : RenderedSource or RealSource
     detectors : tuple of DetectorSpec
-        Pictures are written of the first one.
-        cases : tuple of Case
+        The detectors to compare. The pictures show the results of the first one.
+    cases : tuple of Case
     severities : tuple of float
         Increasing; the first is 0.
     models : callable, optional
@@ -99,7 +99,7 @@ def run_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, i
 
 
 def _begin(plan: Plan, folder: Path) -> Callable[[Cell], None]:
-    """What computes and keeps a cell."""
+    """Function that computes and stores a cell."""
     cv2.setNumThreads(1)
     return partial(_run, plan, folder, plan.models() if plan.models else {})
 
@@ -122,7 +122,7 @@ def _run(plan: Plan, folder: Path, models: dict[str, Estimate], cell: Cell) -> N
 
 
 def _plain_number(value: object) -> float:
-    """A number of NumPy as a number that JSON can hold."""
+    """A number of NumPy as a number that JSON can represent."""
     if isinstance(value, np.number | np.bool_):
         return float(value)
     raise TypeError(f"expected a number, got {type(value).__name__}")

@@ -10,7 +10,7 @@ from twin.judge.labelled.model import ContactModel, MeasuredFrames
 from twin.progress import Step
 
 FRICTIONS = (0.0, 0.15, 0.25, 0.32, 0.4, 0.5, 0.65, 1.0, 2.0)
-"""Coefficients of friction that are tried to find a frame's individual friction."""
+"""Coefficients of friction among which a frame's individual friction is chosen."""
 BINS = 4
 """Number of bins of a measure in the table of mean errors."""
 MEASURES = {"depth_mm": "depth, mm", "angle_deg": "turn, deg", "shear_mm": "shear, mm"}

@@ -26,7 +26,7 @@ from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel, read_arm_labels
 from twin.types import FINE, Form
 
-_SAME = 1e-9  # of the way: fractions that mean the same pose
+_SAME = 1e-9  # tolerance of a fraction of the path: fractions that differ by less belong to the same pose
 
 
 @dataclass(frozen=True)

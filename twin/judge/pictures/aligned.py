@@ -29,7 +29,8 @@ class Aligned:
     image : (H, W, 3) or (H, W) uint8
     pins_px : (N, 2) float
         Raw-frame px, in the specification's order.
-        state : FittedPins
+    state : FittedPins
+        Pins of the fitted skin.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Reading real frames. They must be raw, of one size, neither dark nor saturated, and show every pin, or nearly every one."""
+"""Reading of real frames, with checks: frames must be raw, have one size, be neither dark nor saturated, and show (nearly) all pins."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +20,8 @@ DARK_LEVEL, BRIGHT_PERCENTILE = 40.0, 99.0
 # Least gray level of a saturated pixel, and largest share of saturated pixels in the disc.
 SATURATED_LEVEL, MOST_SATURATED = 250, 0.1
 FEW_LOST = 0.03
-"""Share of the pins in view that a frame may lack where light and skin are fitted to the others: a glint, or a dark cap at the rim."""
+"""Largest fraction of the visible pins that may be missing in a frame, if light and skin are fitted to the other pins. A glint or a dark
+cap at the rim may hide a pin."""
 
 
 @dataclass(frozen=True)
@@ -64,15 +65,15 @@ def read_real(
     lost: float = 0.0,
     progress: Step | None = None,
 ) -> RealFrames:
-    """Read raw frames. If there are more than ``limit``, those that are read are spread evenly over the recording.
+    """Read raw frames. If there are more than ``limit``, a selection that is evenly distributed over the recording is read.
 
     Parameters
     ----------
     limit : int, optional
     fitted : int
-        Leave out the frames that are read with this number as the limit, because a specification was fitted to them.
+        Limit with which a specification was fitted. The frames that would be read with this limit are omitted.
     lost : float
-        Largest share of the pins in view that a frame may lack; the lacking ones are NaN.
+        Largest fraction of the visible pins that may be missing in a frame. The missing pins are NaN.
 
     Raises
     ------
@@ -110,7 +111,7 @@ def read_real(
 
 
 def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc, lost: float = 0.0) -> Observation:
-    """Check that a frame can be compared, and return its observation; at most the share ``lost`` of its pins may lack.
+    """Check that a frame can be compared, and return its observation. At most the fraction ``lost`` of its pins may be missing.
 
     Raises
     ------

@@ -38,7 +38,7 @@ LEAST_INDENT_MM = 0.3
 BANK_MARGIN_DEG = 3.0
 # Degree of the polynomial.
 DEGREE = 3
-# Turns that are added to the rig's turn of the image at the starts of the fit, deg.
+# Rotations that are added to the rig's ``image_turn_deg`` at the starts of the fit, deg.
 TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
 # Least number of frames to fit to.
 FEWEST = 2

@@ -26,11 +26,11 @@ from twin.progress import Progress, Step, silent, stage
 
 
 class TwoSample(Protocol):
-    """Result of a two-sample test: share of rightly assigned patches, and its interval."""
+    """Result of a two-sample test: fraction of correctly classified patches, and its interval."""
 
     @property
     def accuracy(self) -> float:
-        """Share of the patches that were told right."""
+        """Fraction of the patches that were classified correctly."""
 
     @property
     def low(self) -> float:
@@ -67,11 +67,11 @@ def run_realism(
     spec : SensorSpec
     out : Path
     with_poses : bool
-        Also render from the labels alone.
+        Whether frames are also rendered from the labels alone.
     limit : int, optional
-        Most frames that are used; they are spread evenly over the folder.
+        Largest number of frames; they are evenly distributed over the folder.
     fitted : int
-        Leave out the frames to which ``calibrate_optics`` with this limit fits.
+        Limit with which ``calibrate_optics`` was run. The frames to which it fitted are omitted.
     without : collection of str
         Details that are not rendered (`twin.optics.relief.without`).
     quality : {"drawn", "preview", "standard", "high"}

@@ -8,7 +8,7 @@ from scipy.optimize import linear_sum_assignment
 
 from twin.camera.projection import Disc
 
-# Side of the median filter that gives the ground, px; least difference of a spot from the ground, gray levels.
+# Side of the median filter that computes the background, px; smallest difference of a spot from the background, gray levels.
 GROUND_PX, RISE = 25, 20.0
 # Least area of a spot.
 MIN_AREA_PX2 = 4

@@ -59,7 +59,7 @@ class Statistics:
         Mean spectra.
     spectrum_db : float
         Difference of the mean spectra (see ``log_distance_db``).
-        real_spots, rendered_spots : Spots
+    real_spots, rendered_spots : Spots
     spots_apart_px : (m,) float
         Distances of spots that have a counterpart.
     """

@@ -36,7 +36,7 @@ class ServoSpec(Section):
     name : str
         The file's stem; not a key of the file.
     description : str
-        What the file is for.
+        Purpose of the file.
     source : str
         Source of the numbers.
     experiment : str

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 
 class TwinError(Exception):
-    """Base of the errors that are raised on purpose. The message says what was expected, what came, and what to do."""
+    """Base class of this program's own errors. The message states what was expected, what was found, and what to do."""
 
 
 class OptionError(TwinError):

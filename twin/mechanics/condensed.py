@@ -162,7 +162,7 @@ class SmallContact:
         """Displacements of all kept unknowns (k,), rotated back to the state of the tangent, and changes of the border unknowns (2,).
 
         ``soften``: solve softened contact first, and start the true problem from its solution.
-        ``least``: residual relative to the contact forces; no smaller one is asked for.
+        ``least`` is the smallest residual, relative to the contact forces, that is required.
         """
         wanted = max(_INEXACT * (FORCE_FLOOR_N if soften else balance.absolute), least * balance.scale_n)
         start = np.zeros(len(self._near.near) + 2)

@@ -48,7 +48,7 @@ class ContactPoints:
     lift_mm : (p, 3) float
         Offset of the exact outer surface from the spline surface at rest.
     area_mm2 : (p,) float
-        Rest area of the skin that a point stands for; the areas tile the skin.
+        Rest area of the skin that belongs to each point; the areas tile the skin.
     element : (p,) int
         Element that contains the point.
     place : (p,) complex

@@ -23,7 +23,7 @@ def project_on_xy(points_mm: FloatArray) -> Probe:
 
 
 class Solid(Wrapped):
-    """A solid that compiled code knows.
+    """A solid for which there is compiled code.
 
     Attributes
     ----------

@@ -13,7 +13,7 @@ from twin.types import FloatArray
 _CREASE_MM = 1e-3
 """Radius of curvature below which a surface counts as a crease. The Hessian of a crease is set to 0."""
 PLANE, ROUND, EDGE, PRISM = range(4)
-"""Kinds of solids, for compiled code that takes any of them."""
+"""Codes of the kinds of solids, for compiled code that handles all of them."""
 
 
 @compiled(error_model="numpy")

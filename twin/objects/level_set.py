@@ -49,8 +49,8 @@ def rows(points_mm: FloatArray) -> FloatArray:
 def unit_normals(slope: FloatArray, hessian: FloatArray) -> None:
     """Turn, in place, a field's slope g (k, 3) into the unit normal n and its second derivative H (k, 3, 3) into P H P / |g|, P = I - n n.
 
-    The result is the derivative of n along the level set: it is symmetric, and H n = 0. It leaves out the change of n along n, which is
-    zero for an exact distance. A place without slope gets the normal -z and no curvature.
+    The result is the derivative of n along the level set: it is symmetric, and H n = 0. It does not contain the change of n along n, which
+    is zero for an exact distance. A place without slope gets the normal -z and no curvature.
     """
     for k in range(len(slope)):
         size = np.sqrt(slope[k, 0] ** 2 + slope[k, 1] ** 2 + slope[k, 2] ** 2)

@@ -14,9 +14,9 @@ from twin.objects.level_set import Triple
 from twin.types import FloatArray, IntArray
 
 _LEAF = 4
-"""Most triangles in a leaf of the tree."""
+"""Largest number of triangles in a leaf of the tree."""
 _FLAT_MM2 = 1e-12
-"""Area below which a triangle is left out. It has no usable normal, and its neighbours cover the same place."""
+"""Area below which a triangle is ignored. It has no usable normal, and its neighbours cover the same place."""
 
 
 def signed_distance(mesh: trimesh.Trimesh, points_mm: FloatArray) -> FloatArray:

@@ -37,7 +37,7 @@ _MARGIN_MM = 4.0
 _NODES = 250_000
 """Number of nodes of the grid. Sampling takes about 1 s, and the grid 2 MB of memory."""
 _FINEST_MM = 0.25
-"""Least spacing of the grid."""
+"""Smallest spacing of the grid."""
 
 
 @dataclass(frozen=True)

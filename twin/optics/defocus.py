@@ -11,7 +11,7 @@ from twin.compiled import compiled
 from twin.types import FloatArray
 
 LEAST_VARIANCE = 0.03
-"""Variance of the least blur that is not interpolated from a sharp picture, px^2: that of a disc of 0.7 px."""
+"""Variance of the smallest blur that is not interpolated from a sharp picture, px^2: that of a disc of 0.7 px."""
 FINE = 16
 """Number of places along each side of a pixel at which a disc's cover of the pixel is evaluated."""
 HALVINGS = 12

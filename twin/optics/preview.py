@@ -43,7 +43,7 @@ BELT_PLACES = 48
 DARK = 1e-3
 """Linear light below which an error has the same weight in a fit, whatever the light is."""
 TRUST = 3e-3
-"""Weight of the assumption "direct light alone" in a fit, relative to the most visible material. It decides for hardly visible ones."""
+"""Weight of the prior "direct light alone" in a fit, relative to the most visible material. For hardly visible materials it dominates."""
 NEAR_PX = 4.0
 """Standard deviation, px, of the Gaussian neighbourhood in which traced and drawn light of the skin are compared."""
 MOST_SKIN_GAIN = 4.0
@@ -201,7 +201,8 @@ class Preview:
         drawing = self._drawing(self._rest)
         known = self._known(self._rest)
         gel = traced - known
-        # the weights depend on the drawn light: with the noisy traced light, samples that are too dark would get too much weight
+        # the weights depend on the drawn light: with the noisy traced light, samples that are too dark would get too much weight;
+        # traced light below 0 was set to 0, so it has no weight
         drawn = known + self._through * self._gel(drawing, Shading())
         weight = np.where(traced > 0, (np.maximum(drawn, 0) + DARK) ** -0.5, 0)
         alone = np.eye(8).reshape(8, 2, 4, 1)  # shadings in which one gain, or one offset, is 1 and all others are 0

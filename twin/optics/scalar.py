@@ -79,7 +79,7 @@ class ScalarView:
 
 
 def nearest_point(place: FloatArray, direction: FloatArray) -> FloatArray:
-    """The point (3,) with the least sum of squared distances to the lines through ``place`` (n, 3) along ``direction``."""
+    """The point (3,) with the smallest sum of squared distances to the lines through ``place`` (n, 3) along ``direction``."""
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     return np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, place))
 

@@ -118,7 +118,7 @@ class GelTracer:
         return result / self.window.gel_index**2
 
     def _follow(self, mi: ModuleType, dr: ModuleType, ray: DrJit, weight: DrJit, random: PixelSamples) -> tuple[DrJit, DrJit, DrJit, DrJit]:
-        """The next vertices of rays in the gel. Rays that meet nothing on their way to the window are reflected by it."""
+        """The next vertices of rays in the gel. The window reflects rays that reach it without meeting a surface."""
         first = self.scene.ray_intersect_preliminary(ray, coherent=False)
         up = ~first.is_valid() & (ray.d.z < -1e-6)
         far = dr.select(up, (self.window.front - ray.o.z) / dr.minimum(ray.d.z, -1e-6), 0.0)

@@ -186,7 +186,7 @@ class RenderReport(TypedDict):
     override: str | None
     """TACTIP_VARIANT."""
     remedy: str | None
-    """What to install; None where nothing is slow."""
+    """Advice on what to install; None if no rendering is slow."""
 
 
 def report() -> RenderReport:

@@ -1,8 +1,8 @@
 """Work in a folder that can be interrupted and continued at any moment. Results that other code made are never used.
 
 If the items of the work are independent, each is stored under a name that includes a digest of its inputs and of the code. Files of other
-code have other names and are not read. If the items are parts of one whole (a data set), the folder states once what code makes it, and
-other code is refused, because the parts would not be consistent.
+code have other names and are not read. If the items are parts of one whole (a data set), the folder contains one record of the code that
+makes it, and other code is refused, because the parts would not be consistent.
 """
 
 import json
@@ -117,7 +117,7 @@ def kept_json(folder: Path, item: Item, compute: Callable[[], Any]) -> Any:
 
 
 def require_same_code(folder: Path, *by: Maker, begun: bool) -> None:
-    """Record in a folder what code makes its content, or check that it is still the same code.
+    """Record in a folder which code makes its content, or check that the code has not changed.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A condition: one way in which a sensor degrades, as frozen data, and the stage of the chain on which it acts.
+"""A condition: one kind of degradation of a sensor, as frozen data, and the stage of the chain on which it acts.
 
 The stages are specification, contact, light on the film, camera response, frame, and the pipeline's settings. If the value is the nominal
 one, every hook returns its input unchanged, bit for bit.
@@ -95,7 +95,7 @@ class OnSection(Generic[S]):
 
 @dataclass(frozen=True)
 class Condition:
-    """One way in which a sensor degrades.
+    """One kind of degradation of a sensor.
 
     The parameter is ``nominal`` at severity 0 and ``severe`` at severity 1, and linear in the severity.
 
@@ -108,7 +108,7 @@ class Condition:
     spec : callable, optional
         ``spec(spec, value, rng)`` returns the degraded specification, before anything is rendered; ``OnSection`` if one section changes.
     solves : bool
-        Whether the mechanics of the specification change, so that contacts must be solved anew.
+        Whether the mechanics of the specification change, so that contacts must be solved again.
     light : callable, optional
         ``light(light, value, view, rng)`` returns the degraded linear light on the film, before the camera's response.
     frame : callable, optional
@@ -166,7 +166,7 @@ class Case:
 
     @property
     def solves(self) -> bool:
-        """Whether contacts must be solved anew."""
+        """Whether contacts must be solved again, because a condition changes the mechanics."""
         return any(c.solves for c in self.conditions)
 
     @property

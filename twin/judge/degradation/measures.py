@@ -27,9 +27,9 @@ class Measure:
     limit : float
         Limit of the mean over the contacts.
     least : bool
-        Whether the limit is a least value instead of a largest value.
+        Whether the limit is the smallest permitted value instead of the largest.
     in_pitches : bool
-        Whether the limit is in mean distances of neighbouring pins instead of ``unit``.
+        Whether the unit of the limit is the mean distance of neighbouring pins instead of ``unit``.
     """
 
     name: str

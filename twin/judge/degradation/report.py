@@ -26,7 +26,7 @@ SHOWN = ("valid", "recall", "precision", "centroid_px", "area_error", "edges", *
 TITLES = {m.name: m.title + (f", {m.unit}" if m.unit else "") for m in (*MEASURES, *POSE_MEASURES)}
 """Title of each measure with its unit."""
 TWICE = 2.0
-"""Least ratio of widths at which an envelope counts as twice as wide."""
+"""Smallest ratio of widths at which an envelope counts as twice as wide."""
 CASE_DPI = 90
 """Resolution of a condition's chart, dots per inch. It is low, because a page has dozens of them."""
 

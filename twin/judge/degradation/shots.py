@@ -105,7 +105,7 @@ class RenderedSource:
         return [contact.name for contact in self.contacts]
 
     def shoot(self, case: Case, severity: float) -> list[DegradedShot]:
-        """The frames degraded by a case. Contacts that cannot be solved are left out."""
+        """The frames degraded by a case. Contacts that cannot be solved are omitted."""
         spec = case.on_spec(self.spec, severity)
         view = View.of(spec, np.zeros((spec.pins.count, 2)))
         geometry = _with_light_of(self.spec, spec)
@@ -181,7 +181,7 @@ def degraded_state(
     Raises
     ------
     TwinError
-        A case changes the mechanics: its contacts have to be solved anew, with `RenderedSource`.
+        A case changes the mechanics: its contacts must be solved again, with `RenderedSource`.
     """
     if solved := [case.name for case, _ in cases if case.solves]:
         raise TwinError(f"{', '.join(solved)}: changes the mechanics, so this contact would be another one; use 'twin robustness'")
@@ -255,7 +255,7 @@ class _Film:
 def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contacts: tuple[Contact, ...]) -> tuple[_Film, ...]:
     """Films of contacts of the sensor ``mechanics``, projected by the camera of ``geometry``, with the lights of ``spec``.
 
-    All conditions that act after the film use these films. Contacts that cannot be solved are left out.
+    All conditions that act after the film use these films. Contacts that cannot be solved are omitted.
     """
     preview, films = Preview(spec), []
     for draw, contact in enumerate(contacts):

@@ -26,7 +26,7 @@ from twin.types import Form, Frame
 AGREE = 0.15
 """Distance of two detectors' places, as a share of the pins' median spacing, below which they agree on a pin. Chosen."""
 LEAST_KNOWN = 0.97
-"""Least share of a frame's pins on which detectors must agree. Frames with a smaller share are refused."""
+"""Smallest fraction of a frame's pins on which detectors must agree. Frames with a smaller fraction are refused."""
 LEAST_AGREEING = 2
 """Number of detectors that must agree on a pin."""
 

@@ -103,7 +103,7 @@ def table_of(found: Comparison) -> list[dict]:
 
 
 def pin_errors(simulated_px: np.ndarray, measured_px: np.ndarray) -> np.ndarray:
-    """Mean distance of the pins for each frame, (..., M), from places (..., M, N, 2). Lost pins (NaN) are left out."""
+    """Mean distance of the pins for each frame, (..., M), from places (..., M, N, 2). Lost pins (NaN) are ignored."""
     return np.nanmean(np.linalg.norm(simulated_px - measured_px, axis=-1), axis=-1)
 
 

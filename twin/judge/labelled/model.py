@@ -42,7 +42,7 @@ class MeasuredFrames:
         Places; NaN for lost pins.
     no_contact_px : (N, 2) float
     problems : list of str
-        Irregularities and what was left out, one line each.
+        Irregularities of the recording and omitted frames, one line each.
     at_rest_seen : bool
         Whether the pins at rest were seen in a frame, or measured before on this unit; otherwise they are those of the specification.
     """

@@ -224,6 +224,6 @@ def halves(count: int, seed: int = 0) -> np.ndarray:
 
 
 def mean_pin_error_px(simulated_px: np.ndarray, seen_px: np.ndarray) -> np.ndarray:
-    """Mean distance over the pins (..., N, 2). Lost pins are left out."""
+    """Mean distance over the pins (..., N, 2). Lost pins are ignored."""
     error: np.ndarray = np.nanmean(np.linalg.norm(simulated_px - seen_px, axis=-1), axis=-1)
     return error

@@ -48,7 +48,7 @@ def write_pictures(folder: Path, pairs: list[Pair], kind: str) -> list[dict]:
 
 
 def image_summary(pairs: list[Pair]) -> dict:
-    """Mean, median, least and largest value of each figure over the pairs, and the share of renders in which exactly all pins are found."""
+    """Mean, median, smallest and largest value of each figure over the pairs, and fraction of renders with exactly all pins found."""
     out = {}
     for name in pairs[0].figures.as_dict():
         values = np.array([getattr(pair.figures, name) for pair in pairs])

@@ -14,7 +14,7 @@ LOWEST_CYCLES = 4.0
 GAUSSIAN_MAD = 1.4826
 """Ratio of a Gaussian's standard deviation to its median absolute deviation."""
 CLIP_ROUNDS = 3
-"""Number of rounds in which residuals above three standard deviations are left out."""
+"""Number of rounds in which residuals above three standard deviations are removed."""
 NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
 """Kernel whose response to constant, linear and bilinear surfaces is zero, and whose gain for white noise is 1 (Immerkaer 1996)."""
 
@@ -49,7 +49,7 @@ def bin_of(distance_px: np.ndarray, edges_px: np.ndarray) -> np.ndarray:
 def radial_rows(
     measure: str, real: tuple[np.ndarray, np.ndarray], rendered: tuple[np.ndarray, np.ndarray], edges_px: np.ndarray
 ) -> list[RadialRow]:
-    """A measure in every bin. ``real`` and ``rendered`` are distances in px and values, (n,) each. NaN values are left out."""
+    """A measure in every bin. ``real`` and ``rendered`` are distances in px and values, (n,) each. NaN values are ignored."""
     means = []
     for distance, values in (real, rendered):
         where = bin_of(distance, edges_px)
@@ -81,7 +81,7 @@ def radial_spectrum(gray: np.ndarray, center_px: np.ndarray, radius_px: float) -
     Returns
     -------
     frequency : (b,) float
-        Cycles per px, up to 0.5; rings without a sample are left out.
+        Cycles per px, up to 0.5; rings without a sample are omitted.
     power : (b,) float
         Squared gray levels.
     """

@@ -46,7 +46,7 @@ def find_spots(gray: np.ndarray, disc: Disc, pins_px: np.ndarray, spacing_px: fl
 
 
 def steady_spots(frames: list[Spots], share: float = STEADY_SHARE) -> Spots:
-    """Spots that at least a share of the frames shows, with their mean places and mean peaks."""
+    """Spots that are visible in at least the fraction ``share`` of the frames, with their mean places and mean peaks."""
     px, peak = np.concatenate([spots.px for spots in frames]), np.concatenate([spots.peak for spots in frames])
     of = np.repeat(np.arange(len(frames)), [len(spots.px) for spots in frames])
     places, peaks, left = [], [], np.ones(len(px), bool)

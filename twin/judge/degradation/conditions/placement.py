@@ -20,7 +20,7 @@ def shifted(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorS
 
 
 def tilted(camera: CameraSpec, value: float, rng: np.random.Generator) -> CameraSpec:
-    """A camera turned about x."""
+    """A camera that is rotated about x."""
     return camera.model_copy(update={"tilt_x_deg": camera.tilt_x_deg + value})
 
 
@@ -43,7 +43,7 @@ def vignetted(camera: CameraSpec, value: float, rng: np.random.Generator) -> Cam
 
 
 def roll(degrees: float, view: View) -> np.ndarray:
-    """Map (2, 3) of pixels for a camera that is turned about its axis."""
+    """Map (2, 3) of pixels for a camera that is rotated about its axis."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     turn, about = np.array([[c, -s], [s, c]]), np.array([view.spec.camera.cx_px, view.spec.camera.cy_px])
     return np.column_stack([turn, about - turn @ about])
@@ -60,12 +60,12 @@ def warped(light: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def rolled(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
-    """A camera turned about its axis."""
+    """A camera that is rotated about its axis."""
     return warped(light, roll(value, view)) if value else light
 
 
 def rolled_points(px: np.ndarray, value: float, view: View) -> np.ndarray:
-    """Places in the picture of a rolled camera."""
+    """Positions in the picture of a rolled camera."""
     matrix = roll(value, view)
     return px @ matrix[:, :2].T + matrix[:, 2] if value else px
 
@@ -76,7 +76,7 @@ def sheared(light: np.ndarray, value: float, view: View, rng: np.random.Generato
 
 
 def sheared_points(px: np.ndarray, value: float, view: View) -> np.ndarray:
-    """Places in that picture."""
+    """Positions in a sheared picture."""
     matrix = skew(0.5 * value * view.px_per_mm / view.radius_px, view)
     return px @ matrix[:, :2].T + matrix[:, 2] if value else px
 

@@ -1,4 +1,4 @@
-"""The blur of a lens with a finite aperture: circles of confusion, and a picture that they blur."""
+"""Blur of a lens with a finite aperture: circles of confusion, and blurring of a picture with them."""
 
 from functools import lru_cache
 
@@ -13,23 +13,23 @@ from twin.types import FloatArray
 LEAST_VARIANCE = 0.03
 """Variance of the smallest blur that is not interpolated from a sharp picture, px^2: that of a disc of 0.7 px."""
 FINE = 16
-"""Number of places along each side of a pixel at which a disc's cover of the pixel is evaluated."""
+"""Number of points along each side of a pixel at which the coverage of the pixel by a disc is evaluated."""
 HALVINGS = 12
-"""Number of halvings of the interval in which a disc's diameter is searched."""
+"""Number of bisection steps in the search of a disc's diameter."""
 
 
 def circles_px(view: ViewSpec, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Circles of confusion of points (n, 3) in the gel.
 
-    A ray through another place o of the pupil has another tangent t at the film: ``t(o) + o / focus``, because the film is sharp at the
-    focus. Away from the axis the pupil's places fill an ellipse, whose middle is not on the ray through the pupil's centre.
+    A ray through a point o of the pupil has the tangent ``t(o) + o / focus`` at the film, because points at the focus distance are sharp.
+    Away from the axis the rays through the pupil fill an ellipse on the film. Its centre differs from the ray through the pupil's centre.
 
     Returns
     -------
     diameter : (n,) float
-        Root of the mean of the squares of the ellipse's axes, px.
+        Root mean square of the ellipse's axes, px.
     shift : (n, 2) float
-        From the image through the pupil's centre to the mean of all, px.
+        Shift from the image through the pupil's centre to the mean image over the pupil, px.
     """
     camera = view.camera
     radius = 0.5 * camera.aperture_mm
@@ -44,9 +44,10 @@ def circles_px(view: ViewSpec, points_mm: FloatArray) -> tuple[FloatArray, Float
 
 
 def defocused(image: FloatArray, circles: FloatArray) -> FloatArray:
-    """A picture (H, W, C) float32 of which each pixel is blurred by its circle of confusion, with diameters (H, W) in px.
+    """A picture (H, W, C) float32 in which each pixel is blurred by its own circle of confusion, with diameters (H, W) in px.
 
-    A few blurred pictures are interpolated by the variance of their blur, which is a sixteenth of the square of the diameter.
+    The result is interpolated between a few blurred pictures. The interpolation is linear in the variance of the blur, which is 1 / 16 of
+    the squared diameter.
     """
     first, last = int(_level(float(circles.min()))), int(np.ceil(_level(float(circles.max()))))
     if last == 0:
@@ -57,7 +58,7 @@ def defocused(image: FloatArray, circles: FloatArray) -> FloatArray:
 
 @compiled()
 def _level(diameter_px: float) -> float:
-    """Place of a blur among the blurred pictures, whose variances are 0, then 1, 2, 4, ... times the least."""
+    """Fractional index of a blur among the blurred pictures. Their variances are 0, and 1, 2, 4, ... times ``LEAST_VARIANCE``."""
     blur = diameter_px**2 / 16 / LEAST_VARIANCE
     if blur < 1:
         return blur
@@ -67,7 +68,7 @@ def _level(diameter_px: float) -> float:
 
 @compiled()
 def _interpolated(blurred: FloatArray, circles: FloatArray, first: int) -> FloatArray:
-    """Of blurred pictures (K, H, W, C), whose levels begin with ``first``, the one (H, W, C) whose pixels have these circles (H, W)."""
+    """Picture (H, W, C) whose pixels have the given circles (H, W), from blurred pictures (K, H, W, C) with levels from ``first`` on."""
     levels, height, width, channels = blurred.shape
     found = np.empty((height, width, channels), np.float32)
     for row in range(height):
@@ -85,7 +86,8 @@ def _interpolated(blurred: FloatArray, circles: FloatArray, first: int) -> Float
 def disc(variance: float) -> FloatArray:
     """Kernel (k, k) of a disc with this variance, px^2, along each axis.
 
-    A pixel's cover by a disc has not the disc's variance, because the pixel is not a point. Therefore a disc of another size is used.
+    The coverage of pixels by a disc has another variance than the disc, because a pixel is not a point. Therefore a disc of another size is
+    used.
     """
     low, high = 0.0, 4 * np.sqrt(variance) + 1
     reach = int(np.ceil(0.5 * high))
@@ -98,7 +100,7 @@ def disc(variance: float) -> FloatArray:
 
 
 def _cover(diameter_px: float, reach: int) -> FloatArray:
-    """Share (k, k) of a disc's area in each pixel up to ``reach`` from the pixel at its centre."""
+    """Fraction (k, k) of a disc's area in each pixel, up to ``reach`` pixels from the pixel at its centre."""
     pixels = 2 * reach + 1
     place = (np.arange(pixels * FINE) + 0.5) / FINE - 0.5 * pixels
     inside = np.clip(0.5 + FINE * (0.5 * diameter_px - np.hypot(place[:, None], place)), 0, 1)

@@ -1,8 +1,8 @@
-"""The gel as seen by the scalar variant, which works on every machine. It is an approximation with Mitsuba's own path tracer.
+"""Rendering of the gel with the scalar variant, which works on every machine: an approximation with Mitsuba's own path tracer.
 
-The camera is a pinhole in the gel, at the point nearest to the caps' rays. The LEDs are in the gel, at the places where they appear
-from the caps. The picture is then warped to the places at which the window shows it, with the depth of the caps. The window reflects no
-light.
+The camera is a pinhole in the gel, at the point nearest to the caps' rays. The LEDs are in the gel, at their apparent positions as seen
+from the caps. The picture is then warped to the refracted image through the window, for points at the depth of the caps. The window
+reflects no light.
 """
 
 from collections.abc import Sequence
@@ -24,9 +24,9 @@ from twin.types import FloatArray, IntArray, PinState
 OVERSAMPLING = 1.3
 """Number of pixels of the pinhole camera's image for one pixel of the frame, along a side."""
 COARSE = 8
-"""Spacing in px of the places at which the caps' depth is interpolated."""
+"""Spacing of the points at which the caps' depth is interpolated, px."""
 DEPTH_NEIGHBOURS = 24
-"""Number of nearest caps from which the depth of a place is interpolated."""
+"""Number of nearest caps from which the depth of a point is interpolated."""
 
 
 class ScalarView:
@@ -64,7 +64,7 @@ class ScalarView:
         return np.stack([map_coordinates(channel, at[:, ::-1].T, order=3, mode="nearest") for channel in np.moveaxis(image, 2, 0)], axis=1)
 
     def _places(self, state: PinState) -> FloatArray:
-        """Place (H W, 2) in the pinhole image that each pixel of the window shows: its ray's point at the depth of nearby caps."""
+        """Position (H W, 2) in the pinhole image for each pixel of the window: the image of its ray's point at the depth of nearby caps."""
         caps_mm = state.caps_mm
         x0, y0, x1, y1 = self._window_px
         coarse = [np.arange(lo, hi + COARSE, COARSE) for lo, hi in ((x0, x1), (y0, y1))]
@@ -91,7 +91,7 @@ def _refined(values: FloatArray, shape: tuple[int, int]) -> FloatArray:
 
 
 def _apparent_lights(mi: ModuleType, view: ViewSpec, patches: Sequence[Patch], caps_mm: FloatArray) -> dict[str, DrJit]:
-    """An emitter for every LED, at the point in the gel from which its light seems to come, with the brightness that it has there."""
+    """An emitter for every LED, at the apparent position of the LED in the gel, with its apparent brightness."""
     made, unseen = {}, mi.load_dict({"type": "null"})
     for k, patch in enumerate(p for p in patches if p.half_mm.any()):
         place, direction, gain = _seen_from(view, patch, caps_mm)

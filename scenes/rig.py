@@ -80,13 +80,13 @@ class RigSpec(Section):
     turn_sign : 1 or -1
         -1 if the robot's angles are left-handed rotations about its axes.
     plate_tilt_deg : float
-        Tilt of the object's surface along the direction across: in this direction the surface rises towards the sensor. The twin computes
-        its contacts, and therefore the labels of simulated contacts, with it.
+        Tilt of the object's surface along the direction across. If it is positive, the surface recedes from the sensor in this direction.
+        The twin computes its contacts, and therefore the labels of simulated contacts, with it.
     object_shift_mm : two numbers
         Position of the object's origin in the robot's coordinates along the direction across, and along approach x across.
     object_turn_deg : float
-        Right-handed rotation of the object about the approach. A rotation by 90 moves the direction approach x across to the direction
-        across.
+        Right-handed rotation of the object about the approach. With 90, a line of the object along approach x across becomes a line along
+        the direction across.
     label_depth_per_move : float or None
         Change of a contact's depth in mm per mm of a move across that the label contains, but that the arm had not executed yet.
         ``twin audit`` finds it in the recording. Labels of recordings are corrected with it. Default: the tangent of ``plate_tilt_deg``.

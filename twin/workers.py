@@ -148,7 +148,7 @@ def _deaf_to_ctrl_c() -> Iterator[None]:
     """Context in which SIGINT is delayed until its end. Processes that are started in it do not receive SIGINT."""
     heard: list[tuple[int, FrameType | None]] = []
     before = None
-    if threading.current_thread() is threading.main_thread():  # in another thread, the main thread would raise the signal
+    if threading.current_thread() is threading.main_thread():  # another thread may receive SIGINT; Python would then raise it here
         before = signal.signal(signal.SIGINT, lambda number, frame: heard.append((number, frame)))
     masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if hasattr(signal, "pthread_sigmask") else None  # not on Windows
     try:

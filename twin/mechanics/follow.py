@@ -17,7 +17,7 @@ STEP_MM = 0.45  # largest motion of the object at the pressed skin in one load s
 LARGEST_MOVE_MM = 30.0  # largest motion between two poses of one contact; the path between poses farther apart is unknown
 SETTLED_MM = 0.005  # threshold for the motion of the object under the arm's compliance; it is 0.02 px in the shipped cameras
 _MOST_SETTLING = 8  # largest number of load steps until the pose of a compliant arm converges; one or two are usual
-_PLACES = 2000  # points on a whole sphere; the distance of the object is computed at those that lie on the skin
+_PLACES = 2000  # number of points on a whole sphere; the distance of the object is computed at the points on the skin
 _BACK_MM = 1.0  # step of the search for a pose without contact
 _WHERE = "following the object"  # name of the load step in error messages
 

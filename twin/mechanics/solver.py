@@ -31,7 +31,7 @@ _STEP_MM = 0.4
 _LOOK_MM = 2.0
 """Largest motion of the object between two poses at which the solver computes where the object will press, mm."""
 _FOCUS_POINTS = 2000
-"""Points on a whole sphere; where the object will press is computed at those that lie on the skin."""
+"""Number of points on a whole sphere. The gap to the object is computed at the points on the skin, to find where the object will press."""
 _FOCUS_GAP_MM = 0.5
 """Decay length of the weights of the focus, mm. With the object at first touch, a direction with a gap g gets the weight exp(-g / this).
 So the object's local shape determines the focus, and not the indentation."""

@@ -96,12 +96,15 @@ def _varied_beyond(experiment: ExperimentSpec, values: dict[str, np.ndarray]) ->
 
 
 def plate_slope(rig: RigSpec | None) -> float:
-    """Increase of depth per mm of motion across on the twin's plate, mm/mm; 0 without a rig. It applies to labels of simulated contacts."""
+    """Change of depth per mm across on the twin's plate, mm/mm; 0 without a rig. It applies to labels of simulated contacts.
+
+    A move across decreases the depth by this value per mm. A move that the label contains, but that was not executed, increases it.
+    """
     return float(np.tan(np.radians(rig.plate_tilt_deg))) if rig else 0.0
 
 
 def label_slope(rig: RigSpec | None) -> float:
-    """Increase of depth per mm of motion across for labels of recordings, mm/mm.
+    """Change of depth per mm across for labels of recordings, mm/mm (see ``plate_slope``).
 
     It is the measured value (``RigSpec.label_depth_per_move``), or the slope of the twin's plate if there is none.
     """

@@ -1,4 +1,4 @@
-"""The way to an object: from wherever the arm stands to the pose clear of it, around the object and not through it."""
+"""Plans the path of an arm to the pose clear of an object: from any pose, around the object and not through it."""
 
 import numpy as np
 
@@ -10,23 +10,23 @@ from hardware.safety import distance_to_axis
 MARGIN_MM = 10.0
 # Largest angle between two poses along this circle, in deg.
 STEP_DEG = 30.0
-# Distance between the places of a straight way at which the gap is checked, in mm.
+# Distance, in mm, between the points of a straight path at which the gap is checked.
 SAMPLE_MM = 1.0
 
 
 def way_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> list[np.ndarray]:
-    """Poses (6,) to pass from ``start`` on, the last of them ``clear``.
+    """Poses (6,) of the path from ``start``; the last one is ``clear``.
 
-    The way is straight if the dome stays outside a circle around the object's section. Otherwise the arm first leaves the circle if it is
-    inside, and then goes the shorter way along it, with the sensor turned towards the object. The object is treated as infinitely
-    high, so the way is level whatever the heights of its ends are. The arm's links and the object's holder are not known.
+    The path is straight if the dome stays outside a circle around the object's section. Otherwise the arm first leaves the circle if it is
+    inside, and then takes the shorter way along it, with the sensor turned towards the object. The object is treated as infinitely high.
+    Therefore the path avoids it at every height. The arm's links and the object's holder are not known and not considered.
 
-    There is no way around an object without an end (a plane, an edge). Only its surface is taken into account, and the way is straight.
+    An infinite object (a plane, an edge) can't be passed. Only its surface is considered, and the path is straight.
 
     Raises
     ------
     DeviceError
-        The straight way to an object without an end leads through it.
+        The straight path to an infinite object leads through it.
     """
     outline = placed.outline()
     if not np.allclose(outline[0], outline[-1]):
@@ -59,7 +59,7 @@ def way_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> li
 
 
 def _require_in_front(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> None:
-    """Raise ``DeviceError`` unless the dome's centre stays in front of the surface on its straight way. It may begin in contact."""
+    """Raise ``DeviceError`` unless the dome's centre stays in front of the surface on its straight path. The path may begin in contact."""
     ends = [matrix_of(pose)[:3, :3] @ placed.mounting.centre_mm + pose[:3] for pose in (start, clear)]
     samples = max(2, int(np.ceil(np.linalg.norm(ends[1] - ends[0]) / SAMPLE_MM)))
     gap_mm = min(placed.distance_mm(ends[0] + share * (ends[1] - ends[0])) for share in np.linspace(0.0, 1.0, samples))

@@ -1,9 +1,9 @@
-"""Collecting labelled frames in the recordings' own format: for each contact a pose, a tap, a shear and one frame.
+"""Collects labelled frames in the recordings' own format. Each contact consists of a pose, a tap, a shear and one frame.
 
-``collect_frames`` goes from a plan to labelled frames in a folder, and goes on with a collection that was interrupted. The arm starts
-``CLEAR_MM`` from the object and lifts off by ``LIFT_MM`` between two contacts. From lift to lift it goes around the object as
-``hardware.approach`` plans it; in front of an object without an end it goes straight. A frame counts only if it was exposed after the arm
-reported that it stands at the commanded pose. The table holds the reported pose.
+``collect_frames`` goes from a plan to labelled frames in a folder, and continues an interrupted collection. The arm starts ``CLEAR_MM``
+from the object and lifts off by ``LIFT_MM`` between two contacts. Between two lifted poses it moves around the object on a path of
+``hardware.approach``; in front of an infinite object it moves straight. A frame counts only if it was exposed after the arm reported that
+it stands at the commanded pose. The table holds the reported pose.
 """
 
 import csv
@@ -41,24 +41,25 @@ from twin.types import Form, Frame
 CLEAR_MM = 50.0
 # Distance from the object between two contacts, in mm.
 LIFT_MM = 10.0
-# A move that guards or arm shorten by more than this (mm) is an error.
+# Largest shortening of a move by guards or arm, mm. A larger one is an error.
 NEAR_MM = 0.5
-# Time in s that a move may take beyond what its way and speed give.
+# Time in s that a move may take in addition to the duration that its path and speed give.
 MOVE_TIMEOUT_S = 30.0
-# Factor on the time that a move's way and speed give: arms round their speed to whole percents.
+# Factor on the duration that a move's path and speed give, because arms round their speed to whole percents.
 SPARE = 2.0
-# Longest wait in s for a frame of the arm where it stands.
+# Longest wait in s for a frame while the arm stands still.
 FRAME_TIMEOUT_S = 5.0
-# Contacts of a collection: at a few seconds each, an arm is at work for months.
+# Most contacts of a collection. At a few seconds each, they take an arm months.
 MOST_CONTACTS = 1_000_000
 # Files of a collection, as in the published recordings: labels, description, times, and the frame without contact.
 TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
-# How contacts are spread over an experiment's ranges: each at random; so that the first ones fill the ranges evenly; or evenly at first,
-# and then where the contacts so far leave a model least sure.
+# Distributions of contacts over an experiment's ranges: each at random; evenly, even for the first contacts alone; or evenly at first, and
+# then at the contacts that reduce a model's uncertainty most.
 DESIGNS = ("random", "even", "unsure")
-# Contacts of the design "unsure" that fill the ranges evenly, for each label that varies.
+# Number of contacts of the design "unsure" that fill the ranges evenly, per label that varies.
 EVEN_AT_FIRST = 2
-# What chooses such a contact: from the collection's folder, the experiment, a seed and the contact's number to its pose and move (12,).
+# Function that chooses such a contact: from the collection's folder, the experiment, a seed and the contact's number to pose and move
+# (12,).
 Chooser = Callable[[Path, ExperimentSpec, int, int], np.ndarray]
 COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
 
@@ -73,14 +74,14 @@ class Contact:
 
 @dataclass
 class Collection:
-    """A folder that labelled frames are collected into.
+    """A folder into which labelled frames are collected.
 
     Parameters
     ----------
     folder : Path
         A new or empty folder, or the folder of a collection with the same ``about``, which is continued.
     about : dict
-        What the frames depend on, in types that JSON can hold.
+        Everything that the frames depend on, in types that JSON can hold.
     form : Form
         Form of the frames.
     """
@@ -90,12 +91,12 @@ class Collection:
     form: Form
 
     def __post_init__(self) -> None:
-        """Open the folder: check what it holds, and drop a line that was not finished.
+        """Open the folder: check its content, and drop an unfinished line.
 
         Raises
         ------
         DeviceError
-            The folder holds something else, or a collection that was made otherwise.
+            The folder holds something else, or a collection with other settings.
         """
         self.pictures = self.folder / ("frames_bw" if self.form is Form.RECORDING else "images")
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -125,7 +126,7 @@ class Collection:
 
     @property
     def count(self) -> int:
-        """Contacts collected so far.
+        """Number of contacts collected so far.
 
         Raises
         ------
@@ -149,7 +150,7 @@ class Collection:
 
     @property
     def rest(self) -> Path:
-        """Where the frame without contact lies, once it has been taken."""
+        """Path of the frame without contact, once it has been taken."""
         return self.pictures / REST
 
     def keep_rest(self, frame: Frame) -> None:
@@ -157,7 +158,7 @@ class Collection:
         write_image(self.rest, frame.image)
 
     def keep(self, index: int, frame: Frame, label: np.ndarray, move: np.ndarray, log: dict[str, Any]) -> None:
-        """Write a contact in this order: its picture, its line of the log, its row of the table. So the picture of every row exists."""
+        """Write a contact in this order: picture, line of the log, row of the table. Therefore the picture of every row exists."""
         name = f"frame_{index}_0.png"
         write_image(self.pictures / name, frame.image)
         with (self.folder / LOG).open("a", encoding="utf-8") as file:
@@ -179,11 +180,11 @@ class Collection:
 
 
 def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str = "random") -> Contact:
-    """Pose and move of contact ``index`` within the experiment's ranges. It depends on these arguments alone.
+    """Pose and move of contact ``index`` within the experiment's ranges. They depend only on these arguments.
 
-    With the design "even" the first contacts fill the ranges evenly, however many are made: they are a scrambled sequence of Sobol (1967;
-    scrambled by Owen 1998). In recordings of a plate a model from 10 such contacts errs in depth as one from nearly 20 random ones. The
-    design "unsure" begins like this.
+    With the design "even", the first contacts fill the ranges evenly, whatever their number is: they are a scrambled Sobol sequence (Sobol
+    1967; scrambled by Owen 1998). In recordings of a plate, a model from 10 such contacts has the same error in depth as one from nearly 20
+    random contacts. The design "unsure" begins with the same contacts.
     """
     low, high = np.array(list(experiment.ranges().values())).T
     if design == "random":
@@ -199,7 +200,7 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
 
 @dataclass(frozen=True)
 class _Asked:
-    """Which contact is made next in a collection."""
+    """Chooses the next contact of a collection."""
 
     experiment: ExperimentSpec
     seed: int
@@ -218,8 +219,8 @@ class _Asked:
 class WorkFrame:
     """The robot's coordinates of an experiment in front of an object (the work frame).
 
-    Labels mean what the mounting says: after ``clear`` and ``tap``, the pose with labels of 0 has the depth and the angle from the
-    surface's normal that labels of 0 stand for.
+    Labels are those of the mounting: after ``clear`` and ``tap``, the pose with labels of 0 has the depth and the angle from the surface's
+    normal that labels of 0 mean.
 
     Parameters
     ----------
@@ -265,14 +266,14 @@ def collect(
     on_rest: Callable[[Frame], None] | None = None,
     progress: Step | None = None,
 ) -> int:
-    """Collect contacts until the collection holds ``count``. Contacts that it holds already are not made again.
+    """Collect contacts until the collection holds ``count``. Contacts that it already holds are not made again.
 
-    After any end, Ctrl-C included, the arm is stopped, withdrawn (if it has come to the object) and disabled.
+    At every end, Ctrl-C included, the arm is stopped, withdrawn (if it has come to the object) and disabled.
 
     Parameters
     ----------
     count : int
-        Contacts in the collection at the end.
+        Number of contacts in the collection at the end.
     seed : int
         Seed of the drawn contacts.
     design : {"random", "even", "unsure"}
@@ -284,7 +285,7 @@ def collect(
     guards : tuple of Guard
         Called before every move, in this order. Each may change the target or refuse it.
     frame_timeout_s : float
-        Longest wait in s for a frame of the arm where it stands.
+        Longest wait in s for a frame while the arm stands still.
     on_rest : callable, optional
         Called with the frame without contact after it was kept.
     progress : Step, optional
@@ -292,12 +293,12 @@ def collect(
     Returns
     -------
     int
-        Contacts in the collection.
+        Number of contacts in the collection.
 
     Raises
     ------
     DeviceError
-        The source is not live, no way leads to the object, the arm did not reach its target, letting go of the arm failed, or no frame
+        The source is not live, no path leads to the object, the arm did not reach its target, the release of the arm failed, or no frame
         came.
     StoreError
         Another run collects into the folder, or the folder can't be written to.
@@ -326,7 +327,7 @@ def _collect_all(
     on_rest: Callable[[Frame], None] | None,
     progress: Step | None,
 ) -> list[str]:
-    """Go to the object, make the contacts that are missing, and let go of the arm. Returns what failed while letting go."""
+    """Go to the object, make the missing contacts, and release the arm. Returns the failures of the release."""
     try:
         with rig.watch.alert():
             rig.arm.enable()
@@ -378,14 +379,14 @@ def _collect_one(rig: "_Stops", experiment: ExperimentSpec, collection: Collecti
 
 @dataclass
 class _Stops:
-    """Moves an arm from stop to stop of its work frame, and takes frames where it stands.
+    """Moves an arm from stop to stop in its work frame, and takes frames while it stands still.
 
     Attributes
     ----------
     label : (6,) float
-        Work coordinates of the contact at which the arm is, or to which it goes. The arm is withdrawn from there.
+        Work coordinates of the contact at which the arm is, or to which it moves. From there the arm is withdrawn.
     at_object : bool
-        Whether the arm has come around the object. From then on a straight way leads from ``label`` back.
+        Whether the arm has come around the object. From then on a straight path leads back from ``label``.
     """
 
     source: FrameSource
@@ -400,18 +401,18 @@ class _Stops:
     at_object: bool = False
 
     def go(self, label: np.ndarray, away_mm: float = 0.0) -> ArmState:
-        """Go straight to work coordinates (6,), ``away_mm`` back along the approach. Returns the state there."""
+        """Move straight to work coordinates (6,), ``away_mm`` back along the approach. Returns the state there."""
         return self._go_to(self.work.base_pose(label, self.arm.state().pose, away_mm=away_mm))
 
     def go_around(self, label: np.ndarray, away_mm: float) -> ArmState:
-        """As ``go``, but around the object and not through it."""
+        """As ``go``, but on a path around the object."""
         start = self.arm.state().pose
         for pose in way_around(self.placed, start, self.work.base_pose(label, start, away_mm=away_mm)):
             state = self._go_to(pose)
         return state
 
     def withdraw(self) -> ArmState:
-        """Go clear of the object."""
+        """Move clear of the object."""
         return self.go(self.label, CLEAR_MM)
 
     def frame_after(self, state: ArmState) -> Frame:
@@ -422,7 +423,7 @@ class _Stops:
             raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
 
     def _go_to(self, target: np.ndarray) -> ArmState:
-        """Go straight to a pose (6,). Returns the state that confirms it."""
+        """Move straight to a pose (6,). Returns the state that confirms it."""
         self.watch.require()
         state = self.arm.state()
         for guard in self.guards:
@@ -439,7 +440,7 @@ class _Stops:
 
 @dataclass(frozen=True)
 class CollectPlan:
-    """What to collect, and with which devices.
+    """Settings of a collection, and its devices.
 
     Attributes
     ----------
@@ -447,17 +448,17 @@ class CollectPlan:
     stimulus : ObjectSpec
         The object that is touched.
     experiment : ExperimentSpec
-        Which contacts are made.
+        Experiment that defines the contacts.
     servo : ServoSpec
-        The arm's speeds, and where the object stands.
+        The arm's speeds, and the object's place.
     camera, arm : str
         As for ``build_rig``.
     count : int
-        Contacts in the folder at the end.
+        Number of contacts in the folder at the end.
     seed : int or None
         Seed of the drawn contacts. None: the experiment's own seed.
     design : {"random", "even", "unsure"}
-        How the contacts are spread over the experiment's ranges.
+        Distribution of the contacts over the experiment's ranges.
     chooser : callable or None
         Chooses the contacts of the design "unsure" after the first ones: ``training.design.LeastSure(sensor)``.
     form : Form or None
@@ -465,9 +466,9 @@ class CollectPlan:
     limits : str or None
         Safety limits, by name or file. None: those of the arm's kind.
     plain_light : bool
-        The twin's frames without path tracing; see ``build_rig``.
+        Draw the twin's frames without path tracing; see ``build_rig``.
     also : tuple of str
-        Further formats that each contact is kept in as soon as it is made, each in a subfolder.
+        Further formats in which each contact is kept as soon as it is made, each in a subfolder.
     """
 
     sensor: SensorSpec
@@ -508,7 +509,7 @@ class Collected:
     before: int
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The result as lines of text."""
         return [f"{self.count} contacts in {self.folder} ({self.count - self.before} new)"]
 
 
@@ -557,7 +558,7 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
 def _collect_on_rig(
     plan: CollectPlan, rig: Rig, collection: Collection, kept: KeptAlso, require_rest: Callable[[Frame], None], progress: Progress
 ) -> None:
-    """Make the contacts that are missing; each is kept in the further formats before the next one is made."""
+    """Make the missing contacts. Each is kept in the further formats before the next one is made."""
     with rig, stage(progress, "contacts") as step:
 
         def made(done: float, total: float = 1.0, note: str = "") -> None:
@@ -583,7 +584,7 @@ def _collect_on_rig(
 
 
 def _about(plan: CollectPlan, rig: Rig) -> dict[str, Any]:
-    """What the frames depend on. A collection is continued only if all of this is the same."""
+    """Everything that the frames depend on. A collection is continued only if all of this is the same."""
     low, high = zip(*plan.experiment.ranges().values(), strict=True)
     return {
         "comments": f"collected: {plan.experiment.name}, {plan.sensor.name}, {plan.stimulus.name}",
@@ -599,5 +600,5 @@ def _about(plan: CollectPlan, rig: Rig) -> dict[str, Any]:
         "moves_rng": [high[6:], low[6:]],
         "linear_speed": plan.servo.linear_mm_s,
         "angular_speed": plan.servo.angular_deg_s,
-        **({} if plan.design == "random" else {"design": plan.design}),  # as before there were designs
+        **({} if plan.design == "random" else {"design": plan.design}),  # left out for "random", so that older collections can be continued
     }

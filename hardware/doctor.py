@@ -1,4 +1,4 @@
-"""What this machine has, what is missing, and the remedy: packages, renderer, 3D pictures, cameras, serial ports. Opens no device."""
+"""Lists what this machine has, what is missing, and the remedy: packages, renderer, 3D pictures, cameras, serial ports. Opens no device."""
 
 import importlib.metadata
 import importlib.util
@@ -18,7 +18,7 @@ from twin.store import cache_folder
 SYSFS_CAMERAS = Path("/sys/class/video4linux")
 # Packages whose versions are listed.
 PACKAGES = ("mitsuba", "drjit", "pyvista", "vtk", "trimesh", "torch", "scikit-image", "pyserial", "opencv-python-headless", "numba")
-# The program's own packages. Another project may have one of the same name.
+# The program's own packages. They are checked, because another project may have a package of the same name.
 OWN = ("scenes", "twin", "training", "hardware")
 # Kinds of devices, each with the remedy if none is found.
 DEVICES = {
@@ -29,7 +29,7 @@ DEVICES = {
 
 @dataclass(frozen=True)
 class Device:
-    """A device node and what the system says it is."""
+    """A device node and its description by the system."""
 
     node: str
     description: str
@@ -51,7 +51,7 @@ def serial_ports() -> list[Device]:
 
 @dataclass(frozen=True)
 class Machine:
-    """What was found.
+    """What this machine has.
 
     Attributes
     ----------
@@ -60,15 +60,15 @@ class Machine:
     rendering : list of str
         Lines on Mitsuba's variants, LLVM and the GPU.
     can_render : bool
-        Whether anything can be rendered here.
+        Whether this machine can render.
     plain_pictures : str
-        Why VTK draws no 3D pictures ("" if it does). Without VTK the pictures are drawn plainly.
+        Reason why VTK draws no 3D pictures ("" if it does). Simpler pictures are then drawn.
     devices : dict of str to list of Device
-        By kind: ``camera`` and ``serial``.
+        Devices by kind: ``camera`` and ``serial``.
     places : dict of str to Path
-        The folder that each of the program's own packages is imported from.
+        The folder from which each of the program's own packages is imported.
     kept : Path or None
-        The folder of kept results; None if nothing is kept.
+        The folder of stored results; None if nothing is stored.
     """
 
     packages: dict[str, str]
@@ -80,7 +80,7 @@ class Machine:
     kept: Path | None
 
     def lines(self) -> list[str]:
-        """The result in words."""
+        """The result as lines of text."""
         lines = [f"Python      {platform.python_version()} ({sys.executable}) on {platform.system()} {platform.machine()}"]
         lines += [f"{name:11} {version or 'MISSING; run ' + repr('make setup')}" for name, version in self.packages.items()]
         lines += ["", *self._own_lines(), f"kept results {self.kept or 'none: the cache is off'}"]
@@ -94,7 +94,7 @@ class Machine:
         return lines
 
     def _own_lines(self) -> list[str]:
-        """Where the program's own packages are; a line of each if they do not lie in one place."""
+        """The place of the program's own packages, or a line for each package if they lie in different places."""
         if len(set(self.places.values())) == 1:
             return [f"{', '.join(self.places)} in {next(iter(self.places.values()))}"]
         said = [f"{name} in {place}" for name, place in self.places.items()]
@@ -110,7 +110,7 @@ def examine_machine() -> Machine:
 
 
 def _places() -> dict[str, Path]:
-    """The folder that each of the program's own packages is imported from."""
+    """The folder from which each of the program's own packages is imported."""
     found = {name: importlib.util.find_spec(name) for name in OWN}
     return {name: Path(spec.origin).parents[1] for name, spec in found.items() if spec is not None and spec.origin}
 

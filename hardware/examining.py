@@ -1,4 +1,4 @@
-"""Whether the sensor in hand is well: frames of a camera, or of what was recorded, examined."""
+"""Check of a sensor's condition from frames of a camera or of a recording."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,24 +12,24 @@ from twin.pins import DetectorSpec, Finding, Grade, examine
 from twin.progress import Progress, silent, stage
 from twin.types import Form, Frame
 
-LIMIT = 20  # frames that are looked at
-MOST_LIVE = 1000  # frames of a camera that are kept: 6 GB at 1920 x 1080 in colour
+LIMIT = 20  # most frames that are used
+MOST_LIVE = 1000  # most frames of a camera that are kept: 6 GB at 1920 x 1080 in colour
 
 
 @dataclass(frozen=True)
 class Examination:
-    """What was found, and what was odd in the recording."""
+    """The findings, and the irregularities of the recording."""
 
     findings: list[Finding]
     notes: list[str] = field(default_factory=list)
 
     @property
     def bad(self) -> bool:
-        """Whether something is bad."""
+        """Whether any finding is bad."""
         return any(found.verdict is Grade.BAD for found in self.findings)
 
     def lines(self) -> list[str]:
-        """For people: each finding, and below it what to do; and what was odd."""
+        """Lines of text: each finding with its remedy below it, then the irregularities."""
         lines = [f"note: {note}" for note in self.notes]
         for found in self.findings:
             lines.append(f"{found.verdict.upper():5} {found.name:10} {found.text}")
@@ -52,18 +52,18 @@ def examine_sensor(
     Parameters
     ----------
     source : str
-        As ``open_camera`` takes it.
+        Text for ``open_camera``.
     form : Form, optional
-        Of the frames; told by size and content by default.
+        Form of the frames; recognised by size and content by default.
     detector : DetectorSpec, optional
-        What 'twin tune' found; the specification's own by default.
+        Result of 'twin tune'; by default the specification's own detector.
 
     Raises
     ------
     FrameError
         The detector is not of method ``twin``, or there are no frames.
     DeviceError
-        There is no such camera, or it gives nothing.
+        There is no such camera, or it delivers no frame.
     """
     if detector is not None and detector.method != "twin":
         raise FrameError(
@@ -75,12 +75,12 @@ def examine_sensor(
 
 
 def frames_of(source: str, sensor: SensorSpec | None, form: Form | None, limit: int) -> tuple[list[Frame], list[str]]:
-    """The next ``limit`` frames of a camera, or as many, evenly spread, of what was recorded; and what was odd in the recording.
+    """The next ``limit`` frames of a camera, or as many of a recording, evenly spread, and the irregularities of the recording.
 
     Raises
     ------
     FrameError
-        There are no frames, or more than ``MOST_LIVE`` of a camera are asked for.
+        There are no frames, or more than ``MOST_LIVE`` of a camera are requested.
     """
     camera = open_camera(source, sensor, form)
     if not camera.is_live:

@@ -1,4 +1,4 @@
-"""One run of surface following: from a plan to results, which are also written to disk."""
+"""One run of surface following, from a plan to results that are also written to disk."""
 
 import logging
 from contextlib import ExitStack
@@ -31,52 +31,52 @@ from twin.store import write_json, writes
 from twin.types import FIRST, Frame
 
 LOG = logging.getLogger(__name__)
-# Folder of the session in that of the results.
+# Subfolder of the results with the session.
 SESSION = "session"
-# Following ends after this time in s without a usable frame.
+# Time, s, without a usable frame after which following ends.
 GIVE_UP_S = 5.0
-# Rate in Hz from which the loop's period is set if no rate is given. Then each decision waits for the move before it, and the period is
-# only the pause after a frame that could not be used.
+# Rate, Hz, that determines the loop's period if no rate is given. Then each decision waits for the move before it, and the period is only
+# the pause after a frame that could not be used.
 STREAM_HZ = 10.0
-# Decisions a second that may be asked for: no camera is faster than the last, and an arm does not wait longer than with the first.
+# Range of the rate, decisions per second. No camera is faster than the second, and an arm waits too long with a rate below the first.
 SLOWEST_HZ, FASTEST_HZ = 0.1, 1000.0
-# Steps that may be asked for: the arm would be at work for days.
+# Most steps of a run. They take an arm days.
 MOST_STEPS = 1_000_000
 
 
 @dataclass(frozen=True)
 class FollowPlan:
-    """What to follow, and with which devices. The sensor and the form of its frames are the model's.
+    """Settings of a run, and its devices. The sensor and the form of its frames are those of the model.
 
     Attributes
     ----------
     stimulus : ObjectSpec
         The object.
     servo : ServoSpec
-        Gains, speeds and where the object stands.
+        Gains, speeds and the object's place.
     camera, arm : str
-        As for ``build_rig``. Without a camera the twin's frames are drawn, for a simulated arm alone: a real one would move by what it
-        does not touch.
+        As for ``build_rig``. If no camera is given, the twin's frames are drawn. This is allowed for a simulated arm only, because a real
+        arm would follow a contact that does not exist.
     steps : int or None
-        Number of steps. None: once around the object.
+        Number of steps; None: once around the object.
     stream_hz : float or None
-        Decisions a second. None: each decision waits for the move before it.
+        Decisions per second; None: each decision waits for the move before it.
     limits : str or None
-        Safety limits, by name or file. None: those of the arm's kind.
+        Safety limits, by name or file; None: those of the arm's kind.
     record : bool
         Keep every frame and step in a session.
     seed : int
         Seed of the twin's noise.
     plain_light : bool
-        The twin's frames without path tracing; see ``build_rig``.
+        Draw the twin's frames without path tracing; see ``build_rig``.
     known_place : bool
-        Whether the object really stands at the servo's placement, so that the results can be compared with the truth. In the twin it
-        always does.
+        Whether the object really stands at the servo's placement, so that the results can be compared with the truth. This is always true
+        in the twin.
     at_rest : str
-        What pins are counted from: ``first`` (the frame that is taken clear of the object), ``none`` (the rest places that the model
-        knows, or that the contacts tell once they do), or a file.
+        The pins at rest: ``first`` (from the frame that is taken clear of the object), ``none`` (those that the model knows, or that follow
+        from the contacts), or a file.
     also : tuple of str
-        Further formats that the session is kept in at its end, each in a subfolder of it.
+        Further formats in which the session is kept at its end, each in a subfolder of it.
     """
 
     stimulus: ObjectSpec
@@ -111,7 +111,7 @@ class FollowPlan:
 
 @dataclass(frozen=True)
 class Followed:
-    """The result of ``follow``. ``failure`` says why it ended early ("" if it did not); ``outline_mm`` (N, 2) is in the base frame."""
+    """The result of ``follow``. ``failure`` states why it ended early ("" if it did not); ``outline_mm`` (N, 2) is in the base frame."""
 
     measures: Measures
     timing: Timing
@@ -122,7 +122,7 @@ class Followed:
     written: list[Path] = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """The result in words, without what is not known."""
+        """The result as lines of text, without unknown values."""
         m = self.measures
         smooth = {"smoothness S": m.smoothness, "local": m.local_smoothness, "jerk in mm per step^3": m.jerk}
         out = [
@@ -135,7 +135,7 @@ class Followed:
             out[0] += f", {m.completed:.0%} of the way, contact lost {m.lost_contacts:g} times"
             told = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
             out[2:2] = [
-                f"{told if np.isfinite(m.path_error_mm) else ''}"  # a policy estimates nothing
+                f"{told if np.isfinite(m.path_error_mm) else ''}"  # a policy gives no estimate
                 f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
             ]
         else:
@@ -147,14 +147,14 @@ class Followed:
 def follow(
     plan: FollowPlan, model: SensorModel, out: Path, *, about: dict[str, Any] | None = None, progress: Progress = silent
 ) -> Followed:
-    """Follow an object and write the results to ``out``. A run that ends before its last step has results, too.
+    """Follow an object and write the results to ``out``. A run that ends before its last step also has results.
 
     Parameters
     ----------
     model : SensorModel
-        Tells the pose in each frame.
+        Model that estimates the pose in each frame.
     about : dict, optional
-        What to keep beside the measures, such as the model's name (JSON).
+        Further entries for the stored measures, such as the model's name (JSON).
 
     Raises
     ------
@@ -194,7 +194,7 @@ def follow(
             if not loop.records:
                 raise
             failure = str(error)
-        finally:  # after Ctrl-C, too, so that the steps so far are kept
+        finally:  # also after Ctrl-C, so that the steps so far are stored
             if loop.records:
                 followed = _results(plan, rig, loop, wanted_mm, failure)
                 followed.written.extend(_write(out, plan, model, followed, told))
@@ -232,13 +232,13 @@ def _settings(plan: FollowPlan, rig: Rig, steps: int) -> LoopSettings:
 
 
 def _told(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
-    """What is kept beside the results."""
+    """The entries that are stored with the results."""
     names = {"sensor": model.sensor.name, "object": plan.stimulus.name, "camera": plan.camera, "arm": plan.arm}
     return names | {"servo": plan.servo.model_dump()}
 
 
 def _say_turns(rig: Rig, servo: ServoSpec, wanted_mm: float) -> None:
-    """Say beforehand where on the way the last axis of an arm of four axes will turn back."""
+    """Report in advance where on its path an arm of four axes will turn back its last axis."""
     axis = LastAxis(getattr(rig.arm, "kinematics", None), rig.mounting.centre_mm)
     for distance_mm in turns_back_mm(rig.placed, axis, servo.indent_mm, wanted_mm):
         LOG.warning("%s: its last axis will turn back by a full turn after about %.0f mm, clear of the object", rig.arm.name, distance_mm)
@@ -251,7 +251,7 @@ def _note_step(session: SessionWriter | None, step: Step, steps: int, record: St
 
 
 def _take_rest(session: SessionWriter | None, model: SensorModel, frame: Frame) -> SensorModel:
-    """Keep the frame that was taken clear of the object, and count pins from it."""
+    """Store the frame that was taken clear of the object, and use its pins as the pins at rest."""
     if session is not None:
         session.keep_rest(frame)
     return counting_from_first(model, frame)

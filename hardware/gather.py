@@ -1,4 +1,4 @@
-"""Frames of a live camera as a folder: what 'twin new' needs of a sensor of which nothing is known."""
+"""Takes frames of a live camera into a folder, as input of 'twin new' for an unknown sensor."""
 
 import shutil
 import time
@@ -13,11 +13,11 @@ from twin.frames.images import write_image
 from twin.store import output
 
 FRAMES = 40
-"""Frames that are taken, the one without contact included."""
+"""Number of frames, including the one without contact."""
 EVERY_S = 0.5
-"""Time between two frames: enough to press elsewhere."""
+"""Time, s, between two frames: enough to press at another place."""
 MOST_WAIT_S = 10.0
-"""Longest wait for one frame."""
+"""Longest wait, s, for one frame."""
 
 
 def gather_frames(
@@ -36,15 +36,15 @@ def gather_frames(
     source : FrameSource
         Not yet connected.
     folder : Path
-        Where the frames are written; an earlier run's are replaced.
+        Folder for the frames. Frames of an earlier run are replaced.
     count : int
-        Frames in all.
+        Total number of frames.
     every_s : float
         Time between two frames.
     say : callable
-        Gets what the person has to do, a line at a time.
+        Called with each line that tells the person what to do.
     sleep : callable
-        Waits for a time in s.
+        Function that waits for a time in s.
 
     Returns
     -------

@@ -1,8 +1,8 @@
-"""The last axis of an arm of four axes. It turns the sensor about the vertical, and it has an end on both sides.
+"""The last axis of an arm of four axes. It turns the sensor about the vertical, and its range has two ends.
 
-R = J1 + J4 is not wrapped, and J4 has a range of at most one full turn: each orientation of the sensor has at most one R within the range.
-An orientation a little beyond an end is held at the end. Farther beyond, the axis has to turn back by a full turn, for which the sensor
-leaves the object.
+R = J1 + J4 is not wrapped, and J4 has a range of at most one full turn. Therefore each orientation of the sensor has at most one R within
+the range. An orientation slightly beyond an end is held at the end. Farther beyond the end, the axis has to turn back by a full turn, for
+which the sensor leaves the object.
 """
 
 from dataclasses import dataclass, field
@@ -12,33 +12,33 @@ import numpy as np
 from hardware.arms.kinematics import Kinematics, LinkageKinematics
 from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
 
-# An orientation that is farther than this beyond the axis' end (deg) needs a turn back. It is larger than the noise of an estimated angle:
-# otherwise the axis would turn back and forth.
+# Angle beyond the end of the range, deg, above which an orientation needs a turn back. It is larger than the noise of an estimated angle.
+# Otherwise the axis would turn back and forth.
 HOLD_DEG = 5.0
-# Distance from the end of the range, in deg, at which the axis is held: rounding must not take a pose for one of the other turn.
+# Distance, deg, from the end of the range at which the axis is held. With it, rounding can't change the turn to which a pose belongs.
 EDGE_DEG = 0.01
-# A turn larger than this (deg) is a turn back: no step of a servo is as large.
+# Angle, deg, above which a turn is a turn back. No step of a servo is as large.
 HALF_TURN_DEG = 180.0
-# Repetitions in which place and turn of a held sensor agree.
+# Number of iterations in which place and turn of a held sensor are matched.
 HOLD_STEPS = 4
 
 
 @dataclass(frozen=True)
 class LastAxis:
-    """What the last axis can do. Arms of other kinds have no end to mind.
+    """Range of the last axis. Arms of other kinds have no limited last axis.
 
     Attributes
     ----------
     kinematics : Kinematics or None
     centre_mm : (3,) float
-        The place in the tool's frame that stays where it is when the axis is held.
+        Point in the tool's frame that does not move when the axis is held.
     """
 
     kinematics: Kinematics | None
     centre_mm: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def on_turn(self, pose: np.ndarray, near_deg: float) -> tuple[np.ndarray, float]:
-        """The pose (6,) with R on the same turn as ``near_deg``, held at the axis' end, and the angle in deg by which it is held back."""
+        """The pose (6,) with R on the same turn as ``near_deg``, held at the axis' end, and the angle in deg by which it was changed."""
         if not isinstance(self.kinematics, LinkageKinematics):
             return np.array(pose, float), 0.0
         low, high = self.kinematics.limits_deg[3]
@@ -52,7 +52,7 @@ class LastAxis:
         return out, abs(float(out[5] - wanted))
 
     def turned_back(self, here: np.ndarray, target: np.ndarray) -> np.ndarray | None:
-        """The pose (6,) at ``here`` after a turn back, from which a target (6,) beyond the end is reached; None if there is none."""
+        """The pose (6,) at ``here`` after a turn back, from which a target (6,) beyond the end can be reached; None if there is none."""
         if self.kinematics is None:
             return None
         other = self.kinematics.nearest_pose(target)
@@ -63,7 +63,7 @@ class LastAxis:
 
 
 def turns_back_mm(placed: PlacedObject, axis: LastAxis, indent_mm: float, length_mm: float) -> list[float]:
-    """Distances along the outline, in mm, after which the last axis will turn back, if the object stands where it should."""
+    """Distances along the outline, in mm, after which the last axis will turn back if the object stands at its specified place."""
     outline = placed.outline()
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))])
     way = np.gradient(outline, axis=0)

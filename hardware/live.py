@@ -1,6 +1,6 @@
-"""Watching a camera, or replaying a session: from a plan to estimates, figures and, if wanted, a recorded session.
+"""Watches a camera, or replays a session: from a plan to estimates, figures and, if requested, a recorded session.
 
-``watch`` runs the model on every frame. ``LiveSession`` is its loop; ``Shower`` shows the newest frame in a thread of its own.
+``watch`` runs the model on every frame. ``LiveSession`` is its loop; ``Shower`` shows the newest frame from its own thread.
 """
 
 import threading
@@ -30,13 +30,13 @@ from twin.store import output
 from twin.studio.live_page import LivePage, LiveShot
 from twin.types import FIRST, NONE, Frame
 
-# Newest times of each kind that the figures are computed from.
+# Number of newest times of each kind from which the figures are computed.
 KEPT_TIMES = 10_000
 # Number of newest frames from which the present frame rate is computed.
 RATE_SPAN = 30
 # Interval in s between two pictures of the view.
 SHOW_S = 0.1
-# Time in s that a view may take at the end to write or send what it was shown.
+# Time, s, that a view has at the end to write or send its data.
 CLOSE_S = 20.0
 # Longest wait for a frame, in s.
 FRAME_TIMEOUT_S = 5.0
@@ -53,7 +53,7 @@ class LiveSession:
     Parameters
     ----------
     source : FrameSource
-        Connected.
+        Connected source.
     estimator : Estimator
     record : SessionWriter, optional
     on_estimate : callable, optional
@@ -82,7 +82,7 @@ class LiveSession:
         DeviceError
             The camera has ended, or delivers no frame.
         FrameError
-            A frame is not one of the model's sensor.
+            A frame does not belong to the model's sensor.
         """
         self._begun_s = time.monotonic()
         while going() and (most is None or self.count < most) and (seconds is None or time.monotonic() - self._begun_s < seconds):
@@ -114,13 +114,13 @@ class LiveSession:
         return self.timing()
 
     def timing(self) -> Timing:
-        """Figures so far."""
+        """The figures so far."""
         rate_hz = self.count / max(time.monotonic() - self._begun_s, 1e-9)
         late, ages, spent = (Spread.of(list(times)) for times in (self._late, self._ages, self._spent))
         return Timing(self.count, rate_hz, rate_hz, late, ages, spent, self.source.dropped)
 
     def lines(self, estimate: Estimate) -> list[str]:
-        """Pose with its interval, rates and losses, for people."""
+        """Lines of text: pose with its interval, rates and losses."""
         if estimate.valid:
             rows = zip(estimate.names, estimate.value, estimate.low, estimate.high, strict=True)
             pose = [f"{name} {value:+.2f} [{low:+.2f}, {high:+.2f}]" for name, value, low, high in rows]
@@ -133,7 +133,7 @@ class LiveSession:
 
 
 def estimate_line(estimate: Estimate) -> dict:
-    """An estimate as a session keeps it."""
+    """An estimate in the form in which a session stores it."""
     return {
         "names": list(estimate.names),
         "value": np.asarray(estimate.value),
@@ -145,7 +145,7 @@ def estimate_line(estimate: Estimate) -> dict:
 
 
 def same_estimates(steps: list[dict], values: list[np.ndarray]) -> int:
-    """How many of a session's steps hold exactly the estimates (K,) that its frames give now."""
+    """Number of steps of a session whose stored estimates equal exactly the present ones (K,)."""
     same = 0
     for step, value_now in zip(steps, values, strict=False):
         kept = np.array([np.nan if value is None else value for value in step.get("value", [])], float)
@@ -154,19 +154,19 @@ def same_estimates(steps: list[dict], values: list[np.ndarray]) -> int:
 
 
 class Shower:
-    """Shows the newest frame in a thread of its own, so that drawing does not delay the session. A context manager.
+    """Shows the newest frame from its own thread, so that drawing does not delay the session. A context manager.
 
     Parameters
     ----------
     session : LiveSession
     pipeline : Pipeline
-        Finds what is drawn over a frame.
+        Pipeline that finds the pins that are drawn over a frame.
     view : View
 
     Raises
     ------
     DeviceError
-        On entering if the view can't be opened, on leaving if it broke.
+        When the context is entered, if the view can't be opened; when it is left, if the view has failed.
     """
 
     def __init__(self, session: LiveSession, pipeline: Pipeline, view: View) -> None:
@@ -177,7 +177,7 @@ class Shower:
 
     @property
     def open(self) -> bool:
-        """Whether the view has not broken."""
+        """Whether the view still works."""
         return not self._end.is_set()
 
     def __enter__(self) -> "Shower":
@@ -218,7 +218,7 @@ class Shower:
                     continue
                 try:
                     lines = self._session.lines(newest[1])
-                except RuntimeError:  # the session added a time while it was read
+                except RuntimeError:  # the session added a time while the times were read
                     continue
                 shown = newest
                 view.show(LiveShot(*newest, tuple(lines[1:])), seen_in(*newest, self._pipeline))
@@ -226,12 +226,12 @@ class Shower:
 
 @dataclass(frozen=True)
 class WatchPlan:
-    """What to watch, how to show it, and whether to keep it.
+    """Settings of watching: source, view and recording.
 
     Attributes
     ----------
     camera : str
-        As ``open_camera`` takes it; "" with ``replay``.
+        Text for ``open_camera``; "" with ``replay``.
     replay : Path or None
         A recorded session instead of a camera.
     record : Path or None
@@ -239,16 +239,16 @@ class WatchPlan:
     shown : bool
         Show the frames on a page for the browser.
     rerun : str or None
-        A target of ``RerunView``: show the frames there instead, whatever ``shown`` says.
+        A target of ``RerunView``. The frames are then shown there, whatever ``shown`` is.
     seconds, count : float or None, int or None
         Stop after this time in s, or after this number of frames.
     at_rest : str
-        What pins are counted from: ``first`` (the first frame), ``none`` (the rest places that the model knows, or that the contacts
-        tell once they do), or a file.
+        The pins at rest: ``first`` (from the first frame), ``none`` (those that the model knows, or that follow from the contacts), or a
+        file.
     port : int
-        Port of the page; 0: a free one.
+        Port of the page; 0 for a free one.
     also : tuple of str
-        Further formats that the session is kept in at its end, each in a subfolder of ``record``.
+        Further formats in which the session is kept at its end, each in a subfolder of ``record``.
     """
 
     camera: str = ""
@@ -289,11 +289,11 @@ class Watched:
     frames : int
         Number of frames.
     notes : list of str
-        What was odd in the recording or session.
+        Irregularities of the recording or session.
     valid : int
         Number of frames with a valid estimate.
     invalid : str
-        Why the last frame without one had none.
+        Reason why the last frame without a valid estimate had none.
     """
 
     timing: Timing
@@ -306,7 +306,7 @@ class Watched:
     invalid: str = ""
 
     def lines(self) -> list[str]:
-        """The result in words."""
+        """The result as lines of text."""
         lines = ["ended"] if self.interrupted else []
         lines += [f"note: {note}" for note in self.notes]
         lines += self.timing.lines()
@@ -335,7 +335,7 @@ def watch(
     plan : WatchPlan
     model : SensorModel
     name : str
-        The model's name, which is kept with the session.
+        The model's name, which is stored with the session.
     on_shown : callable, optional
         Called with the address of the view once it is open.
     on_estimate : callable, optional
@@ -344,7 +344,7 @@ def watch(
     Raises
     ------
     TwinError
-        There is no such camera or session, its sensor is not the model's, or the view can't be opened or broke.
+        There is no such camera or session, its sensor is not the model's, or the view can't be opened or fails.
     """
     kept = KeptAlso(plan.record or Path(), plan.also, model.sensor)
     source = SessionSource(plan.replay) if plan.replay is not None else open_camera(plan.camera, model.sensor, model.form)
@@ -362,13 +362,13 @@ def watch(
         stack.enter_context(source)
         model, rest = _at_rest(plan, model, source, rest)
         session, shower = LiveSession(source, model, on_estimate=keep), None
-        pipeline = Pipeline(model.sensor, model.form, model.pipeline.reference)  # of the view's own thread
+        pipeline = Pipeline(model.sensor, model.form, model.pipeline.reference)  # a separate one for the view's thread
         view = _view(plan, f"{model.sensor.name}, {source.name}", pipeline)
         if view is not None:
             shower = stack.enter_context(Shower(session, pipeline, view))
             if on_shown is not None:
                 on_shown(view.url)
-        if plan.record is not None:  # the last step: no folder is made if one of the steps before fails
+        if plan.record is not None:  # last, so that no folder is made if an earlier step fails
             about = {"sensor": model.sensor.name, "form": str(source.form), "camera": source.name, "model": name}
             stack.enter_context(output(plan.record, *SESSION_FILES))
             stack.enter_context(kept)
@@ -387,17 +387,17 @@ def watch(
 
 
 def _catch_up(session: LiveSession, kept: KeptAlso) -> None:
-    """Keep a session that has a step in the further formats, however it ended."""
+    """Write a session with at least one step in the further formats, however it ended."""
     if session.count:
         kept.catch_up()
 
 
 def _at_rest(plan: WatchPlan, model: SensorModel, source: FrameSource, rest: Frame | None) -> tuple[SensorModel, Frame | None]:
-    """The model that counts pins from the frame without contact, or from where contacts tell that they are at rest; and that frame."""
+    """The model with the pins at rest from the frame without contact, or from the contacts, and that frame."""
     if plan.at_rest == FIRST:
         rest = await_frame(source)
         return counting_from_first(model, rest), rest
-    # A session may be replayed with another model than its own, which may not count pins from a frame without contact.
+    # A session may be replayed with another model, which may not use displacements from rest.
     if rest is not None and (model.counts_from_rest or plan.replay is None):
         return model.at_rest(rest), rest
     return model.seeking_rest(), rest

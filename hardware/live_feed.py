@@ -1,4 +1,4 @@
-"""What the studio's mode 'Live' takes: a camera with its estimates, and an arm that is read only until it is armed."""
+"""Devices for the studio's mode 'Live': a camera with its estimates, and an arm that is only read until it is armed."""
 
 import os
 import threading
@@ -23,19 +23,19 @@ from twin.records.session import SessionWriter
 from twin.studio.live_page import LiveShot
 from twin.types import Frame
 
-# Speed of an arm that the page moves, in mm/s and deg/s: slow enough to be watched.
+# Speed, mm/s and deg/s, of an arm that the page moves. It is slow, so that a person can watch it.
 SLOW_MM_S, SLOW_DEG_S = 10.0, 10.0
-# Longest time in s that the end of a feed waits for its last frame.
+# Longest wait, s, for the last frame at the end of a feed.
 END_S = 10.0
 
 
 class WatchedArm:
-    """An arm that is watched. It moves only while it is armed, within its limits, and slowly.
+    """An arm that is shown. It moves only while it is armed, within its limits, and slowly.
 
     Parameters
     ----------
     text : str
-        As ``open_arm`` takes it.
+        Text for ``open_arm``.
 
     Raises
     ------
@@ -56,7 +56,7 @@ class WatchedArm:
 
     @property
     def armed(self) -> bool:
-        """Whether the page may move it."""
+        """Whether the page may move the arm."""
         return self._armed
 
     def connect(self) -> None:
@@ -64,7 +64,7 @@ class WatchedArm:
         self._arm.connect()
 
     def words(self) -> str:
-        """Where it is and how it is."""
+        """The arm's pose and state, as text."""
         try:
             state = self._arm.state()
         except DeviceError as error:
@@ -74,20 +74,20 @@ class WatchedArm:
         return f"{self.name}: {kind}, at {pose} (mm, deg)"
 
     def limits(self) -> str:
-        """What it may do once it is armed."""
+        """The arm's limits once it is armed, as text."""
         limits = self._arm.limits
         box = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in zip("xyz", limits.box_mm, strict=True))
         slow = min(SLOW_MM_S, limits.linear_mm_s)
         return f"tool within {box} mm, {slow:g} mm/s, one step at a time; it is disabled when the studio ends"
 
     def arm(self) -> None:
-        """Enable it, and make it slow."""
+        """Enable the arm, and set a low speed."""
         self._arm.enable()
         self._arm.set_speed(SLOW_MM_S, SLOW_DEG_S)
         self._armed = True
 
     def disarm(self) -> None:
-        """Stop and disable it; both are tried."""
+        """Stop and disable the arm. Both are tried."""
         self._armed = False
         if failed := try_each(stop=self._arm.stop, disable=self._arm.disable):
             raise DeviceError(f"{self.name}: {'; '.join(failed)}; use its own stop button")
@@ -98,7 +98,7 @@ class WatchedArm:
         Raises
         ------
         DeviceError
-            It is not armed, it moves already, or its limits forbid the move.
+            The arm is not armed, is already moving, or its limits forbid the move.
         """
         if not self._armed:
             raise DeviceError(f"{self.name}: read only; arm it first")
@@ -112,12 +112,12 @@ class WatchedArm:
             self._moves.release()
 
     def emergency_stop(self) -> None:
-        """Stop it and cut its power."""
+        """Stop the arm and cut its power."""
         self._armed = False
         self._arm.emergency_stop()
 
     def close(self) -> None:
-        """Disarm it if it is armed, and close the connection."""
+        """Disarm the arm if it is armed, and close the connection."""
         if self._armed:
             with suppress(DeviceError):
                 self.disarm()
@@ -125,18 +125,18 @@ class WatchedArm:
 
 
 def require_feed(camera: str, arm: str, recording: str, sensor: SensorSpec) -> None:
-    """Refuse a camera, an arm or a recording, each "" for none, that can't be meant. Nothing is connected.
+    """Refuse texts for camera, arm or recording that can't be valid; "" stands for none. Nothing is connected.
 
     Raises
     ------
     DeviceError, FrameError
-        There is no such thing, or its frames are not the sensor's.
+        There is no such device or recording, or its frames are not the sensor's.
     """
     if camera:
         open_camera(camera, sensor)
     if arm:
         WatchedArm(arm)
-    if recording and not os.path.exists(recording):  # what is in it is read when it is opened
+    if recording and not os.path.exists(recording):  # its content is checked when it is opened
         raise FrameError(f"--recording {recording}: no such folder; give a recording")
 
 
@@ -146,9 +146,9 @@ class CameraFeed:
     Parameters
     ----------
     camera : str
-        As ``open_camera`` takes it.
+        Text for ``open_camera``.
     arm : str
-        As ``open_arm`` takes it, "" for none.
+        Text for ``open_arm``; "" for none.
     model : SensorModel
 
     Raises
@@ -197,14 +197,14 @@ class CameraFeed:
                 self._session.run(going=lambda: not self._end.is_set())
                 if not self._end.is_set():
                     on_end(f"{self.name}: at its end")
-            except Exception as error:  # whatever it is, a picture that stands still must be told
+            except Exception as error:  # any error must be reported, because otherwise the picture would just stand still
                 on_end(str(error) if isinstance(error, TwinError) else f"{self.name}: ended by a fault of this program ({error!r})")
 
         self._thread = threading.Thread(target=run, name="studio-camera", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """End. The arm is let go of first, and the rest is done even if one part fails.
+        """End. The arm is released first. All parts are released, even if one fails.
 
         Raises
         ------
@@ -217,7 +217,7 @@ class CameraFeed:
             raise DeviceError(f"{self.name}: {'; '.join(failed)}")
 
     def record(self, folder: Path) -> None:
-        """Keep every frame and estimate from now on, as ``twin live --record`` does.
+        """Store every frame and estimate from now on, as ``twin live --record`` does.
 
         Raises
         ------
@@ -229,7 +229,7 @@ class CameraFeed:
             self._writer = SessionWriter(folder, about)
 
     def end_record(self) -> str:
-        """End the recording; what was written."""
+        """End the recording; returns what was written, in words."""
         with self._writing:
             writer, self._writer = self._writer, None
         if writer is None:

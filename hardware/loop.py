@@ -1,7 +1,7 @@
-"""The servo loop: frame, estimate, law, move. It knows a frame source, an estimator and an arm, and not what stands behind them.
+"""The servo loop: frame, estimate, law, move. It uses any frame source, estimator and arm through their protocols.
 
-A frame is exposed while the arm moves. So the loop keeps the newest states of the arm (``ArmWatch``) and takes the pose at the time of the
-frame's exposure from them. The same thread stops an arm that answers no more.
+A frame is exposed while the arm moves. Therefore the loop keeps the newest states of the arm (``ArmWatch``), and takes the pose at the
+frame's exposure from them. The thread of ``ArmWatch`` also stops an arm that no longer answers.
 """
 
 import logging
@@ -32,30 +32,30 @@ from twin.types import Frame
 LOG = logging.getLogger(__name__)
 # Largest number of pieces into which guards and arm may divide a move that is waited for.
 MOST_PIECES = 200
-# A move that ends nearer than this to its target (mm) needs no further piece.
+# Largest distance, mm, between the end of a move and its target at which no further piece is needed.
 NEAR_MM = 0.5
-# The same for its turn, in deg.
+# The same for the turn, in deg.
 NEAR_DEG = 0.5
-# Time in s that a move may take beyond what its way and speed give.
+# Time in s that a move may take in addition to the duration that its path and speed give.
 MOVE_TIMEOUT_S = 10.0
-# Factor on the time that a move's way and speed give: arms round their speed to whole percents.
+# Factor on the duration that a move's path and speed give, because arms round their speed to whole percents.
 SPARE = 2.0
-# The arm may lag behind its target by this number of the servo's largest moves. When it lags farther, it gets no new target.
+# Largest lag of the arm behind its target, in largest moves of the servo. An arm that lags farther gets no new target.
 BEHIND_MOVES = 2.0
 
 
 class Decided(StrEnum):
-    """What each round of the loop ends with."""
+    """The decision with which a round of the loop ends."""
 
     MOVE = "moved"
     AWAIT_ARM = "let the arm catch up"
-    AWAIT_FRAME = "awaited a newer frame"  # the arm is too far from the place that the last frame showed
+    AWAIT_FRAME = "awaited a newer frame"  # the arm is too far from the place in the last frame
     HOLD = "held still"
 
 
 @dataclass
 class _View:
-    """What the newest used frame showed.
+    """The result of the newest used frame.
 
     Attributes
     ----------
@@ -63,11 +63,11 @@ class _View:
         None before the first one.
     reading : Reading
     doubt : str
-        Why the estimate can't be trusted ("" if it can).
+        Reason why the estimate can't be trusted ("" if it can).
     exposed_pose : (6,) float
         The arm's pose when the last trusted frame was exposed.
     tangent : (4, 4) float
-        The surface that this frame showed; None before the first one.
+        Tangent of the surface in this frame; None before the first trusted frame.
     """
 
     frame: Frame | None = None
@@ -80,32 +80,32 @@ class _View:
 
 @dataclass
 class ServoLoop:
-    """Runs the law on what a camera shows.
+    """Runs the law on the frames of a camera.
 
     Parameters
     ----------
     source : FrameSource
-        Connected.
+        Connected source.
     estimator : Estimator
     arm : Arm
-        Connected; ``run`` enables and disables it.
+        Connected arm; ``run`` enables and disables it.
     servo : ServoSpec
     mounting : Mounting
     settings : LoopSettings
     guards : list of Guard
         Called before every move, in this order. Each may change the target or refuse it.
     sense : callable, optional
-        Called before the move with what each fresh estimate tells: depth, force, torque, slip, and when the frame was exposed.
+        Called before each move with the contact of each fresh estimate: depth, force, torque, slip, and time of the exposure.
     forget : callable, optional
-        Called when the sensor leaves the object on purpose, to turn back the last axis of an arm of four axes.
+        Called when the sensor leaves the object on purpose, for a turn back of the last axis of an arm of four axes.
     retreat : callable, optional
         Withdraws the arm. It gets the direction (3,) away from the object in the base frame. By default the arm moves straight by the
         servo's ``clear_mm``.
     way : callable, optional
-        Gives the poses to pass from the arm's pose to the pose clear of the object, which is the last of them. By default the arm goes
+        Gives the poses of the path from the arm's pose to the pose clear of the object, which is the last one. By default the path is
         straight.
     law : callable, optional
-        In place of the servo law: gives the next pose (6,) from the arm's pose (6,) and the estimate.
+        Replaces the servo law: gives the next pose (6,) from the arm's pose (6,) and the estimate.
     take_rest : callable, optional
         Gets a frame without contact, taken clear of the object, and returns the estimator to use from then on.
     on_step : callable, optional
@@ -129,7 +129,7 @@ class ServoLoop:
 
     def __post_init__(self) -> None:
         self.records: list[StepRecord] = []
-        self.notes: list[str] = []  # what went wrong
+        self.notes: list[str] = []  # problems of the run
         self.decided: list[tuple[Decided, float]] = []  # every decision, with the age (s) of its frame (NaN without a frame)
         self._held_since: float | None = None  # when the arm began to hold still
         self._sent: np.ndarray | None = None  # pose (6,) where the arm's queue ends, if it has a queue
@@ -141,9 +141,9 @@ class ServoLoop:
         self._started_s = self._ended_s = 0.0
 
     def run(self, start_pose: np.ndarray) -> Timing:
-        """Approach the start pose (6,), follow the surface for the given steps, retreat.
+        """Approach the start pose (6,), follow the surface for the number of steps of the settings, retreat.
 
-        After any end, Ctrl-C included, the arm is stopped, retreats along the sensor's axis and is disabled.
+        At every end, Ctrl-C included, the arm is stopped, retreats along the sensor's axis and is disabled.
 
         Raises
         ------
@@ -166,7 +166,7 @@ class ServoLoop:
         return self.timing()
 
     def _approach(self, start_pose: np.ndarray) -> None:
-        """Go to the place clear of the object, and take the frame without contact there."""
+        """Move to the pose clear of the object, and take the frame without contact there."""
         with self._watch.doing("enabling"):
             self.arm.enable()
             self.arm.set_speed(self.servo.linear_mm_s, self.servo.angular_deg_s)
@@ -182,7 +182,7 @@ class ServoLoop:
             self.estimator = self.take_rest(rest)
 
     def require_labels(self, names: tuple[str, ...]) -> None:
-        """Raise ``DeviceError`` if the model's labels are not those that following needs. Call it before anything moves."""
+        """Raise ``DeviceError`` unless the model has the labels that following needs. Call it before anything moves."""
         depth, angle = self.mounting.depth_label, self.mounting.angle_label
         if not {depth, angle} <= set(names):
             raise DeviceError(f"the model tells {', '.join(names)}; following a surface needs the experiment's {depth} and {angle}")
@@ -260,10 +260,10 @@ class ServoLoop:
                 self.arm.wait_settled(self._sent, timeout_s=MOVE_TIMEOUT_S)
 
     def _next(self, from_pose: np.ndarray, fresh: bool) -> tuple[np.ndarray, Memory]:
-        """The pose (6,) that the law wants next, and the sums that it keeps."""
+        """The next pose (6,) of the law, and the sums that it keeps."""
         view = self._view
         if self.law is not None:
-            assert view.estimate is not None  # a view without doubt has one
+            assert view.estimate is not None  # a trusted view has an estimate
             return self.law(from_pose, view.estimate), self._memory
         assert view.tangent is not None
         step = servo_step(self.servo, self.mounting, view.tangent, from_pose, self._memory, fresh=fresh)
@@ -286,7 +286,7 @@ class ServoLoop:
         return True
 
     def _lags(self, state: ArmState, from_pose: np.ndarray, now_s: float) -> bool:
-        """Whether the arm is too far behind its target to get a new one. The time when this began is kept."""
+        """Whether the arm is too far behind its target to get a new one. The time at which this began is stored."""
         if _apart_mm(from_pose, state.pose) <= BEHIND_MOVES * self.servo.largest_move_mm:
             return False
         self._behind_since = now_s if self._behind_since is None else self._behind_since
@@ -302,9 +302,9 @@ class ServoLoop:
             )
 
     def _record(self, state: ArmState, from_pose: np.ndarray, sent: np.ndarray, *, fresh: bool, taken_s: float) -> None:
-        """Keep the record of a move, and pass it to ``on_step``."""
+        """Store the record of a move, and pass it to ``on_step``."""
         view, now_s = self._view, time.monotonic()
-        assert view.frame is not None and view.estimate is not None  # nothing is decided before the first frame
+        assert view.frame is not None and view.estimate is not None  # decisions begin with the first frame
         record = StepRecord(
             index=len(self.records),
             time_s=now_s,
@@ -330,7 +330,7 @@ class ServoLoop:
             self.on_step(record, view.frame, view.estimate)
 
     def _frame(self, state: ArmState) -> Frame:
-        """The frame to decide on: a recording's next one, one exposed at the present stop, or the newest one."""
+        """The frame to decide on: the next one of a recording, one exposed at the present stop, or the newest one."""
         if not self.source.is_live:
             return self.source.read()
         if self.settings.blocking:
@@ -342,14 +342,14 @@ class ServoLoop:
         return self.source.read_latest(max_age_s=self.servo.max_frame_age_s)
 
     def _exposed_after(self, time_s: float) -> Frame:
-        """The first frame exposed after a time; ``TimeoutError``. The wait ends when the arm is lost."""
+        """The first frame exposed after a time; raises ``TimeoutError`` if none comes. The wait also ends if the arm is lost."""
         return self._watch.frame_after(self.source, time_s, timeout_s=self.settings.frame_timeout_s)
 
     def _reading(self, estimate: Estimate) -> tuple[Reading, str]:
-        """The depth and angle of an estimate, and why they can't be trusted ("" if they can)."""
+        """Depth and angle of an estimate, and the reason why they can't be trusted ("" if they can)."""
         if not estimate.valid:
             return Reading(np.nan, np.nan), estimate.reason
-        if self.law is not None:  # which knows no depth and angle
+        if self.law is not None:  # such a law does not use depth and angle
             return Reading(np.nan, np.nan), ""
         self.require_labels(estimate.names)
         value = dict(zip(estimate.names, np.asarray(estimate.value, float), strict=True))
@@ -364,11 +364,11 @@ class ServoLoop:
         return reading, ""
 
     def _hold(self, reason: str, problem: Exception | None, age_s: float = float("nan")) -> None:
-        """Stop the arm where it is. ``DeviceError`` after ``give_up_s`` without a usable frame."""
+        """Stop the arm at its present pose. Raises ``DeviceError`` after ``give_up_s`` without a usable frame."""
         self.decided.append((Decided.HOLD, age_s))
         if self._held_since is None:
             self._held_since = time.monotonic()
-            self._sent = None  # a stop empties the queue, even if feedback reports a motion for some time
+            self._sent = None  # a stop empties the queue, even if feedback still reports a motion for some time
             self.arm.stop()
             self.notes.append(f"held still before step {len(self.records)}: {reason}")
             LOG.warning("%s: %s", self.arm.name, self.notes[-1])
@@ -389,8 +389,8 @@ class ServoLoop:
     def _move(self, target: np.ndarray, *, wait: bool) -> np.ndarray:
         """Move to a pose (6,) and return the pose that was sent last.
 
-        With ``wait``, the move is repeated until it ends at the target, because guards and arm may shorten it. If the last axis has to
-        turn back for it, it turns first, where the arm is.
+        With ``wait``, the move is repeated until it ends at the target, because guards and arm may shorten it. If the last axis must turn
+        back for the target, it turns first, at the arm's present place.
         """
         if wait:
             target = self._turned_for(target)
@@ -405,7 +405,7 @@ class ServoLoop:
         return sent
 
     def _turned_for(self, target: np.ndarray) -> np.ndarray:
-        """The target (6,) on the turn that the last axis is on, after it has turned back if it had to."""
+        """The target (6,) on the present turn of the last axis, after a turn back if one is needed."""
         here = self._state().pose
         pose, held_deg = self._axis.on_turn(target, here[5])
         if held_deg <= HOLD_DEG:
@@ -416,7 +416,7 @@ class ServoLoop:
                 f"{self.arm.name}: its last axis can't turn the sensor that far, {held_deg:.0f} deg are missing; turn the object "
                 "('placement.turn_deg' in a file for --servo), or give no more --steps than were made"
             )
-        for share in (1 / 3, 2 / 3, 1.0):  # each less than half a turn, so that nobody can take it for a turn the other way
+        for share in (1 / 3, 2 / 3, 1.0):  # each part is less than half a turn, so that its direction is unambiguous
             self._move(here + share * (turned - here), wait=True)
         return self._axis.on_turn(target, turned[5])[0]
 
@@ -439,7 +439,7 @@ class ServoLoop:
         return moved(pose, -self.servo.clear_mm * self.mounting.axis)
 
     def _let_go(self, *, retreat: bool) -> None:
-        """Stop the arm, withdraw it if it may touch the object, and disable it. Every step is tried."""
+        """Stop the arm, withdraw it if it may touch the object, and disable it. Every step is tried, even if one before it failed."""
 
         def back() -> None:
             pose = self.arm.state().pose

@@ -24,7 +24,7 @@ AHEAD_S = 0.06
 LOOK_S = 0.01
 # Largest delay in s of an arm that should have reached the end of its piece. A later arm gets a new piece that starts where the arm is.
 LATE_S = 0.5
-# A target counts as reached within this distance, in mm and in deg.
+# Distance from a target, in mm and in deg, below which it counts as reached.
 REACHED = 0.02
 
 
@@ -83,7 +83,7 @@ class NewestTarget:
             try:
                 self._step()
             except BaseException:
-                self._target = None  # the thread must send nothing more, after Ctrl-C either
+                self._target = None  # so that the thread sends nothing more, also after Ctrl-C
                 raise
             self._wake.set()
             return self._arm.state().pose if self._sent is None else self._sent

@@ -1,4 +1,4 @@
-"""A policy as the law of a loop: its action becomes the arm's next pose."""
+"""A policy as the law of a loop: it converts the policy's action to the arm's next pose."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,11 +12,11 @@ from twin.policy import Policy, PolicyError, PolicyModel, load_policy
 from twin.rig.mounting import Mounting
 
 AROUND = ("SurfaceFollow", "ContourFollow")
-"""Tasks whose policies go along an object's outline, as the arm does that they are given."""
+"""Tasks whose policies follow an object's outline, as a loop with an arm needs it."""
 
 
 def policy_law(policy: Policy, mounting: Mounting) -> Callable[[np.ndarray, Estimate], np.ndarray]:
-    """From the arm's pose (6,) and the policy's answer to a frame to the next pose (6,)."""
+    """Function from the arm's pose (6,) and the policy's answer to a frame to the next pose (6,)."""
     T_tool_work = np.eye(4)
     T_tool_work[:3, :3] = mounting.work_axes
 
@@ -31,12 +31,12 @@ def policy_law(policy: Policy, mounting: Mounting) -> Callable[[np.ndarray, Esti
 
 
 def load_for_outlines(path: Path) -> PolicyModel:
-    """A policy that goes along an object's outline, ready for frames.
+    """Load a policy that follows an object's outline, ready for frames.
 
     Raises
     ------
     PolicyError
-        The file holds none, or one of another task.
+        The file holds no policy, or one of another task.
     """
     policy = load_policy(path)
     if policy.about["task"] not in AROUND:

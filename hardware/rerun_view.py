@@ -19,23 +19,23 @@ if TYPE_CHECKING:
     import rerun
 
 VIEWER, SUFFIX = "viewer", ".rrd"
-# Longest wait for a viewer, at the start and at the end, in s. A new viewer takes a second or two.
+# Longest wait, s, for a viewer, at the start and at the end. A new viewer needs a second or two.
 ANSWER_S = 8.0
 
 
 class RerunView:
-    """Logs what it is shown. A context manager.
+    """Logs frames and estimates to Rerun. A context manager.
 
     Parameters
     ----------
     title : str
     target : str
-        ``viewer`` (opened on this machine), a new file ``*.rrd``, or the address of a viewer that runs (``rerun+http://...``).
+        ``viewer`` (opened on this machine), a new file ``*.rrd``, or the address of a running viewer (``rerun+http://...``).
 
     Raises
     ------
     DeviceError
-        The package is missing, the target is none of these, or the file is there already.
+        The package is missing, the target is none of these, or the file already exists.
     """
 
     def __init__(self, title: str, target: str) -> None:
@@ -57,19 +57,19 @@ class RerunView:
         Raises
         ------
         DeviceError
-            No viewer answers there, or the file can't be written.
+            No viewer answers at the address, or the file can't be written.
         """
         stream = self._stream = self._rerun.RecordingStream(re.sub(r"\W+", "-", self._title))
         try:
             if self._target == VIEWER:
                 stream.spawn()
             elif "://" in self._target:
-                with create_connection(_address(self._target), timeout=ANSWER_S):  # this reports a refusal at once and in few words
+                with create_connection(_address(self._target), timeout=ANSWER_S):  # reports a refusal at once and in few words
                     stream.connect_grpc(self._target)
             else:
                 Path(self._target).parent.mkdir(parents=True, exist_ok=True)
                 stream.save(self._target)
-            stream.flush(timeout_sec=ANSWER_S)  # connecting reports no error, flushing does
+            stream.flush(timeout_sec=ANSWER_S)  # connecting itself reports no error, but flushing does
         except (RuntimeError, OSError, ValueError) as error:
             remedy = "start a viewer ('rerun' prints its address) and give rerun+http://HOST:9876/proxy, or a file"
             raise DeviceError(f"--rerun {self._target}: can't be opened ({error}); {remedy} *{SUFFIX}") from error
@@ -90,7 +90,7 @@ class RerunView:
         return self._stream
 
     def show(self, shot: LiveShot, seen: Observation) -> None:
-        """A frame with its pins and graph, the estimate's values with their intervals, and the lines, on ``frame`` and ``time``."""
+        """Log a frame with its pins and graph, the estimate's values with their intervals, and the lines, on ``frame`` and ``time``."""
         rerun, stream, frame, estimate = self._rerun, self._opened(), shot.frame, shot.estimate
         stream.set_time("frame", sequence=frame.sequence)
         stream.set_time("time", duration=frame.time_s)
@@ -105,7 +105,7 @@ class RerunView:
 
 
 def _address(target: str) -> tuple[str, int]:
-    """Host and port of a viewer's address; ``ValueError`` where it has none."""
+    """Host and port of a viewer's address; raises ``ValueError`` if it has none."""
     parts = urlsplit(target)
     if not parts.hostname or not parts.port:
         raise ValueError("no host and port")

@@ -1,6 +1,6 @@
-"""An arm whose every move is checked by ``hardware.safety``, and which lets go of the object after any exception.
+"""An arm whose every move is checked by ``hardware.safety``, and which releases the object after any exception.
 
-Letting go has several steps: stop, retreat, disable. ``try_each`` tries every one of them, even if one before it failed.
+The release has several steps: stop, retreat, disable. ``try_each`` tries every step, even if one before it failed.
 """
 
 import sys
@@ -19,7 +19,7 @@ from hardware.errors import DeviceError, StaleDataError, also, leave
 from hardware.last_axis import LastAxis
 from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, clip, decide, decide_joints
 
-# Newest decisions that are kept in memory.
+# Number of newest decisions that are kept in memory.
 KEPT_DECISIONS = 10_000
 # Shares of the retreat's length. They are tried in this order until the limits allow one.
 RETREAT_SHARES = (1.0, 0.75, 0.5, 0.25)
@@ -31,13 +31,13 @@ def try_each(**steps: Callable[[], object]) -> list[str]:
     Returns
     -------
     list of str
-        What failed. If an exception is being handled, each failure is also added to it as a note; that of ``stop``, after which the arm
-        may move, is added to the message.
+        The failures. If an exception is being handled, each failure is also added to it as a note. A failure of ``stop``, after which the
+        arm may move, is added to the message.
 
     Raises
     ------
     BaseException
-        What interrupted a step (``KeyboardInterrupt``), after all steps were tried.
+        The exception that interrupted a step (``KeyboardInterrupt``), after all steps were tried.
     """
     on_its_way, failed, interrupt = sys.exc_info()[1], [], None
     for name, act in steps.items():
@@ -58,7 +58,7 @@ def try_each(**steps: Callable[[], object]) -> list[str]:
 
 
 class RefusedMoveError(DeviceError):
-    """A move was not allowed; ``decision`` says why."""
+    """A move was not allowed; ``decision`` states the reason."""
 
     def __init__(self, name: str, decision: Decision) -> None:
         super().__init__(f"{name}: not moved ({decision.code}, {decision.action}): {decision.reason}")
@@ -67,7 +67,7 @@ class RefusedMoveError(DeviceError):
 
 @dataclass(frozen=True)
 class LoggedDecision:
-    """A decision, what it was about, and when (``time.monotonic()``)."""
+    """A decision, the call that it belongs to, and its time (``time.monotonic()``)."""
 
     time_s: float
     call: str
@@ -85,9 +85,9 @@ class SafeArm:
     arm : Arm
     limits : SafetyLimits
     normal : (3,) float
-        Direction in the base frame in which the tool leaves the object; ``normal`` may be set at any time.
+        Direction in the base frame in which the tool leaves the object; ``normal`` can be set at any time.
     log : callable or None
-        Called with every LoggedDecision; the newest are kept in ``decisions`` in any case.
+        Called with every LoggedDecision. The newest are also kept in ``decisions``.
     """
 
     def __init__(
@@ -109,11 +109,11 @@ class SafeArm:
         self._sensed: Sensed | None = None
 
     def sense(self, sensed: Sensed) -> None:
-        """Report what the sensor shows. After the first call a move needs a frame that is new enough. A NaN means not known."""
+        """Report the estimated contact. After the first call, a move needs a frame that is new enough. NaN means unknown."""
         self._sensed = sensed
 
     def forget_contact(self) -> None:
-        """Forget what ``sense`` told: the sensor leaves the object. No move needs a frame until ``sense`` is called again."""
+        """Drop the contact of ``sense``, because the sensor leaves the object. No move needs a frame until ``sense`` is called again."""
         self._sensed = None
 
     @property
@@ -180,12 +180,12 @@ class SafeArm:
         self.arm.set_speed(linear, angular)
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        """As ``Arm.move_linear``; the pose returned is the one that was allowed.
+        """As ``Arm.move_linear``. Returns the allowed pose.
 
         Raises
         ------
         RefusedMoveError
-            The move was not allowed. The arm was stopped, and retreated if it is too deep in contact.
+            The move was not allowed. The arm was stopped. If the contact is too deep, it also retreated.
         """
         state = self._newest_state("move_linear")
         decision = decide(pose, state, self.limits, now_s=time.monotonic(), kinematics=self.kinematics, sensed=self._sensed)
@@ -193,7 +193,7 @@ class SafeArm:
         return self.arm.move_linear(decision.allowed, wait=wait, timeout_s=timeout_s)
 
     def clipped(self, pose: np.ndarray) -> np.ndarray:
-        """The pose (6,) that ``move_linear`` would allow from where the arm is, as near to the one given as the limits permit."""
+        """The pose (6,), as near to the given one as the limits permit, that ``move_linear`` would allow from the arm's present pose."""
         return clip(pose, self._newest_state("clipped").pose, self.limits, self.kinematics)
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
@@ -238,7 +238,7 @@ class SafeArm:
         if decision.action is Action.MOVE:
             return
         try:
-            if decision.code is not Code.NOT_ENABLED:  # such an arm stands
+            if decision.code is not Code.NOT_ENABLED:  # an arm that is not enabled stands still
                 self.arm.stop()
             if decision.action is Action.RETRACT:
                 self.retreat()

@@ -1,4 +1,4 @@
-"""Safety limits of an arm, and the decision, made before every move, whether it is allowed. A decision has a code and no side effects."""
+"""Safety limits of an arm, and the decision before every move whether it is allowed. A decision has a code and no side effects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from hardware.errors import DeviceError
 from scenes.base import Fraction, NonNegative, Positive, Section, SpecError
 from scenes.load import read_section
 
-# Halvings of a way in the search for its last allowed place: 100 mm are divided to 0.01 mm.
+# Number of bisections of a path in the search for its last allowed place: 100 mm are divided to 0.01 mm.
 CLIP_HALVINGS = 14
 SHIPPED_LIMITS = Path(__file__).parent / "limits"
 
@@ -33,8 +33,8 @@ Range = Annotated[tuple[float, float], AfterValidator(_rising)]
 class SafetyLimits(Section):
     """Limits of an arm's moves in a loop.
 
-    An optional limit that is left out does not exist. The defaults are cautious numbers for a desktop arm with a soft sensor; nothing in
-    the arms' manuals asks for them.
+    An optional limit that is left out does not apply. The defaults are cautious values for a desktop arm with a soft sensor. The arms'
+    manuals do not require them.
 
     Attributes
     ----------
@@ -51,17 +51,18 @@ class SafetyLimits(Section):
     linear_mm_s, angular_deg_s : float
         Largest speeds.
     contact_mm : float
-        Deepest contact that the sensor may report.
+        Largest depth that the sensor may report.
     force_n, torque_nmm : float, optional
-        Largest force, and largest torque about the sensor's axis, that the sensor may report; the arm retreats from larger ones.
+        Largest force, and largest torque about the sensor's axis, that the sensor may report. If one is exceeded, the arm retreats.
     hold_force_n, hold_torque_nmm : float, optional
-        Force and torque beyond which the arm holds still, and does not retreat.
+        Force and torque above which the arm holds still without a retreat.
     slip_share : float, optional
-        Largest share of the contact that may slide; the arm holds still where more does.
+        Largest share of the contact that may slide. If it is exceeded, the arm holds still.
     slip_begins : float, optional
-        Largest probability that the contact has begun to slide, of a model that remembers the frames before; beyond it the arm holds still.
+        Largest probability that the contact has begun to slide, for a model that remembers earlier frames. If it is exceeded, the arm holds
+        still.
     frame_age_s : float
-        Largest age of the frame that a move is decided on.
+        Largest age of the frame on which a move is decided.
     feedback_age_s : float
         Largest age of the arm's own feedback.
     retreat_mm : float
@@ -131,7 +132,7 @@ class Code(StrEnum):
     LINKAGE_LIMIT = "linkage-limit"
     LINE_BLOCKED = "line-blocked"
     STEP_TOO_LONG = "step-too-long"
-    UNGATED = "ungated"  # stop, emergency_stop, disable, clear_error: never refused
+    UNGATED = "ungated"  # stop, emergency_stop, disable, clear_error: these are never refused
     SPEED_CAPPED = "speed-capped"
     SHUTDOWN = "shutdown"
 
@@ -140,7 +141,7 @@ class Action(StrEnum):
     """Action that follows from a decision."""
 
     MOVE = "move"
-    REFUSE = "refuse"  # do not send it; stop an earlier move
+    REFUSE = "refuse"  # do not send the move; stop an earlier move
     HOLD = "hold"  # stop and stand still
     RETRACT = "retract"  # stop, and leave the object along its normal
 
@@ -164,7 +165,7 @@ class Decision:
 
 @dataclass(frozen=True)
 class Sensed:
-    """The sensor's estimate of the contact. What the model does not tell is NaN, and no limit applies to it.
+    """The sensor's estimate of the contact. A value that the model does not estimate is NaN, and no limit applies to it.
 
     Attributes
     ----------
@@ -195,7 +196,7 @@ class Sensed:
 
     @classmethod
     def of(cls, depth_mm: float, frame_time_s: float, names: Sequence[str], value: np.ndarray) -> "Sensed":
-        """From the labels (K,) of an estimate.
+        """The contact from the labels (K,) of an estimate.
 
         They are ``force_x, force_y, force_z`` or ``Fx, Fy, Fz``, ``torque_z`` or ``Tz``, ``slip_share`` and ``slip_begins``.
         """
@@ -210,7 +211,7 @@ class Sensed:
 
 @dataclass(frozen=True)
 class _FeltRule:
-    """What the arm does when what the sensor feels exceeds a limit; both are named by their attributes. NaN exceeds nothing."""
+    """The reaction of the arm if a value of the contact exceeds a limit. Both are named by their attributes. NaN never exceeds a limit."""
 
     felt: str
     limit: str
@@ -226,7 +227,7 @@ class _FeltRule:
 
 _TURNED, _STILL = "the sensor feels {felt:.0f} N mm about its axis", "the arm holds still beyond {limit:g}"
 _SLIDES = "the contact begins to slide (probability {felt:.0%}, allowed {limit:.0%}); press harder"
-# In the order in which they count.
+# The rules, in the order of their priority.
 _FELT = (
     _FeltRule("depth_mm", "contact_mm", Action.RETRACT, Code.TOO_DEEP, "{felt:.1f} mm deep in contact (allowed {limit:g} mm)"),
     _FeltRule("force_n", "force_n", Action.RETRACT, Code.TOO_STRONG, "the sensor feels {felt:.1f} N (allowed {limit:g} N)"),
@@ -283,9 +284,9 @@ def decide(
 
 
 def clip(target: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics: Kinematics | None = None) -> np.ndarray:
-    """The pose (6,) to which a move straight from ``start`` (6,) may go, as near to the target (6,) as simple means find.
+    """The end pose (6,) of a straight move from ``start`` (6,) that the limits allow, as near to the target (6,) as a simple search finds.
 
-    It is the target moved into the box, shortened to a step, and then, if other limits forbid it, the last allowed place on the way.
+    It is the target moved into the box and shortened to a step. If other limits forbid this pose, it is the last allowed place on the path.
     """
     pose = np.array(target, float)
     if not np.isfinite(pose).all():
@@ -297,7 +298,7 @@ def clip(target: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics
         pose = kinematics.nearest_pose(pose)
     pose, _ = shorten(start, pose, limits, unwrapped=unwrapped)
     way, allowed, refused = pose - start, 0.0, 2.0
-    for _ in range(CLIP_HALVINGS + 1):  # the whole way first
+    for _ in range(CLIP_HALVINGS + 1):  # the first trial is the whole path
         share = (allowed + refused) / 2
         at = start + share * way
         if _place(at, start, limits) or (kinematics is not None and _joints(at, start, limits, kinematics)):
@@ -312,7 +313,7 @@ def clip(target: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics
 def decide_joints(
     joints_deg: np.ndarray, state: ArmState, limits: SafetyLimits, *, now_s: float, kinematics: Kinematics, sensed: Sensed | None = None
 ) -> Decision:
-    """Decide whether the joints may move to angles. Every degree of the way is checked. Too long a move is refused, not shortened."""
+    """Decide whether the joints may move to angles. Every degree of the path is checked. Too long a move is refused, not shortened."""
     if halted := _halt(state, limits, now_s=now_s, sensed=sensed):
         return halted
     end = np.asarray(joints_deg, float)
@@ -332,9 +333,9 @@ def decide_joints(
 
 
 def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwrapped: bool = False) -> tuple[np.ndarray, bool]:
-    """Shorten a move to the longest allowed step. Returns the target, or a point on the way to it, and whether the move was shortened.
+    """Shorten a move to the longest allowed step. Returns the target, or a point on the path to it, and whether the move was shortened.
 
-    A turn goes the shorter way. If it is ``unwrapped`` (R of an arm of four axes), it is executed as given.
+    A turn takes the shorter direction. If it is ``unwrapped`` (R of an arm of four axes), it is executed as given.
     """
     way = target - start
     if not unwrapped:

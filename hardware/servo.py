@@ -1,4 +1,4 @@
-"""The servo law, a pure function: from the surface that a frame showed and the present pose of the arm to its next pose.
+"""The servo law, a pure function: from the surface in a frame and the arm's present pose to its next pose.
 
 An estimate of depth and angle, together with the arm's pose when the frame was exposed, puts the surface's tangent into the
 base frame. The law compares the present pose of the arm with that tangent, so a frame may be older than the last move.
@@ -45,7 +45,7 @@ class Step:
         The arm's next pose.
     memory : Memory
     error_mm, error_deg : float
-        Reference less reading.
+        Reference minus reading.
     """
 
     pose: np.ndarray
@@ -89,9 +89,9 @@ def servo_step(
     spec : ServoSpec
     mounting : Mounting
     T_base_surface : (4, 4) float
-        The surface's tangent, as ``tangent_of`` gives it.
+        The surface's tangent from ``tangent_of``.
     pose : (6,) float
-        Where the arm is now, or was last sent.
+        The arm's present pose, or the last pose to which it was sent.
     memory : Memory
     fresh : bool
         Whether the tangent comes from a new frame; an old frame does not change the sums.

@@ -1,4 +1,4 @@
-"""A recorded session behind the live sources' protocol."""
+"""A recorded session with the protocol of the live sources."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +9,7 @@ from twin.types import Frame
 
 
 class SessionSource(SequentialSource):
-    """A session's frames in the order of its steps. A frame that served several steps is given once for each.
+    """A session's frames in the order of its steps. A frame that several steps used is given once for each.
 
     Parameters
     ----------
@@ -18,7 +18,7 @@ class SessionSource(SequentialSource):
     Raises
     ------
     FrameError
-        As of ``twin.records.session.Session``.
+        As for ``twin.records.session.Session``.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -32,7 +32,7 @@ class SessionSource(SequentialSource):
 
     @property
     def rest(self) -> Frame | None:
-        """The frame without contact that pins were counted from."""
+        """The no-contact frame from which the pins' displacements were computed."""
         return self.session.rest
 
     def notes(self) -> list[str]:

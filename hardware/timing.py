@@ -1,16 +1,16 @@
-"""How fast and how late a loop is."""
+"""Figures of a loop's rate and latency."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-# Percentiles that are given, in %.
+# Percentiles that are reported, in %.
 LEVELS = (50, 95, 99)
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Percentiles of times, in s; NaN without any time."""
+    """Percentiles of times, in s; NaN if there are no times."""
 
     p50: float
     p95: float
@@ -27,15 +27,15 @@ class Spread:
 
 @dataclass(frozen=True)
 class Timing:
-    """What a loop measured.
+    """Measurements of a loop.
 
     Attributes
     ----------
     steps : int
     rate_hz : float
-        Steps a second.
+        Steps per second.
     fresh_hz : float
-        Steps a second on a frame that was not used before.
+        Steps per second on a frame that was not used before.
     latency_s : Spread
         Time from a fresh frame's exposure to the command that it led to.
     age_s : Spread
@@ -43,9 +43,9 @@ class Timing:
     compute_s : Spread
         Time from receiving the frame to the command.
     dropped : int
-        Frames that nobody read.
+        Number of frames that nobody read.
     decided_hz : float
-        Decisions a second: to move (a step), to wait for the arm or the camera, or to hold still. NaN if the loop decides nothing.
+        Decisions per second: to move (a step), to wait for the arm or the camera, or to hold still. NaN if the loop makes no decisions.
     decided : dict of str to int
         Number of decisions of each kind.
     """
@@ -61,9 +61,9 @@ class Timing:
     decided: dict[str, int] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
-        """The figures in words.
+        """The figures as lines of text.
 
-        A loop that decides nothing gives poses instead of commands. Frames of a recording have no age, so theirs is left out.
+        A loop that makes no decisions gives poses instead of commands. Frames of a recording have no age, so it is left out.
         """
         total = sum(self.decided.values())
         decided = [f"decisions at {self.decided_hz:.1f} Hz: " + ", ".join(f"{n / total:.0%} {what}" for what, n in self.decided.items())]

@@ -1,6 +1,6 @@
-"""How well a surface was followed: the trajectory, its measures, and its pictures.
+"""Evaluation of surface following: the trajectory, its measures, and its pictures.
 
-Measures are the Tac-VGNN paper's smoothness S, and others that do not depend on the axes. The pictures are those of the paper's figure:
+The measures are the Tac-VGNN paper's smoothness S, and others that do not depend on the axes. The pictures are those of the paper's figure:
 the trajectory, a zoom with its local smoothness, depth and angle.
 """
 
@@ -19,13 +19,13 @@ from twin.report.themes import BLUE, RED
 from twin.rig.mounting import Mounting
 from twin.store import text_file
 
-# Points in a window of the local smoothness.
+# Number of points in a window of the local smoothness.
 LOCAL_N = 9
-# Steps after the start that the errors leave out.
+# Number of steps at the start that the errors leave out.
 SETTLING_N = 5
 # Half the side of the zoom, in mm.
 ZOOM_MM = 12.0
-# Colours of the tool's path and of the felt surface.
+# Colours of the tool's path and of the estimated surface.
 TOOL, FELT = BLUE, RED
 
 
@@ -36,16 +36,16 @@ class Trajectory:
     Attributes
     ----------
     tool_mm : (M, 2) float
-        Place of the tool, base frame x and y.
+        Position of the tool, x and y in the base frame.
     felt_mm : (M, 2) float
-        The surface as the estimates place it.
+        Position of the surface by the estimates.
     depth_mm, angle_deg : (M,) float
         Estimated depth and angle.
     true_depth_mm, true_angle_deg, true_indent_mm : (M,) float
     off_mm : (M,) float
         Distance of ``felt_mm`` from the true surface.
     along_mm : (M,) float
-        Way along the object's outline to the touched place.
+        Distance along the object's outline to the touched place.
     """
 
     tool_mm: np.ndarray
@@ -71,17 +71,17 @@ class Measures:
     local_smoothness : float
         Mean of S over windows of points, each turned so that its ends lie along x.
     path_error_mm : float
-        Root mean square distance of the felt surface from the true one.
+        Root mean square distance of the estimated surface from the true one.
     depth_error_mm, angle_error_deg : float
         Mean absolute error of the estimates.
     hold_depth_mm, hold_angle_deg : float
-        Mean absolute distance of the true depth and angle from the reference.
+        Mean absolute difference of the true depth and angle from the reference.
     jerk : float
         Root mean square third difference of the tool's path, mm per step^3.
     completed : float
-        Share of the wanted way along the outline.
+        Share of the wanted distance along the outline.
     lost_contacts : float
-        Times that the sensor left the surface.
+        Number of times that the sensor left the surface.
     """
 
     steps: int
@@ -131,8 +131,8 @@ def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedO
 
 
 def felt_place(mounting: Mounting, record: StepRecord) -> np.ndarray:
-    """The place (3,) of the surface by an estimate: the foot of the dome's centre on the tangent."""
-    if np.isnan(record.depth_mm):  # a policy tells no surface
+    """The place (3,) of the surface from an estimate: the foot of the perpendicular from the dome's centre to the tangent."""
+    if np.isnan(record.depth_mm):  # a policy estimates no surface
         return np.full(3, np.nan)
     tangent = tangent_of(mounting, record.exposed_pose, Reading(record.depth_mm, record.angle_deg))
     tool = matrix_of(record.exposed_pose)
@@ -142,7 +142,7 @@ def felt_place(mounting: Mounting, record: StepRecord) -> np.ndarray:
 
 
 def measure(path: Trajectory, *, indent_mm: float, angle_deg: float, wanted_mm: float) -> Measures:
-    """Measures of a trajectory against a reference depth and angle and a wanted way along the outline."""
+    """Measures of a trajectory, for a reference depth and angle and a wanted distance along the outline."""
     late = slice(min(SETTLING_N, max(len(path.depth_mm) - 1, 0)), None)
 
     def mean_abs(values: np.ndarray) -> float:
@@ -193,7 +193,7 @@ def jerk(points_mm: np.ndarray) -> float:
 
 
 def lost_contacts(indent_mm: np.ndarray) -> float:
-    """How often the indentation (M,) falls to zero or less. The start counts as touching. NaN if the indentation is not known."""
+    """Number of times that the indentation (M,) falls to zero or less. The start counts as contact. NaN if the indentation is not known."""
     if np.isnan(indent_mm).any():
         return float("nan")
     off = np.concatenate([[False], indent_mm <= 0])
@@ -201,7 +201,7 @@ def lost_contacts(indent_mm: np.ndarray) -> float:
 
 
 def way_along(outline_mm: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
-    """Way (M,) along an outline (N, 2) to the places nearest to points (M, 2), going on over its end where it is closed."""
+    """Distance (M,) along an outline (N, 2) to the places nearest to points (M, 2). On a closed outline it continues past the end."""
     steps = np.linalg.norm(np.diff(outline_mm, axis=0), axis=1)
     way = np.concatenate([[0.0], np.cumsum(steps)])
     nearest = np.array([np.argmin(np.linalg.norm(outline_mm - point, axis=1)) for point in points_mm], int)
@@ -212,7 +212,7 @@ def way_along(outline_mm: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
 
 
 def write_csv(path: Path, trajectory: Trajectory) -> Path:
-    """The trajectory as a table."""
+    """Write the trajectory as a table, and return its path."""
     columns: dict[str, np.ndarray] = {}
     for name, values in asdict(trajectory).items():
         if values.ndim == 2:
@@ -261,7 +261,7 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
 
 
 def comparison_figure(rows: list[tuple[str, str, Trajectory, np.ndarray]]) -> Figure:
-    """Objects across, models down: (model, object, trajectory, outline) each."""
+    """A figure with objects as columns and models as rows, from (model, object, trajectory, outline) each."""
     models, objects = list(dict.fromkeys(row[0] for row in rows)), list(dict.fromkeys(row[1] for row in rows))
     figure, axes = new_figure(len(objects), len(models), panel_inch=3.2)
     for model, name, path, outline in rows:

@@ -1,1 +1,1 @@
-"""Learning from recordings and twin data: labels, graphs as tensors."""
+"""Learning from recordings and simulated data: data sets with labels, models, evaluation, studies."""

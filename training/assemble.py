@@ -1,8 +1,8 @@
-"""A predictor from trained networks: the ensemble's average, a Gaussian process averaged with it, and calibrated intervals.
+"""Assembly of a predictor from trained networks: averages of networks and Gaussian processes, and calibrated intervals.
 
-Intervals are conformal (Vovk et al. 2005; Barber et al. 2021 for ensembles). Every training row that a network held out is predicted
-without itself. The 90 % quantile of the errors, each divided by its expected scale, then widens or narrows the stated intervals. Such a
-prediction is made by one network and not by the whole ensemble, so the intervals are too wide rather than too narrow.
+Intervals are conformal (Vovk et al. 2005; Barber et al. 2021 for ensembles). Every training row that a network held out is predicted by
+this network. Each error is divided by its expected scale. The 90 % quantile of these ratios is the factor that widens or narrows the stated
+intervals. Such a prediction is made by one network and not by the whole ensemble, so the intervals are too wide rather than too narrow.
 
 The intervals for raw labels are calibrated separately, because a raw label is wrong by the whole move if the move was not executed.
 Frames whose move looks executed, and frames whose move does not, have separate quantiles (Mondrian conformal prediction, Vovk et al.
@@ -24,13 +24,13 @@ from twin.pins.reference import Reference
 
 # Share of the labels that should lie inside their intervals.
 COVERAGE = 0.9
-# Frames without which no error is so large that this share of all errors is smaller: with n frames the largest is n / (n + 1) of them.
+# Least number of held-out errors: among n errors, the largest one stands for the quantile n / (n + 1), which must be at least COVERAGE.
 LEAST_HELD = 9
 # Rows of a group below which the quantile of all rows is used, because so few rows give no reliable quantile of their own.
 SMALL_GROUP = 30
 # Weights of the Gaussian process in its average with the networks that are tried; the one with the smallest error is used.
 BLENDS = np.linspace(0, 1, 21)
-# Weight of the process ``beside`` in its average with the networks. It is not fitted, because both were trained on the labelled frames.
+# Weight of the process ``beside`` in its average with the networks. It is not fitted, because both learn from the same labelled frames.
 PROCESS_SHARE = 0.5
 
 
@@ -43,7 +43,7 @@ class Ensemble:
     reference : Reference
         The pins at rest in training.
     content : dict
-        As ``calibrate`` returns it and ``weights.pt`` holds it. If it has the key ``beside``, the arrays of a process of two
+        The result of ``calibrate``, which ``weights.pt`` holds. If it has the key ``beside``, with the arrays of a process of two
         fidelities, this process is averaged with the labels in view 0.
     size : dict
         Sizes of the networks that differ from the model's own.
@@ -62,7 +62,7 @@ class Ensemble:
         self.blend, self.quantile = np.asarray(content["blend"]), np.asarray(content["quantile"])
         self.raw_quantile = np.asarray(content["raw_quantile"])
         self.beside = Processes.of_arrays(TWO_FIDELITIES, content["beside"]) if "beside" in content else None
-        none_circular = np.zeros(len(self.shift))  # as in runs that were made before directions were known
+        none_circular = np.zeros(len(self.shift))  # for runs of earlier versions, which had no directions
         self.code = LabelCode(tuple(bool(circular) for circular in np.asarray(content.get("circular", none_circular))))
 
     def outputs(self, inputs: Inputs, rows: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -141,9 +141,9 @@ def calibrate(
     train : (m,) int
         Training rows.
     networks : list of dict
-        Each with ``weights``, and ``held``: the rows that it was not trained on.
+        For each network its ``weights``, and ``held``: the rows that it was not trained on.
     code : LabelCode
-        How the K labels are written as E numbers.
+        Code that writes the K labels as E numbers.
     scaling : (E,) float, (E,) float
         Shift and scale of these numbers.
     labels, helpers, kernel, size, seed
@@ -152,7 +152,8 @@ def calibrate(
     Returns
     -------
     dict
-        ``networks``, ``kernels``, ``circular``, ``shift``, ``scale``, ``blend``, ``quantile``, ``raw_quantile``: what ``Ensemble`` takes.
+        ``networks``, ``kernels``, ``circular``, ``shift``, ``scale``, ``blend``, ``quantile`` and ``raw_quantile``: the content of
+        ``Ensemble``.
     """
     shift, scale = scaling
     learnt = data.targets.corrected if labels == "corrected" else data.targets.raw
@@ -210,13 +211,13 @@ def undone(executed: np.ndarray) -> np.ndarray:
 
 
 def group_quantiles(scores: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Conformal quantiles (2, K) of scores (n, K), for each group (n,) of 0 and 1; a small group has the quantile of all rows."""
+    """Conformal quantiles (2, K) of scores (n, K), for each group (n,) of 0 and 1. A small group gets the quantile of all rows."""
     parts = [scores[group == k] for k in (0, 1)]
     return np.stack([conformal_quantile(part if len(part) >= SMALL_GROUP else scores) for part in parts])
 
 
 def conformal_quantile(scores: np.ndarray, coverage: float = COVERAGE) -> np.ndarray:
-    """For each column the (n + 1) ``coverage``-th smallest of scores (n, K); the largest if n is too small for that."""
+    """The (n + 1) ``coverage``-th smallest of the scores (n, K) in each column; the largest if n is too small."""
     n = len(scores)
     place = min(int(np.ceil((n + 1) * coverage)), n) - 1
     return np.sort(scores, axis=0)[place]

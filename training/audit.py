@@ -1,4 +1,4 @@
-"""Audit of a recording: do its labels agree with its pins?
+"""Audit of a recording: a test of whether its labels agree with its pins.
 
 The pins are a smooth function of the labels that vary: pose p after the move, and move m. Polynomials of these are fitted to the leading
 modes of the recording's own displacements. Then each frame is compared with several explanations ("stories") of what the arm did:
@@ -7,10 +7,10 @@ modes of the recording's own displacements. Then each frame is compared with sev
 - not executed, if the frame was taken before the move: ``(p - m, 0)``
 - sign errors: executed, with the opposite sign of the angles or of the moves.
 
-Of a direction c that goes round the whole circle (an edge's) the polynomials take cos c and sin c, the other labels also times these two,
-and the moves as the tool sees them, which is turned by c.
+If a label is a direction c on the whole circle (an edge's direction), the polynomials use cos c and sin c, the products of the other labels
+with these two, and the moves in the tool's frame, which is turned by c.
 
-Fitting the polynomials and choosing each frame's story alternate until no choice changes. Only pins and ``targets.csv`` are read.
+The fit of the polynomials and the choice of each frame's story alternate until no choice changes. Only pins and ``targets.csv`` are read.
 """
 
 from dataclasses import dataclass
@@ -22,18 +22,18 @@ from scipy.spatial.transform import Rotation
 from training.label_code import HALF_CIRCLE_DEG
 from training.pins import PinTable
 
-MODES = 14  # leading modes of the displacement that the labels are fitted to
-DEGREE = 4  # of the polynomials, if the frames are enough for it
-FEW = 4  # labels of which the polynomials always have this degree; those of more labels have a lower one where frames are few
-LOWEST = 2  # degree of the polynomials
-# Frames in contact for each polynomial that is fitted to them. With 300 frames of the published 127-pin recording 95 % of the verdicts on
-# large moves are those of all its 3763 frames, with 200 frames 92 %; 70 frames are fitted exactly, so that every move looks executed.
+MODES = 14  # number of leading modes of the displacement to which the polynomials are fitted
+DEGREE = 4  # degree of the polynomials, if there are enough frames for it
+FEW = 4  # most labels for which the degree is always DEGREE; with more labels and few frames the degree is lower
+LOWEST = 2  # lowest degree of the polynomials
+# Least number of frames in contact per polynomial term. With 300 frames of the published 127-pin recording, 95 % of the verdicts on large
+# moves agree with those from all its 3763 frames; with 200 frames 92 %. 70 frames are fitted exactly, so that every move looks executed.
 FRAMES_A_TERM = 4
-ROUNDS = 30  # most turns of fit and choice
-MOST_LEFT_OUT = 0.02  # part of the frames, the worst ones, that the fit leaves out
-FLAG_CHI2 = 60.0  # chi^2 by which a sign error must fit better than both other stories
-ODD_CHI2 = 12.0  # usual chi^2; a frame with more of it fits no story
-STILL = 0.16  # usual displacement; less of it is no contact (the shallowest taps of the published recordings have 0.19)
+ROUNDS = 30  # most rounds of fit and choice
+MOST_LEFT_OUT = 0.02  # share of the frames, those with the largest misfit, that the fit leaves out
+FLAG_CHI2 = 60.0  # least difference of chi^2 by which a sign error must fit better than both other stories
+ODD_CHI2 = 12.0  # ratio of a frame's chi^2 to the median above which the frame fits no story
+STILL = 0.16  # ratio to the median displacement below which there is no contact (published recordings: 0.19 in the shallowest taps)
 STORIES = ("executed", "not executed", "angle's sign", "shear's sign")
 
 
@@ -52,13 +52,14 @@ class Audit:
     twins : (M,) int
         Index of the first frame with exactly the same pins; the frame's own index if there is none before it.
     depth_per_move : float
-        Change of depth in mm for each mm of ``move_1`` over frames whose move was not executed. It shows the plate's tilt. The depth is
-        the last of ``pose_1..3`` that varies.
+        Change of depth, mm per mm of ``move_1``, over frames whose move was not executed. It shows the plate's tilt. The depth is the last
+        of ``pose_1..3`` that varies.
     drift : dict
-        Part of the row number's variance (R^2) that the pins tell beyond the labels, and the drift in px from the first to the last row.
+        Share of the row number's variance (R^2) that the pins explain beyond the labels, and the drift in px from the first to the last
+        row.
     untold : str
-        Why the frames can't be asked which story they fit: they are too few. Then ``executed``, ``chi2`` and ``depth_per_move`` are NaN,
-        ``odd`` and ``wrong_sign`` false, and ``drift`` is empty. "" where they are enough.
+        Reason why the stories can't be judged: the frames are too few. Then ``executed``, ``chi2`` and ``depth_per_move`` are NaN, ``odd``
+        and ``wrong_sign`` are false, and ``drift`` is empty. "" if there are enough frames.
     """
 
     executed: np.ndarray
@@ -73,14 +74,14 @@ class Audit:
 
 
 def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
-    """Ask every frame which story it fits; where the frames are too few to tell, the answer is that they are (``Audit.untold``).
+    """Find the story that fits each frame. If there are too few frames, no story is judged, and ``Audit.untold`` states this.
 
     Parameters
     ----------
     pins : PinTable
         M valid frames.
     pose, move : (M, 6) float
-        ``pose_1..6`` and ``move_1..6`` as in the table, mm and deg; 0 where it has none.
+        ``pose_1..6`` and ``move_1..6`` as in the table, mm and deg; 0 for columns that the table does not have.
     """
     moved = (pins.nodes_px - pins.reference.pins_px).reshape(len(pins), -1)
     size = np.linalg.norm(moved, axis=1)
@@ -117,7 +118,7 @@ def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
         depth = labels.depth, degree, scale[labels.depth]
         tilt = _depth_per_move(terms[1], modes, weight, precision, stories[1], move[:, 0], used & ~done, *depth)
     usual = np.median(best[~no_contact])
-    # The polynomials are an approximation, so the misfits are larger than noise alone would make them. Their unit is the usual misfit.
+    # The polynomials are an approximation, so the misfits are larger than from noise alone. They are divided by the usual misfit.
     odds = np.clip((chi2[:, 1] - chi2[:, 0]) / (2 * max(usual / modes.shape[1], 1.0)), -50, 50)
     chi2[no_contact] = np.nan
     return Audit(
@@ -134,14 +135,14 @@ def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
 
 @dataclass(frozen=True)
 class LabelColumns:
-    """Which labels of a recording vary.
+    """The varying labels of a recording.
 
     Attributes
     ----------
     posed, moved : (P,), (Q,) int
-        Those of the pose, without the direction, and those of the move.
+        Indices of the pose's varying labels, without the direction, and of the move's.
     direction : int or None
-        The one of the pose that goes round the whole circle.
+        Index of the pose's label that goes round the whole circle.
     """
 
     posed: np.ndarray
@@ -162,7 +163,7 @@ class LabelColumns:
         return int(places[-1]) if len(places) else None
 
     def columns(self, pose: np.ndarray, move: np.ndarray) -> np.ndarray:
-        """Pose and move (M, 6) as the columns of which the polynomials are made; the moves come last."""
+        """The columns from which the polynomials are made, from pose and move (M, 6). The moves come last."""
         parts, moves = [pose[:, self.posed]], move
         if self.direction is not None:
             turn = Rotation.from_rotvec(np.radians(pose[:, self.direction])[:, None] * np.eye(3)[self.direction - 3])
@@ -172,7 +173,7 @@ class LabelColumns:
         return np.hstack([*parts, moves[:, self.moved]])
 
     def degree(self, touching: int) -> tuple[int, str]:
-        """Degree of the polynomials for so many frames in contact, and why these can't tell which moves were executed; "" if they can."""
+        """Degree of the polynomials for a number of frames in contact, and the reason why these are too few; "" if they are enough."""
         some = np.zeros((1, 6))
         count = max(self.columns(some, some).shape[1], FEW)
         lowest = DEGREE if count <= FEW else LOWEST
@@ -193,7 +194,7 @@ def _modes(moved: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 def polynomials(story: np.ndarray, highest: int) -> np.ndarray:
-    """All products (M, P) of up to ``highest`` columns of labels (M, C), the constant one first."""
+    """All products (M, P) of up to ``highest`` columns of labels (M, C). The first column is constant."""
     columns = [np.ones(len(story))]
     for degree in range(1, highest + 1):
         columns += [story[:, list(which)].prod(axis=1) for which in combinations_with_replacement(range(story.shape[1]), degree)]
@@ -216,7 +217,7 @@ def _depth_per_move(
     degree: int,
     depth_scale: float,
 ) -> float:
-    """Slope in mm per mm of the depth that the pins show beyond the label, by the move, over frames whose move was not executed.
+    """Slope, mm per mm, of the depth that the pins show beyond the label over the move, for frames whose move was not executed.
 
     Parameters
     ----------
@@ -237,9 +238,9 @@ def _depth_per_move(
     depth : int
         Column of the depth in ``story``.
     degree : int
-        Of the polynomials.
+        Degree of the polynomials.
     depth_scale : float
-        Depth in mm that the value 1 stands for in ``story``.
+        Depth in mm that corresponds to the value 1 in ``story``.
     """
     if rows.sum() < 20 or np.ptp(shear_mm[rows]) < 1:
         return 0.0
@@ -259,7 +260,7 @@ def _twins(nodes_px: np.ndarray) -> np.ndarray:
 
 
 def _drift(pins: PinTable, terms: np.ndarray, used: np.ndarray, columns: int) -> dict:
-    """Drift of the outermost pins' mean place and spread over the rows of the table, after what the labels explain is subtracted.
+    """Drift of the outermost pins' mean place and spread over the rows of the table, beyond the part that the labels explain.
 
     The first terms (M, P) after the constant one are the ``columns`` of the labels.
     """

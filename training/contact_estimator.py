@@ -1,8 +1,9 @@
-"""One estimator for several kinds of contact of a sensor: it says which one a frame shows, and the pose by the model of that kind.
+"""One estimator for several kinds of contact of a sensor: it finds the kind of a frame's contact, and estimates the pose by that kind's
+model.
 
-Its folder holds the small copies of runs, what tells the kinds apart (``training.contacts``), and ``contacts.json``: the run of each kind,
-with the intervals that hold for this kind. Several kinds may have one run, which learnt from both. Weights that go with the package may
-have such a folder inside: ``contacts``.
+Its folder holds the small copies of runs, the classifier of the kinds (``training.contacts``), and ``contacts.json``: the run of each kind,
+with the intervals for this kind. Several kinds may share a run that learnt from all of them. The shipped weights of a sensor may have such
+a folder inside: ``contacts``.
 """
 
 import json
@@ -29,9 +30,9 @@ from twin.frames.tables import numbers
 from twin.store import write_json, writes
 from twin.types import Form, Frame
 
-# Folder of the models of several kinds of contact inside that of a sensor's weights.
+# Folder, inside that of a sensor's weights, with the models of several kinds of contact.
 INSIDE = "contacts"
-# File that tells the model and the intervals of each kind.
+# File with the model and the intervals of each kind.
 KINDS = "contacts.json"
 # Names of intervals in that file.
 INTERVALS = ("quantile", "raw_quantile")
@@ -39,12 +40,12 @@ AGAIN = "copy the model's folder anew"
 
 
 class ContactEstimator:
-    """Estimates kind and pose of the contact in frames of one sensor. A raw frame is first made the picture that its recorder would store.
+    """Estimates kind and pose of the contact in frames of one sensor. A raw frame is first converted to the form of its recorder.
 
     Parameters
     ----------
     parts : dict of str to PoseEstimator
-        A model of each kind; all are of one sensor and form.
+        A model for each kind; all belong to one sensor and form.
     contacts : Contacts
 
     Raises
@@ -73,7 +74,7 @@ class ContactEstimator:
         Raises
         ------
         TrainingError
-            A model, or what tells the kinds apart, can't be read.
+            A model, or the classifier of the kinds, can't be read.
         """
         path = folder / KINDS
         try:
@@ -89,12 +90,12 @@ class ContactEstimator:
 
     @property
     def counts_from_rest(self) -> bool:
-        """Whether all models can use a frame without contact of the sensor in use."""
+        """Whether all models can use a frame without contact of the present sensor."""
         return all(part.counts_from_rest for part in self.parts.values())
 
     @property
     def recorded_sensor(self) -> SensorSpec:
-        """As of ``PoseEstimator``."""
+        """As for ``PoseEstimator``."""
         return self._any.recorded_sensor
 
     def at_rest(self, frame: Frame) -> "ContactEstimator":
@@ -103,19 +104,19 @@ class ContactEstimator:
 
     @property
     def caveats(self) -> list[str]:
-        """As of ``PoseEstimator``, of all models."""
+        """As for ``PoseEstimator``; of all models."""
         return list(dict.fromkeys(line for part in self.parts.values() for line in part.caveats))
 
     def remembering(self) -> "ContactEstimator":
-        """Itself: models of several kinds of contact do not tell slip."""
+        """The estimator itself, because models of several kinds of contact do not estimate slip."""
         return self
 
     def at_known_rest(self) -> "ContactEstimator":
-        """As of ``PoseEstimator``."""
+        """As for ``PoseEstimator``."""
         return self._with({name: part.at_known_rest() for name, part in self.parts.items()})
 
     def at_rest_of(self, frames: Iterable[Frame]) -> tuple["ContactEstimator", bool]:
-        """As of ``PoseEstimator``."""
+        """As for ``PoseEstimator``."""
         looked = list(frames)
         told = {name: part.at_rest_of(looked) for name, part in self.parts.items()}
         return self._with({name: part for name, (part, _) in told.items()}), any(other for _, other in told.values())
@@ -128,12 +129,12 @@ class ContactEstimator:
     def __call__(self, frame: Frame) -> PoseEstimate:
         """Estimate kind and pose of the contact in one frame.
 
-        It is not valid, and states the reason, if too few pins are found, or if the frame shows none of the known kinds.
+        The estimate is not valid, and states the reason, if too few pins are found, or if the contact is of no known kind.
 
         Raises
         ------
         FrameError
-            The frame is not one of the sensor.
+            The frame does not belong to the sensor.
         """
         started = perf_counter()
         if frame.form == Form.RAW and self.form == Form.RECORDING and self.sensor.recording is not None:
@@ -147,17 +148,17 @@ class ContactEstimator:
         return self.parts[kind].estimate_one(seen, started, kind)
 
     def taken_for(self, pins: PinTable) -> dict[str, float]:
-        """Share of a table's valid frames that are taken for each kind, and for "none"."""
+        """Shares of a table's valid frames that are classified as each kind, and as "none"."""
         told = self.contacts.tell(pins)
         return {name or "none": float(np.mean(told == name)) for name in (*self.parts, "")}
 
     def for_labels(self, recording: Recording) -> list[str]:
-        """The kinds whose labels a recording varies: those with most labels, all of which have more than one value there.
+        """The kinds whose labels all vary in a recording; of these, the kinds with the most labels.
 
         Raises
         ------
         TrainingError
-            There is none.
+            There is no such kind.
         """
         known = {name: numbers(cells) for name, cells in recording.labels.items()}
         varied = {name for name, values in known.items() if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)}
@@ -169,7 +170,7 @@ class ContactEstimator:
         return [name for name in fitting if self.parts[name].names == self.parts[first].names]
 
     def predict_rows(self, data: Dataset, rows: np.ndarray, kinds: Sequence[str]) -> Prediction:
-        """Estimate the labels of some rows (B,) of a data set, each by the likeliest of some kinds that have the same labels."""
+        """Estimate the labels of some rows (B,) of a data set, each by the most probable of some kinds with the same labels."""
         told = self.contacts.likeliest(data.pins.rows(rows), kinds)
         none = np.full((len(rows), len(self.parts[kinds[0]].names)), np.nan)
         made = Prediction(none.copy(), none.copy(), none.copy(), none[:, 0].copy())
@@ -183,24 +184,24 @@ class ContactEstimator:
 
 
 def contacts_folder(run: str | Path) -> Path | None:
-    """The folder of models of several kinds that a run's folder, or a sensor's name, stands for; None if it has none."""
+    """The folder with the models of several kinds, for a run's folder or a sensor's name; None if it has none."""
     folder = folder_of(run)
     return next((place for place in (folder, folder / INSIDE) if (place / CONTACTS).is_file()), None)
 
 
 @dataclass(frozen=True)
 class KindOfContact:
-    """A kind of contact, as ``put_together`` takes it.
+    """A kind of contact, as input of ``put_together``.
 
     Attributes
     ----------
     model : str
         Name of the run that estimates it.
     frames : sequence of Dataset
-        Frames of this kind, from which is learnt to tell the kinds apart. Give those that the run learnt from.
+        Frames of this kind, from which the classifier learns. Give the frames from which the run learnt.
     intervals : dict of str to array
-        The run's interval quantiles for this kind, from frames that it did not learn from (``training.evaluate.intervals_on``); empty:
-        the run's own.
+        The run's interval quantiles for this kind, from frames that it did not learn from (``training.evaluate.intervals_on``). If empty,
+        the run's own intervals are used.
     """
 
     model: str

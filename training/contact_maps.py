@@ -1,9 +1,9 @@
-"""Contact maps from the pins of one frame: the deformed skin, and pressure and shear over it, learnt from simulated contacts.
+"""Contact maps from the pins of one frame: the deformed skin, and pressure and shear over it. They are learnt from simulated contacts.
 
-Finite elements know the force at every place of the skin, and where the skin is. Both are written as a mean and a few principal
-directions on the sensor's grid (``twin.mechanics.skin_map``). A small network goes from the model's modes of the pins to the amplitudes.
-Forces are first averaged over a millimetre of skin: pins, which stand two millimetres apart, tell no finer detail. What the model itself
-tells of the whole force and torque is then imposed on the map, because it knows them better than the sum of a map does.
+The finite elements give the force at every place of the skin, and the places themselves. Both are written as a mean and a few principal
+directions on the sensor's grid (``twin.mechanics.skin_map``). A small network computes their amplitudes from the model's modes of the pins.
+Forces are first averaged over a millimetre of skin, because pins two millimetres apart show no finer detail. Then the map is corrected to
+the model's estimates of the whole force and torque, because these are more accurate than the map's sum.
 """
 
 from collections.abc import Mapping
@@ -23,24 +23,24 @@ from twin.mechanics.skin_map import SIDE, ContactMaps, between_nodes, skin_grid
 from twin.store import ArrayFile, Layers, layers_from, layers_to
 
 MAPS = "maps.safetensors"
-"""File of a run that holds its maps."""
+"""File of a run with its maps."""
 FILE = ArrayFile("file of contact maps", "twin train", version=1, error=TrainingError, again=AGAIN)
 DETAIL_MM = 1.0
-"""Standard deviation of the Gaussian over which forces are averaged."""
+"""Standard deviation, mm, of the Gaussian over which forces are averaged."""
 FORCE_DIRECTIONS, SKIN_DIRECTIONS = 120, 40
-"""Principal directions of forces and of the skin's places: they leave 2 % and 0.02 % of the variance."""
+"""Numbers of principal directions of the forces and of the skin's places. They leave 2 % and 0.02 % of the variance."""
 MOST_STATES, MOST_FOR_DIRECTIONS = 6000, 1500
-"""Contact states that the network learns from (100 MB of forces), and of those the ones that the directions are found in."""
+"""Most contact states from which the network learns (100 MB of forces), and most of these states from which the directions are computed."""
 FEWEST_STATES = 50
-"""States that are needed: with fewer there is nothing to learn."""
+"""Least number of states from which maps can be learnt."""
 UNITS, EPOCHS, BATCH, RATE, DECAY, JITTER = 384, 40, 128, 3e-3, 0.02, 0.02
 """Training: units of both layers, epochs, states of a step, highest learning rate, weight decay, noise of the inputs."""
 GAIN = 3.0
-"""Deviation of the largest mode at the network's input: with it the network learns fastest from small modes."""
+"""Standard deviation of the largest mode at the network's input. With it, the network learns fastest from small modes."""
 HEADROOM = 1.2
-"""A mode counts up to this much beyond its largest size in training: a network's word on what lies farther out means nothing."""
+"""Largest size of a mode, relative to its largest size in training. Larger values are clipped, because the network does not extrapolate."""
 PLAIN_N = 0.3
-"""Normal force from which on maps are judged: lighter touches move the pins by less than their noise."""
+"""Least normal force, N, of states on which maps are judged. Lighter contacts move the pins by less than their noise."""
 FORCES = ("force_x", "force_y", "force_z")
 """Labels of the whole force."""
 TORQUE = "torque_z"
@@ -56,7 +56,7 @@ class Directions:
 
     @classmethod
     def of(cls, values: np.ndarray, most: int, rng: np.random.Generator) -> "Directions":
-        """The ``most`` largest directions of values (M, V), from some of the rows."""
+        """At most ``most`` principal directions of values (M, V), the largest first, computed from some of the rows."""
         mean = values.mean(axis=0)
         away = values[np.sort(rng.permutation(len(values))[:MOST_FOR_DIRECTIONS])] - mean
         square, vectors = np.linalg.eigh(away @ away.T)
@@ -79,11 +79,11 @@ class MapModel:
     ----------
     geometry : GeometrySpec
     gain, limit : (1,), (D,) float
-        Factor on the modes, and their largest size.
+        Factor on the modes, and largest size of each mode.
     layers : tuple of (weights, offset)
-        The network.
+        Layers of the network.
     force, skin : Directions
-        Of the forces (3 G values, N, divided by the root of each node's area) and of the places of the skin's nodes (3 c values, mm).
+        Directions of the forces (3 G values, N, divided by the root of each node's area) and of the skin nodes' places (3 c values, mm).
     """
 
     geometry: GeometrySpec
@@ -100,7 +100,7 @@ class MapModel:
         ----------
         modes : (D,) float
         told : dict of str to float
-            What the model tells of the frame, by label: the whole force and torque are those of the maps, if they are among them.
+            The model's estimates for the frame, by label. If they include the whole force or torque, the maps are corrected to these.
         """
         h = self.gain * np.clip(modes, -self.limit, self.limit)
         for weight, bias in self.layers[:-1]:
@@ -119,14 +119,14 @@ class MapModel:
 
 @dataclass(frozen=True)
 class _Truth:
-    """Averaged forces (M, 3 G) per root of the nodes' areas, and places (M, 3 c) of the skin, of simulated states."""
+    """Averaged forces (M, 3 G), divided by the root of the nodes' areas, and places (M, 3 c) of the skin, of simulated states."""
 
     force: np.ndarray
     skin: np.ndarray
 
 
 def _truth(data: Dataset, rows: np.ndarray, geometry: GeometrySpec) -> _Truth:
-    """What is known of rows (m,) of a data set; names of joined data sets have their folder before them."""
+    """Known forces and places of rows (m,) of a data set. In joined data sets the folder stands before a frame's name."""
     grid = skin_grid(geometry)
     called = told_apart([folder.resolve() for folder in data.folders]) if len(data.folders) > 1 else [""]
     names = data.pins.image_name[rows]
@@ -150,7 +150,7 @@ def _truth(data: Dataset, rows: np.ndarray, geometry: GeometrySpec) -> _Truth:
 
 
 def learn_maps(modes: np.ndarray, data: Dataset, rows: np.ndarray, *, seed: int = 0) -> MapModel:
-    """Learn maps from rows (m,) of simulated contacts, ``FEWEST_STATES`` at least, whose model sees the modes (M, D)."""
+    """Learn maps from rows (m,) of simulated contacts, at least ``FEWEST_STATES``, and the model's modes (M, D) of all rows."""
     rng = np.random.default_rng([seed, 4])
     rows = np.sort(rng.permutation(rows)[:MOST_STATES])
     geometry = data.pins.sensor.geometry
@@ -164,7 +164,7 @@ def learn_maps(modes: np.ndarray, data: Dataset, rows: np.ndarray, *, seed: int 
 
 
 def _layers(x: np.ndarray, y: np.ndarray, seed: int) -> Layers:
-    """Layers of a network that goes from x (M, D) to y (M, k)."""
+    """Layers of a network trained to compute y (M, k) from x (M, D)."""
     generator = torch.Generator().manual_seed(seed)
     sizes = [x.shape[1], UNITS, UNITS, y.shape[1]]
     layers = [nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False)]
@@ -187,7 +187,7 @@ def _layers(x: np.ndarray, y: np.ndarray, seed: int) -> Layers:
 
 
 def write_maps(path: Path, model: MapModel) -> None:
-    """Write what ``read_maps`` reads: large arrays in half precision."""
+    """Write maps in the form that ``read_maps`` reads: large arrays in half precision."""
     arrays = {"gain": model.gain, "limit": model.limit, **layers_to(model.layers)}
     for name, directions in (("force", model.force), ("skin", model.skin)):
         arrays |= {f"{name}.mean": directions.mean, f"{name}.rows": directions.rows}
@@ -195,7 +195,7 @@ def write_maps(path: Path, model: MapModel) -> None:
 
 
 def read_maps(path: Path, geometry: GeometrySpec) -> MapModel:
-    """What ``write_maps`` wrote, for the sensor of the run.
+    """Read the maps that ``write_maps`` wrote, for the sensor of the run.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def read_maps(path: Path, geometry: GeometrySpec) -> MapModel:
 
 @dataclass(frozen=True)
 class MapErrors:
-    """How true maps are on simulated states with more than ``PLAIN_N`` of normal force; forces averaged over ``DETAIL_MM``.
+    """Errors of maps on simulated states with more than ``PLAIN_N`` of normal force. Forces are averaged over ``DETAIL_MM``.
 
     Attributes
     ----------
@@ -223,9 +223,9 @@ class MapErrors:
     pressure_correlation, shear_correlation : float
         Mean correlation of pressures, and of shear tractions, over the skin's nodes.
     resultant : float
-        Median of |sum of the map - true force| relative to the true force.
+        Median of the difference between the map's sum and the true force, relative to the true force.
     skin_mm : float
-        Mean distance of the skin's nodes from where they are.
+        Mean distance of the skin's nodes from their true places.
     """
 
     states: int
@@ -237,7 +237,7 @@ class MapErrors:
 
 
 def judge_maps(made: list[ContactMaps], data: Dataset, rows: np.ndarray) -> MapErrors | None:
-    """Compare maps with what is known of rows (m,) of a simulated data set; None if all of them are too light."""
+    """Compare maps with the known forces and places of rows (m,) of a simulated data set; None if all contacts are too light."""
     geometry = data.pins.sensor.geometry
     grid, truth = skin_grid(geometry), _truth(data, rows, geometry)
     rated = []

@@ -1,8 +1,9 @@
 """Classification of a frame's contact: one of the kinds that a sensor's models were trained on (plate, edge, ...), or none of them.
 
-Kinds are told apart by a small network on the modes of the displacements. Then it is asked whether the frame is one of its kind: within
-a kind the first modes, which follow pose, friction and way of a contact, decide the further ones, by a polynomial that is fitted to the
-kind's frames. A frame whose further modes are otherwise, or whose first modes are far from those of every known frame, is of no kind.
+Kinds are distinguished by a small network on the modes of the displacements. A second test asks whether the frame is typical of its kind.
+Within a kind, the first modes depend on pose, friction and path of a contact, and they determine the further modes. A polynomial that is
+fitted to the kind's frames describes this dependence. A frame belongs to no kind if its further modes differ from the polynomial's, or if
+its first modes are far from those of every known frame.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,29 +23,29 @@ from twin.store import ArrayFile, Layers, layers_from, layers_to
 
 CONTACTS = "contacts.safetensors"
 FILE = ArrayFile("file of kinds of contact", "training.contact_estimator.put_together", version=1, error=TrainingError, again=AGAIN)
-# Modes of the displacements of all kinds together, by which kinds are told apart.
+# Number of modes of the displacements of all kinds together, which the network uses.
 COMMON_MODES = 60
-# First modes of a kind, and all modes of it that are looked at.
+# Number of first modes of a kind, and number of all its modes that are used.
 FREE_MODES, KIND_MODES = 12, 60
-# First modes whose products of three are terms of the polynomial; of the free modes all products of two are.
+# Number of first modes whose third-order products are terms of the polynomial. Second-order products use all first modes.
 CUBED = 6
-# Penalty of the polynomial's fit, for modes of deviation 1, per frame.
+# Penalty of the polynomial's fit, per frame, for modes of standard deviation 1.
 RIDGE = 1e-3
-# Frames of a kind that are kept as known ones.
+# Most frames of a kind that are kept as known frames.
 KNOWN = 2000
-# Part of the frames that the fit did not see, that are of their kind by its limits.
+# Share of the frames left out of the fit that lie within their kind's limits.
 TYPICAL = 0.99
-# Ratio to the limits above which a frame is of no kind.
+# Ratio to the limits above which a frame belongs to no kind.
 MARGIN = 1.15
 # Training of the network: units, epochs, batch, learning rate, weight decay.
 UNITS, EPOCHS, BATCH, RATE, DECAY = 64, 30, 128, 3e-3, 1e-3
-# Least deviation of a mode relative to the largest: smaller ones are rounding.
+# Least standard deviation of a mode relative to the largest one. Smaller modes are rounding errors.
 LEAST_DEVIATION = 1e-6
 
 
 @dataclass(frozen=True)
 class Modes:
-    """Principal components of displacements (M, N, 2), each of deviation 1: ``mean`` (2 N,) and ``components`` (2 N, K)."""
+    """Principal components of displacements (M, N, 2), each of standard deviation 1: ``mean`` (2 N,) and ``components`` (2 N, K)."""
 
     mean: np.ndarray
     components: np.ndarray
@@ -66,19 +67,19 @@ class Modes:
 
 @dataclass(frozen=True)
 class Kind:
-    """What frames of one kind have in common.
+    """Common properties of frames of one kind.
 
     Attributes
     ----------
     modes : Modes
     weight : (T, K - free) float
-        From the polynomial's terms to the further modes.
+        Coefficients from the polynomial's terms to the further modes.
     usual : (K - free,) float
-        Root mean square of what the polynomial leaves.
+        Root mean square of the polynomial's residual.
     known : (n, free) float
         First modes of known frames.
     limits : (2,) float
-        Of the further modes' misfit, and of the distance to the nearest known frame.
+        Limits of the further modes' misfit, and of the distance to the nearest known frame.
     """
 
     modes: Modes
@@ -88,7 +89,7 @@ class Kind:
     limits: np.ndarray
 
     def strangeness(self, moved: np.ndarray) -> np.ndarray:
-        """(M,) how far frames (M, N, 2) are from this kind: up to 1 for typical ones."""
+        """(M,) dissimilarity of frames (M, N, 2) to this kind: at most 1 for typical frames."""
         return (self._measures(moved) / self.limits).max(axis=1)
 
     def _measures(self, moved: np.ndarray) -> np.ndarray:
@@ -101,12 +102,12 @@ class Kind:
 
     @classmethod
     def fit(cls, moved: np.ndarray, seed: int, group: np.ndarray | None = None) -> "Kind":
-        """The kind of displacements (M, N, 2). A fifth of them is not fitted: it sets the limits.
+        """Fit the kind of displacements (M, N, 2). A fifth of them is left out of the fit and sets the limits.
 
         Parameters
         ----------
         group : (M,) int, optional
-            Frames that belong together, such as the states of one contact; they are fitted or not together.
+            Frames with the same value, such as the states of one contact, are either all fitted or all left out.
 
         Raises
         ------
@@ -143,15 +144,15 @@ def _terms(first: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Contacts:
-    """The kinds of contact that are known of one sensor.
+    """The known kinds of contact of one sensor.
 
     Attributes
     ----------
     kinds : dict of str to Kind
     modes : Modes
-        Of all kinds together.
+        Modes of all kinds together.
     layers : tuple of (weights, offset)
-        The network that tells kinds apart.
+        The network that distinguishes the kinds.
     """
 
     kinds: dict[str, Kind]
@@ -159,13 +160,13 @@ class Contacts:
     layers: Layers = field(repr=False)
 
     def likeliest(self, pins: PinTable, among: Sequence[str]) -> np.ndarray:
-        """(M,) str: which of some kinds each valid frame of a table shows rather than the others."""
+        """(M,) str: the most probable of some kinds for each valid frame of a table."""
         names = [name for name in self.kinds if name in among]
         columns = [list(self.kinds).index(name) for name in names]
         return np.array(names)[self._scores(moved_of(pins))[:, columns].argmax(axis=1)]
 
     def tell(self, pins: PinTable) -> np.ndarray:
-        """(M,) str: the kind that each valid frame of a table shows; "" for none of them."""
+        """(M,) str: the kind of each valid frame of a table; "" if it belongs to none."""
         moved = moved_of(pins)
         likeliest = self._scores(moved).argmax(axis=1)
         names = np.array(list(self.kinds), object)[likeliest]
@@ -189,7 +190,7 @@ def moved_of(pins: PinTable) -> np.ndarray:
 
 
 def fit_contacts(frames: Mapping[str, Sequence[Dataset]], *, seed: int) -> Contacts:
-    """Learn to tell kinds of contact, each given by one or more data sets of one sensor.
+    """Learn to classify kinds of contact, each given by one or more data sets of one sensor.
 
     Raises
     ------
@@ -207,7 +208,7 @@ def fit_contacts(frames: Mapping[str, Sequence[Dataset]], *, seed: int) -> Conta
 
 
 def groups_of(parts: Sequence[Dataset]) -> np.ndarray | None:
-    """The group of each row of several data sets, one after the other; None if no data set has groups. A row without one is alone."""
+    """The group of each row of consecutive data sets; None if no data set has groups. A row without a group forms its own group."""
     if all(part.group is None for part in parts):
         return None
     found, first = [], 0
@@ -219,7 +220,7 @@ def groups_of(parts: Sequence[Dataset]) -> np.ndarray | None:
 
 
 def _layers(seen: np.ndarray, right: np.ndarray, seed: int) -> Layers:
-    """Layers of a network that tells the number (M,) of each row's kind from its modes (M, K)."""
+    """Layers of a network trained to classify the kind (M,), given as numbers, from modes (M, K)."""
     generator = torch.Generator().manual_seed(seed)
     sizes = [seen.shape[1], UNITS, UNITS, int(right.max()) + 1]
     layers = [nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False)]
@@ -242,7 +243,7 @@ def _layers(seen: np.ndarray, right: np.ndarray, seed: int) -> Layers:
 
 
 def write_contacts(path: Path, contacts: Contacts) -> None:
-    """Write what ``read_contacts`` reads: arrays in half precision, except the few that need more."""
+    """Write contacts in the form that ``read_contacts`` reads: arrays in half precision, except the few that need more."""
     arrays = {"modes.mean": contacts.modes.mean, "modes.components": contacts.modes.components, **layers_to(contacts.layers)}
     for name, kind in contacts.kinds.items():
         parts = {"mean": kind.modes.mean, "components": kind.modes.components}
@@ -253,7 +254,7 @@ def write_contacts(path: Path, contacts: Contacts) -> None:
 
 
 def read_contacts(path: Path) -> Contacts:
-    """What ``write_contacts`` wrote.
+    """Read the contacts that ``write_contacts`` wrote.
 
     Raises
     ------

@@ -70,7 +70,7 @@ class Dataset:
         return replace(self, pins=self.pins.rows(index), targets=self.targets.rows(index), group=group)
 
     def natural_order(self) -> np.ndarray:
-        """(M,) int: its rows in the natural order of their frames' names; of copies first the first ones, then the second ones."""
+        """(M,) int: indices that put the rows in the natural order of their frames' names. For copied rows all first copies come first."""
         copies: dict[str, int] = {}
         keys = []
         for name in self.pins.image_name.tolist():
@@ -79,7 +79,7 @@ class Dataset:
         return np.array(sorted(range(len(keys)), key=keys.__getitem__), int)
 
     def in_order(self) -> "Dataset":
-        """The same data set in the natural order of its frames' names, whatever order the table has; its groups numbered as they come."""
+        """The same data set in the natural order of its frames' names, whatever order the table has. Groups are numbered in this order."""
         ordered = self.rows(self.natural_order())
         if ordered.group is None:
             return ordered
@@ -148,7 +148,7 @@ def load_dataset(
     if not len(good):
         raise FrameError(f"{folder}: no frame has both pins and labels; {'; '.join(problems[:3])}")
     group = recording.labels[GROUP_COLUMN][rows][good] if GROUP_COLUMN in recording.labels else None
-    kept = folder if isinstance(folder, Path) else Path(folder)  # a path of frames_at stays one
+    kept = folder if isinstance(folder, Path) else Path(folder)  # a path of ``frames_at`` keeps its table and no-contact frame
     return Dataset(pins.rows(good), targets.rows(good), (kept,), group, list(recording.problems) + problems)
 
 
@@ -156,7 +156,7 @@ def joined(parts: list[Dataset]) -> Dataset:
     """Join several data sets of one sensor. Rows that form a group in one of them form a group in the result.
 
     The data sets are joined in the order of their folders' names, whatever the order in which they are given. Displacements are counted
-    from the first one's layout without contact.
+    from the first data set's layout without contact.
 
     Raises
     ------
@@ -196,12 +196,12 @@ def joined(parts: list[Dataset]) -> Dataset:
 
 
 def with_common_labels(parts: Sequence[Dataset]) -> list[Dataset]:
-    """Data sets with those labels that all of them have: what varies in one may be the same throughout another.
+    """Data sets reduced to the labels that all of them have. A label may vary in one data set and be constant in another.
 
     Raises
     ------
     FrameError
-        They have none in common.
+        They have no common label.
     """
     common = tuple(name for name in parts[0].targets.names if all(name in part.targets.names for part in parts))
     if not common:
@@ -211,7 +211,7 @@ def with_common_labels(parts: Sequence[Dataset]) -> list[Dataset]:
 
 
 def told_apart(folders: list[Path]) -> list[str]:
-    """The ends of paths, as short as all can be while no two are the same: mostly the folders' names."""
+    """The shortest ends of the paths that are all different: mostly the folders' names."""
     longest = max(len(folder.parts) for folder in folders)
     ends = (["/".join(folder.parts[-count:]) for folder in folders] for count in range(1, longest + 1))
     return next(names for names in ends if len(set(names)) == len(names))

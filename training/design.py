@@ -1,6 +1,6 @@
-"""Where the next labelled contact tells most: active learning by the least expected variance (Cohn 1994).
+"""Choice of the next labelled contact that reduces the uncertainty most: active learning by the least expected variance (Cohn 1994).
 
-The pins' leading modes are Gaussian processes of the labels that vary. A contact at a label lowers their posterior variance everywhere
+The pins' leading modes are modelled as Gaussian processes of the labels that vary. A contact at a label lowers the posterior variance
 around it. The next contact is the candidate that lowers the mean variance over the experiment's ranges most.
 """
 
@@ -21,15 +21,15 @@ from twin.pins import Pipeline
 from twin.pins.batch import recording_reference
 
 CANDIDATES = 256
-"""Contacts among which the next one is chosen, spread evenly over the ranges."""
+"""Number of candidates for the next contact, spread evenly over the ranges."""
 WHERE = 128
-"""Contacts over which the variance is averaged, spread evenly as well."""
+"""Number of contacts over which the variance is averaged, spread evenly over the ranges."""
 MODES = 12
-"""Leading modes of the pins' displacement that are looked at; they hold nearly all of it."""
+"""Number of leading modes of the pins' displacement that are used. They contain nearly all of it."""
 
 
 class LeastSure:
-    """Chooses the next contact of a collection; called with its folder, its experiment, a seed and the number of the contact.
+    """Chooses the next contact of a collection. It is called with the collection's folder, its experiment, a seed and the contact's number.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def least_sure(experiment: ExperimentSpec, labels: np.ndarray, moved_px: np.ndar
     Parameters
     ----------
     seed : int
-        Chooses the candidates.
+        Seed of the choice of the candidates.
     """
     low, high = np.array(list(experiment.ranges().values())).T
     varied = np.flatnonzero(high > low)
@@ -95,14 +95,15 @@ def least_sure(experiment: ExperimentSpec, labels: np.ndarray, moved_px: np.ndar
 
 
 def nearest_to_even(labels: np.ndarray, units: Sequence[str], count: int, *, seed: int) -> np.ndarray:
-    """Rows (count,) of a recording that are nearest to contacts spread evenly over its labels (M, K), none twice; the first ones as well.
+    """Different rows (count,) of a recording that are nearest to contacts spread evenly over its labels (M, K). The first rows alone are
+    also spread evenly.
 
-    So a collection that was made at random gives the frames that ``twin collect --design even`` would have made.
+    In this way a random collection gives frames like those of ``twin collect --design even``.
 
     Parameters
     ----------
     seed : int
-        Of the even sequence, a scrambled one of Sobol.
+        Seed of the even sequence, a scrambled Sobol sequence.
     """
     code = LabelCode(goes_round(units, labels))
     low, high = labels.min(axis=0), labels.max(axis=0)
@@ -123,7 +124,7 @@ def nearest_to_even(labels: np.ndarray, units: Sequence[str], count: int, *, see
 
 
 def _even(low: np.ndarray, high: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """A power of two of labels (count, K) that fill the ranges (K,) evenly: a scrambled sequence of Sobol."""
+    """Labels (count, K) that fill the ranges (K,) evenly: a scrambled Sobol sequence; ``count`` is a power of two."""
     varied = np.flatnonzero(high > low)
     found = np.tile(low, (count, 1))
     found[:, varied] += Sobol(len(varied), scramble=True, rng=rng).random(count) * (high - low)[varied]

@@ -1,13 +1,13 @@
-"""How the pins of a kind of sensor can be displaced, learnt without labels, and the pins' places at rest that it tells of another unit.
+"""Model of the possible displacements of the pins, learnt without labels, and the estimate of another unit's pins at rest from contacts.
 
-What contacts can do to the pins is little: a few numbers (depth, tilt, shear) tell nearly all of it. With the leading principal
+A few numbers (depth, tilt, shear) determine nearly the whole displacement of the pins by a contact. With the leading principal
 coordinates a (D,) of the displacements, in standard deviations, the displacement u (2N,) is
 
     u = mean + sum_k a_k scale_k mode_k + sum_j w_j(a) mode_(D + j) + what is left
 
 where w are polynomials of the third degree. A unit whose pins at rest are not known shows p = r + u(a) in each frame. Its rest places r
-(2N,) and all a follow together by least squares (Gauss-Newton): because u is curved, the part of r that looks like a contact is told too,
-which no mean of the frames tells.
+(2N,) and all a are estimated together by least squares (Gauss-Newton). Because u is curved, this also determines the part of r that looks
+like a contact, which no mean of the frames determines.
 """
 
 from dataclasses import dataclass
@@ -23,40 +23,41 @@ from twin.pins import Reference
 from twin.store import ArrayFile
 
 DISPLACEMENTS = "displacements.safetensors"
-"""File of a run that holds what its pins' displacements can be."""
+"""File of a run with its model of displacements."""
 FILE = ArrayFile("file of displacements", "twin train", version=1, error=TrainingError, again=AGAIN)
 LEADING, MODES, DEGREE = 6, 40, 3
-"""Leading coordinates, modes in all, degree of the polynomials that tell the other modes.
-Of 3,400 frames of 331 pins they leave 0.12 of 3.8 px."""
+"""Number of leading coordinates, number of all modes, and degree of the polynomials that determine the other modes. For 3,400 frames of 331
+pins the model leaves 0.12 of 3.8 px."""
 FEWEST_FRAMES = 400
 """Least number of frames from which displacements are learnt: the polynomials have 78 terms."""
 MOST_FRAMES = 4000
-"""Frames that displacements are learnt from at most."""
+"""Most frames from which displacements are learnt."""
 RIDGE = 1e-3
 """Penalty of the polynomials' coefficients, per frame."""
 FEWEST_CONTACTS, MOST_CONTACTS = 40, 120
-"""Frames from which rest places are told: with 40 they are 0.1 px off, with 120 0.03 px (331 pins); more change nothing."""
+"""Least and largest number of frames from which rest places are estimated. With 40 frames they are 0.1 px off, with 120 frames 0.03 px (331
+pins). More frames change nothing."""
 SAME_UNIT = 0.02
-"""Rest places that are nearer than this to those that are known, rms in spacings, are taken for the same: those are more exact.
-Of one unit 40 contacts tell them within 0.011; two units of one drawing differ by 0.03 and more."""
+"""Rms distance, in spacings, below which estimated rest places count as equal to the known ones, which are more exact. From 40 contacts of
+one unit the distance is 0.011. Two units of one drawing differ by 0.03 and more."""
 SMOOTH, ALONE = 0.13, 0.03
-"""Prior deviation of a unit's pins from the specification's places, in spacings: of a smooth change of place, and of each pin by itself."""
+"""Prior standard deviations of a unit's pins from the specification's places, in spacings: of a smooth deviation, and of each pin alone."""
 NOISE = 0.007
-"""Least noise of a pin, in spacings."""
+"""Least standard deviation of a pin's noise, in spacings."""
 SETTLE, MOST_ROUNDS, SETTLED = 6, 20, 3e-4
-"""Rounds in which the contacts alone are sought first, most rounds after them, and the change, in spacings, at which they end."""
+"""Numbers of rounds: first rounds for the contacts alone, and most rounds after them; change, in spacings, at which the rounds end."""
 LONGEST_STEP = 0.7
-"""Most that a coordinate changes in a round."""
+"""Largest change of a coordinate in a round."""
 OTHER_UNIT = (
     "the pins at rest were found from the contacts: they are not where they were measured on the unit that the weights are for, so this is "
     "another unit, or its camera or tip was touched; one frame without contact (init_0.png beside the frames) is more exact"
 )
-"""Note for contacts from which other rest places follow than those that are known."""
+"""Note for contacts from which rest places follow that differ from the known ones."""
 
 
 @dataclass(frozen=True)
 class Displacements:
-    """What displacements of N pins can be; arrays as in the module's equation, px.
+    """Model of the displacements of N pins; arrays as in the module's equation, px.
 
     Attributes
     ----------
@@ -65,11 +66,11 @@ class Displacements:
         Orthonormal.
     scale : (D,) float
     weights : (T, K - D) float
-        Of the constant and the products of two and three coordinates.
+        Coefficients of the constant and of the products of two and three coordinates.
     left : (K - D, K - D) float
-        Covariance of what is left in these modes, px^2.
+        Covariance of the residual in these modes, px^2.
     noise : float
-        Standard deviation of what is left beside them.
+        Standard deviation of the residual outside the modes.
     """
 
     mean: np.ndarray
@@ -91,7 +92,7 @@ class Displacements:
         return np.stack([(self.at(a + h) - self.at(a - h)) / (2 * step) for h in steps], axis=2)
 
     def precision(self, least: float) -> np.ndarray:
-        """Inverse covariance (2N, 2N) of what the equation leaves, with at least this noise, px, of each coordinate."""
+        """Inverse covariance (2N, 2N) of the equation's residual, with at least the noise ``least``, px, in each coordinate."""
         others = self.modes[len(self.scale) :]
         whole: np.ndarray = np.linalg.inv(others.T @ self.left @ others + (self.noise**2 + least**2) * np.eye(others.shape[1]))
         return (whole + whole.T) / 2
@@ -99,13 +100,13 @@ class Displacements:
 
 @dataclass(frozen=True)
 class RestFound:
-    """Pins' places at rest that contacts tell.
+    """Pins at rest, estimated from contacts.
 
     Attributes
     ----------
     pins_px : (N, 2) float
     left_px : float
-        What the displacements leave of the frames, rms of a coordinate.
+        Rms residual of a coordinate in the frames.
     """
 
     pins_px: np.ndarray
@@ -113,7 +114,7 @@ class RestFound:
 
 
 def learn_displacements(moved_px: np.ndarray) -> Displacements | None:
-    """Learn from displacements (M, N, 2) of contacts; None from fewer than ``FEWEST_FRAMES``."""
+    """Learn the model from displacements (M, N, 2) of contacts; None for fewer than ``FEWEST_FRAMES``."""
     if len(moved_px) < FEWEST_FRAMES:
         return None
     chosen = spread(len(moved_px), MOST_FRAMES)
@@ -131,18 +132,18 @@ def learn_displacements(moved_px: np.ndarray) -> Displacements | None:
 
 
 def _terms(a: np.ndarray) -> np.ndarray:
-    """One, and the products of two and three of the coordinates (M, D)."""
+    """The constant 1, and the products of two and three of the coordinates (M, D)."""
     chosen = [list(term) for degree in range(2, DEGREE + 1) for term in combinations_with_replacement(range(a.shape[1]), degree)]
     return np.column_stack([np.ones(len(a)), *(np.prod(a[:, term], axis=1) for term in chosen)])
 
 
 def rest_from_contacts(known: Displacements, start: Reference, pins_px: np.ndarray) -> RestFound:
-    """Rest places of a unit from its pins (M, N, 2) in contacts of any kind that the displacements know.
+    """Rest places of a unit, estimated from its pins (M, N, 2) in contacts of any kind that the model describes.
 
     Parameters
     ----------
     start : Reference
-        Where the pins are without contact as far as is known: by the specification, or of another unit.
+        Assumed rest places: those of the specification, or of another unit.
     """
     spacing = float(np.median(start.spacing_px))
     seen = pins_px.reshape(len(pins_px), -1) - start.pins_px.ravel()
@@ -169,12 +170,12 @@ def rest_from_contacts(known: Displacements, start: Reference, pins_px: np.ndarr
 
 
 def other_rest(known: Displacements | None, start: Reference, pins_px: np.ndarray) -> np.ndarray | None:
-    """The rest places (N, 2) that contacts (M, N, 2), NaN where not found, tell, if they are others than those that are counted from.
+    """The rest places (N, 2) estimated from contacts (M, N, 2), NaN where not found, if they differ from the assumed ones.
 
     Returns
     -------
     (N, 2) float or None
-        None where displacements are not known, contacts are too few, or the places are the same as far as the contacts tell.
+        None if there is no model of displacements, contacts are too few, or the difference is not significant.
     """
     whole = pins_px[np.isfinite(pins_px).all(axis=(1, 2))]
     if known is None or len(whole) < FEWEST_CONTACTS:
@@ -191,12 +192,12 @@ def _round(
     """Whitened slopes (M, 2N, D) and distances (M, 2N) at the coordinates (M, D), and each frame's inverse Hessian and gradient."""
     slopes = whiten @ known.slopes(a)
     away = (seen - known.at(a)) @ whiten.T
-    hessian = slopes.transpose(0, 2, 1) @ slopes + np.eye(a.shape[1])  # the prior of a coordinate is that of the frames that were learnt
+    hessian = slopes.transpose(0, 2, 1) @ slopes + np.eye(a.shape[1])  # the prior of a coordinate is its distribution in training
     return slopes, away, np.linalg.inv(hessian), np.einsum("fnk,fn->fk", slopes, away, optimize=True) - a
 
 
 def _deviation(rest_px: np.ndarray, spacing_px: float) -> np.ndarray:
-    """Prior covariance (2N, 2N) of a unit's rest places about the specification's, px^2."""
+    """Prior covariance (2N, 2N), px^2, of the difference of a unit's rest places from the specification's."""
     place = rest_px - rest_px.mean(axis=0)
     x, y = (place / np.abs(place).max()).T
     square = x * x + y * y
@@ -207,18 +208,18 @@ def _deviation(rest_px: np.ndarray, spacing_px: float) -> np.ndarray:
 
 
 def write_displacements(path: Path, known: Displacements) -> None:
-    """Write what ``read_displacements`` reads; modes in half precision."""
+    """Write the model in the form that ``read_displacements`` reads; modes in half precision."""
     arrays = {name: getattr(known, name).astype(np.float32) for name in ("mean", "scale", "weights", "left")}
     FILE.write(path, arrays | {"modes": known.modes.astype(np.float16)}, {"noise": known.noise})
 
 
 def read_displacements(path: Path, pins: int) -> Displacements:
-    """What ``write_displacements`` wrote for a sensor of so many pins.
+    """Read the model that ``write_displacements`` wrote, for a sensor with ``pins`` pins.
 
     Raises
     ------
     TrainingError
-        The file can't be read, is damaged, or is of another sensor.
+        The file can't be read, is damaged, or belongs to another sensor.
     """
     with FILE.opened(path) as (about, arrays):
         known = Displacements(**{name: array.astype(float) for name, array in arrays.items()}, noise=float(about["noise"]))

@@ -1,4 +1,4 @@
-"""A trained model with its sensor and its pipeline: a frame goes in, a pose comes out. This is what a live loop calls."""
+"""A trained model with its sensor and pipeline: it estimates the pose in a frame. A live loop calls it."""
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -36,11 +36,12 @@ from twin.store import fingerprint
 from twin.types import Form, Frame, Observation
 
 LOST_USUAL = 0.02
-"""Share of the pins that is lost in usual frames."""
+"""Share of lost pins in usual frames."""
 LOST_WIDENS = 2.0
-"""Growth of the intervals with the share of lost pins: with a hidden patch of 15 or 30 % errors of depth in the twin grow by 1.2 or 1.6."""
+"""Growth of the intervals with the share of lost pins. With a hidden patch of 15 or 30 % of the pins, errors of depth in the twin grow by a
+factor of 1.2 or 1.6."""
 SIMULATED_FORCES = ("force_x", "force_y", "force_z", "torque_z")
-"""Labels that are proportional to the stiffness of the sensor that was simulated."""
+"""Labels that are proportional to the stiffness of the simulated sensor."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +64,13 @@ class PoseEstimate:
     ms : float
         Time from the frame to the estimate.
     contact : str
-        The kind of contact that the frame was taken for; empty if the model does not tell kinds, or if it is none that it knows.
+        The kind of the frame's contact; empty if the model does not classify kinds, or if the contact is of no known kind.
     touched : float
-        Probability that anything is touched; NaN where no frame without contact was given (``PoseEstimator.at_rest``).
+        Probability that anything is touched; NaN if no frame without contact was given (``PoseEstimator.at_rest``).
     notes : tuple of str
-        Why the intervals of this frame are wider than those of others.
+        Reasons why the intervals of this frame are wider than those of others.
     seen : Observation or None
-        The pins that the estimate was made from; None if the model looks at the picture itself.
+        The pins that the estimate was made from; None if the model uses the picture itself.
     """
 
     names: tuple[str, ...]
@@ -98,13 +99,14 @@ class PoseEstimator:
     Attributes
     ----------
     learnt_from : (m, 2) int64 or None
-        Marks of the frames that the model learnt from (``training.identity.frame_marks``); None if the run does not hold them.
+        Marks of the frames from which the model learnt (``training.identity.frame_marks``); None if the run does not hold them.
     maps : MapModel or None
-        What makes contact maps; None unless the run learnt them.
+        Model of contact maps; None unless the run learnt it.
     slip : SlipModel or None
-        What tells slip from a sequence of frames; None unless the run learnt it.
+        Model of slip in a sequence of frames; None unless the run learnt it.
     displacements : Displacements or None
-        How contacts can displace the pins, which tells the rest places of a unit without a no-contact frame; None unless the run learnt it.
+        Model of the pins' possible displacements, which gives the rest places of a unit without a no-contact frame; None unless the run
+        learnt it.
 
     Raises
     ------
@@ -123,7 +125,7 @@ class PoseEstimator:
         reference = make_reference(content["reference_px"].numpy(), self.sensor.pins)
         self.pipeline = Pipeline(self.sensor, self.form, reference, graph=config["pipeline"]["graph"])
         self.ensemble = Ensemble(self.part, reference, content, config["size"])
-        known = config.get("known_rest_px")  # of each pin without contact, measured on the unit that the weights are for
+        known = config.get("known_rest_px")  # pins at rest, measured on the unit from which the weights were learnt
         self._known_rest_px = None if known is None else np.array(known, float)
         learnt = {group: {key: value.numpy() for key, value in arrays.items()} for group, arrays in content["aside"].items()}
         self.learnt_from: np.ndarray | None = content["learnt_from"].numpy() if "learnt_from" in content else None
@@ -175,7 +177,7 @@ class PoseEstimator:
         return self.part.counts_from_rest
 
     def at_rest(self, frame: Frame) -> "PoseEstimator":
-        """The model for the sensor that took ``frame``: displacements are counted from the pins in this frame without contact.
+        """The model for the sensor that took ``frame`` without contact. Displacements are then computed from the pins in this frame.
 
         Raises
         ------
@@ -184,7 +186,7 @@ class PoseEstimator:
 
         Notes
         -----
-        From then on a frame that shows no contact gives no estimate.
+        The returned model gives no estimate for a frame that shows no contact.
         """
         if not self.counts_from_rest:
             raise FrameError(f"a no-contact frame serves only a model that counts pins from rest, {self.model} does not; leave it out")
@@ -194,11 +196,11 @@ class PoseEstimator:
         return found
 
     def remembering(self) -> "PoseEstimator":
-        """The model for frames that follow each other in time, which remembers those before; itself if the run did not learn slip.
+        """The model for consecutive frames, which remembers earlier frames; the model itself if the run did not learn slip.
 
-        Its estimates have the labels ``training.slip.NAMES`` besides: the probabilities that the contact has begun to slide and that all
-        of it slides, the drag that is left until then (mm), and the direction in which the object moves over the skin (deg, sensor
-        frame, from x towards y). A frame that gives no estimate ends the contact: what comes after it is a new one.
+        Its estimates also have the labels ``training.slip.NAMES``: the probabilities that the contact has begun to slide and that all of it
+        slides, the sliding share, the remaining drag until all of it slides (mm), and the direction in which the object moves over the skin
+        (deg, sensor frame, from x towards y). A frame without an estimate ends the contact: the next frame belongs to a new contact.
         """
         if self.slip is None:
             return self
@@ -210,9 +212,9 @@ class PoseEstimator:
 
     @property
     def recorded_sensor(self) -> SensorSpec:
-        """The sensor, its pins at rest where they were measured on the unit that the weights are for, if they were.
+        """The sensor with the pins at rest of the unit from which the weights were learnt, if they were measured.
 
-        A recording without a no-contact frame is counted from there.
+        Displacements in a recording without a no-contact frame are computed from these.
         """
         if self._known_rest_px is None:
             return self.sensor
@@ -220,22 +222,22 @@ class PoseEstimator:
         return self.sensor.model_copy(update={"pipeline": self.sensor.pipeline.model_copy(update={str(self.form): blob})})
 
     def at_known_rest(self) -> "PoseEstimator":
-        """The same model for frames of the unit that its weights are for, where there is no frame without contact."""
+        """The same model for frames without a no-contact frame, taken by the unit from which its weights were learnt."""
         return self._counted_from(nominal_reference(self.recorded_sensor, self.form)) if self._known_rest_px is not None else self
 
     def other_rest(self, start: Reference, nodes_px: np.ndarray) -> Reference | None:
-        """The rest layout that contacts with their pins (M, N, 2) tell, where it is another than ``start``, from which they are counted.
+        """The rest layout estimated from contacts with pins (M, N, 2), if it differs from ``start``, the assumed one.
 
-        None where it is the same, as far as contacts tell, where they are fewer than ``training.displacements.FEWEST_CONTACTS``, or where
-        the run did not learn how contacts displace pins.
+        None if the difference is not significant, if there are fewer contacts than ``training.displacements.FEWEST_CONTACTS``, or if the
+        run did not learn how contacts displace the pins.
         """
         found = other_rest(self.displacements, start, nodes_px) if self.counts_from_rest else None
         return None if found is None else make_reference(found, self.sensor.pins)
 
     def at_rest_of(self, frames: Iterable[Frame]) -> tuple["PoseEstimator", bool]:
-        """The model for the sensor that took ``frames`` of contacts, where no frame shows it without contact, and whether it is another.
+        """The model for the sensor that took ``frames`` of contacts, none of them without contact, and whether the sensor is another unit.
 
-        Its rest places are those that were measured on the unit of the weights, unless the contacts tell others: see ``other_rest``.
+        The rest places are those measured on the unit of the weights, unless the contacts show others: see ``other_rest``.
         """
         pipeline = self.at_known_rest().pipeline
         graphs = [seen.graph for frame in frames if (seen := pipeline(frame)).valid]
@@ -248,9 +250,9 @@ class PoseEstimator:
         return (estimator, False) if other is None else (estimator._counted_from(other), True)
 
     def seeking_rest(self) -> SensorModel:
-        """The model for a camera's frames where no frame shows its sensor without contact: as ``at_rest_of``, while the frames come.
+        """The model for a camera's frames if no frame shows its sensor without contact. It works as ``at_rest_of``, while frames arrive.
 
-        Itself if it does not count pins from rest.
+        The result is the model itself if its inputs are not displacements from rest.
         """
         return RestSeeker(self) if self.counts_from_rest else self
 
@@ -283,12 +285,12 @@ class PoseEstimator:
             )
 
     def __call__(self, frame: Frame) -> PoseEstimate:
-        """Estimate the pose in one frame. If too few pins are found, the result is not valid and states the reason.
+        """Estimate the pose in one frame. If too few pins are found, the estimate is not valid and states the reason.
 
         Raises
         ------
         FrameError
-            The frame is not one of the model's sensor: wrong size, type or form.
+            The frame does not belong to the model's sensor: wrong size, type or form.
         """
         started = perf_counter()
         if not isinstance(self.part, PinModel):
@@ -302,7 +304,7 @@ class PoseEstimator:
 
     @property
     def caveats(self) -> list[str]:
-        """Why the intervals of all frames are wider than the model's own, a line each."""
+        """Reasons why the intervals of all frames are wider than the model's own, one line each."""
         found = []
         if self._unmeasured > 1:
             found.append(
@@ -325,16 +327,16 @@ class PoseEstimator:
 
     @property
     def _stiffness(self) -> float:
-        """Factor by which simulated forces may be larger or smaller."""
+        """Factor by which the true forces may be larger or smaller than the simulated ones."""
         return self.sensor.skin.stiffness_factor
 
     @property
     def _force(self) -> np.ndarray:
-        """(K,) bool: labels that are forces or torques of simulated contacts, which are proportional to the sensor's stiffness."""
+        """(K,) bool: labels that are forces or torques of simulated contacts. They are proportional to the sensor's stiffness."""
         return np.array([name in SIMULATED_FORCES for name in self.config["columns"]])
 
     def _widened(self, value: np.ndarray, half: np.ndarray, lost_share: float) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-        """Low and high ends (K,) of the intervals with all that is not known, and what is special about the frame."""
+        """Low and high ends (K,) of the intervals with all unknown effects, and notes on this frame."""
         lost = 1.0 + LOST_WIDENS * lost_share if lost_share > LOST_USUAL else 1.0
         half = half * lost * self._unmeasured
         more, less = value * (self._stiffness - 1), value * (1 / self._stiffness - 1)
@@ -344,12 +346,12 @@ class PoseEstimator:
         return low, high, notes
 
     def contact_maps(self, frame: Frame) -> tuple[PoseEstimate, ContactMaps | None]:
-        """The estimate of one frame, and the pressure and shear over the skin that go with it; no maps if the estimate is not valid.
+        """The estimate of one frame, with the pressure and shear over the skin; no maps if the estimate is not valid.
 
         Raises
         ------
         FrameError
-            The frame is not one of the model's sensor: wrong size, type or form.
+            The frame does not belong to the model's sensor: wrong size, type or form.
         TrainingError
             The run has no maps.
         """
@@ -360,7 +362,7 @@ class PoseEstimator:
         return made, self.maps_of(seen.pins, made.value[None])[0]
 
     def maps_of(self, pins: PinTable, values: np.ndarray) -> list[ContactMaps]:
-        """Contact maps of many frames, from their pins and what the model tells of them (M, K).
+        """Contact maps of many frames, from their pins and the model's estimates for them (M, K).
 
         Raises
         ------
@@ -371,7 +373,7 @@ class PoseEstimator:
         return [model(modes, dict(zip(self.names, said, strict=True))) for modes, said in zip(self.modes_of(pins), values, strict=True)]
 
     def require_maps(self) -> MapModel:
-        """What makes contact maps; ``TrainingError`` if the run has none."""
+        """The model of contact maps; raises ``TrainingError`` if the run has none."""
         if self.maps is None:
             raise TrainingError(
                 f"the model of '{self.sensor.name}' makes no contact maps; train touch on simulated contacts, which tell "
@@ -402,7 +404,7 @@ class PoseEstimator:
         )
 
     def pins_in(self, frame: Frame) -> OneFrame | Unseen:
-        """The pins of one frame, or why they can't be used; raises as a call."""
+        """The pins of one frame, or the reason why they can't be used; raises as a call does."""
         return self._of_pins.pins_in(self._trained, frame)
 
     def estimate_one(self, seen: OneFrame, started: float, contact: str) -> PoseEstimate:
@@ -411,15 +413,15 @@ class PoseEstimator:
         Parameters
         ----------
         started : float
-            When the frame came, by ``perf_counter``.
+            Time at which the frame arrived, by ``perf_counter``.
         contact : str
-            The kind of contact that the frame was taken for.
+            Kind of the frame's contact.
         """
         slip = None if self._tracker is None else self._tracker(self.modes_of(seen.pins)[0])
         return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip, seen.lost_share)
 
     def unseen(self, seen: Unseen, started: float) -> PoseEstimate:
-        """The estimate of a frame that shows no pose that the model knows."""
+        """The estimate of a frame that shows no known pose."""
         return self._as_estimate(seen, started)
 
     def predict_rows(self, data: Dataset, rows: np.ndarray) -> Prediction:
@@ -428,7 +430,7 @@ class PoseEstimator:
         Raises
         ------
         FrameError
-            The frames are of another sensor or form.
+            The frames belong to another sensor or form.
         """
         self.check(data.pins.sensor, data.pins.form)
         return self.part.estimate_rows(self._trained, data, rows)
@@ -436,13 +438,13 @@ class PoseEstimator:
     def predict_table(self, pins: PinTable) -> Prediction:
         """Estimate the labels of many valid frames of one camera at once.
 
-        The camera may sit elsewhere than in training. Its displacement is measured in the table's own frame without contact; if there
-        is none, it is the median over the frames.
+        The camera may sit at another place than in training. Its displacement is measured in the table's own frame without contact. Without
+        such a frame it is the median over the frames.
 
         Raises
         ------
         FrameError
-            The frames are of another sensor or form.
+            The frames belong to another sensor or form.
         TrainingError
             The model does not estimate from pins.
         """
@@ -467,7 +469,7 @@ class PoseEstimator:
 
 
 def _instead_of(run: Path) -> str:
-    """What to give in place of a folder that holds no model: the shipped or neighbouring one with the nearest name, if there is one."""
+    """Suggestion for a folder that holds no model: the shipped or neighbouring model with the most similar name, if there is one."""
     shipped = shipped_names()
     beside = [folder.name for folder in run.parent.iterdir() if (folder / "config.json").is_file()] if run.parent.is_dir() else []
     near = get_close_matches(run.name, [*(shipped if run.name == str(run) else []), *beside], n=1)
@@ -482,15 +484,16 @@ def folder_of(run: str | Path) -> Path:
 
 
 def models_by_sensor(run: str | Path | None = None, first: str = "") -> Callable[[str], PoseEstimator | None]:
-    """A function from a sensor's name to a trained model of it: that of a run, else the weights that go with the package, else None.
+    """A function from a sensor's name to a trained model of it: that of a run, else the shipped one, else None.
 
-    From the first model on the networks of this process run in one thread: at their size more threads cost more than they bring.
+    After the first model is loaded, the networks of this process run in one thread: for networks of this size, more threads cost more time
+    than they save.
 
     Parameters
     ----------
     run : path, optional
     first : str
-        Name of the sensor that the run has to be of; "" for any.
+        Name of the sensor to which the run must belong; "" for any.
 
     Raises
     ------
@@ -511,7 +514,7 @@ def models_by_sensor(run: str | Path | None = None, first: str = "") -> Callable
 
 
 def digest_of(run: str | Path) -> str:
-    """Digest of everything that a model's estimates depend on: its weights, its configuration, and the code that runs it."""
+    """Digest of everything that affects a model's estimates: its weights, its configuration, and the code that runs it."""
     folder, digest = folder_of(run), hashlib.sha256(fingerprint(PoseEstimator).encode())
     for name in (CONFIG, WEIGHTS, TENSORS):
         if (folder / name).is_file():
@@ -520,7 +523,7 @@ def digest_of(run: str | Path) -> str:
 
 
 def load_remembering(run: str | Path) -> PoseEstimator:
-    """A trained model for frames that follow each other in time: ``PoseEstimator.load`` and ``PoseEstimator.remembering``.
+    """A trained model for consecutive frames: ``PoseEstimator.load`` and ``PoseEstimator.remembering``.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Evaluation of a trained model on a recording: errors, intervals and leaks as numbers, a table and pictures.
+"""Evaluation of a trained model on a recording: errors, intervals and leaks, as numbers, a table and pictures.
 
-The second part measures robustness: images are changed before the pipeline reads them, in ways that no contact causes. The camera is
+The second part measures robustness. Images are changed before the pipeline reads them, in ways that no contact causes: the camera is
 displaced in a random direction, or pins are removed. The result is the increase of the errors.
 """
 
@@ -35,7 +35,7 @@ from twin.types import Form, Frame
 DEPTH_EDGES_MM = (-4.0, -3.0, -2.0, -1.0, 0.0)
 ANGLE_EDGES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 SHEAR_EDGES_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-# Least move in mm or deg for which it is judged whether it was executed: the frame shows too little of a smaller move.
+# Least move, mm or deg, of frames on which the probability of an executed move is judged. A smaller move hardly changes the frame.
 LARGE_MOVE = 1.0
 # Number of frames, spread evenly over the recording, whose time to a pose is measured.
 TIMED_FRAMES = 100
@@ -43,7 +43,7 @@ TIMED_FRAMES = 100
 LEAK_LABEL = "pose_6"
 # Move that belongs to this label, in deg.
 LEAK_MOVE = "move_6"
-# Least number of frames of the leak check: fewer give no reliable line.
+# Least number of frames of the leak check. Fewer frames give no reliable slope.
 LEAK_FRAMES = 3
 # Share by which a changed image is larger or smaller.
 SCALE_CHANGE = 0.01
@@ -58,7 +58,7 @@ ERASED_MARGIN = 1.25
 
 
 def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndarray:
-    """Rows of a data set: with ``validation`` those that the run kept out of its training, by their names; with ``all`` every row.
+    """Rows of a data set: with ``validation`` those that the run kept out of its training, found by their names; with ``all`` every row.
 
     Raises
     ------
@@ -108,9 +108,9 @@ def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
 
 
 def intervals_on(run: Path, data: Dataset, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Interval quantiles of a finished run, by their names in ``weights.pt``, with which 90 % of some rows' labels lie inside.
+    """Interval quantiles of a finished run, by their names in ``weights.pt``, that contain 90 % of the labels of some rows.
 
-    Give rows that the run did not learn from. ``widen_intervals`` stores them.
+    Give rows from which the run did not learn. ``widen_intervals`` stores the quantiles.
     """
     estimator = PoseEstimator.load(run)
     made, targets = estimator.predict_rows(data, rows), data.targets.rows(rows)
@@ -123,7 +123,7 @@ def intervals_on(run: Path, data: Dataset, rows: np.ndarray) -> dict[str, np.nda
 
 @dataclass(frozen=True)
 class Leak:
-    """Does a model estimate from the time at which a frame was taken instead of from the contact? Recordings are sorted by time.
+    """Check of whether a model estimates from the time of a frame instead of from its contact. Recordings are sorted by time.
 
     Attributes
     ----------
@@ -201,7 +201,7 @@ def time_frames(estimator: Callable[[Frame], object], data: Dataset) -> float | 
 
 
 def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarray, metrics: dict, labels: str) -> list[Path]:
-    """Write ``predictions.csv``, ``metrics.json`` and ``errors.png``. The truth in the table are ``labels``: corrected or raw."""
+    """Write ``predictions.csv``, ``metrics.json`` and ``errors.png``. The true values in the table are the ``labels``: corrected or raw."""
     targets = data.targets.rows(rows)
     truth = getattr(targets, labels)
     half_width = made.half_width_raw if labels == "raw" else made.half_width
@@ -227,7 +227,7 @@ def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, lab
     for k, (name, unit) in enumerate(zip(targets.names, targets.units, strict=True)):
         error = errors[:, k]
         for chosen, colour, label in ((~undone, "#1f77b4", "move executed"), (undone, "#ff7f0e", "not executed")):
-            near = truth[chosen, k] + error[chosen]  # a direction is drawn on the truth's turn of the circle
+            near = truth[chosen, k] + error[chosen]  # a direction is drawn within half a turn of the truth
             axes[k].plot(truth[chosen, k], near, ".", color=colour, markersize=2, label=label)
             axes[count + k].plot(truth[chosen, k], error[chosen], ".", color=colour, markersize=2)
         axes[k].set(title=f"{name}: MAE {np.abs(error).mean():.3g} {unit} ({labels})", ylabel=f"predicted, {unit}")

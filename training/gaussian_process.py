@@ -1,4 +1,4 @@
-"""Gaussian process regression. One implementation serves three uses:
+"""Gaussian process regression. This implementation has three uses:
 
 - the process whose prediction is averaged with that of the networks (``fit_processes``),
 - labels from simulated and real data together (``fit_two_fidelities``),
@@ -28,7 +28,8 @@ from scipy.optimize import minimize
 
 # Variance added to every row, so that rounding does not make the Cholesky factorisation fail. Labels have a variance of about 1.
 JITTER = 1e-6
-# Most rows of each kind on which the likelihood is maximised. The cost grows with their third power, and more rows change no result.
+# Most rows of each kind on which the likelihood is maximised. The cost grows with the third power of their number, and more rows change
+# no result.
 FIT_ROWS = 1000
 # Steps of Adam. The likelihood of some hundred rows no longer changes after this many.
 CLIMB_STEPS = 60
@@ -40,9 +41,9 @@ ADAM_DECAYS = (0.9, 0.999)
 ADAM_LEAST = 1e-8
 # Common length of ``fit_smooth_processes``, in medians of the distance between two rows: such processes are nearly quadratic.
 SMOOTH_LENGTHS = 4.0
-# Sizes of its smooth and its linear term, standard deviations of the label: the smooth one is large, because the length is.
+# Sizes of its smooth and its linear term, in standard deviations of the label. The smooth term is large, because its length is large.
 SMOOTH_SIZES = np.array([4.5, 0.3])
-# Standard deviations of the noise that it tries, of a label with standard deviation 1.
+# Standard deviations of the noise that are tried, for a label of standard deviation 1.
 SMOOTH_NOISES = (0.015, 0.03, 0.06, 0.12, 0.25)
 # Least standard deviation of an input, in the input's unit, so that a constant input does not lead to a division by 0.
 LEAST_SPREAD = 1e-9
@@ -377,9 +378,9 @@ def fit_processes(
 
 
 def fit_smooth_processes(inputs: np.ndarray, labels: np.ndarray, *, group: np.ndarray | None = None) -> tuple[Processes, np.ndarray]:
-    """As ``fit_processes``, but all inputs have one common length, and only the noise is chosen: by the error of rows that are left out.
+    """As ``fit_processes``, but all inputs share one length, and only the noise is chosen, by the error of rows that are left out.
 
-    For inputs whose scales already say how much they matter. It takes seconds, and with many inputs and few rows it overfits nothing.
+    It is meant for inputs whose scales already show their importance. It takes seconds, and does not overfit with many inputs and few rows.
     """
     points = Points.of(inputs)
     chosen = inputs[drawn_rows(len(inputs), 0)]
@@ -412,7 +413,7 @@ def fit_two_fidelities(
     simulated_labels, real_labels : (S, K) and (n, K) float
         Standardised.
     seed : int
-        Chooses the simulated states that are used. Some hundreds show how labels depend on inputs, and more change no result.
+        Seed of the choice of simulated states. Some hundreds show how labels depend on inputs, and more change no result.
 
     Returns
     -------

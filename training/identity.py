@@ -1,4 +1,4 @@
-"""The data that a run learnt from, identified by the names of its frames, in any order of the table."""
+"""Identity of the data that a run learnt from: digests and marks of its frames, independent of the table's order."""
 
 import hashlib
 from collections.abc import Mapping
@@ -11,20 +11,20 @@ from training.recipes import TrainingError
 from training.targets import TARGET_COLUMNS
 from twin.store import inputs_digest
 
-DIGESTS = {  # what a run's configuration tells of its data by a digest, and what a message calls it where it differs
+DIGESTS = {  # keys of the digests in a run's configuration, with the words for a message about a difference
     "names": "frames of other names",
     "labels": "other labels",
     "frames": "other frames under the same names",
 }
-ASIDE = ("problems", "data")  # keys of a run's configuration that its result does not depend on
-COUNTED = "parameters"  # key that only a finished run's configuration has: how many its networks have
-EXACT = 9  # decimals of labels that count, mm and deg: the last bits of a sum may differ between machines
-NAMED = 3  # frames, or settings, that a message names
-MARK_BYTES = 8  # of a frame's mark: of a million frames two have the same by chance once in 37 million
+ASIDE = ("problems", "data")  # keys of a run's configuration that do not affect its result
+COUNTED = "parameters"  # key that only a finished run's configuration has: the number of parameters of its networks
+EXACT = 9  # decimals of labels, mm and deg, that are compared, because the last bits of a sum may differ between machines
+NAMED = 3  # most frames, or settings, that a message names
+MARK_BYTES = 8  # size of a frame's mark: a million frames have two equal marks by chance once in 37 million cases
 
 
 def identity_of(data: Dataset, model: Model) -> dict[str, str]:
-    """Digests of a data set as a model learns from it, by the keys of ``DIGESTS``; the order of its rows does not matter."""
+    """Digests of a data set as a model sees it, by the keys of ``DIGESTS``. The order of the rows does not matter."""
     ordered = data.in_order()
     targets = ordered.targets
     return {
@@ -56,9 +56,9 @@ def rows_named(data: Dataset, names: list[str]) -> np.ndarray:
 
 
 def frame_marks(data: Dataset) -> np.ndarray:
-    """Two marks (M, 2) int64 of each frame, by which it is known again under another name or in another recording.
+    """Two marks (M, 2) int64 of each frame, which identify it under another name or in another recording.
 
-    The first is of its pins' places, the second of their displacements: a data set that is joined to others keeps the second alone.
+    The first mark is that of its pins' places, the second that of their displacements. In joined data sets only the second stays the same.
     """
     pins = data.pins
     places = [np.round(px, SEEN_DECIMALS) + 0.0 for px in (pins.nodes_px, pins.nodes_px - pins.reference.pins_px)]
@@ -67,7 +67,7 @@ def frame_marks(data: Dataset) -> np.ndarray:
 
 
 def learnt_before(learnt: np.ndarray | None, data: Dataset) -> list[str]:
-    """A line if a run learnt from frames of a data set, by the marks of those (m, 2); if it does not tell its frames, that it does not."""
+    """A line if a run learnt from frames of a data set, found by the run's marks (m, 2), or if the run does not hold its frames' marks."""
     if learnt is None:
         return ["the run does not tell from which frames it learnt: whether these are among them is not known; train again to know"]
     known = np.isin(frame_marks(data), learnt).any(axis=1)
@@ -80,7 +80,7 @@ def learnt_before(learnt: np.ndarray | None, data: Dataset) -> list[str]:
 
 
 def changed_since(config: Mapping, data: Dataset, model: Model) -> list[str]:
-    """How a data set differs from the one that a run learnt from, a line each; of runs of earlier versions that this can't be told."""
+    """Differences between a data set and the one that a run learnt from, one line each. Runs of earlier versions do not hold them."""
     rows = config["rows"]
     if "frames" not in rows:
         return [
@@ -92,7 +92,7 @@ def changed_since(config: Mapping, data: Dataset, model: Model) -> list[str]:
 
 
 def difference(wanted: Mapping, found: Mapping) -> str:
-    """In which data and settings two configurations of runs differ, in words; "" where they don't."""
+    """Differences of data and settings between two configurations of runs, in words; "" if there are none."""
     keys = [key for key in {**wanted, **found} if key not in (*ASIDE, COUNTED) and wanted.get(key) != found.get(key)]
     said: list[str] = []
     if "rows" in keys:
@@ -110,5 +110,5 @@ def _rows_differ(wanted: Mapping, found: object) -> list[str]:
         return ["data that it does not name"]
     differ = [key for key in DIGESTS if wanted[key] != found.get(key)]
     if "names" in differ:
-        return [DIGESTS["names"]]  # then labels and frames differ in any case
+        return [DIGESTS["names"]]  # labels and frames then differ in any case
     return [DIGESTS[key] for key in differ] or ["another number of frames"]

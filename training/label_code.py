@@ -1,7 +1,7 @@
-"""Labels as the numbers that a model estimates: a direction that goes round the whole circle as its sine and cosine, others as they are.
+"""Code of labels as the numbers that a model estimates: a direction on the whole circle becomes its sine and cosine, others stay unchanged.
 
-A direction has no beginning: 179 deg and -179 deg are 2 deg apart. A model that estimated the number of degrees would have to jump
-there, and would err by up to 180 deg near the jump.
+A direction has no beginning: 179 deg and -179 deg are 2 deg apart. A model that estimated the angle itself would need a jump there, and
+its errors near the jump would be up to 180 deg.
 """
 
 from collections.abc import Sequence
@@ -19,19 +19,19 @@ def goes_round(units: Sequence[str], labels: np.ndarray) -> tuple[bool, ...]:
 
 
 def label_error(made: np.ndarray, truth: np.ndarray, units: Sequence[str]) -> np.ndarray:
-    """Estimates less truth, (..., K) both. Angles are compared the short way round, from -180 to 180 deg."""
+    """Estimates minus truth, (..., K) both. The difference of angles is taken from -180 to 180 deg."""
     angle = np.array([unit == "deg" for unit in units], bool)
     return np.where(angle, wrapped_deg(made - truth), made - truth)
 
 
 def wrapped_deg(angle_deg: np.ndarray) -> np.ndarray:
-    """The same angles from -180 to 180 deg. Those that already are stay the same to the last bit."""
+    """The same angles from -180 to 180 deg. Angles in this range are not changed in any bit."""
     return np.where(np.abs(angle_deg) <= HALF_CIRCLE_DEG, angle_deg, (angle_deg + 180) % 360 - 180)
 
 
 @dataclass(frozen=True)
 class LabelCode:
-    """K labels as E numbers: each direction is two numbers, sine and cosine, in the place of one.
+    """Code of K labels as E numbers: a direction is replaced by two numbers, its sine and cosine.
 
     Attributes
     ----------

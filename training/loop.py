@@ -1,4 +1,4 @@
-"""One network's training, epoch by epoch, with a state that can be kept on disk and continued."""
+"""Training of one network, epoch by epoch. Its state can be stored on disk, and the training continued from it."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -25,7 +25,7 @@ EXECUTED_LOSS = 0.05
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows that a network is trained on and watched by.
+    """The rows with which a network is trained and monitored.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Rows:
     executed : (M,) float32
         Whether the move was executed: 1, 0, or NaN if that is not known.
     train, held : (m,) int64
-        Rows to train on, and rows by which the error is watched.
+        Rows to train on, and rows on which the error is monitored.
     """
 
     inputs: Inputs
@@ -49,7 +49,7 @@ class Rows:
 
 
 def no_penalty(network: nn.Module) -> None:
-    """The penalty of networks that have none: nothing is added to the loss."""
+    """The penalty of networks without one: it adds nothing to the loss."""
 
 
 @dataclass
@@ -190,7 +190,7 @@ def row_loss(out: dict, labels: torch.Tensor, executed: torch.Tensor, weight: to
     """
     error = out["mean"] - labels
     loss = ((error.abs() if kind == "l1" else error.square()) * weight).mean()
-    if "first" in out:  # a first guess, which a later part of the network refines
+    if "first" in out:  # the first guess of a network that refines it later
         loss = loss + ((out["first"] - labels).abs() * weight).mean()
     if "log_scale" in out:
         scale = out["log_scale"]

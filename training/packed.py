@@ -28,17 +28,17 @@ from twin.store import write_bytes, write_text, writes
 
 WEIGHTS = "weights.safetensors"
 SHIPPED = Path(__file__).parent / "weights"
-MOST_ROWS = 2000  # rows of a Gaussian process that a small copy holds: 1 MB
-LARGE = 1000  # numbers; a larger array is kept in half precision
+MOST_ROWS = 2000  # most rows of a Gaussian process in a small copy: 1 MB
+LARGE = 1000  # number of elements above which an array is stored in half precision
 NETWORKS = "networks"  # the networks' weights, in ``weights.pt``
 KERNELS = "kernels"  # the arrays of the Gaussian processes of the modes, one for each view, in ``weights.pt``
-KERNEL_LABELS = "kernel_labels"  # the labels that they estimate
-BESIDE = "beside"  # the arrays of the Gaussian process beside the networks, in ``weights.pt``
-SHA256 = "weights_sha256"  # digest of the small copy's weights, in its configuration; the shipped copies were made before there was one
+KERNEL_LABELS = "kernel_labels"  # the labels that these processes estimate
+BESIDE = "beside"  # the arrays of the Gaussian process that is averaged with the networks, in ``weights.pt``
+SHA256 = "weights_sha256"  # digest of the small copy's weights, in its configuration; older shipped copies have none
 RECORDINGS = (
-    "recordings"  # names of the folders that the run learnt from, in the small copy's configuration; ``rows`` tells how many frames
+    "recordings"  # names of the folders from which the run learnt, in the small copy's configuration; ``rows`` has the number of frames
 )
-NOT_PACKED = (KERNELS, KERNEL_LABELS, "parameters", "learnt_from")  # entries of ``weights.pt`` that are not packed as they are
+NOT_PACKED = (KERNELS, KERNEL_LABELS, "parameters", "learnt_from")  # entries of ``weights.pt`` that are left out or packed in another form
 
 
 def shipped_names() -> list[str]:
@@ -53,7 +53,7 @@ def pack(run: Path, out: Path) -> int:
     Raises
     ------
     TrainingError
-        The run is a small copy already, has Gaussian processes of more than ``MOST_ROWS`` rows, or is of a model that has no small copy.
+        The run is a small copy already, has Gaussian processes of more than ``MOST_ROWS`` rows, or has a model without small copies.
     """
     if not (run / TENSORS).is_file():
         raise TrainingError(f"{run}: a small copy already; give the run that it was made of")

@@ -1,4 +1,4 @@
-"""The pins of every frame of a recording. The pipeline finds them once; they are then stored on disk.
+"""The pins of every frame of a recording. The pipeline finds them once; then they are stored on disk.
 
 Stored results are valid only for the code that made them. This module imports nothing of the simulation, so that stored pins of real
 recordings stay valid if only the simulation changes.
@@ -23,7 +23,7 @@ from twin.progress import Step
 from twin.store import cached_arrays
 from twin.types import Form, Frame
 
-LIGHT_SIGMA = 0.12  # sd of the Gaussian over which a cap's light is averaged, in mean rest spacings: about a third of a cap
+LIGHT_SIGMA = 0.12  # standard deviation of the Gaussian that averages a cap's light, in mean rest spacings: about a third of a cap
 LEAST_LEVEL = 0.5  # gray levels, added before the logarithm is taken: half a step of the camera
 # Fields of a PinTable that hold a row for each frame.
 PIN_COLUMNS = ("image_name", "nodes_px", "area_px2", "lost", "valid", "light")
@@ -41,7 +41,7 @@ class PinTable:
         The layout of the N pins without contact.
     image_name : (M,) str
     nodes_px : (M, N, 2) float
-        Places of the pins; that of a lost pin is predicted. NaN for frames that are not valid.
+        Places of the pins; a lost pin has its predicted place. NaN for frames that are not valid.
     area_px2 : (M, N) float
         Voronoi areas; NaN for frames that are not valid.
     lost : (M, N) bool
@@ -50,7 +50,7 @@ class PinTable:
     measured : bool
         Whether the reference was measured with the camera of these frames. Otherwise it is computed from the specification.
     light : (M, N) float, optional
-        Logarithm of the gray level at each pin (``cap_light``); 0 where there are no pictures.
+        Logarithm of the gray level at each pin (``cap_light``); 0 if there are no pictures.
     """
 
     sensor: SensorSpec
@@ -80,7 +80,7 @@ class PinTable:
         return PinTable(self.sensor, self.form, self.reference, **columns, measured=self.measured)
 
     def seen_from(self, reference: Reference) -> "PinTable":
-        """The table with another layout without contact. Displacements and ratios of areas stay the same."""
+        """The table relative to another layout without contact. Displacements and ratios of areas do not change."""
         nodes_px = reference.pins_px + (self.nodes_px - self.reference.pins_px)
         area_px2 = reference.area_px2 * (self.area_px2 / self.reference.area_px2)
         return replace(self, reference=reference, nodes_px=nodes_px, area_px2=area_px2)
@@ -141,8 +141,8 @@ def cap_light(frame: Frame, nodes_px: np.ndarray, reference: Reference) -> np.nd
 
 
 def recording_key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
-    """All that a recording's pins, or its pictures as a network sees them, depend on beside the code: its files, and of the specification
-    the layout, the view and how frames are made and read. A rig that is fitted anew changes none of them."""
+    """Everything, besides the code, that affects a recording's pins, or its pictures as a network gets them: its files and, of the
+    specification, the layout, the view, and how frames are made and read. A new fit of the rig changes none of these."""
     root = recording.path if recording.path.is_dir() else recording.path.parent
     states = sorted((str(file.relative_to(root)), *_state(file)) for file in root.rglob("*") if file.is_file())
     return {
@@ -157,7 +157,7 @@ def recording_key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
 
 
 def _state(file: Path) -> tuple[int, int, int]:
-    """Changes with every change of the file: copying tools set the time of the last change, but not when the file was put there."""
+    """A value that changes with every change of the file. The inode's time is included, because copying tools set the modification time."""
     status = file.stat()
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 

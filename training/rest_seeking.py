@@ -1,4 +1,4 @@
-"""A model for a camera whose sensor nobody showed without contact: it gathers contacts until they tell the pins' rest places."""
+"""A model for a camera whose sensor was never shown without contact. It collects contacts until these determine the pins at rest."""
 
 import logging
 from typing import Protocol
@@ -14,12 +14,13 @@ from twin.types import Form, Frame, Observation
 LOG = logging.getLogger(__name__)
 SAME_UNIT = "the pins at rest are, by more contacts, where they were measured on the unit that the weights are for"
 UNLIKE = 0.05
-"""A frame counts as another contact if its pins differ from those of every contact so far by this, rms in spacings. Three of four frames
-of 40 random contacts (331 and 127 pins) differ so from the next one; a contact that is held differs by the pins' noise, 0.01."""
+"""Least rms difference, in spacings, between the pins of a frame and those of every collected contact, for the frame to count as another
+contact. Of 40 random contacts (331 and 127 pins), three of four differ by this much from the next one. A held contact differs by the pins'
+noise, 0.01."""
 
 
 class RestingModel(SensorModel, Protocol):
-    """A model that contacts can tell where its pins are at rest (``training.estimator.PoseEstimator``)."""
+    """A model whose pins at rest can be estimated from contacts (``training.estimator.PoseEstimator``)."""
 
     def at_known_rest(self) -> "RestingModel": ...
 
@@ -27,10 +28,11 @@ class RestingModel(SensorModel, Protocol):
 
 
 class RestSeeker:
-    """A model on a stream of frames: it counts from the rest places that are known, and from those that the contacts tell once they do.
+    """A model on a stream of frames. It starts with the known rest places, and changes to those estimated from the contacts as soon as
+    possible.
 
-    They are asked after ``FEWEST_CONTACTS`` contacts that differ, and again, for the last time, after ``MOST_CONTACTS``. The frame at
-    which that happens takes up to a second longer.
+    The rest places are estimated after ``FEWEST_CONTACTS`` different contacts, and once more after ``MOST_CONTACTS``. The frame at which
+    this happens takes up to a second longer.
 
     Parameters
     ----------
@@ -39,9 +41,9 @@ class RestSeeker:
     Attributes
     ----------
     sensor, form, pipeline : SensorSpec, Form, Pipeline
-        As the model's; the pipeline has the rest places that are counted from at present.
+        As those of the model. The pipeline has the rest places that are used at present.
     other : bool
-        Whether the contacts told other rest places than those that are known.
+        Whether the estimated rest places differ from the known ones.
     """
 
     sensor: SensorSpec
@@ -56,30 +58,30 @@ class RestSeeker:
         self._unlike_px = UNLIKE * float(np.median(self.pipeline.reference.spacing_px))
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
-        """As the model's."""
+        """As the model's ``check``."""
         self._model.check(sensor, form)
 
     def at_rest(self, frame: Frame) -> SensorModel:
-        """The model, counting from a frame without contact: nothing is sought any more."""
+        """The model with the rest places of a frame without contact; no rest places are estimated any more."""
         return self._given.at_rest(frame)
 
     def seeking_rest(self) -> SensorModel:
-        """Itself."""
+        """The object itself."""
         return self
 
     def __call__(self, frame: Frame) -> Estimate:
-        """The estimate of one frame, counted from the rest places that are known by then; raises as the model does."""
+        """The estimate of one frame, with the rest places that are known by then; raises as the model does."""
         made = self._model(frame)
         if self._gathered(made.seen) and len(self._contacts_px) in (FEWEST_CONTACTS, MOST_CONTACTS):
             told, other = self._given.told_rest(np.array(self._contacts_px))
-            if other or self.other:  # else the model that remembers the frames so far goes on
+            if other or self.other:  # otherwise the present model continues, because it remembers the frames so far
                 self._model, self.other, self.pipeline = told, other, told.pipeline
                 made = self._model(frame)
                 LOG.warning("%s, after %d contacts", OTHER_UNIT if other else SAME_UNIT, len(self._contacts_px))
         return made
 
     def _gathered(self, seen: Observation | None) -> bool:
-        """Whether a frame's pins are those of another contact than any so far, which is then kept."""
+        """Whether a frame's pins show a contact that differs from all collected ones. It is then collected."""
         if seen is None or seen.graph is None or len(self._contacts_px) >= MOST_CONTACTS:
             return False
         nodes_px = seen.graph.nodes_px

@@ -1,12 +1,12 @@
 """Training runs. A run's folder holds the following files, so that training can be continued after it was killed:
 
-- ``config.json``: the resolved configuration (model, recipe, sensor, pipeline, labels), and what the run learnt from: the names of the
-  frames that it kept out, and digests of names, labels and frames.
+- ``config.json``: the resolved configuration (model, recipe, sensor, pipeline, labels), the names of the frames that were kept out of
+  training, and digests of names, labels and frames.
 - ``curves.csv``: the learning curves.
-- ``checkpoint.pt``: the state of training, while the run goes on.
-- ``weights.pt``: the trained model, when the run is done.
+- ``checkpoint.pt``: the state of training while the run is in progress.
+- ``weights.pt``: the trained model, when the run is finished.
 
-Every file is written whole or not at all.
+Every file is written as a whole or not at all.
 """
 
 import csv
@@ -34,12 +34,12 @@ from twin.frames.forms import blob_spec
 from twin.store import fingerprint, write_text, writes
 
 RUN_FILES = (CONFIG, "curves.csv", TENSORS)
-FOLDS = 10  # parts of the training rows; each network of an ensemble watches another part
+FOLDS = 10  # parts of the training rows; each network of an ensemble holds out another part
 KEEP_EVERY_S = 20.0  # s between two checkpoints
-FEWEST_PARTS = 3  # rows, or groups of rows, to learn from: with fewer a network that watches one learns from next to nothing
-MOST_SEED = 2**32 - 1  # PyTorch takes seeds of 64 bits, and each network has a seed of its own
-BEGIN_ANEW = "remove it to begin anew, or give another --out"  # instead of going on from a damaged checkpoint
-EXTRA_WEIGHT = 0.3  # of a helper label in the loss, beside 1 of a label that is asked for
+FEWEST_PARTS = 3  # least number of rows, or groups of rows: with fewer, almost no rows are left beside the held-out part
+MOST_SEED = 2**32 - 1  # largest seed. PyTorch takes seeds of 64 bits, and each network has its own seed
+BEGIN_ANEW = "remove it to begin anew, or give another --out"  # remedy for a damaged checkpoint
+EXTRA_WEIGHT = 0.3  # weight of a helper label in the loss; requested labels have the weight 1
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,16 @@ class RunConfig:
     recipe : Recipe
     labels : {"corrected", "raw"}
     seed : int
-        Of weights and order; also shifts which fold is watched.
+        Seed of weights and order. It also shifts which fold is held out.
     split : int or None
         Seed of the validation fifth that is kept out of training; None trains on all rows.
     helpers : tuple of str
-        Label columns that are learnt only because they help the others; they have less weight.
+        Label columns that are learnt only because they help to learn the others; they have less weight.
     size : dict
         Sizes of the network that differ from the model's own.
     labelled : dict
-        ``identity_of`` the real frames from which was learnt what simulated pins miss, and their ``image_names``; empty for other runs.
-
+        ``identity_of`` the real frames from which the errors of simulated pins were learnt, and their ``image_names``; empty for other
+        runs.
     Raises
     ------
     TrainingError
@@ -93,7 +93,7 @@ def train_run(
     device: str = "cpu",
     progress: Callable | None = None,
 ) -> bool:
-    """Train, or continue what ``out`` holds. The order of the data set's rows does not matter.
+    """Train a run, or continue the one in ``out``. The order of the data set's rows does not matter.
 
     Parameters
     ----------
@@ -112,10 +112,10 @@ def train_run(
     Raises
     ------
     TrainingError
-        ``out`` holds another run, there are too few frames, or ``max_minutes`` is no time.
+        ``out`` holds another run, there are too few frames, or ``max_minutes`` is not a valid time.
     """
     started = monotonic()
-    if max_minutes is not None and not max_minutes >= 0:  # NaN would never stop
+    if max_minutes is not None and not max_minutes >= 0:  # also true for NaN, with which the training would never stop
         raise TrainingError(f"--max-minutes {max_minutes}: give a time of 0 or more")
     data = data.in_order()
     train = training_rows(config, data)
@@ -163,7 +163,7 @@ def train_run(
 
 
 def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
-    """Whether a folder holds this run (the same settings, data and code) and it is finished.
+    """Whether a folder holds this run (the same settings, data and code) and the run is finished.
 
     Raises
     ------
@@ -180,12 +180,12 @@ def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
 
 
 def training_rows(config: RunConfig, data: Dataset) -> np.ndarray:
-    """Rows (m,) of a data set in order (``Dataset.in_order``) that a run learns from."""
+    """Rows (m,) of a data set in order (``Dataset.in_order``) from which a run learns."""
     return np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
 
 
 def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
-    """The whole configuration as ``config.json`` holds it; ``data`` in order, of which the rows ``train`` (m,) are learnt from."""
+    """The whole configuration as in ``config.json``; ``data`` are in order, and ``train`` (m,) are the training rows."""
     pins = data.pins
     kept_out = np.setdiff1d(np.arange(len(data)), train)
     return {
@@ -219,7 +219,7 @@ def labels_learnt(data: Dataset, config: RunConfig) -> np.ndarray:
 
 
 def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: LabelCode) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
-    """Labels (M, E) as the network learns them, float32, and shift and scale (E,) back to the code's: ``number = shift + scale x``."""
+    """Labels (M, E) as the network learns them, float32, and shift and scale (E,) for the code's numbers: ``number = shift + scale x``."""
     labels = code.encode(labels_learnt(data, config))
     known, k = labels[train], labels.shape[1]
     if config.recipe.scaling == "standard":
@@ -230,7 +230,7 @@ def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: Lab
         shift, scale = np.zeros(k), np.ones(k)
     scale = np.where(scale > 0, scale, 1.0)
     pair = np.array(code.circular)[code.label_of]
-    shift, scale = np.where(pair, 0.0, shift), np.where(pair, np.sqrt(0.5), scale)  # a direction stays one, whatever labels there are
+    shift, scale = np.where(pair, 0.0, shift), np.where(pair, np.sqrt(0.5), scale)  # sine and cosine of a direction need a common scale
     return torch.from_numpy(((labels - shift) / scale).astype(np.float32)), shift, scale
 
 
@@ -314,7 +314,7 @@ def _keep(out: Path, resolved: dict, done: list, loop: Loop | None) -> None:
 
 
 def _opened(out: Path, resolved: dict) -> dict | None:
-    """The checkpoint of an interrupted run of the same configuration; None where there is nothing to continue."""
+    """The checkpoint of an interrupted run with the same configuration; None if there is nothing to continue."""
     path = out / CHECKPOINT
     if not path.is_file():
         if (out / TENSORS).is_file():

@@ -1,4 +1,4 @@
-"""The files of a run, written whole and read with care: what is damaged, or was never a run's, is an error that names the file."""
+"""Files of a run. They are written as a whole, and checked when they are read: a damaged or wrong file is an error that names the file."""
 
 import json
 import zipfile
@@ -19,10 +19,10 @@ from training.recipes import TrainingError
 from twin.store import write_with
 from twin.types import Form
 
-CONFIG = "config.json"  # what a run was told, resolved
-TENSORS = "weights.pt"  # its trained networks
-CHECKPOINT = "checkpoint.pt"  # the state of training, while it goes on
-LARGEST_CONFIG = 100_000_000  # bytes; a configuration names the frames that were kept out, a million of them take 20 MB
+CONFIG = "config.json"  # the resolved configuration of a run
+TENSORS = "weights.pt"  # the trained networks
+CHECKPOINT = "checkpoint.pt"  # the state of training while the run is in progress
+LARGEST_CONFIG = 100_000_000  # bytes; a configuration names the frames kept out of training, and a million names take 20 MB
 AGAIN = "train again, or copy the run's folder anew"
 
 
@@ -32,7 +32,7 @@ class _Pipeline(BaseModel):
 
 
 class _Config(BaseModel):
-    """What a model needs of ``config.json``; the rest says how it was trained."""
+    """The part of ``config.json`` that a model needs. The rest describes its training."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -53,7 +53,7 @@ def read_config(run: Path) -> dict[str, Any]:
     Raises
     ------
     TrainingError
-        It can't be read, or a model can't be made from it.
+        The file can't be read, or a model can't be made from it.
     """
     path = run / CONFIG
     try:
@@ -72,12 +72,12 @@ def read_config(run: Path) -> dict[str, Any]:
 
 
 def require_together(run: Path, config: Mapping[str, Any], content: Mapping[str, Any]) -> None:
-    """Refuse weights that are not those of the configuration beside them.
+    """Refuse weights that do not belong to the configuration beside them.
 
     Raises
     ------
     TrainingError
-        They are of other pins or of another number of labels.
+        The weights have other pins or another number of labels.
     """
     sensor = SensorSpec.model_validate(config["sensor"])
     pins, labels = len(content["reference_px"]), len(content.get("circular", content["shift"]))
@@ -88,14 +88,14 @@ def require_together(run: Path, config: Mapping[str, Any], content: Mapping[str,
 
 
 def read_tensors(path: Path, remedy: str = AGAIN) -> dict[str, Any]:
-    """What ``write_tensors`` wrote.
+    """Read a dict that ``write_tensors`` wrote.
 
-    PyTorch itself does not compare the checksums in the file, so a single changed byte would change weights in silence.
+    PyTorch itself does not compare the checksums in the file, so a single changed byte would change weights without an error.
 
     Parameters
     ----------
     remedy : str
-        What the user is told to do where the file can't be used.
+        What the message tells the user to do if the file can't be used.
 
     Raises
     ------
@@ -122,17 +122,17 @@ def read_tensors(path: Path, remedy: str = AGAIN) -> dict[str, Any]:
 
 
 def damaged(path: Path, how: str, remedy: str = AGAIN) -> TrainingError:
-    """The error to raise where a file of a run can't be used: names the file, how it is damaged, and the remedy."""
+    """The error for a file of a run that can't be used: it names the file, the damage, and the remedy."""
     return TrainingError(f"{path}: not of a run of this version, or damaged ({how}); {remedy}")
 
 
 def write_tensors(path: Path, content: dict) -> None:
-    """Write a dict of numbers, text, lists, arrays and tensors so that ``read_tensors`` reads it."""
+    """Write a dict of numbers, text, lists, arrays and tensors in the form that ``read_tensors`` reads."""
     write_with(path, lambda file: torch.save(_as_tensors(content), file))
 
 
 def _as_tensors(value: object) -> object:
-    """The same content with arrays as tensors: PyTorch reads tensors back without running code that a file may hold."""
+    """The same content with arrays as tensors, because PyTorch reads tensors without running code that a file may hold."""
     if isinstance(value, np.ndarray):
         return torch.from_numpy(value)
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Simulated data sets: reading those without pictures, and what is known of their contacts besides the table of labels."""
+"""Reads simulated data sets without pictures, and the known properties of their contacts that the table of labels does not hold."""
 
 import csv
 import io
@@ -26,7 +26,7 @@ from twin.rig.touch import Surface, surface_labels
 from twin.types import Form
 
 TABLE = "targets.csv"
-LEAST_AREA_MM2 = 1e-6  # where nothing touches, no share of the area slides
+LEAST_AREA_MM2 = 1e-6  # least contact area, mm^2, by which the sliding area is divided, so that without contact the share is 0
 
 
 def is_simulated(folder: Path) -> bool:
@@ -45,7 +45,7 @@ def open_simulated(folder: Path, spec: SensorSpec, form: Form | None = None) -> 
     Parameters
     ----------
     form : Form, optional
-        Form of the frames in whose pixels the pins are to be given; by default that of the data set.
+        Form of the frames in whose pixels the pins are given; by default that of the data set.
 
     Raises
     ------
@@ -79,12 +79,12 @@ def open_simulated(folder: Path, spec: SensorSpec, form: Form | None = None) -> 
 
 
 def config_of(folder: Path) -> GenerationConfig:
-    """What a simulated data set was made with.
+    """The configuration of a simulated data set.
 
     Raises
     ------
     DatasetError
-        Its record is missing or damaged.
+        The file is missing or damaged.
     """
     path = folder / CONFIG
     try:
@@ -96,8 +96,9 @@ def config_of(folder: Path) -> GenerationConfig:
 def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     """Depth and angle of the touched surface, of any shape, as labels: see ``twin.rig.touch.surface_labels``.
 
-    The object's place follows from the pose that the arm was sent to and the rig's parameters that were drawn for the contact. What
-    the object gave way is subtracted. Therefore the labels of a flat plate are those of the table, less moves that were not executed.
+    The object's place follows from the pose to which the arm was sent and from the rig's parameters that were drawn for the contact, minus
+    the object's displacement by its compliance. Therefore the labels of a flat plate are those of the table without moves that were not
+    executed.
 
     Parameters
     ----------
@@ -136,12 +137,12 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def contact_labels(folder: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Force, torque, area, share that slides and touch of simulated frames: values (M,) by the names of ``CONTACT_UNITS``.
+    """Force, torque, area, sliding share and contact of simulated frames: values (M,) by the names of ``CONTACT_UNITS``.
 
     Parameters
     ----------
     names : M str
-        Names of frames; NaN for those that are not in the data set.
+        Names of frames; values are NaN for frames that are not in the data set.
     """
     truth, _, _ = open_truth(folder)
     rows_by_name = row_of(truth)

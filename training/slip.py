@@ -1,16 +1,17 @@
-"""Slip from a sequence of frames, learnt from simulated drags: has the contact begun to slide, does all of it slide, how far is it to that.
+"""Detection of slip in a sequence of frames, learnt from simulated drags: whether slip has begun, whether the whole contact slides, and how
+far it is from that.
 
-Friction depends on the past, so one frame does not tell it. A small recurrent network sees the model's modes of the pins in each frame and
-their change since the frame before, and remembers. It learns from contacts that are pressed and then dragged: finite elements know which
-part of the skin slides, and with it
+Friction depends on the past, so one frame does not show slip. A small recurrent network gets the model's modes of the pins in each frame
+and their change since the frame before, and remembers. It learns from contacts that are pressed and then dragged. The finite elements give
+the part of the skin that slides, and from it follow
 
 - the beginning of slip: at least a tenth of the pressed skin slides under a drag;
 - slip of the whole contact: nineteen twentieths of it slide;
-- the sliding share: which part of the pressed skin slides under the drag;
-- the way that is left to it: how far the object must still be dragged.
+- the sliding share: the share of the pressed skin that slides under the drag;
+- the remaining drag: how far the object must still be dragged until the whole contact slides.
 
-A press alone is no drag, though skin that spreads over a smooth object slides on it. The states of a contact are gone through at random
-speeds with random stops, and every frame has its own noise of the pins, so that the network depends on no rate.
+A press alone does not count as slip, although skin that spreads over a smooth object slides on it. In training the states of a contact are
+traversed at random speeds with random stops, and every frame has its own noise of the pins, so that the network depends on no frame rate.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,47 +39,47 @@ from twin.mechanics.skin_map import skin_grid
 from twin.store import ArrayFile
 
 SLIP = "slip.safetensors"
-"""File of a run that holds its network for slip."""
+"""File of a run with its network for slip."""
 FILE = ArrayFile("network for slip", "twin train", version=1, error=TrainingError, again=AGAIN)
 BEGINS, WHOLE = 0.1, 0.95
-"""Share of the pressed skin that slides when slip begins, and when the whole contact slides."""
+"""Share of the pressed skin that slides when slip begins, and share above which the whole contact counts as sliding."""
 FEWEST_DRAGS = 30
-"""Contacts that are dragged until they slide, with fewer of which slip is not learnt."""
+"""Least number of contacts that are dragged until they slide. With fewer, slip is not learnt."""
 HELD_OUT = 6
-"""One contact in this many is kept out to set thresholds and intervals."""
+"""One contact in this many is held out of training, to set thresholds and intervals."""
 WAYS = 2400
-"""Ways that are learnt from: each contact is gone through several times, at another speed each time."""
+"""Number of sequences for training. Each contact gives several, at different speeds."""
 SLOWEST, FASTEST = 0.15, 1.0
-"""Load steps (0.4 mm at most) from one frame to the next."""
+"""Smallest and largest speed, in load steps (0.4 mm at most) per frame."""
 STOP_SHARE, LONGEST_STOP = 0.04, 8
-"""Share of frames at which the object stops, and the most frames for which it does."""
+"""Probability that the object stops at a frame, and bound (exclusive) of the number of frames of a stop."""
 NOISE_PX = 0.1
-"""Noise of a pin in a frame."""
+"""Standard deviation of a pin's noise in a frame, px."""
 GAIN, CHANGE = 3.0, 5.0
-"""Deviation of the largest mode at the network's input, and by how much more its change counts."""
+"""Standard deviation of the largest mode at the network's input, and factor on the change of the modes."""
 JITTER = 0.02
-"""Noise of the network's inputs in training."""
+"""Standard deviation of the noise of the network's inputs in training."""
 UNITS, EPOCHS, BATCH, RATE, DECAY = 64, 12, 24, 5e-3, 0.02
 """Training: units of both layers, epochs, sequences of a step, highest learning rate, weight decay."""
 LEAST_LEFT_MM = 0.1
-"""Added to the way that is left before its logarithm is taken."""
+"""Distance, mm, that is added to the remaining drag before its logarithm is taken."""
 LEFT_WEIGHT, SHARE_WEIGHT = 0.3, 0.1
-"""Weights in the loss: of the way that is left and of the direction, and of the sliding share."""
+"""Weights in the loss: of the remaining drag and of the direction, and of the sliding share."""
 LEFT_SCALES, SHARE_SCALES = (-4.0, 2.0), (-3.5, 0.0)
-"""Bounds of the logarithm of an error that the network states: of the way that is left, and of the sliding share (0.03 to 1)."""
+"""Bounds of the logarithm of the errors that the network states: of the remaining drag, and of the sliding share (0.03 to 1)."""
 SEEN_DRAG_MM = 0.3
-"""Drag from which on its direction is learnt."""
+"""Least drag, mm, for which its direction is learnt."""
 FALSE_ALARMS = 0.01
-"""Share of the kept-out frames without slip of which an alarm may speak: it sets the alarm's threshold."""
+"""Share of the held-out frames without slip that may raise the alarm. It determines the alarm's threshold."""
 NAMES = ("slip_begins", "slip_whole", "slip_sliding", "slip_left", "slip_direction")
-"""Labels of an estimate that remembers: probabilities of slip's beginning and of slip of the whole contact, sliding share, way left,
-direction."""
+"""Additional labels of an estimate that remembers: probabilities of slip's beginning and of slip of the whole contact, sliding share,
+remaining drag, direction."""
 SLIP_UNITS = ("", "", "", "mm", "deg")
 
 
 @dataclass(frozen=True)
 class Drag:
-    """A simulated contact that is pressed, and dragged from some state on; S states.
+    """A simulated contact that is pressed, and then dragged; S states.
 
     Attributes
     ----------
@@ -89,7 +90,7 @@ class Drag:
     share : (S,) float
         Share of the pressed skin that slides; 0 before the drag.
     drag_mm : (S,) float
-        How far the object was dragged.
+        Distance by which the object was dragged.
     direction : (2,) float
         Unit vector of the drag in the image plane of the sensor frame; (0, 0) if there was none.
     """
@@ -101,7 +102,7 @@ class Drag:
     direction: np.ndarray
 
     def turned(self, symmetry: Symmetry, rings: int) -> "Drag":
-        """The same drag of the turned or mirrored object over a sensor whose pins stand in rings."""
+        """The same drag with the object turned or mirrored over a sensor whose pins form rings."""
         lost = np.empty_like(self.lost)
         lost[:, symmetry.places(rings)] = self.lost
         direction = symmetry.matrix[:2, :2] @ self.direction
@@ -109,7 +110,7 @@ class Drag:
 
     @property
     def whole_mm(self) -> float:
-        """Drag at which the whole contact slides first; NaN if it never does."""
+        """Drag at which the whole contact first slides; NaN if it never does."""
         sliding = np.flatnonzero(self.share >= WHOLE)
         if not len(sliding):
             return float("nan")
@@ -121,18 +122,18 @@ class Drag:
 
 @dataclass(frozen=True)
 class Way:
-    """A drag as a sequence of frames sees it; T frames.
+    """A drag as a sequence of T frames.
 
     Attributes
     ----------
     modes : (T, D) float
-        What the model sees of the pins.
+        The model's modes of the pins.
     begins, whole : (T,) bool
         Whether slip has begun, and whether the whole contact slides.
     share : (T,) float
         Share of the pressed skin that slides; 0 before the drag.
     left_mm : (T,) float
-        Drag that is left until the whole contact slides; NaN where it never does.
+        Remaining drag until the whole contact slides; NaN if it never does.
     drag_mm : (T,) float
     direction : (2,) float
     """
@@ -148,7 +149,7 @@ class Way:
 
 @dataclass(frozen=True)
 class Slip:
-    """What is told of a contact's slip after a frame.
+    """Estimate of a contact's slip after a frame.
 
     Attributes
     ----------
@@ -157,11 +158,11 @@ class Slip:
     share, share_low, share_high : float
         Share of the pressed skin that slides under a drag, and the ends of its 90 % interval.
     left_mm, left_low_mm, left_high_mm : float
-        Drag that is left until the whole contact slides, and the ends of its 90 % interval.
+        Remaining drag until the whole contact slides, and the ends of its 90 % interval.
     direction_deg : float
         Direction in which the object moves over the skin, in the sensor frame from x towards y.
     alarm : bool
-        Whether ``begins`` is beyond the threshold that was set for few false alarms.
+        Whether ``begins`` exceeds the threshold that was set for few false alarms.
     """
 
     begins: float
@@ -185,9 +186,9 @@ class Slip:
 
 
 class SlipNetwork(nn.Module):
-    """Eight numbers of every frame of sequences (B, T, D).
+    """Network with eight output numbers for every frame of sequences (B, T, D).
 
-    They are the logits of slip's beginning and of slip of the whole contact, the logarithms of the way left and of its error, the
+    They are the logits of slip's beginning and of slip of the whole contact, the logarithms of the remaining drag and of its error, the
     direction (2), the logit of the sliding share and the logarithm of its error.
     """
 
@@ -206,18 +207,18 @@ class SlipNetwork(nn.Module):
 
 @dataclass(frozen=True)
 class SlipModel:
-    """A trained network, the gain and bounds of its modes, the alarm's threshold, and factors on the errors that the network states.
+    """A trained network with the gain and bounds of its modes, the alarm's threshold, and factors on the errors that the network states.
 
     Attributes
     ----------
     network : SlipNetwork
     gain : float
     limit : (D,) float
-        A mode counts up to this size.
+        Size above which a mode is clipped.
     alarm_at : float
-        Probability of slip's beginning from which on an alarm is given.
+        Probability of slip's beginning above which the alarm is given.
     left_factor, share_factor : float
-        With these, 90 % of the ways left, and of the sliding shares, lie within the stated errors.
+        Factors with which 90 % of the remaining drags, and of the sliding shares, lie within the stated errors.
     """
 
     network: SlipNetwork = field(repr=False)
@@ -233,7 +234,7 @@ class SlipModel:
         return np.concatenate([now, CHANGE * (now - last)], axis=-1).astype(np.float32)
 
     def told(self, out: np.ndarray) -> Slip:
-        """What the network's numbers (8,) say."""
+        """The estimate from the network's numbers (8,)."""
         begins, whole, share = (1 / (1 + np.exp(-np.clip(out[[0, 1, 6]].astype(float), -50, 50)))).tolist()
         middle, wide = float(out[2]), self.left_factor * float(np.exp(np.clip(out[3], *LEFT_SCALES)))
         left, low, high = (max(float(np.exp(np.clip(at, -9, 5))) - LEAST_LEFT_MM, 0.0) for at in (middle, middle - wide, middle + wide))
@@ -243,7 +244,7 @@ class SlipModel:
 
 
 class SlipTracker:
-    """Follows the slip of one contact from frame to frame.
+    """Tracks the slip of one contact from frame to frame.
 
     Parameters
     ----------
@@ -255,12 +256,12 @@ class SlipTracker:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the contact: the next frame is the first of another one."""
+        """Forget the contact: the next frame is the first of another contact."""
         self._memory: torch.Tensor | None = None
         self._before: np.ndarray | None = None
 
     def __call__(self, modes: np.ndarray) -> Slip:
-        """What is told after a frame with these modes (D,)."""
+        """The estimate after a frame with these modes (D,)."""
         before = modes if self._before is None else self._before
         x = torch.from_numpy(self._model.inputs(modes, before))[None, None]
         with torch.no_grad():
@@ -270,7 +271,7 @@ class SlipTracker:
 
 
 def drags_of(data: Dataset) -> list[tuple[np.ndarray, Drag]]:
-    """Drags of the contacts of a simulated data set with all their states, each with its rows (S,); contacts that are only pressed, too."""
+    """Drags of the contacts of a simulated data set with all their states, each with its rows (S,), including contacts without a drag."""
     truth, _, _ = open_truth(data.folder)
     names = ("caps_mm", "visible", "path_id", "move", "T_sensor_object", "map_force_n", "map_touched_mm2", "map_slipping_mm2")
     arrays = arrays_of(truth, names)
@@ -314,14 +315,14 @@ def _drag(arrays: dict[str, np.ndarray], nodes_mm: np.ndarray) -> Drag:
 
 
 class Eyes:
-    """What a model sees of the caps of its sensor: their places in the frame with noise, and then the model's modes.
+    """The model's view of its sensor's caps: their projections in the frame with noise, and from these the model's modes.
 
     Parameters
     ----------
     modes_of : callable
         Modes (T, D) of a table of T frames (``PoseEstimator.modes_of``).
     pins : PinTable
-        Of the sensor and the form, counted from its own pins at rest.
+        A table of the sensor and form, relative to the sensor's own pins at rest.
     """
 
     def __init__(self, modes_of: Callable[[PinTable], np.ndarray], pins: PinTable) -> None:
@@ -348,7 +349,7 @@ class Eyes:
 
 
 def gone_through(drag: Drag, at: np.ndarray, eyes: Eyes, rng: np.random.Generator) -> Way:
-    """A drag as frames show it that are taken at places ``at`` (T,) of its states, 0 to S - 1; between two states all is linear."""
+    """A drag in frames at positions ``at`` (T,) in its sequence of states, 0 to S - 1, with linear interpolation between two states."""
     low = np.minimum(at.astype(int), len(drag.share) - 2)
     part = at - low
 
@@ -363,7 +364,7 @@ def gone_through(drag: Drag, at: np.ndarray, eyes: Eyes, rng: np.random.Generato
 
 
 def random_places(states: int, rng: np.random.Generator) -> np.ndarray:
-    """Places (T,) from the first to the last of a contact's states, at a random speed with random stops."""
+    """Positions (T,) from the first to the last of a contact's states, at a random speed with random stops."""
     stride, found = np.exp(rng.uniform(np.log(SLOWEST), np.log(FASTEST))), [0.0]
     while found[-1] < states - 1:
         if rng.random() < STOP_SHARE:
@@ -373,7 +374,7 @@ def random_places(states: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def learn_slip(drags: Sequence[Drag], eyes: Eyes, sensor: SensorSpec, *, seed: int = 0) -> SlipModel:
-    """Learn slip from drags, ``FEWEST_DRAGS`` of which slide in the end. Where pins stand in rings, each is also turned and mirrored."""
+    """Learn slip from drags. At least ``FEWEST_DRAGS`` must slide in the end. If pins form rings, each drag is also turned and mirrored."""
     rings = sensor.pins.rings if sensor.pins.layout == "rings" else None
     turns = [] if rings is None else symmetries(sensor.pins.phase_deg)
     rng = np.random.default_rng([seed, 5])
@@ -393,7 +394,7 @@ def learn_slip(drags: Sequence[Drag], eyes: Eyes, sensor: SensorSpec, *, seed: i
 
 
 def _fit(model: SlipModel, ways: list[Way], seed: int) -> None:
-    """Train the network of a model; sequences of like lengths are learnt from together."""
+    """Train the network of a model. Each step uses sequences of similar lengths."""
     generator = torch.Generator().manual_seed(seed)
     ways = sorted(ways, key=lambda way: len(way.modes))
     groups = [_padded(model, ways[k : k + BATCH]) for k in range(0, len(ways), BATCH)]
@@ -413,7 +414,7 @@ def _fit(model: SlipModel, ways: list[Way], seed: int) -> None:
 
 
 def _padded(model: SlipModel, ways: list[Way]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Inputs (B, T, 2 D), which frames there are (B, T), and what is wanted of them (B, T, 8), of ways one of which has T frames."""
+    """Inputs (B, T, 2 D), a mask of the existing frames (B, T), and targets (B, T, 8) of ways, padded to the longest one's T frames."""
     longest = max(len(way.modes) for way in ways)
     x = np.zeros((len(ways), longest, 2 * ways[0].modes.shape[1]), np.float32)
     there = np.zeros((len(ways), longest), bool)
@@ -431,7 +432,7 @@ def _padded(model: SlipModel, ways: list[Way]) -> tuple[torch.Tensor, torch.Tens
 
 
 def _loss(out: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
-    """Mean loss of frames: numbers (M, 8) against what is wanted (M, 8)."""
+    """Mean loss of frames: numbers (M, 8) against targets (M, 8)."""
     loss = nn.functional.binary_cross_entropy_with_logits(out[:, :2], wanted[:, :2], reduction="none").sum(dim=1).mean()
     known, shown = wanted[:, 2] > 0, wanted[:, 4] > 0
     left = _likelihood(out[:, 2] - wanted[:, 3], out[:, 3].clamp(*LEFT_SCALES))
@@ -444,12 +445,12 @@ def _loss(out: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
 
 
 def _likelihood(off: torch.Tensor, log_error: torch.Tensor) -> torch.Tensor:
-    """Negative logarithm of the density of errors (M,) that are normally distributed, without its constant."""
+    """Negative logarithm of the density of normally distributed errors (M,), without its constant."""
     return (off / log_error.exp()) ** 2 / 2 + log_error
 
 
 def _calibrated(model: SlipModel, ways: list[Way]) -> SlipModel:
-    """The model with threshold and intervals from ways that it did not learn from."""
+    """The model with threshold and intervals from ways from which it did not learn."""
     x, there, wanted = _padded(model, ways)
     with torch.no_grad():
         out, _ = model.network(x)
@@ -466,20 +467,20 @@ def _calibrated(model: SlipModel, ways: list[Way]) -> SlipModel:
 
 
 def _factor(off: np.ndarray, log_error: np.ndarray, bounds: tuple[float, float]) -> float:
-    """By how much stated errors must be multiplied so that 90 % of the errors (M,) lie within them."""
+    """Factor on the stated errors with which 90 % of the errors (M,) lie within them."""
     scores = np.abs(off) / np.exp(np.clip(log_error, *bounds))
     return float(conformal_quantile(scores[:, None], COVERAGE)[0])
 
 
 def write_slip(path: Path, model: SlipModel) -> None:
-    """Write what ``read_slip`` reads."""
+    """Write the model in the form that ``read_slip`` reads."""
     about = {key: getattr(model, key) for key in ("gain", "alarm_at", "left_factor", "share_factor")}
     weights = {key: value.numpy() for key, value in model.network.state_dict().items()}
     FILE.write(path, weights | {"limit": model.limit.astype(np.float32)}, about)
 
 
 def read_slip(path: Path) -> SlipModel:
-    """What ``write_slip`` wrote.
+    """Read the model that ``write_slip`` wrote.
 
     Raises
     ------
@@ -498,24 +499,24 @@ def read_slip(path: Path) -> SlipModel:
 
 @dataclass(frozen=True)
 class SlipErrors:
-    """How well slip is told on simulated drags.
+    """Errors of slip estimates on simulated drags.
 
     Attributes
     ----------
     contacts, frames : int
     whole_accuracy : float
-        Share of the frames in which slip of the whole contact is told rightly.
+        Share of the frames in which slip of the whole contact is classified correctly.
     false_alarms : float
         Share of the frames without slip that raise the alarm.
     lead_mm : float
-        Mean drag between the first alarm under the drag and slip of the whole contact; an alarm that comes later counts as negative, a
-        missing one as the drag's end.
+        Mean drag between the first alarm during the drag and slip of the whole contact. A later alarm gives a negative value; a missing
+        alarm counts as one at the drag's end.
     late : float
         Share of the contacts whose alarm came after the whole contact slid.
     share, share_covered : float
         Mean absolute error of the sliding share, and the part of the true shares inside the 90 % intervals.
     left_mm, left_covered : float
-        Mean absolute error of the way left, and the share inside the 90 % intervals.
+        Mean absolute error of the remaining drag, and the share of true values inside the 90 % intervals.
     direction_deg : float
         Median error of the direction.
     """
@@ -534,7 +535,7 @@ class SlipErrors:
 
 
 def judge_slip(model: SlipModel, ways: Sequence[Way]) -> SlipErrors:
-    """Compare what is told of ways with what is true."""
+    """Compare the estimates for ways with the true values."""
     right: list[bool] = []
     alarms: list[bool] = []
     inside: list[bool] = []

@@ -26,10 +26,10 @@ PRESETS = {
     "edge-3d": ("pose_1", "pose_3", "pose_6"),
     "edge-circle": ("pose_2", "pose_3", "pose_6"),
 }
-# Preset whose columns depend on the recording: everything that its table tells about a contact (``contact_columns``).
+# Preset whose columns depend on the recording: all columns of its table about the contact (``contact_columns``).
 CONTACT = "contact"
-# What is known of a simulated contact beside the arm's pose: name of the label and its unit. Forces are of the skin on the object, in the
-# sensor frame (z out of the tip); the torque is about the sensor's axis; the area is of the skin at rest.
+# Known properties of a simulated contact besides the arm's pose: name of the label and its unit. Forces act from the skin on the object, in
+# the sensor frame (z out of the tip). The torque is about the sensor's axis. The area is that of the skin at rest.
 CONTACT_UNITS = {
     "force_x": "N",
     "force_y": "N",
@@ -41,7 +41,7 @@ CONTACT_UNITS = {
 }
 # Least and greatest value that a label can have.
 BOUNDS = {"contact_area": (0.0, np.inf), "slip_share": (0.0, 1.0), "contact": (0.0, 1.0)}
-# Columns of measured forces and torques in recordings (N, N mm), as published ones call them.
+# Columns of measured forces and torques in recordings (N, N mm), with the names of published recordings.
 MEASURED_UNITS = {"Fx": "N", "Fy": "N", "Fz": "N", "Tx": "Nmm", "Ty": "Nmm", "Tz": "Nmm"}
 # Fields of Targets that hold a row for each frame.
 TARGET_COLUMNS = ("raw", "corrected", "executed", "move")
@@ -157,7 +157,7 @@ def choose_targets(
     x_mm = _numbers(recording.labels["pose_1"], "pose_1", [])[rows] if "pose_1" in recording.labels else np.zeros(len(rows))
     right = corrected(names, raw, executed, move, depth_per_move, np.nan_to_num(x_mm))
     undone = 1.0 - np.where(np.isnan(executed), 1.0, executed)
-    for k, name in enumerate(names):  # labels that no published recording needs: a move that was not made is missing in each of them
+    for k, name in enumerate(names):  # further labels, which published recordings lack: subtract a move that was not executed from each
         made = f"move_{name.removeprefix('pose_')}"
         if name.startswith("pose_") and name != "pose_6" and made in recording.labels:
             right[:, k] -= undone * np.nan_to_num(_numbers(recording.labels[made], made, [])[rows])
@@ -165,7 +165,7 @@ def choose_targets(
 
 
 def contact_columns(recording: Recording) -> tuple[str, ...]:
-    """Columns of a recording's table that tell about its contacts: poses, moves and shears that vary, forces, torques, areas and slip.
+    """Varying columns of a recording's table that describe its contacts: poses, moves, shears, forces, torques, areas and slip.
 
     Raises
     ------
@@ -178,7 +178,7 @@ def contact_columns(recording: Recording) -> tuple[str, ...]:
         if name in CONTACT_UNITS or name in MEASURED_UNITS or (name.partition("_")[0] in kinds and unit_of(name)):
             values = np.nan_to_num(numbers(cells))
             twice = any(np.array_equal(values, np.nan_to_num(numbers(recording.labels[other]))) for other in names)
-            if np.ptp(values) > 0 and not twice:  # tables of other makers are read under both makers' names
+            if np.ptp(values) > 0 and not twice:  # a column of another convention exists under two names and is used once
                 names.append(name)
     if not names:
         raise FrameError(f"{recording.path}: no column that varies tells about the contacts; {recording.labels_found()}")

@@ -1,8 +1,8 @@
-"""Is anything touched? The answer from the pins alone, where the pins at rest were measured.
+"""Probability that a frame shows any contact, from the pins alone. It needs measured pins at rest.
 
-Without contact a frame differs from the frame at rest by the noise of the pins, and by a shift, turn and scale of the whole view where the
-camera moved a little. A touch moves neighbouring pins together. So the similarity is taken out, each pin's displacement is averaged with
-its neighbours', and the largest of these averages, a (px), tells the probability (at the rim averages of fewer pins count less)
+Without contact, a frame differs from the frame at rest by the noise of the pins, and by a shift, turn and scale of the whole view if the
+camera moved a little. A contact moves neighbouring pins together. Therefore the similarity is removed, each pin's displacement is averaged
+with its neighbours', and the largest average, a (px), gives the probability (at the rim, averages of fewer pins have a smaller weight)
 
     P(contact) = 1 / (1 + exp(-(a - MIDDLE_PX) / WIDTH_PX))
 """
@@ -14,16 +14,16 @@ from twin.pins.reference import Reference
 from twin.types import BoolArray, FloatArray
 
 MIDDLE_PX = 0.28
-"""Average displacement at which contact is as likely as not. Noise of 0.1 px makes 0.23 px at most in 2,000 frames of the shipped sensors;
-a plate or a ball that presses a soft tip with 0.2 N makes 0.3 px at least."""
+"""Average displacement, px, at which the probability of a contact is 0.5. Noise of 0.1 px gives at most 0.23 px in 2,000 frames of the
+shipped sensors. A plate or a ball that presses a soft tip with 0.2 N gives at least 0.3 px."""
 USUAL = 7.0
-"""Pins in an average: one and its six neighbours. At the rim they are fewer, and their noise counts less."""
+"""Usual number of pins in an average: one pin and its six neighbours. At the rim, averages of fewer pins are noisier and weigh less."""
 WIDTH_PX = 0.02
-"""Change of this average by which the odds grow e-fold."""
+"""Change of this average, px, that multiplies the odds by e."""
 
 
 class TouchAnswer:
-    """Tells whether a frame's pins show a contact.
+    """Computes the probability that a frame's pins show a contact.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class TouchAnswer:
         self._reference, self._around = reference, around
 
     def __call__(self, nodes_px: FloatArray, lost: BoolArray) -> float:
-        """Probability of a contact, from pins (N, 2); those that are ``lost`` (N,) do not count. NaN if all are."""
+        """Probability of a contact, from pins (N, 2). Pins that are ``lost`` (N,) are not used. NaN if all are lost."""
         seen = ~lost
         if not seen.any():
             return float("nan")

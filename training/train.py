@@ -1,4 +1,4 @@
-"""Training of a model in one call: labelled recordings are read, joined and learnt from."""
+"""Training of a model in one call: it reads and joins labelled recordings, and learns from them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ from twin.progress import Progress, silent, stage
 from twin.store import writes
 from twin.types import Form
 
-SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helpers of its other labels
+SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helper labels
 SHEAR_HELPERS = ("move_1", "move_6")  # these moves
-FILES = (CONFIG, "curves.csv", TENSORS, MAPS, SLIP, DISPLACEMENTS)  # of a finished run
+FILES = (CONFIG, "curves.csv", TENSORS, MAPS, SLIP, DISPLACEMENTS)  # files of a finished run
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def train_model(
     Parameters
     ----------
     model : str
-        As ``recipe_of`` takes it.
+        Name as for ``recipe_of``.
     recordings : sequence of Path
         Several recordings are joined to one data set.
     target : str
@@ -154,7 +154,7 @@ def add_maps(run: Path, config: RunConfig, data: Dataset) -> list[str]:
     Returns
     -------
     list of str
-        Why there are none, a line at most.
+        The reason why there are no maps, at most one line.
     """
     data = data.in_order()
     rows, estimator = training_rows(config, data), PoseEstimator.load(run)
@@ -165,9 +165,9 @@ def add_maps(run: Path, config: RunConfig, data: Dataset) -> list[str]:
 
 
 def add_displacements(run: Path, config: RunConfig, data: Dataset) -> None:
-    """Learn how contacts displace the pins from the frames that a finished run learnt from, and write it beside its weights.
+    """Learn how contacts displace the pins from the frames that a finished run learnt from, and write the model beside its weights.
 
-    Nothing is written where the model does not count pins from rest, their places at rest were not measured, or frames are few.
+    Nothing is written if the model does not use displacements from rest, the pins at rest were not measured, or there are too few frames.
     """
     if not (model_named(config.model).counts_from_rest and data.pins.measured):
         return
@@ -182,12 +182,12 @@ def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str
     Parameters
     ----------
     parts : sequence of Dataset
-        As they were read, before they were joined.
+        The data sets before they were joined.
 
     Returns
     -------
     list of str
-        Why slip is not told, a line at most.
+        The reason why slip was not learnt, at most one line.
     """
     estimator, drags = PoseEstimator.load(run), []
     kept_out = set(estimator.config["rows"]["kept_out"])
@@ -214,7 +214,7 @@ def columns_of(target: str) -> str | tuple[str, ...]:
     Raises
     ------
     TrainingError
-        A name is there twice, or there is none.
+        A name occurs twice, or there is no name.
     """
     names = tuple(name.strip() for name in target.split(",") if name.strip())
     if not names or len(set(names)) < len(names):

@@ -1,4 +1,4 @@
-"""What a loop knows of an arm (``Arm``, ``ArmState``), and what all drivers share (``BaseArm``).
+"""The interface of an arm for a loop (``Arm``, ``ArmState``), and the common part of all drivers (``BaseArm``).
 
 Units are mm and degrees; times are ``time.monotonic()`` seconds.
 """
@@ -18,13 +18,14 @@ from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError
 
 # Interval in s at which feedback is read. It is shorter than the 8 ms period of the fastest feedback.
 POLL_S = 0.005
-# Feedback older than this (s) is not used. So an arm that is lost or frozen is stopped, and that is said, within a second.
+# Largest age, s, of feedback that is used. Therefore a lost or frozen arm is stopped and reported within a second.
 FEEDBACK_AGE_S = 0.8
-# An arm that says that a number of its pose is larger than this (mm, deg) says nothing.
+# Largest number of a reported pose, mm or deg. A report with a larger number is not valid.
 FARTHEST = 1e5
-# A commanded move shows in feedback sooner than this (s). An arm that rests elsewhere for longer does not execute the move.
+# Longest time, s, until a commanded move shows in feedback. An arm that rests elsewhere for longer does not execute the move.
 BELIEVE_REST_S = 0.15
-# With a long time limit an arm may rest for a tenth of it, but not longer than this (s), before that is an error.
+# Longest rest, s, of an arm in a wait with a long time limit. The arm may rest for a tenth of the limit, but not longer than this, before
+# it is an error.
 MOST_REST_S = 1.5
 
 
@@ -56,11 +57,12 @@ class ArmState:
 class Arm(Protocol):
     """A robot arm. Nothing moves or opens in a constructor; nothing moves before ``enable``.
 
-    Every method but ``connect`` raises ``DeviceNotConnectedError`` when not connected, and ``DeviceError`` when the arm
-    refuses or fails; ``stop``, ``emergency_stop``, ``disable`` and ``clear_error`` are never gated.
+    Every method but ``connect`` raises ``DeviceNotConnectedError`` if the arm is not connected, and ``DeviceError`` if the arm refuses or
+    fails.
+    ``stop``, ``emergency_stop``, ``disable`` and ``clear_error`` are never refused by safety checks.
 
-    No exception of a move or of a wait leaves the arm moving, Ctrl-C included: the arm is stopped first, earlier moves too. If that
-    fails, the message says that the arm may move, and to press its emergency stop.
+    If a move or a wait raises an exception (Ctrl-C included), the arm is stopped first, earlier moves too, so that it does not move on. If
+    the stop fails, the message says that the arm may move, and that its emergency stop must be pressed.
     """
 
     name: str
@@ -79,7 +81,7 @@ class Arm(Protocol):
         Raises
         ------
         DeviceError
-            The arm could not be stopped, and no call before this one has said so. The connection is closed all the same.
+            The arm could not be stopped, and no earlier call has reported this. The connection is closed nevertheless.
         """
 
     def __enter__(self) -> Self: ...
@@ -87,7 +89,7 @@ class Arm(Protocol):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None: ...
 
     def enable(self) -> None:
-        """Switch the motors on. Nothing moves before."""
+        """Switch the motors on. The arm does not move before this call."""
 
     def disable(self) -> None:
         """Switch the motors off."""
@@ -96,10 +98,10 @@ class Arm(Protocol):
         """Acknowledge alarms, so that the arm can be enabled again."""
 
     def stop(self) -> None:
-        """End the motion at once and forget what is queued."""
+        """End the motion at once and empty the queue."""
 
     def emergency_stop(self) -> None:
-        """Stop and cut the motors' power, where the arm has a command for it; ``clear_error`` and ``enable`` bring it back."""
+        """Stop and cut the motors' power, if the arm has a command for it. ``clear_error`` and ``enable`` make the arm usable again."""
 
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         """The newest state; ``StaleDataError`` if it is older than ``max_age_s``."""
@@ -108,14 +110,14 @@ class Arm(Protocol):
         """Set the speeds of the moves that follow."""
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        """Move the tool straight to ``pose`` (6,); returns the pose really commanded (clamped to what the arm can do).
+        """Move the tool straight to ``pose`` (6,). Returns the pose that was really commanded (clamped to the arm's abilities).
 
-        With ``wait`` it returns only when feedback shows the arm at rest there, else ``DeviceError``.
-        Without, it returns when the arm has accepted it.
+        With ``wait`` it returns only when feedback shows the arm at rest there, and raises ``DeviceError`` otherwise. Without ``wait`` it
+        returns when the arm has accepted the move.
         """
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        """Go to joints (J,), deg; otherwise as `move_linear`. Returns the pose that was commanded."""
+        """Move to joints (J,), deg; otherwise as `move_linear`. Returns the pose that was commanded."""
 
     def wait_settled(
         self,
@@ -126,17 +128,17 @@ class Arm(Protocol):
         timeout_s: float = 10.0,
         at_rest: bool = True,
     ) -> ArmState:
-        """Wait for feedback of the arm at rest at ``pose``: the state that confirms it. Without ``at_rest`` the arm may still move there.
+        """Wait for feedback of the arm at rest at ``pose``, and return this state. Without ``at_rest`` the arm may still move there.
 
         Raises
         ------
         DeviceError
-            It did not get there in time, or reports an error.
+            The arm did not get there in time, or reports an error.
         """
 
 
 def stop_after(arm: "Arm | BaseArm", error: BaseException) -> None:
-    """Stop an arm after an error. If that fails, the error says so, too."""
+    """Stop an arm after an error. If the stop fails, this is added to the error."""
     try:
         arm.stop()
     except DeviceError as failed:
@@ -144,11 +146,11 @@ def stop_after(arm: "Arm | BaseArm", error: BaseException) -> None:
 
 
 class BaseArm(Connection):
-    """Base of the arms; see ``hardware.arms.arm.Arm`` for what each method promises."""
+    """Base class of the arms; see ``hardware.arms.arm.Arm`` for the methods."""
 
     name: str
     axes: int
-    _unstopped = False  # whether the newest stop failed, which its error told
+    _unstopped = False  # whether the newest stop failed and this was reported
 
     @property
     @abstractmethod
@@ -221,16 +223,16 @@ class BaseArm(Connection):
             raise
 
     def _require_possible(self, pose: np.ndarray) -> None:
-        """Raise ``StaleDataError`` if no arm can be at a pose (6,) that this one tells: where it is, is not known."""
-        if not (np.abs(pose) < FARTHEST).all():  # NaN is not smaller
+        """Raise ``StaleDataError`` if a reported pose (6,) is impossible, because the arm's real pose is then unknown."""
+        if not (np.abs(pose) < FARTHEST).all():  # also true for NaN
             raise StaleDataError(f"{self.name}: says that it is at {pose}, a place that no arm reaches; stop it, then restart it")
 
     def _may_move(self) -> bool:
-        """Whether a move that was sent may not have ended."""
+        """Whether a move that was sent may still be in progress."""
         return self.is_connected
 
     def _disconnect(self, *acts: Callable[[], None], close: Callable[[], None]) -> None:
-        """Call ``stop`` and other acts, then ``close``. If the stop failed and no earlier stop has told so, its error is raised."""
+        """Call ``stop`` and further actions, then ``close``. The error of a failed stop is raised, unless an earlier stop reported it."""
         told, failed = self._unstopped, None
         for act in (self.stop, *acts):
             try:

@@ -1,4 +1,4 @@
-"""What the alarms of the Dobots mean (the MG400 and the Magician number them alike) and what to do about them."""
+"""Meanings and remedies of the Dobots' alarms. The MG400 and the Magician use the same numbers."""
 
 _JOINT_ENDS = [f"J{joint} is {side} its range" for joint in (1, 2, 3, 4) for side in ("above", "below")]
 

@@ -1,4 +1,4 @@
-"""Kinematics of arms, and targets that are checked before anything is sent.
+"""Kinematics of arms, and checks of targets before anything is sent.
 
 Poses are (6,): ``x, y, z, rx, ry, rz`` in mm and deg, static xyz Euler angles. Both Dobots carry their wrist on a parallel linkage: J2
 and J3 are absolute angles of the two links, J2 from the vertical and J3 downwards from the horizontal. So
@@ -15,10 +15,10 @@ from hardware.errors import DeviceError
 
 # Numbers of the Dobots' alarms that planning raises (see ``hardware.arms.dobot_alarms``).
 NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23
-# Alarm of J1 above its range. The next are J1 below, J2 above, ... up to 71.
+# Alarm of J1 above its range. The following numbers are J1 below, J2 above, ... up to 71.
 FIRST_JOINT_ALARM = 64
 LINKAGE_ABOVE, LINKAGE_BELOW = 72, 73
-# Rounding errors of the inverse kinematics at a limit, in deg, do not violate it.
+# Largest violation of a limit, deg, that is accepted, because the inverse kinematics has rounding errors.
 LIMIT_TOLERANCE_DEG = 1e-6
 
 
@@ -67,7 +67,7 @@ class LinkageKinematics:
     limits_deg : (4, 2) tuple
         Smallest and largest angle of each joint.
     linkage_deg : float or None
-        J3 - J2 may not exceed this (None: no such limit known).
+        Largest J3 - J2; None if no such limit is known.
     """
 
     l1_mm: float
@@ -164,7 +164,7 @@ def linear_target(name: str, kinematics: LinkageKinematics, pose: np.ndarray) ->
     Raises
     ------
     DeviceError
-        It is out of reach.
+        The pose is out of reach.
     """
     sent = kinematics.nearest_pose(pose)
     try:
@@ -182,7 +182,7 @@ def joint_target(name: str, joints_deg: np.ndarray) -> np.ndarray:
 
 
 def require_possible(name: str, kinematics: LinkageKinematics, numbers: np.ndarray, joints_deg: np.ndarray) -> None:
-    """Raise ``DeviceError`` unless the joints (4,) are numbers within the limits. ``numbers`` are those that would be sent."""
+    """Raise ``DeviceError`` unless the joints (4,) are finite and within the limits. ``numbers`` are the values that would be sent."""
     if not np.isfinite(joints_deg).all():
         raise DeviceError(f"{name}: the target {numbers} is not a number; nothing was sent")
     if violation := kinematics.violation(joints_deg):

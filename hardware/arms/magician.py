@@ -17,13 +17,13 @@ from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, requ
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
-# Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take the largest age of feedback.
+# Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take as long as feedback may be old.
 REPLY_TIMEOUT_S = 0.2
 # Times that a command is sent until a reply comes. Moves are absolute, so a repeated move does not move the arm.
 TRIES = 4
 # Longest time of homing, in s.
 HOME_TIMEOUT_S = 60.0
-# What pyserial raises when a port vanishes.
+# Errors that pyserial raises when a port vanishes.
 PORT_ERRORS = (serial.SerialException, OSError, termios.error, TypeError, ValueError)
 # Bytes of the replies to commands that read.
 REPLY_BYTES = {Id.GET_POSE: 32, Id.ALARMS: 16, Id.QUEUE_INDEX: 8}
@@ -54,7 +54,7 @@ class Magician(BaseArm):
         self._serial: serial.Serial | None = None
         self._lock, self._buffer = RLock(), b""
         self._enabled = False
-        self._last_index: int | None = None  # queue index of the newest move; None when no move is pending
+        self._last_index: int | None = None  # queue index of the newest move; None if no move is pending
 
     @property
     def is_connected(self) -> bool:
@@ -106,7 +106,7 @@ class Magician(BaseArm):
         self._unstopped = True
         try:
             self._forget_queue()
-            self._request(Id.QUEUE_START, ctrl=WRITE)  # the queue is empty now; it must run, or the next move would never begin
+            self._request(Id.QUEUE_START, ctrl=WRITE)  # the empty queue must run, or the next move would never begin
         except DeviceError as error:
             raise type(error)(f"{self.name}: can't be stopped and may move. Switch it off! {error}") from error
         self._unstopped = False
@@ -235,7 +235,7 @@ class Magician(BaseArm):
         Raises
         ------
         DeviceError
-            A reply of another length came: what is attached is no Magician.
+            A reply of another length came, so the attached device is not a Magician.
         """
         wanted = REPLY_BYTES.get(id) if ctrl == 0 else None
         deadline = time.monotonic() + REPLY_TIMEOUT_S

@@ -1,4 +1,4 @@
-"""What goes over the Magician's serial line: ``AA AA | len | id | ctrl | params | checksum``. Used by driver and emulator."""
+"""Messages on the Magician's serial line: ``AA AA | len | id | ctrl | params | checksum``. Driver and emulator use this module."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -99,7 +99,7 @@ def checksum(body: bytes) -> int:
 
 
 def take_message(buffer: bytes) -> tuple[Message | None, bytes]:
-    """The first valid frame in what has arrived, and what is left.
+    """The first valid frame in the received bytes, and the remaining bytes.
 
     Noise and frames with a wrong checksum are skipped. AA may occur within the parameters, so only a whole frame
     with a correct checksum counts. Bytes that may be the beginning of a frame are kept.

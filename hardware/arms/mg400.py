@@ -33,31 +33,32 @@ LOG = logging.getLogger(__name__)
 ENABLE_TIMEOUT_S = 5.0
 # Longest wait in s for the reply to a move, which an arm that works sends at once.
 MOTION_REPLY_S = 1.0
-# The same for a stop, an emergency stop and a disable. After it the next means is tried, because the arm may still move.
+# The same for a stop, an emergency stop and a disable. After this time the next method is tried, because the arm may still move.
 STOP_REPLY_S = 0.5
-# Feedback shows within this time (s) that a stop or a disable was obeyed: more than two periods of the slower of the two ports in use.
+# Longest time, s, until feedback shows that a stop or a disable was executed: more than two periods of the slower of the two used ports.
 SHOWS_S = 0.5
-# Feedback shows within this time (s) the alarm because of which a move was refused.
+# Longest time, s, until feedback shows the alarm that caused the refusal of a move.
 ALARM_S = 0.2
-# For MUTE_S (s) after one of these has failed, further ones wait only STOP_AGAIN_S (s), so that the end of a program isn't delayed.
-# The same holds where feedback is silent: an arm that is frozen gives no reply, and that must be said within a second.
+# Shorter wait for replies. For MUTE_S (s) after a stop, emergency stop or disable has failed, further ones wait only STOP_AGAIN_S (s), so
+# that the end of a program is not delayed. The same holds if feedback is silent: a frozen arm gives no reply, and this must be reported
+# within a second.
 MUTE_S, STOP_AGAIN_S = 3.0, 0.08
-# Feedback has at least this time (s) to confirm a move: two periods of the slower of the two ports in use.
+# Least time, s, that feedback has to confirm a move: two periods of the slower of the two used ports.
 SETTLE_S = 0.5
-# Modes of an arm that is enabled, and of one that moves. All questions about them ask the feedback's mode, and no other field.
+# Modes of an enabled arm, and of a moving arm. All decisions about this use the feedback's mode, and no other field.
 ENABLED_MODES = {Mode.ENABLED, Mode.BACKDRIVE, Mode.RUNNING, Mode.RECORDING, Mode.PAUSE, Mode.JOG}
 MOVING_MODES = {Mode.RUNNING, Mode.JOG}
 PAUSED = "paused by another client; stop() drops the queue, Continue() of that client would execute it"
 DISABLED = "was disabled by another program or at its button; call enable() when nobody else uses it"
-# In a move shorter than this (mm) the turn may determine the speed.
+# Largest length of a move, mm, in which the turn may determine the speed.
 SHORT_MM = 5.0
-# Old firmware does not reply to moves. There a move counts as done after the arm has rested for this time (s).
+# Old firmware does not reply to moves. With it, a move counts as done after the arm has rested for this time (s).
 RESTED_S = 0.05
 
 
 @dataclass(frozen=True)
 class Mg400Ports:
-    """Where the arm listens; the feedback ports are tried in order."""
+    """Ports on which the arm listens; the feedback ports are tried in order."""
 
     dashboard: int = DASHBOARD_PORT
     motion: int = MOTION_PORT
@@ -81,7 +82,8 @@ class MG400(BaseArm):
     kinematics : LinkageKinematics
         Used to check targets before they are sent, so that the arm does not raise an alarm.
     lenient : bool
-        For controllers and emulators that are only alike: feedback counts whatever its test value is, a motion is seen in the joints,
+        For controllers and emulators that are only similar: feedback counts whatever its test value is, a motion is detected from the
+        joints,
         and ``Sync`` is not used.
     """
 
@@ -100,15 +102,15 @@ class MG400(BaseArm):
         self._motion = CommandPort(self.name, host, ports.motion)
         self._feedback = Feedback(self.name, host, ports.feedback, lenient=lenient)
         self._lenient = lenient
-        self._in_use = False  # true from connect to disconnect, even while a connection is lost
+        self._in_use = False  # true from connect to disconnect, even if the connection is lost in between
         self._bare = False  # old firmware: echoes on the dashboard, nothing on the motion port
         self._alarm_text: str | None = None
-        self._speed: tuple[float, float] | None = None  # mm/s and deg/s; None after percents were set
-        self._sent: np.ndarray | None = None  # end of the queue, as long as the arm may still move there
-        self._enabled = False  # whether this driver has enabled the arm, and not disabled it since
-        self._under_way = False  # whether a move was sent that feedback has not shown to have ended
-        self._mute_s = -np.inf  # when the newest stop or its like failed
-        self._late_replies = False  # whether replies to moves may come that nobody waits for any more
+        self._speed: tuple[float, float] | None = None  # mm/s and deg/s; None after speeds were set in percent
+        self._sent: np.ndarray | None = None  # end of the queue while the arm may still move there
+        self._enabled = False  # whether this driver has enabled the arm and not disabled it since
+        self._under_way = False  # whether a move was sent whose end feedback has not shown yet
+        self._mute_s = -np.inf  # time of the newest failed stop, emergency stop or disable
+        self._late_replies = False  # whether late replies to moves may arrive for which no call waits any more
 
     @property
     def is_connected(self) -> bool:
@@ -116,7 +118,7 @@ class MG400(BaseArm):
 
     def connect(self) -> None:
         self._require_disconnected()
-        self._close()  # what is left of a lost connection
+        self._close()  # remains of a lost connection
         try:
             self._dashboard.open()
             self._motion.open()
@@ -131,7 +133,7 @@ class MG400(BaseArm):
     def disconnect(self) -> None:
         if self._in_use and (self._enabled or self._under_way):
             self._disconnect(self.disable, close=self._close)
-        else:  # an arm that this driver has not enabled may be at work for another program
+        else:  # an arm that this driver has not enabled may be in use by another program
             self._close()
 
     def enable(self) -> None:
@@ -150,10 +152,10 @@ class MG400(BaseArm):
     def disable(self) -> None:
         self._tell_in_any_case("DisableRobot()", "disabled")
         self._under_way = self._enabled = False
-        self._shows(lambda packet: int(packet["mode"]) not in ENABLED_MODES)  # so that the next state tells it
+        self._shows(lambda packet: int(packet["mode"]) not in ENABLED_MODES)  # so that the next state shows it
 
     def clear_error(self) -> None:
-        """Clear the alarms and forget the queue; after an emergency stop ``enable`` brings the arm back."""
+        """Clear the alarms and empty the queue. After an emergency stop, ``enable`` then makes the arm usable again."""
         self._require_connected()
         self._sent = None
         with contextlib.suppress(DeviceError):
@@ -163,7 +165,7 @@ class MG400(BaseArm):
         self._alarm_text = None
 
     def stop(self) -> None:
-        """Stop and drop the queue. If the arm refuses to stop it is switched off, and a ``DeviceError`` says so."""
+        """Stop and empty the queue. If the arm refuses to stop, it is switched off, and a ``DeviceError`` reports this."""
         self._require_in_use()
         self._sent, self._unstopped = None, True
         try:
@@ -171,7 +173,7 @@ class MG400(BaseArm):
         except DeviceNotConnectedError:
             raise
         except DeviceError as error:
-            if not self._shows(lambda packet: int(packet["mode"]) not in MOVING_MODES):  # else only the reply was lost
+            if not self._shows(lambda packet: int(packet["mode"]) not in MOVING_MODES):  # otherwise only the reply was lost
                 try:
                     self.emergency_stop()
                 except DeviceError:
@@ -182,7 +184,7 @@ class MG400(BaseArm):
         self._unstopped = self._under_way = False
 
     def _shows(self, obeyed: Callable[[np.void], bool], *, within_s: float = SHOWS_S) -> bool:
-        """Whether feedback soon shows that a command was obeyed, and goes on showing it: the first packet may be older than the command."""
+        """Whether feedback soon and then steadily shows that a command was executed. The first packet may be older than the command."""
         asked_s, since_s = time.monotonic(), np.inf
         with contextlib.suppress(StaleDataError):
             while time.monotonic() - asked_s < within_s:
@@ -217,7 +219,7 @@ class MG400(BaseArm):
         )
 
     def _trouble(self, mode: int) -> str:
-        """What is wrong with the arm in a mode, in words; "" if nothing."""
+        """The arm's fault in a mode, in words; "" if there is none."""
         if mode == Mode.ERROR:
             return self._alarm()
         if mode == Mode.PAUSE:
@@ -236,7 +238,7 @@ class MG400(BaseArm):
         self._speed = linear_mm_s, angular_deg_s
 
     def set_speed_percent(self, *, linear: float | None = None, angular: float | None = None, overall: float | None = None) -> None:
-        """``SpeedL``, ``SpeedJ`` and ``SpeedFactor``, which all multiply; rounded down to whole percents."""
+        """Set ``SpeedL``, ``SpeedJ`` and ``SpeedFactor``, which multiply each other. Values are rounded down to whole percents."""
         self._require_connected()
         self._speed = None
         for name, percent in (("SpeedL", linear), ("SpeedJ", angular), ("SpeedFactor", overall)):
@@ -245,7 +247,7 @@ class MG400(BaseArm):
 
     @property
     def overall_percent(self) -> float:
-        """``SpeedFactor`` in %, as feedback tells it."""
+        """``SpeedFactor`` in %, as feedback reports it."""
         self._require_connected()
         return float(self._feedback.newest(SILENCE_S)[0]["speed_scaling"])
 
@@ -256,7 +258,7 @@ class MG400(BaseArm):
         return sent
 
     def _turning_option(self, pose: np.ndarray) -> str:
-        """``SpeedL`` of a short move that mainly turns. The part that takes longer, line or turn, sets the speed.
+        """``SpeedL`` of a short move that mainly turns. The slower part, line or turn, determines the speed.
 
         The manual gives the syntax of ``SpeedL`` only; we assume that it scales line and turn alike. If an arm applied it to the
         line alone, the fast part would be shorter than ``SHORT_MM``.
@@ -282,7 +284,7 @@ class MG400(BaseArm):
     ) -> None:
         self._require_connected()
         require_possible(self.name, self.kinematics, numbers, joints)
-        packet, _ = self._feedback.newest(SILENCE_S)  # old firmware does not report a refusal
+        packet, _ = self._feedback.newest(SILENCE_S)  # checked here, because old firmware does not report a refusal
         if int(packet["mode"]) == Mode.ERROR:
             raise DeviceError(f"{self.name}: {self._alarm()}")
         if int(packet["mode"]) not in ENABLED_MODES:
@@ -301,7 +303,7 @@ class MG400(BaseArm):
         self._under_way = False
 
     def _send_motion(self, text: str) -> None:
-        if self._late_replies:  # a late reply to an old request would be taken for the reply to this one
+        if self._late_replies:  # a late reply to an old request could be taken for the reply to this one
             self._motion.open()
             self._late_replies = False
         self._under_way = True
@@ -312,7 +314,7 @@ class MG400(BaseArm):
         reply = self._motion.request(text, timeout_s=MOTION_REPLY_S, look=lambda: self._feedback.newest(SILENCE_S))
         self._late_replies = False
         if reply.error_id == ErrorId.FAILED and self._shows(lambda packet: int(packet["mode"]) == Mode.ERROR, within_s=ALARM_S):
-            raise DeviceError(f"{self.name}: {self._alarm()}")  # it came up only now
+            raise DeviceError(f"{self.name}: {self._alarm()}")  # the alarm appeared only now
         self._check(text, reply)
 
     def _await_queue(self, deadline: float, timeout_s: float) -> None:
@@ -344,12 +346,12 @@ class MG400(BaseArm):
         return self._in_use and self._under_way
 
     def _require_in_use(self) -> None:
-        """``DeviceNotConnectedError`` before ``connect`` and after ``disconnect``, but not while a connection is lost."""
+        """Raise ``DeviceNotConnectedError`` before ``connect`` and after ``disconnect``, but not while a connection is lost."""
         if not self._in_use:
             self._require_connected()
 
     def _await_mode(self, reached: Callable[[int], bool], otherwise: str) -> None:
-        """Wait for feedback newer than now whose mode is one of those wanted."""
+        """Wait for feedback newer than this call whose mode is one of the wanted modes."""
         asked_s = time.monotonic()
         while True:
             packet, time_s = self._feedback.newest(SILENCE_S)
@@ -363,7 +365,7 @@ class MG400(BaseArm):
         return int(self._feedback.newest(SILENCE_S)[0]["mode"])
 
     def _alarm(self) -> str:
-        """The alarms in words; the arm is asked once for each error."""
+        """The alarms in words. The arm is asked only once for each error."""
         if self._alarm_text is None:
             ids: list[int] = []
             with contextlib.suppress(DeviceError):
@@ -372,7 +374,7 @@ class MG400(BaseArm):
         return self._alarm_text
 
     def _tell_in_any_case(self, request: str, what: str) -> None:
-        """Needs only the dashboard connection. If that is or gets lost it is opened once more, because the arm may still move."""
+        """Send a request over the dashboard connection alone. A lost connection is opened once more, because the arm may still move."""
         self._require_in_use()
         expected = time.monotonic() - self._mute_s > MUTE_S and self._feedback.age_s() <= SILENCE_S
         timeout_s = STOP_REPLY_S if expected else STOP_AGAIN_S

@@ -16,13 +16,13 @@ from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 CONNECT_TIMEOUT_S = 2.0
 # Longest wait for a reply, in s.
 REPLY_TIMEOUT_S = 2.0
-# A feedback connection that is silent for this time (s) is closed and opened again.
+# Time, s, of silence after which a feedback connection is closed and opened again.
 SILENCE_S = FEEDBACK_AGE_S
-# Interval in s at which a wait for a reply looks whether the arm is still there.
+# Interval in s at which a wait for a reply checks whether the arm still answers.
 LOOK_S = 0.05
 # Pause before feedback is connected again, in s. Public clients wait 5 s, but a servo that stands still needs feedback sooner.
 RECONNECT_S = 0.5
-# Joints that differ by more than this (deg) from one packet to the next are in motion.
+# Difference of a joint between two packets, deg, above which the arm is in motion.
 MOTION_DEG = 1e-4
 # Largest number of bytes in one read: more than half a second of feedback.
 BACKLOG_BYTES = 64 * PACKET_BYTES
@@ -63,14 +63,15 @@ class CommandPort:
             self._socket, self._buffer = None, ""
 
     def request(self, text: str, *, timeout_s: float = REPLY_TIMEOUT_S, look: Callable[[], object] = lambda: None) -> Reply:
-        """Send a request and wait for its reply; late replies to others are dropped. ``look`` is called meanwhile and may raise an error.
+        """Send a request and wait for its reply. Late replies to other requests are dropped. ``look`` is called meanwhile and may raise an
+        error.
 
         Raises
         ------
         DeviceNotConnectedError
             The connection is lost.
         DeviceError
-            No reply in time.
+            No reply came in time.
         """
         with self._lock:
             self.send(text)
@@ -141,12 +142,12 @@ class CommandPort:
 
     @staticmethod
     def _numbered(text: str) -> bool:
-        """Whether a text may be the beginning of a reply."""
+        """Whether a text can be the beginning of a reply."""
         return text.lstrip()[:1] in "-0123456789"
 
 
 class Feedback:
-    """Keeps the newest feedback packet. A thread reads all that arrives and reconnects after silence.
+    """Keeps the newest feedback packet. A thread reads all packets, and reconnects after silence.
 
     Parameters
     ----------
@@ -165,7 +166,7 @@ class Feedback:
 
     def __init__(self, name: str, host: str, ports: tuple[int, ...], *, lenient: bool = False) -> None:
         self._name, self._host, self._ports, self._lenient = name, host, ports, lenient
-        self._came, self._closed = b"", False  # the first bytes that held no packet, and whether the newest connection was closed
+        self._came, self._closed = b"", False  # the first received bytes without a packet, and whether the newest connection was closed
         self._joints: np.ndarray | None = None
         self.turned_s = -np.inf  # when the joints were last seen in motion
         self._newest: tuple[np.void, float] | None = None
@@ -204,12 +205,12 @@ class Feedback:
         return float("inf") if newest is None else time.monotonic() - newest[1]
 
     def newest(self, max_age_s: float) -> tuple[np.void, float]:
-        """The newest packet and when it arrived.
+        """The newest packet and the time of its arrival.
 
         Raises
         ------
         StaleDataError
-            It is older than ``max_age_s``.
+            The packet is older than ``max_age_s``.
         """
         with self._arrived:
             newest = self._newest

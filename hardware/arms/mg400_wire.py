@@ -1,4 +1,4 @@
-"""What goes over the MG400's wires: ports, error ids, modes, replies and the feedback packet. Used by driver and emulator."""
+"""Data on the MG400's connections: ports, error ids, modes, replies and the feedback packet. Driver and emulator use this module."""
 
 import re
 from dataclasses import dataclass
@@ -71,13 +71,13 @@ class Reply:
         return [float(text) for text in re.findall(r"-?\d+(?:\.\d+)?(?:e-?\d+)?", self.values)]
 
     def alarms(self) -> list[int]:
-        """The alarms of a reply to ``GetErrorID``, from 5 to 7 groups. What is not a whole number is left out."""
+        """The alarms in a reply to ``GetErrorID``, from 5 to 7 groups. Values that are not whole numbers are left out."""
         listed = [text.strip() for group in re.findall(r"\[([^\[\]]*)\]", self.values) for text in group.split(",")]
         return [int(text) for text in listed if re.fullmatch(r"-?\d+", text)]
 
 
 def take_reply(buffer: str) -> tuple[Reply | None, str]:
-    """The first complete reply in what has arrived, and what is left.
+    """The first complete reply in the received text, and the remaining text.
 
     Replies end at ``;``, except that a refusal may come as two fragments: ``-1,{},;EnableRobot();``.
     """
@@ -94,7 +94,7 @@ def take_reply(buffer: str) -> tuple[Reply | None, str]:
 
 
 def why_refused(error_id: int, request: str) -> str:
-    """What an error id means, with the remedy."""
+    """The meaning of an error id, with the remedy."""
     if error_id == ErrorId.FAILED:
         return (
             f"the arm refused {request} (-1). If it refuses everything it is not in TCP mode: in DobotStudio Pro choose "
@@ -167,7 +167,7 @@ PACKET = np.dtype(
 
 
 def newest_packet(buffer: bytes, *, lenient: bool = False) -> tuple[np.void | None, bytes, int]:
-    """The newest whole packet in what has arrived.
+    """The newest whole packet in the received bytes.
 
     A packet counts if its length is 1440, its test value is at its place, no other packet begins inside it, and it is
     followed by another packet or by nothing yet. Otherwise it was cut short. ``lenient``: the test value may be anything.
@@ -198,7 +198,7 @@ def newest_packet(buffer: bytes, *, lenient: bool = False) -> tuple[np.void | No
 
 
 def told_apart(came: bytes) -> str:
-    """What bytes are, that came where something else was expected, in words: text is quoted, others are counted."""
+    """Description of unexpected bytes, in words: text is quoted, other bytes are counted."""
     text = came[:60].split(b"\r\n")[0]
     if not came:
         return "nothing"
@@ -208,7 +208,7 @@ def told_apart(came: bytes) -> str:
 
 
 def why_no_packet(came: bytes, *, closed: bool) -> str:
-    """Why what came from a feedback port holds no packet of an MG400, with the remedy."""
+    """Reason why the bytes from a feedback port hold no packet of an MG400, with the remedy."""
     if not came and closed:
         return "it hung up at once: another program holds the arm (DobotStudio Pro, a script). Close it, then connect again"
     if not came:

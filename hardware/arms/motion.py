@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from hardware.arms.kinematics import LINE_LEAVES_WORKSPACE, NO_INVERSE, TARGET_LIMIT, Kinematics, OutOfReachError, Violation
 
 LINE_STEP_MM = 5.0  # distance between the places of a line at which limits are checked
-# Largest distance in mm between a circle and the lines that stand for it, and the largest number of lines: a Magician queues 32.
+# Largest distance in mm between a circle and the lines that approximate it, and largest number of lines. A Magician queues 32.
 CIRCLE_MM, CIRCLE_LINES = 0.02, 30
-# Places are on one line if the sine of the angle between them is below this.
+# Sine of the angle between places below which they lie on one line.
 STRAIGHT = 1e-6
-HISTORY_N = 512  # moves that are remembered, so that a camera can ask where the arm was
+HISTORY_N = 512  # number of moves that are kept, so that a camera can ask for past poses
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def travel_time_s(length: float, speed: float, acceleration: float) -> float:
 
 
 def travelled(fraction: float, ramp: float) -> float:
-    """Share of the way after a share of the time; acceleration and braking each take the share ``ramp`` of the time."""
+    """Share of the path after a share of the time. Acceleration and braking each take the share ``ramp`` of the time."""
     t = min(max(fraction, 0.0), 1.0)
     if ramp > 0:
         if t < ramp:
@@ -89,9 +89,9 @@ class Piece:
 
 
 def between(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, share: float, linear: bool) -> np.ndarray:
-    """The pose or joints at a share of the way; at 0 and 1 exactly the ends.
+    """The pose or joints at a share of the path; at 0 and 1 exactly the ends.
 
-    An arm of six axes turns the shortest way. An arm of four axes turns by the difference of R, which is not wrapped.
+    An arm of six axes turns the shorter way. An arm of four axes turns by the difference of R, which is not wrapped.
     """
     if share <= 0 or share >= 1:
         return (start if share <= 0 else end).copy()
@@ -103,7 +103,7 @@ def between(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, share: f
 
 
 def check_line(kinematics: Kinematics, start: np.ndarray, end: np.ndarray) -> Violation | None:
-    """The first limit that a straight move would violate: its end is checked first, then its way."""
+    """The first limit that a straight move would violate: its end is checked first, then its path."""
     steps = max(1, int(np.ceil(np.linalg.norm(end[:3] - start[:3]) / LINE_STEP_MM)))
     for n in (steps, *range(1, steps)):
         try:
@@ -118,13 +118,13 @@ def check_line(kinematics: Kinematics, start: np.ndarray, end: np.ndarray) -> Vi
 
 
 class MotionTrack:
-    """Where an arm is, was, and according to plan will be. Safe to use from several threads.
+    """Past, present and planned poses of an arm. It can be used from several threads.
 
     Parameters
     ----------
     kinematics : Kinematics
     joints_deg : (J,) float
-        Where it stands to begin with.
+        Joints at the start.
     """
 
     def __init__(self, kinematics: Kinematics, joints_deg: np.ndarray) -> None:
@@ -135,7 +135,7 @@ class MotionTrack:
 
     @property
     def end_s(self) -> float:
-        """When the last piece ends (-inf if there was none)."""
+        """Time at which the last piece ends (-inf if there was none)."""
         return self._pieces[-1].end_s
 
     def pose(self, time_s: float) -> np.ndarray:
@@ -146,7 +146,7 @@ class MotionTrack:
         return self._at(time_s).joints_deg(time_s)
 
     def moving(self, time_s: float) -> bool:
-        """Whether a piece lasts at that time."""
+        """Whether a piece is in progress at that time."""
         return bool(self.end_s > time_s)
 
     def target(self) -> Piece:
@@ -177,7 +177,7 @@ class MotionTrack:
             return piece
 
     def dwell(self, duration_s: float, *, now_s: float) -> Piece:
-        """Append a time in which the arm stands where the last piece ended."""
+        """Append a time in which the arm rests at the end of the last piece."""
         with self._lock:
             last = self._pieces[-1]
             begins_s = max(now_s, last.end_s)
@@ -186,7 +186,7 @@ class MotionTrack:
             return self._pieces[-1]
 
     def stop(self, now_s: float) -> None:
-        """Stand still from ``now_s`` on and forget what was still to come."""
+        """Stand still from ``now_s`` on, and drop the remaining motion."""
         with self._lock:
             kept = [piece for piece in self._pieces if piece.start_s < now_s] or [self._pieces[0]]
             if kept[-1].end_s > now_s:
@@ -199,7 +199,7 @@ class MotionTrack:
 
 
 def _lengths(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, linear: bool) -> tuple[float, float]:
-    """Way in mm and in deg."""
+    """Length of the path in mm and in deg."""
     if not linear:
         return 0.0, float(np.abs(end - start).max())
     turn = turn_between_deg(start, end) if kinematics.axes == 6 else abs(end[5] - start[5])

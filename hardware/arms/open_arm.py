@@ -1,4 +1,4 @@
-"""One way to any arm: ``open_arm("mg400:192.168.1.6")``."""
+"""Makes an arm of any kind from its specification: ``open_arm("mg400:192.168.1.6")``."""
 
 from hardware.arms.arm import Arm
 from hardware.arms.magician import Magician
@@ -17,7 +17,7 @@ ARM_SPECS = (
 
 
 def open_arm(spec: str) -> Arm:
-    """An arm by its specification; nothing is opened before ``connect``.
+    """An arm from its specification. Nothing is opened before ``connect``.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ SLOW_FACTOR = 0.1
 
 
 class SimulatedFault(StrEnum):
-    """What a simulated arm can do wrong."""
+    """Faults of a simulated arm."""
 
     SLOW = "slow"  # moves at a tenth of the speed
     STALL = "stall"  # stops halfway and says that it is at rest
@@ -32,13 +32,13 @@ class SimulatedArm(BaseArm):
     ----------
     axes : {4, 6}
     pose : (6,) float
-        Where it stands to begin with.
+        Pose at the start.
     speeds : Speeds
         Speeds until ``set_speed`` is called; without acceleration the speed is constant.
     time_scale : float
-        How much faster than real it moves (``inf``: at once).
+        Factor by which it moves faster than a real arm (``inf``: instantly).
     faults : iterable of SimulatedFault
-        ``faults`` is a set that may be changed at any time. A change holds for later moves; SILENT holds at once.
+        ``faults`` is a set that can be changed at any time. A change applies to later moves; SILENT applies at once.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""JPEG pictures over HTTP (multipart/x-mixed-replace): what a server of such a stream writes, and a camera that reads it."""
+"""JPEG pictures over HTTP (multipart/x-mixed-replace): the writing of such a stream, and a camera that reads it."""
 
 import contextlib
 import http.client
@@ -21,15 +21,15 @@ BOUNDARY = "frame"
 CONTENT_TYPE = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
 # Quality (0 to 100) of the JPEGs that are written.
 JPEG_QUALITY = 95
-# A read has failed after this time in s without a byte.
+# Time, s, without a byte after which a read has failed.
 SILENT_S = 2.0
 # Largest accepted picture, in bytes.
 LARGEST_PART = 32_000_000
 # Header of a part with the exposure in Unix seconds, in lower case, as mjpg-streamer sends it.
 TIME_HEADER = "x-timestamp"
-# A time stamp that differs from now by more than this (s) comes from another clock and is not used.
+# Largest difference, s, between a time stamp and the present time. A time stamp with a larger difference is of another clock and not used.
 CLOCK_SLACK_S = 60.0
-# Bytes that a server's connection holds. The kernel doubles it; what the client's side holds comes on top.
+# Bytes in the send buffer of a server's connection. The kernel doubles the number, and the client has its own buffer.
 HELD_BYTES = 16_384
 # First and last bytes of a JPEG.
 START, END = b"\xff\xd8", b"\xff\xd9"
@@ -42,20 +42,20 @@ def jpeg_of(image: np.ndarray) -> bytes:
 
 
 class Writable(Protocol):
-    """What bytes can be written to."""
+    """An object to which bytes can be written."""
 
     def write(self, data: bytes, /) -> int | None: ...
 
 
 def write_part(out: Writable, jpeg: bytes, headers: dict[str, object] | None = None) -> None:
-    """Write one picture of a stream; ``OSError`` where the client has gone."""
+    """Write one picture of a stream; raises ``OSError`` if the client is gone."""
     more = "".join(f"{name}: {value}\r\n" for name, value in (headers or {}).items())
     head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n{more}\r\n"
     out.write(head.encode("ascii") + jpeg + b"\r\n")
 
 
 def hold_little(connection: socket.socket) -> None:
-    """Let a server's connection hold few pictures: a client that pauses gets few old ones, and then the newest."""
+    """Limit a connection's buffer to few pictures, so that a client that pauses gets few old pictures, and then the newest."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, HELD_BYTES)
 
 
@@ -106,12 +106,12 @@ class MjpegCamera(LiveSource):
             raise DeviceError(f"{self.name}: {error}; start the stream or check the address") from error
 
     def _request(self) -> None:
-        """Request the stream; an ``OSError`` says why there is none."""
+        """Request the stream; an ``OSError`` states the reason of a failure."""
         protocol = http.client.HTTPSConnection if self._parts.scheme == "https" else http.client.HTTPConnection
         connection = protocol(self._parts.hostname or "", self._parts.port, timeout=SILENT_S)
         try:
             connection.request("GET", (self._parts.path or "/") + (f"?{self._parts.query}" if self._parts.query else ""))
-            self._socket = connection.sock  # the answer may take it over
+            self._socket = connection.sock  # kept here, because the answer may take it over
             answer = connection.getresponse()
         except (OSError, http.client.HTTPException) as error:
             connection.close()
@@ -146,7 +146,7 @@ class MjpegCamera(LiveSource):
         try:
             headers, data = next_part(stream)
         except (OSError, EOFError, http.client.HTTPException) as error:
-            self._close()  # to be opened anew
+            self._close()  # so that it is opened again
             raise ReadFailed(str(error) or type(error).__name__) from error
         image = decode_jpeg(data)
         number = int(headers["x-sequence"]) if headers.get("x-sequence", "").isdecimal() else None
@@ -162,7 +162,7 @@ class MjpegCamera(LiveSource):
 def next_part(stream: Readable) -> tuple[dict[str, str], bytes]:
     """Headers (lower case) and body of the next part of a multipart stream; ``EOFError`` at its end."""
     headers: dict[str, str] = {}
-    while True:  # up to the next part's headers, past its boundary
+    while True:  # skip lines up to the next part's boundary and headers
         line = stream.readline(65536)
         if not line:
             raise EOFError("the stream ended")
@@ -181,7 +181,7 @@ def next_part(stream: Readable) -> tuple[dict[str, str], bytes]:
 
 
 def decode_jpeg(data: bytes) -> np.ndarray:
-    """A JPEG as gray (H, W) or RGB (H, W, 3) uint8. An incomplete or damaged one raises ``ReadFailed``: decoders guess the rest."""
+    """A JPEG as gray (H, W) or RGB (H, W, 3) uint8. An incomplete or damaged one raises ``ReadFailed``, because decoders guess the rest."""
     if not data.startswith(START) or not data.rstrip(b"\0\r\n").endswith(END):
         raise ReadFailed(f"a torn JPEG ({len(data)} bytes, without its {'end' if data.startswith(START) else 'start'})")
     try:
@@ -191,7 +191,7 @@ def decode_jpeg(data: bytes) -> np.ndarray:
 
 
 def stamped_s(headers: dict[str, str]) -> float:
-    """Time of exposure on the monotonic clock, from a part's headers; the present time if they do not hold it."""
+    """Time of exposure on the monotonic clock, from a part's headers; the present time if the headers do not state it."""
     now_s, unix_s = time.monotonic(), time.time()
     try:
         age_s = unix_s - float(headers[TIME_HEADER])

@@ -1,7 +1,7 @@
-"""What all live sources share: a background reader that keeps the newest frame and reports faults.
+"""Common part of all live sources: a background reader that keeps the newest frame and reports faults.
 
-``capture`` makes a sensor's frame of a camera's picture: it checks the size, makes the picture gray for a mono camera, and thresholds it
-for the recordings' form.
+``capture`` converts a camera's picture to a sensor's frame: it checks the size, makes the picture gray for a mono camera, and thresholds
+it for the recordings' form.
 """
 
 import threading
@@ -18,33 +18,34 @@ from twin.camera.capture import record
 from twin.frames.forms import frame_size, gray_levels
 from twin.types import Form, Frame
 
-# The reader ends after more than this number of failed reads in a row.
+# Most failed reads in a row. After more of them the reader ends.
 MOST_FAILED_READS = 10
 # Pause in s before the next attempt.
 FAILED_PAUSE_S = 0.2
-# The stream is frozen if a picture stays the same for this time (s) and this number of times. A live sensor's pictures differ by noise.
+# A stream counts as frozen if a picture stays the same for this time (s) and this number of times. Pictures of a live sensor differ by
+# noise.
 FROZEN_S, FROZEN_N = 0.5, 5
-# A picture that says that it is older than this (s) when it comes has the time of another clock, or is of no use.
+# Largest stated age, s, of a picture at its arrival. An older picture has a time of another clock, or is useless.
 LATE_S = 5.0
-# Gray level (0 to 255). A picture without a pixel of this level is black: the lamps are off.
+# Gray level (0 to 255) that at least one pixel of a picture must reach. Otherwise the picture is black, because the lamps are off.
 BLACK_LEVEL = 16
-# The first picture of a real camera may take this time (s) after opening, and in addition FIRST_PERIODS periods of its frames.
+# Longest time, s, to the first picture of a real camera after opening. In addition it may take FIRST_PERIODS periods of its frames.
 START_S = 4.0
 FIRST_PERIODS = 5
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What a device delivered.
+    """A picture from a device.
 
     Attributes
     ----------
     image : (H, W) or (H, W, 3) uint8
         Gray or RGB.
     time_s : float
-        ``time.monotonic()`` of the exposure, as well as can be known.
+        Time of the exposure in ``time.monotonic()`` seconds, as precisely as it is known.
     lost : int
-        Pictures that the device says it lost before this one.
+        Number of pictures before this one that the device reports as lost.
     """
 
     image: np.ndarray
@@ -53,21 +54,21 @@ class Picture:
 
 
 class ReadFailed(Exception):  # noqa: N818  (no error until it happens too often)
-    """One picture could not be had; the reader tries again."""
+    """A picture could not be read; the reader tries again."""
 
 
 class LiveSource(Connection):
-    """Base of the live sources; see ``hardware.cameras.source.FrameSource`` for what each method promises.
+    """Base class of the live sources; see ``hardware.cameras.source.FrameSource`` for the methods.
 
     Parameters
     ----------
     name : str
     form : Form
-        Of the frames it hands out.
+        Form of its frames.
     """
 
     is_live = True
-    notices_still = True  # whether a picture that doesn't change is a fault
+    notices_still = True  # whether a picture that does not change is a fault
     _read_last: int  # sequence number of the frame that was read last
     _sequence: int
     _dropped: int
@@ -76,7 +77,7 @@ class LiveSource(Connection):
 
     def __init__(self, name: str, form: Form) -> None:
         self.name, self.form = name, Form(form)
-        self.failed = 0  # reads that failed, in all
+        self.failed = 0  # total number of failed reads
         self._new = threading.Condition()
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
@@ -93,14 +94,14 @@ class LiveSource(Connection):
 
     @abstractmethod
     def _close(self) -> None:
-        """Let go of the device; without effect when closed."""
+        """Release the device; no effect if it is closed."""
 
     def _interrupt(self) -> None:
-        """End a read that waits, if the device can. It is called from another thread than ``_grab``."""
+        """End a waiting read, if the device can. It is called from another thread than ``_grab``."""
 
     @abstractmethod
     def _grab(self) -> Picture:
-        """The next picture; ``ReadFailed``."""
+        """The next picture; raises ``ReadFailed`` if there is none."""
 
     def _finish(self, image: np.ndarray) -> np.ndarray:
         """The picture in the source's form."""
@@ -112,7 +113,7 @@ class LiveSource(Connection):
 
     @property
     def dropped(self) -> int:
-        """Number of frames that nobody read, those lost by the device included."""
+        """Number of frames that nobody read, including those that the device lost."""
         return self._dropped
 
     @property
@@ -122,12 +123,12 @@ class LiveSource(Connection):
 
     @property
     def arrived(self) -> int:
-        """Number of frames from the device so far, lost ones included."""
+        """Number of frames from the device so far, including lost ones."""
         return self._sequence
 
     @property
     def fault(self) -> str:
-        """What is wrong with the pictures ("" if nothing): frozen, black or late."""
+        """The fault of the pictures, in words: frozen, black or late; "" if there is none."""
         return self._fault
 
     def connect(self) -> None:
@@ -251,7 +252,7 @@ def capture(image: np.ndarray, spec: SensorSpec | None, form: Form) -> np.ndarra
     Raises
     ------
     DeviceError
-        Its size is not that of the sensor's camera.
+        The picture's size is not that of the sensor's camera.
     """
     if spec is None:
         return image

@@ -1,4 +1,4 @@
-"""Frames from disk behind the live sources' protocol: they wait for their reader, and end."""
+"""Frames from disk with the protocol of the live sources. They wait for their reader, and have an end."""
 
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from twin.types import Form, Frame
 
 
 class SequentialSource(Connection):
-    """Frames that wait for their reader, and end: what folders, videos and sessions share.
+    """Base class for folders, videos and sessions: their frames wait for their reader, and have an end.
 
     Parameters
     ----------
@@ -31,10 +31,10 @@ class SequentialSource(Connection):
 
     @abstractmethod
     def _frames(self) -> Iterator[Frame]:
-        """All frames from the first on."""
+        """All frames from the first one."""
 
     def notes(self) -> list[str]:
-        """What was odd in what has been read so far, one line each."""
+        """Irregularities in the frames read so far, one line each."""
         return []
 
     @property
@@ -59,11 +59,11 @@ class SequentialSource(Connection):
         return frame
 
     def read_latest(self, *, max_age_s: float = 0.5) -> Frame:
-        """The frame read last, or the first: a recording does not age."""
+        """The frame that was read last, or the first one. A recording has no age."""
         return self.read() if self._newest is None or self._left is None else self._newest
 
     def read_after(self, time_s: float, *, timeout_s: float = 2.0) -> Frame:
-        """The next frame: a recording was exposed when it was, and waits."""
+        """The next frame, whatever its time is, because a recording waits for its reader."""
         return self.read()
 
 
@@ -75,7 +75,7 @@ class RecordedSource(SequentialSource):
     path : path
     spec : SensorSpec, optional
     form : Form, optional
-        Told by the frames' size and content if not given.
+        Recognised by the frames' size and content if not given.
     """
 
     def __init__(self, path: str | Path, spec: SensorSpec | None = None, form: Form | None = None) -> None:

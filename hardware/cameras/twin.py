@@ -1,4 +1,4 @@
-"""A camera in the twin: the sensor's view, drawn for the contact that the arm's pose makes."""
+"""A camera in the twin: it draws the sensor's view of the contact at the arm's pose."""
 
 import logging
 import threading
@@ -25,19 +25,19 @@ LOG = logging.getLogger(__name__)
 PoseSource = Callable[[], ArmState]
 # Pause after a pose that could not be drawn, in s.
 RETRY_S = 0.05
-# Interval in s at which a camera that waits for a reader looks whether it was closed.
+# Interval in s at which a camera that waits for a reader checks whether it was closed.
 ASKED_S = 0.1
-# Longest time from connecting to the first frame, in s: kernels may have to be compiled.
+# Longest time from connecting to the first frame, in s. Kernels may have to be compiled in this time.
 FIRST_FRAME_S = 120.0
-# Standard deviation of the noise in gray levels, for a sensor whose specification has no noise. Measured over time on a real sensor.
+# Standard deviation of the noise in gray levels, for a sensor whose specification has no noise. It was measured over time on a real sensor.
 STEADY_SD = 1.0
 
 
 class TwinCamera(LiveSource):
-    """Draws what the sensor sees while an arm moves it about an object.
+    """Draws the sensor's view while an arm moves it about an object.
 
-    Each frame shows the arm's pose at its ``time_s``. Contacts are solved step after step with all they remember, so what a
-    frame shows depends on the way there.
+    Each frame shows the arm's pose at its ``time_s``. Contacts are solved step by step with their history, so a frame depends on the path
+    to the present pose.
 
     Parameters
     ----------
@@ -47,18 +47,18 @@ class TwinCamera(LiveSource):
         The arm's newest state.
     form : Form
     fps : float
-        The largest number of frames a second.
+        Largest number of frames per second.
     seed : int
-        Of the noise.
+        Seed of the noise.
     preview : Preview, optional
-        A preview of the window that the form needs. By default it draws the direct light alone.
+        A preview of the window that the form needs. By default it draws only the direct light.
     on_demand : bool
         Draw only while a reader waits for a frame. This is for loops that stop for each frame: they do not use the frames in between.
     waits_for_arm : bool
-        Deliver nothing while the arm's pose is not known, however long that takes. Otherwise the camera ends after some failed reads.
+        Deliver nothing while the arm's pose is not known, for any time. Otherwise the camera ends after some failed reads.
     """
 
-    notices_still = False  # the twin has a memory, not a cable
+    notices_still = False  # the twin's pictures may repeat without a fault
     first_frame_s = FIRST_FRAME_S
 
     def __init__(
@@ -120,7 +120,7 @@ class TwinCamera(LiveSource):
         return Picture(steady(image, self._spec.response, rng), told.time_s)
 
     def _pose(self) -> ArmState:
-        """The arm's newest state. A camera that waits for its arm says when the arm is lost and when it is back."""
+        """The arm's newest state. A camera that waits for its arm reports when the arm is lost and when it is back."""
         lost = False
         while True:
             try:
@@ -138,13 +138,13 @@ class TwinCamera(LiveSource):
                 return told
 
     def _opened(self) -> tuple[Follower, Preview]:
-        """What ``_open`` made; ``DeviceNotConnectedError`` before it."""
+        """The objects that ``_open`` made; raises ``DeviceNotConnectedError`` before it."""
         if self._follower is None or self._preview is None:
             raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
         return self._follower, self._preview
 
     def _await_reader(self) -> None:
-        """Wait until a reader asks for a frame. A reader that asks after that gets a frame that is drawn later."""
+        """Wait until a reader asks for a frame. A later reader gets a frame that is drawn later."""
         while not (self._asked.wait(ASKED_S) or self._end.is_set()):
             pass
         self._asked.clear()
@@ -161,7 +161,7 @@ def preview_of(spec: SensorSpec, form: Form) -> Preview:
 
 
 def steady(image: np.ndarray, response: ResponseSpec, rng: np.random.Generator) -> np.ndarray:
-    """A frame with the least noise that a real sensor has, if the specified response has none."""
+    """A frame with at least the noise of a real sensor, for a specified response without noise."""
     if response.read_noise or response.shot_noise:
         return image
     return np.clip(np.rint(image + STEADY_SD * rng.standard_normal(image.shape, np.float32)), 0, 255).astype(np.uint8)

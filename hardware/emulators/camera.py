@@ -1,4 +1,4 @@
-"""A camera emulated on this machine: JPEG pictures over HTTP (multipart/x-mixed-replace), and what can go wrong with them."""
+"""A camera emulated on this machine: it serves JPEG pictures over HTTP (multipart/x-mixed-replace), with faults on request."""
 
 import threading
 import time
@@ -27,7 +27,7 @@ FAULTS = {
 
 @dataclass(frozen=True)
 class _Part:
-    """A picture on the wire: number, exposure (Unix seconds), when it may be sent (monotonic), bytes."""
+    """A picture as it is sent: number, exposure (Unix seconds), earliest time of sending (monotonic), bytes."""
 
     number: int
     exposed_unix_s: float
@@ -36,22 +36,22 @@ class _Part:
 
 
 class CameraEmulator:
-    """Serves a source's frames as a stream; a context manager that listens between ``start`` and ``stop``.
+    """Serves a source's frames as a stream. A context manager, which listens between ``start`` and ``stop``.
 
     Parameters
     ----------
     source : FrameSource
-        Live; connected and disconnected with the emulator.
+        A live source. It is connected and disconnected with the emulator.
     host : str
     port : int
-        0: a free one, see ``url``.
+        Port; 0 for a free one, see ``url``.
     faults : iterable of str
-        ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` may be changed while it runs.
+        ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` can be changed while it runs.
 
     Attributes
     ----------
     made, sent : int
-        Pictures so far, lost ones included, and parts sent to any client.
+        Number of pictures so far, including lost ones, and number of parts sent to any client.
     """
 
     def __init__(self, source: FrameSource, *, host: str = "127.0.0.1", port: int = 0, faults: tuple[str, ...] = ()) -> None:
@@ -68,7 +68,7 @@ class CameraEmulator:
 
     @property
     def url(self) -> str:
-        """Where the stream is."""
+        """Address of the stream."""
         if self._server is None:
             raise DeviceError("camera emulator: not started; call start() first")
         return f"http://{self._address[0]}:{self._server.server_port}/stream.mjpg"
@@ -81,7 +81,7 @@ class CameraEmulator:
         self._end.clear()
         self._source.connect()
         try:
-            await_frame(self._source)  # the first frame compiles kernels: this happens before a client can connect
+            await_frame(self._source)  # the first frame compiles kernels, so it is made before a client can connect
         except BaseException:
             self._server.server_close()
             self._source.disconnect()
@@ -109,7 +109,7 @@ class CameraEmulator:
 
     @property
     def pulled_out(self) -> bool:
-        """Whether the fault has unplugged the camera at present."""
+        """Whether the camera is unplugged by a fault at present."""
         span_s = self.faults.value("unplugged")
         if span_s is None:
             self._pulled_s = None
@@ -118,7 +118,7 @@ class CameraEmulator:
         return time.monotonic() - self._pulled_s < span_s
 
     def next_part(self, after: int) -> _Part | None:
-        """The newest part with a higher number, as soon as it may be sent; None if none comes for a while."""
+        """The newest part with a number larger than ``after``, as soon as it may be sent; None if none comes for a while."""
         with self._new:
             self._new.wait_for(lambda: self._part is not None and self._part.number > after, CLIENT_WAIT_S)
             part = self._part

@@ -7,12 +7,12 @@ from twin.errors import TwinError
 
 
 class Faults:
-    """The faults that are on. May be changed while the device runs.
+    """The faults that are switched on. They can be changed while the device runs.
 
     Parameters
     ----------
     known : dict of str to (float or None, str)
-        Every fault's default value (None: a switch) and what it does.
+        Default value (None: a switch without a value) and effect of every fault.
     given : iterable of str
         ``NAME`` or ``NAME=VALUE``.
 

@@ -38,17 +38,17 @@ FAULTS = {
 
 
 class MagicianEmulator:
-    """A Magician on a pseudo-terminal; a context manager that lives between ``start`` and ``stop``.
+    """A Magician on a pseudo-terminal. A context manager, which works between ``start`` and ``stop``.
 
     Parameters
     ----------
     link : Path or None
-        A symbolic link to make to the terminal; removed at the end. One that leads nowhere is replaced.
+        Symbolic link to the terminal. It is removed at the end. A link that leads nowhere is replaced.
     faults : iterable of str
-        ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` may be changed while it runs.
+        ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` can be changed while it runs.
     joints_deg : (4,) float
     time_scale : float
-        How much faster than the real arm it moves.
+        Factor by which it moves faster than the real arm.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class MagicianEmulator:
             self._thread.join(timeout=2.0)
 
     def unplug(self) -> None:
-        """Pull the cable: the terminal vanishes. The arm goes on with what is queued."""
+        """Pull the cable: the terminal vanishes. The arm still executes its queue."""
         self._ended.set()
         with self._lock:
             for end in self._ends or ():
@@ -147,7 +147,7 @@ class MagicianEmulator:
                 message, buffer = take_message(buffer)
 
     def _answer(self, message: Message) -> Message:
-        """The controller's reply. A command that fails in the emulator raises the alarm of one that the device does not understand."""
+        """The controller's reply. A command that fails in the emulator raises the alarm of a command that is not understood."""
         try:
             return self.arm.answer(message)
         except Exception:

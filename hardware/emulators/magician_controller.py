@@ -13,14 +13,14 @@ from hardware.arms.magician_wire import Id, Message, Ptp
 from hardware.arms.motion import MotionTrack, Speeds, circle
 from hardware.emulators.faults import Faults
 
-# Commands that the queue holds.
+# Largest number of commands in the queue.
 QUEUE_N = 32
 # Numbers of alarms (see ``hardware.arms.dobot_alarms``).
 NOT_UNDERSTOOD, ARC_PLACES, LOST_STEPS = 1, 20, 80
 START_JOINTS_DEG = (0.0, 45.0, 45.0, 0.0)
 # Speed of the joints while homing, in deg/s. Chosen for the emulator.
 HOME_SPEED_DEG_S = 30.0
-# Length of a jog, in mm and in deg, which is beyond every limit.
+# Length of a jog, mm and deg. It is longer than every range of motion.
 JOG_MM, JOG_DEG = 400.0, 300.0
 # Parameters that are stored as received, with their initial bytes. The number of bytes must agree.
 PARAMETERS: dict[int, bytes] = {
@@ -41,14 +41,14 @@ PARAMETERS: dict[int, bytes] = {
     Id.ARC_PARAMS: struct.pack("<4f", 100.0, 100.0, 100.0, 100.0),
     Id.HANDHELD_OUTPUT: bytes(1),
 }
-# What is not attached to the arm: bytes of a write, and the reply to a read, which tells no signal.
+# Parts that are not attached to the arm: bytes of a write, and the reply to a read, which shows no signal.
 NOT_ATTACHED: dict[int, tuple[int, bytes]] = {
     Id.MOTOR: (6, b""),
     Id.MOTOR_STEPS: (10, b""),
     Id.COLOR: (3, bytes(3)),
     Id.INFRARED: (2, bytes(1)),
 }
-# Bytes of parameters that a command may have. pydobot sends CP without its last number: 14 bytes.
+# Numbers of bytes that a command's parameters may have. pydobot sends CP without its last number: 14 bytes.
 SIZES: dict[int, tuple[int, ...]] = {
     Id.RESET_POSE: (9,),
     Id.HOME: (4, 0),
@@ -63,7 +63,7 @@ SIZES: dict[int, tuple[int, ...]] = {
 
 @dataclass(frozen=True)
 class Queued:
-    """A command in the queue and when it came."""
+    """A queued command and the time of its arrival."""
 
     index: int
     message: Message
@@ -99,7 +99,7 @@ class MagicianController:
                 return self.refuse(message)
             if message.is_queued:  # with the write bit or, from some clients, without
                 if len(self._queue) >= QUEUE_N:
-                    return Message(message.id, message.ctrl)  # no index: it was not taken
+                    return Message(message.id, message.ctrl)  # no index, because the command was not accepted
                 self._issued += 1
                 self._queue.append(Queued(self._issued, message, now_s))
                 self.advance()
@@ -226,7 +226,7 @@ class MagicianController:
         return self._go(target, line, begins_s, linear=True)
 
     def _arc(self, numbers: np.ndarray, begins_s: float) -> float:
-        """Along the circle through the present place and two others."""
+        """Move along the circle through the present place and two others."""
         via, end = (np.array([*part[:3], 0.0, 0.0, part[3]]) for part in (numbers[:4], numbers[4:]))
         lines = circle(self._target_pose(), via, end)
         if len(lines) == 2:  # on one straight line

@@ -37,7 +37,7 @@ OLD_FIRMWARE, NEW_FIRMWARE = "1.5.5", "1.7.0"
 FIRST_NUMBERED_REPLIES = (1, 5, 6)
 # Length of a feedback packet that was cut short, in bytes.
 SHORT_BYTES = 1000
-# Interval in s at which a waiting thread looks again.
+# Interval in s at which a waiting thread checks again.
 POLL_S = 0.002
 # Interval in s of the finite differences that give speeds: the period of the fastest feedback.
 DIFFERENCE_S = 0.008
@@ -68,7 +68,7 @@ FAULTS = {
 
 
 class Mg400Emulator:
-    """An MG400 on loopback; a context manager that listens between ``start`` and ``stop``.
+    """An MG400 on loopback. A context manager, which listens between ``start`` and ``stop``.
 
     Parameters
     ----------
@@ -77,19 +77,19 @@ class Mg400Emulator:
     port_offset : int or None
         Added to the arm's port numbers. None: free ports are used, see ``ports``.
     faults : iterable of str
-        ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` may be changed while it runs.
+        ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` can be changed while it runs.
     firmware : str
-        Below 1.5.6 it answers bare echoes and nothing on the motion port; from 1.6 on it has SetUser and SetTool;
-        from 1.7 on it refuses ``GetPose`` with keywords.
+        Below 1.5.6 it replies with bare echoes, and not at all on the motion port. From 1.6 on it has SetUser and SetTool. From 1.7 on it
+        refuses ``GetPose`` with keywords.
     joints_deg : (4,) float
-        Where the arm stands to begin with.
+        Joints at the start.
     time_scale : float
-        How much faster than the real arm it moves.
+        Factor by which it moves faster than the real arm.
 
     Attributes
     ----------
     ports : dict of int to int
-        The arm's own port to the one listened on here.
+        For each of the arm's own ports, the port on which the emulator listens.
     """
 
     def __init__(

@@ -168,7 +168,7 @@ class Mg400Commands:
 
     @staticmethod
     def _whole(request: Request, n: int, parameter: Parameter) -> int:
-        """The whole number at a place of the parameters."""
+        """The whole number at a position of the parameters."""
         ahead = (NUMBER,) * n
         values = Request(request.name, (*["0"] * n, request.values[n]), {}, request.text)
         return int(read_numbers(values, (*ahead, parameter), (n + 1,))[n])
@@ -207,7 +207,7 @@ class Mg400Commands:
         return ""
 
     def _input(self, request: Request, parameter: Parameter) -> str:
-        """Nothing is attached, so no input has a signal."""
+        """Read an input. Nothing is attached, so no input has a signal."""
         read_numbers(request, (parameter,), (1,))
         return "0"
 
@@ -253,7 +253,7 @@ class Mg400Commands:
 
     @staticmethod
     def _split(request: Request) -> tuple[Request, tuple[str, ...]]:
-        """A move and the outputs ``{Mode,Distance,Index,Status}`` that it sets on its way; only the moves with IO have any."""
+        """A move and the outputs ``{Mode,Distance,Index,Status}`` that it sets on its path. Only moves with IO have outputs."""
         if not request.name.endswith("io"):
             return request, ()
         groups = tuple(value for value in request.values if value[0] in "{(")
@@ -263,7 +263,7 @@ class Mg400Commands:
 
     @staticmethod
     def _on_the_way(text: str, n: int, length_mm: float) -> tuple[float, int, int]:
-        """Share of the way at which an output is set, its index and its level."""
+        """Share of the path at which an output is set, its index and its level."""
         mode, distance, index, level = read_table(text, (4,), n)
         share = distance / 100.0 if mode == 0 else distance / max(length_mm, 1e-9)
         if mode not in (0, 1) or not -1.0 <= share <= 1.0 or not OUTPUT.low <= index <= OUTPUT.high or level not in (0, 1):
@@ -271,13 +271,13 @@ class Mg400Commands:
         return share if share >= 0 else 1.0 + share, int(index), int(level)
 
     def _arc(self, request: Request) -> str:
-        """``Arc(X1,Y1,Z1,R1,X2,Y2,Z2,R2)``: along the circle through the present place and two others."""
+        """``Arc(X1,Y1,Z1,R1,X2,Y2,Z2,R2)``: move along the circle through the present place and two others."""
         numbers = read_numbers(request, (NUMBER,) * 8, (8,))
         self._go_round(request, numbers, laps=0)
         return ""
 
     def _circle(self, request: Request) -> str:
-        """``Circle(count,{X1,Y1,Z1,R1},{X2,Y2,Z2,R2})``, or as the vendor's client sends it: eight numbers and the count."""
+        """``Circle(count,{X1,Y1,Z1,R1},{X2,Y2,Z2,R2})``, or in the form of the vendor's client: eight numbers and the count."""
         if len(request.values) == 3:
             laps = self._whole(request, 0, LAPS)
             numbers = read_table(request.values[1], (4,), 2) + read_table(request.values[2], (4,), 3)
@@ -288,7 +288,7 @@ class Mg400Commands:
         return ""
 
     def _go_round(self, request: Request, numbers: list[float], *, laps: int) -> None:
-        """Order the lines of an arc, or of whole circles. Places on one line are refused."""
+        """Queue the lines of an arc, or of whole circles. Places on one straight line are refused."""
         via, end = (self._flange(part, *self._frames(request)).pose for part in (numbers[:4], numbers[4:]))
         start = self.arm.last_target().pose
         poses = circle(start, via, end, whole=laps > 0)
@@ -335,7 +335,7 @@ class Mg400Commands:
             self.arm.reset()
             return ""
         axis = request.values[0].lower().replace(" ", "")
-        if axis not in AXES:  # by the vendor's document any other text stops a jog
+        if axis not in AXES:  # according to the vendor's document, any other text stops a jog
             self.arm.stop_jog()
             return ""
         self.arm.jog(axis, user=self._frames(request)[0])

@@ -21,7 +21,7 @@ EMERGENCY_STOP, COLLISIONS = 85, (112, -2)
 START_JOINTS_DEG = (0.0, 20.0, 40.0, 0.0)
 # Step of the search for the end of a jog, in mm or deg.
 JOG_STEP = 1.0
-# Longest jog, in mm or deg, which is beyond every limit.
+# Longest jog, mm or deg. It is longer than every range of motion.
 JOG_REACH = 1000.0
 
 
@@ -54,7 +54,7 @@ class PlanarFrame:
 
 @dataclass(frozen=True)
 class Order:
-    """A queued command: a move to a pose in a line or to joints, or a wait. ``end_s`` is when it will be done."""
+    """A queued command: a linear move to a pose, a move to joints, or a wait. ``end_s`` is the planned end of the command."""
 
     end: np.ndarray
     linear: bool
@@ -62,10 +62,10 @@ class Order:
     jog: bool = False
     end_s: float = np.inf
     outputs: tuple[tuple[float, int, int], ...] = ()  # share of the time at which a digital output is set, its index and level
-    wait_s: float | None = None  # time to stand, instead of a move
+    wait_s: float | None = None  # time to rest, instead of a move
 
     def at(self, share: float) -> "Order":
-        """The same at a share of its speed."""
+        """The same command at a share of its speed."""
         speeds = replace(self.speeds, linear_mm_s=share * self.speeds.linear_mm_s, angular_deg_s=share * self.speeds.angular_deg_s)
         return replace(self, speeds=speeds)
 
@@ -77,9 +77,9 @@ class Mg400Controller:
     ----------
     faults : Faults
     joints_deg : (4,) float
-        Where it stands to begin with.
+        Joints at the start.
     time_scale : float
-        How much faster than the real arm it moves.
+        Factor by which it moves faster than the real arm.
     """
 
     def __init__(self, faults: Faults, *, joints_deg: Sequence[float] = START_JOINTS_DEG, time_scale: float = 1.0) -> None:
@@ -95,9 +95,9 @@ class Mg400Controller:
         self.percent = {"speedj": 100.0, "speedl": 100.0, "accj": 100.0, "accl": 100.0, "cp": 0.0, "speedfactor": 100.0}
         self.users, self.tools = {0: PlanarFrame()}, {0: PlanarFrame()}
         self.user, self.tool = 0, 0
-        self._orders: list[Order] = []  # begun or planned on the track
+        self._orders: list[Order] = []  # started, or planned on the track
         self._held: list[Order] = []  # waiting for Continue
-        self._due: list[tuple[float, tuple[int, ...]]] = []  # alarms that will come
+        self._due: list[tuple[float, tuple[int, ...]]] = []  # future alarms
 
     def update(self) -> float:
         """Raise the alarms that are due. Returns the present time."""
@@ -112,13 +112,13 @@ class Mg400Controller:
         return now_s
 
     def raise_alarm(self, *alarms: int, time_s: float | None = None) -> None:
-        """Stop with alarms; the queue is held until ``ClearError`` and ``Continue``."""
+        """Stop and raise alarms. The queue is held until ``ClearError`` and ``Continue``."""
         with self.lock:
             self._hold(time.monotonic() if time_s is None else time_s)
             self.alarms += alarms
 
     def press_emergency_stop(self) -> None:
-        """Power off, with an alarm."""
+        """Switch the power off, and raise an alarm."""
         with self.lock:
             self.raise_alarm(EMERGENCY_STOP)
             self._held.clear()
@@ -140,14 +140,14 @@ class Mg400Controller:
             return Mode.ENABLED
 
     def busy(self) -> bool:
-        """Whether anything is still to be done (``Sync`` waits for it)."""
+        """Whether commands are still in progress or queued (``Sync`` waits for them)."""
         now_s = self.update()
         with self.lock:
             return bool(self._held) or self.track.moving(now_s)
 
     @property
     def queue_runs(self) -> bool:
-        """Whether queued moves are carried out."""
+        """Whether queued moves are executed."""
         return not (self.alarms or self._held)
 
     def enable(self) -> None:
@@ -166,9 +166,9 @@ class Mg400Controller:
             self.alarms.clear()
 
     def reset(self) -> None:
-        """Stop and forget the queue."""
+        """Stop and empty the queue."""
         with self.lock:
-            self.update()  # an alarm that was raised stays
+            self.update()  # so that an alarm that was raised stays
             self._hold(time.monotonic())
             self._held.clear()
             self.paused = False
@@ -179,7 +179,7 @@ class Mg400Controller:
         self.digital_out = self.digital_out | bit if level else self.digital_out & ~bit
 
     def drag(self, begin: bool) -> None:
-        """Begin or end the mode in which a person moves the arm by hand; not in error, and only while the arm is enabled."""
+        """Begin or end the mode in which a person moves the arm by hand. It is possible only while the arm is enabled and without error."""
         with self.lock:
             if self.alarms or not self.enabled:
                 raise RefusedError(ErrorId.FAILED)
@@ -187,7 +187,7 @@ class Mg400Controller:
             self.dragged = begin
 
     def set_speed_factor(self, percent: float) -> None:
-        """``SpeedFactor``: it also holds for the moves that go on and wait."""
+        """``SpeedFactor``: it also applies to moves in progress and queued moves."""
         with self.lock:
             now_s = self.update()
             share = percent / self.percent["speedfactor"]
@@ -205,7 +205,7 @@ class Mg400Controller:
             self._due += [(self.track.end_s, alarms) for _, alarms in due]
 
     def stop_jog(self) -> None:
-        """End a jog; other moves go on."""
+        """End a jog. Other moves continue."""
         if self.mode() == Mode.JOG:
             self.reset()
 
@@ -216,7 +216,7 @@ class Mg400Controller:
             self.paused = True
 
     def resume(self) -> None:
-        """``Continue``: do what was held."""
+        """``Continue``: execute the held commands."""
         with self.lock:
             if self.alarms or not self.enabled:
                 raise RefusedError(ErrorId.FAILED)
@@ -262,7 +262,7 @@ class Mg400Controller:
         Raises
         ------
         RefusedError
-            There are none.
+            No joints reach the pose.
         """
         try:
             return self.kinematics.inverse(flange.pose)

@@ -1,4 +1,4 @@
-"""Parsing of the MG400's requests, ``Name(p1,p2,Key=v)``: they are found in a stream, and their parameters are checked."""
+"""Parsing of the MG400's requests, ``Name(p1,p2,Key=v)``: finds them in a stream, and checks their parameters."""
 
 import math
 import re
@@ -78,7 +78,7 @@ def read_table(text: str, counts: tuple[int, ...], n: int) -> list[float]:
     Raises
     ------
     RefusedError
-        They are no numbers (-3000n), not finite or not as many as they should be (-4000n).
+        The values are not numbers (-3000n), or are not finite or have the wrong count (-4000n).
     """
     try:
         numbers = [float(part) for part in text.strip("{}() ").split(",")]

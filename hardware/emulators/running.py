@@ -1,4 +1,4 @@
-"""Running an emulator until somebody ends it."""
+"""Runs an emulator until it is ended."""
 
 import signal
 from collections.abc import Callable
@@ -10,12 +10,12 @@ from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import OLD_FIRMWARE, Mg400Emulator
 from hardware.errors import DeviceError
 
-SLOWEST, FASTEST = 1e-3, 1e3  # times the real arm's speed: beyond these a move takes hours, or no time at all
-CHECK_S = 0.5  # between two looks at whether the emulator failed
+SLOWEST, FASTEST = 1e-3, 1e3  # limits of the time scale: beyond them a move takes hours, or no time at all
+CHECK_S = 0.5  # interval, s, at which a failure of the emulator is checked
 
 
 def say(line: str) -> None:
-    """Print a line at once, so that a program that waits for it on a pipe goes on."""
+    """Print a line at once, so that a program that waits for it on a pipe can continue."""
     print(line, flush=True)
 
 
@@ -26,23 +26,23 @@ def run_until_told(
     *,
     on_ready: Callable[[str], None] = say,
 ) -> None:
-    """Run a device until SIGTERM or Ctrl-C, or until it fails. Only in the main thread.
+    """Run a device until SIGTERM or Ctrl-C, or until it fails. Use it in the main thread only.
 
     Parameters
     ----------
     device : context manager
-        Listens while it is entered.
+        It listens while it is entered.
     ready : callable
-        Tells what listens, and where, once it does.
+        Returns what listens, and where, once it does.
     failure : callable
-        Tells what the device ended with, or None while it runs. That error is raised.
+        Returns the error with which the device ended, or None while it runs. The error is raised.
     on_ready : callable, optional
         Called once with ``ready ...`` when the device listens; by default it is printed.
     """
     ends = {signal.SIGTERM, signal.SIGINT}
     told: list[bool] = []
-    handlers = {end: signal.signal(end, lambda *_: told.append(True)) for end in ends}  # libraries' threads get signals, too
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # waited for: nothing is ever interrupted halfway
+    handlers = {end: signal.signal(end, lambda *_: told.append(True)) for end in ends}  # threads of libraries may get the signals, too
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # signals are waited for, so that nothing is interrupted halfway
     try:
         with device:
             on_ready(f"ready {ready()}")
@@ -65,12 +65,12 @@ def emulate_mg400(
     time_scale: float = 1.0,
     on_ready: Callable[[str], None] = say,
 ) -> None:
-    """Emulate a Dobot MG400 until told to end; see ``Mg400Emulator``.
+    """Emulate a Dobot MG400 until it is ended; see ``Mg400Emulator``.
 
     Parameters
     ----------
     lenient : bool
-        As firmware 1.5.5, whatever ``firmware`` says: bare echoes, no reply to moves.
+        Behave as firmware 1.5.5, whatever ``firmware`` is: bare echoes, no reply to moves.
     """
     _require_time_scale(time_scale)
     version = OLD_FIRMWARE if lenient else firmware
@@ -81,7 +81,7 @@ def emulate_mg400(
 def emulate_magician(
     *, link: Path | None = None, faults: tuple[str, ...] = (), time_scale: float = 1.0, on_ready: Callable[[str], None] = say
 ) -> None:
-    """Emulate a Dobot Magician on a pseudo-terminal until told to end; see ``MagicianEmulator``."""
+    """Emulate a Dobot Magician on a pseudo-terminal until it is ended; see ``MagicianEmulator``."""
     _require_time_scale(time_scale)
     arm = MagicianEmulator(link=link, faults=faults, time_scale=time_scale)
     run_until_told(arm, lambda: f"magician {link or arm.device}", on_ready=on_ready)
@@ -93,5 +93,5 @@ def _require_time_scale(time_scale: float) -> None:
 
 
 def fault_lines(known: dict[str, tuple[float | None, str]]) -> list[str]:
-    """The faults that an emulator knows, with their default values and what they do, for people."""
+    """Lines of text about an emulator's faults: default values and effects."""
     return [f"{name + ('' if default is None else f'={default:g}'):22} {meaning}" for name, (default, meaning) in known.items()]

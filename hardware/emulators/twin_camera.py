@@ -1,4 +1,4 @@
-"""The twin as a camera on the network: it shows the contact at the pose of an arm that runs in another process.
+"""The twin as a camera on the network. It shows the contact at the pose of an arm that another process drives.
 
 ``FeedbackPose`` reads this pose from the feedback ports of an MG400.
 """
@@ -19,7 +19,7 @@ from twin.errors import OptionError
 from twin.rig.mounting import Mounting
 from twin.types import Form
 
-# Feedback older than this (s) is not used.
+# Largest age, s, of feedback that is used.
 MAX_AGE_S = 1.0
 
 
@@ -40,7 +40,7 @@ class FeedbackPose:
 
     @classmethod
     def of(cls, spec: str) -> "FeedbackPose":
-        """From ``mg400:ADDRESS[:DASHBOARD_PORT]``. The feedback ports have the same offset as the dashboard port."""
+        """The reader for ``mg400:ADDRESS[:DASHBOARD_PORT]``. The feedback ports have the same offset as the dashboard port."""
         kind, _, rest = spec.partition(":")
         host, _, port = rest.partition(":")
         if kind not in ("mg400", "mg400-lenient") or not host or (port and not port.isdecimal()):
@@ -57,7 +57,7 @@ class FeedbackPose:
         self._feedback.close()
 
     def __call__(self) -> ArmState:
-        """The newest state; ``StaleDataError``."""
+        """The newest state; raises ``StaleDataError`` if it is too old."""
         packet, time_s = self._feedback.newest(MAX_AGE_S)
         x, y, z, turn = packet["tool_actual"][:4]
         return ArmState(np.array([x, y, z, 0.0, 0.0, turn]), packet["q_actual"][:4].copy(), time_s, bool(packet["enabled"]), False)
@@ -76,18 +76,18 @@ def emulate_camera(
     plain_light: bool = False,
     on_ready: Callable[[str], None] = say,
 ) -> None:
-    """Stream the twin's frames as JPEGs over HTTP until told to end.
+    """Stream the twin's frames as JPEGs over HTTP until it is ended.
 
     Parameters
     ----------
     arm : str
-        Whose feedback tells the pose, as ``FeedbackPose.of`` takes it.
+        Arm whose feedback gives the pose, as text for ``FeedbackPose.of``.
     servo : ServoSpec
-        Where the object stands.
+        Specification with the object's place.
     port : int
-        0: a free one.
+        Port; 0 for a free one.
     fps : float
-        Most pictures a second.
+        Most pictures per second.
     faults : tuple of str
         See ``CameraEmulator``.
     plain_light : bool

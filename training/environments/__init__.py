@@ -1,12 +1,12 @@
 """Gymnasium environments of a TacTip's tasks, on the finite elements or on their surrogate.
 
-Importing this package registers them: ``gymnasium.make("tactip/EdgeFollow-v0")``. Where the package is installed, gymnasium finds them
-without an import.
+Importing this package registers them: ``gymnasium.make("tactip/EdgeFollow-v0")``. If the package is installed, gymnasium finds them without
+an import.
 """
 
 try:
     import gymnasium
-except ImportError as error:  # an extra: the rest of the package works without it
+except ImportError as error:  # gymnasium is an optional dependency: the rest of the package works without it
     raise ImportError("the environments need gymnasium: pip install 'tactip-twin[gym]'") from error
 
 from gymnasium.envs.registration import register, registry
@@ -26,7 +26,7 @@ def ids() -> tuple[str, ...]:
 
 
 def register_all() -> None:
-    """Register the environments; a second call has no effect. Gymnasium calls it where the package is installed."""
+    """Register the environments; a second call has no effect. Gymnasium calls it if the package is installed."""
     for name, full in zip(TASKS, ids(), strict=True):
         if full not in registry:
             where = "training.environments.environment"

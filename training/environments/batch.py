@@ -26,29 +26,29 @@ BackendName = Literal["surrogate", "fem"]
 BACKENDS: tuple[str, ...] = get_args(BackendName)
 """Names of the contact solvers."""
 PERIOD_S = 0.1
-"""Time that a step stands for: an agent decides ten times a second."""
+"""Duration of a step, s: an agent decides ten times per second."""
 LARGEST_MM, LARGEST_DEG = 1.0, 5.0
-"""Motion of a step by an action of 1, along and about each axis."""
+"""Motion of a step, along and about each axis, by an action of 1."""
 MOST_TRIALS = 4
-"""Trials in which an object that is pushed finds its place in a step."""
+"""Most iterations in a step by which the place of a pushed object is found."""
 MOST_STACK = 16
 """Most observations that can be stacked."""
 MOST_ORACLE = 100.0
-"""What only a simulation knows is clipped to this."""
+"""Largest size of the values that only a simulation knows. Larger values are clipped."""
 EXAMPLES = {"axes": ("z", "Ry"), "objects": ("plane", "can")}
-"""Of options that take several names."""
+"""Example values, for error messages, of the options that take several names."""
 RESET_OPTIONS = ("object",)
-"""What ``reset(options=...)`` takes."""
+"""Keys that ``reset(options=...)`` accepts."""
 
 
 def require_whole(name: str, given: Any, least: int) -> None:
-    """Raise ``OptionError`` for anything but a whole number of at least ``least``."""
+    """Raise ``OptionError`` unless the value is a whole number of at least ``least``."""
     if not isinstance(given, int) or isinstance(given, bool) or given < least:
         raise OptionError(f"{name}={given!r}: expected a whole number of at least {least}")
 
 
 def require_task(task: str) -> None:
-    """Raise ``OptionError`` for the name of no task."""
+    """Raise ``OptionError`` if there is no task of this name."""
     if task not in TASKS:
         near = get_close_matches(str(task).lower(), [name.lower() for name in TASKS], n=1)
         hint = "".join(f"did you mean {name!r}? " for name in TASKS if name.lower() in near)
@@ -57,33 +57,34 @@ def require_task(task: str) -> None:
 
 @dataclass(frozen=True)
 class Options:
-    """What an environment can be asked for, by keyword.
+    """Options of an environment, given by keyword.
 
     Attributes
     ----------
     sensor : str
         Name or file.
     observation : {"pins", "oracle", "graph", "image", "pose"}
-        What ``tactile`` holds: displacements of the pins in spacings (N, 2); what no sensor knows; the graph's node features (N, 5); a
-        small gray picture (128, 128); the shipped estimator's pose.
+        Content of ``tactile``: displacements of the pins in spacings (N, 2); values that no sensor knows; the graph's node features (N, 5);
+        a small gray picture (128, 128); the pose of the shipped estimator.
     stack : int
-        Newest observations that are given together, the newest last.
+        Number of newest observations that are given together, the newest last.
     axes : tuple of str, optional
-        Axes that are moved, of x, y, z, Rx, Ry, Rz in the tool's work frame; the task's by default.
+        Axes that the agent moves, of x, y, z, Rx, Ry, Rz in the tool's work frame; the task's by default.
     backend : {"surrogate", "fem"}
-        A fast stand-in with a stated error, or finite elements.
+        The surrogate (a fast approximation with a stated error), or finite elements.
     surrogate : str, optional
-        File of ``twin surrogate``; that which goes with the package by default.
+        File of ``twin surrogate``; the shipped one by default.
     objects : tuple of str, optional
-        Names or files, of which one is drawn for each episode; the task's by default.
+        Names or files of objects. One of them is drawn for each episode. The task's objects by default.
     randomise : str, optional
-        Name or file of a randomisation: friction, camera and other numbers of the sensor, noise of the pins; drawn for each episode.
+        Name or file of a randomisation of friction, camera and other properties of the sensor, and noise of the pins. Values are drawn for
+        each episode.
     pictures : {"none", "preview", "traced"}
-        Find the pins by the real pipeline in rendered frames. Observation "image" draws previews if none are asked for.
+        Find the pins with the real pipeline in rendered frames. Observation "image" uses previews if the value is "none".
     friction_memory : bool
-        False forgets in each step how the object came to where it is (only for ``surrogate``; to measure what the memory is worth).
+        With False each step forgets the object's earlier path (only for ``surrogate``; it serves to measure the memory's effect).
     steps : int, optional
-        Of an episode; the task's by default.
+        Number of steps of an episode; the task's by default.
     """
 
     sensor: str = "mg400-331"
@@ -141,7 +142,7 @@ class Options:
         Raises
         ------
         OptionError
-            There is no such option, or a value can't be meant.
+            There is no such option, or a value is not valid.
         """
         known = [field.name for field in fields(cls)]
         for name in options:
@@ -153,7 +154,7 @@ class Options:
 
 
 def require_known(how: RandomisationSpec | None) -> None:
-    """Raise ``OptionError`` for a randomisation that draws what a surrogate holds fixed."""
+    """Raise ``OptionError`` for a randomisation of values that are fixed in a surrogate."""
     drawn = [] if how is None else [key for key in how.sensor if is_mechanical(*key.split("."))]
     if how is not None and drawn:
         raise OptionError(
@@ -163,7 +164,7 @@ def require_known(how: RandomisationSpec | None) -> None:
 
 
 def _ends(how: RandomisationSpec | None) -> tuple[float | None, ...]:
-    """Ends of the friction that a randomisation draws; None: that of rig or object stays."""
+    """Limits of the friction that a randomisation draws; None if the friction stays that of the rig or object."""
     if how is None or how.friction is None:
         return (None,)
     return how.friction.high, how.friction.stick if how.friction.stick_share else how.friction.low
@@ -171,7 +172,7 @@ def _ends(how: RandomisationSpec | None) -> tuple[float | None, ...]:
 
 @dataclass(frozen=True)
 class Stepped:
-    """What a step of B environments gives: as in gymnasium, with arrays (B,) of all that ``info`` tells, None where a row tells nothing."""
+    """Result of a step of B environments, as in gymnasium; each entry of ``info`` is an array (B,), with None for rows without a value."""
 
     reward: FloatArray
     terminated: BoolArray
@@ -185,14 +186,14 @@ class Batch:
     Parameters
     ----------
     task : str
-        Name, of ``TASKS``.
+        Name of the task, of ``TASKS``.
     count : int
     options : Options
 
     Raises
     ------
     OptionError, SpecError, ContactError
-        Something that is asked for can't be had.
+        An option can't be fulfilled.
     """
 
     def __init__(self, task: str, count: int, options: Options) -> None:
@@ -216,7 +217,7 @@ class Batch:
             except ContactError:
                 if options.objects is not None or len(self.objects) == 1:
                     raise
-                del self.objects[name]  # of the task's own objects those remain that the backend knows
+                del self.objects[name]  # of the task's own objects, only those that the backend knows remain
         self.eye = self._shows = self._make_eye()
         self.axes = options.axes or self.task.axes
         self.action_scale = np.array([LARGEST_DEG if axis.startswith("R") else LARGEST_MM for axis in self.axes])
@@ -230,11 +231,11 @@ class Batch:
         self._seen: FloatArray | ImageArray | None = None
 
     def action_space(self) -> spaces.Box:
-        """Of one environment."""
+        """Action space of one environment."""
         return spaces.Box(-1.0, 1.0, (len(self.axes),), np.float32)
 
     def observation_space(self) -> spaces.Dict:
-        """Of one environment: ``tactile`` and ``goal``."""
+        """Observation space of one environment: ``tactile`` and ``goal``."""
         goal = spaces.Box(-100.0, 100.0, (len(self.task.goal_names),), np.float32)
         stack = self.options.stack
         if self.options.observation == "image":
@@ -273,7 +274,7 @@ class Batch:
         return Contact(sensor, touched, contact_law(sensor.rig, self.tool.mounting, touched, friction=friction))
 
     def settle(self, rows: IntArray) -> None:
-        """Make the first contact of some rows that ``begin`` drew, and fill their stacks of observations."""
+        """Make the first contact of the rows that ``begin`` drew, and fill their stacks of observations."""
         self._move(rows)
         self._look(rows, first=True)
 
@@ -316,11 +317,11 @@ class Batch:
         return {"tactile": seen.copy(), "goal": self.asked().astype(np.float32)}
 
     def asked(self) -> FloatArray:
-        """What the episodes ask for, (B, G), by the task's ``goal_names``."""
+        """Goals of the episodes as the agents get them, (B, G), by the task's ``goal_names``."""
         return self.task.asked(self.goal, self.T_work)
 
     def oracle(self) -> FloatArray:
-        """What no real sensor knows of the newest states, (B, K), by the task's ``oracle_names``."""
+        """Values of the newest states that no real sensor knows, (B, K), by the task's ``oracle_names``."""
         return np.clip(self.task.oracle(self._seen_now()), -MOST_ORACLE, MOST_ORACLE)
 
     def picture(self, row: int) -> ImageArray:
@@ -337,11 +338,11 @@ class Batch:
         return self._shows.frame(row, self.backend.attitude(row), np.random.default_rng(int(self.steps_done[row])))
 
     def begun(self) -> dict[str, Any]:
-        """What ``info`` tells of the beginning of the episodes: names (B,) of the objects."""
+        """Entries of ``info`` at the beginning of the episodes: names (B,) of the objects."""
         return {"object": np.array([None if contact is None else contact.touched.name for contact in self.contacts], object)}
 
     def touch(self) -> Touch:
-        """What rigid sensors would touch in all rows."""
+        """Contact of the tools if the sensors were rigid, in all rows."""
         T = self.tool.seen(self.T_work, self.T_object)
         parts = {field.name: np.zeros((self.count, 3) if field.name == "place_mm" else self.count) for field in fields(Touch)}
         things = [None if contact is None else contact.touched for contact in self.contacts]
@@ -361,7 +362,7 @@ class Batch:
         active[rows] = True
         kept = self.task.kept.copy()
         judged: Judged = self.task.judge(seen)
-        self.task.kept[~active] = kept[~active]  # of rows that only begin, or rest, the task has seen no step
+        self.task.kept[~active] = kept[~active]  # rows that only begin, or rest, made no step, so the task's memory of them is kept
         lost = np.array([bool(why) for why in self.backend.felt.lost])
         failed, reached = (judged.failed | lost) & active, judged.reached & active & ~lost
         late = self.steps_done > self.steps // 2

@@ -1,4 +1,4 @@
-"""The environments as gymnasium knows them: a single one, and a vector of them in one process."""
+"""The environments in gymnasium's interface: a single one, and a vector of them in one process."""
 
 import sys
 import time
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from twin.studio.episode import EpisodePage
 
 RENDER_MODES = ("rgb_array", "human")
-"""What ``render_mode`` may be besides None."""
+"""Values of ``render_mode`` besides None."""
 RENDER_FPS = 10
-"""Pictures a second at the pace of the steps. With ``human`` no step comes sooner."""
+"""Pictures per second at the pace of the steps. With ``human``, steps are slowed to this pace."""
 
 Seen = dict[str, Any]
 
@@ -41,14 +41,14 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
     task : str
         EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ObjectRoll or ObjectPush.
     render_mode : {None, "rgb_array", "human"}
-        With ``human`` each step is shown on a page of the studio, whose address is told on the error stream at the first ``reset``.
+        With ``human`` each step is shown on a page of the studio. Its address is printed on stderr at the first ``reset``.
     options
         See ``training.environments.batch.Options``.
 
     Raises
     ------
     OptionError
-        An option is unknown, or its value can't be meant.
+        An option is unknown, or its value is not valid.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS}  # type: ignore[misc]
@@ -63,7 +63,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         self._shown_s = 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
-        """Begin an episode; ``options`` may name its ``object``."""
+        """Begin an episode; ``options`` can name its ``object``."""
         self._require_open()
         super().reset(seed=seed)
         self.batch.begin(0, self.np_random, options)
@@ -85,7 +85,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         return _row(self.batch.observation()), float(done.reward[0]), bool(done.terminated[0]), bool(done.truncated[0]), info
 
     def render(self) -> ImageArray | None:
-        """The sensor's frame, (H, W, 3) uint8, if the render mode is ``rgb_array``; with ``human`` each step is shown by itself."""
+        """The sensor's frame, (H, W, 3) uint8, if the render mode is ``rgb_array``; else None. With ``human`` each step is shown anyway."""
         self._require_open()
         if self.render_mode != "rgb_array":
             return None
@@ -94,7 +94,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         return self.batch.picture(0)
 
     def close(self) -> None:
-        """End; a second call has no effect, as gymnasium wants it."""
+        """End; a second call has no effect, as gymnasium requires."""
         self._state = "closed"
         page, self._page = self._page, None
         if page is not None:
@@ -149,9 +149,9 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
     task : str
     num_envs : int
     autoreset_mode : AutoresetMode or str
-        When an ended episode is followed by the next: in the step after its end (gymnasium's default), or in the same step.
+        When the next episode begins: in the step after the end of an episode (gymnasium's default), or in the same step.
     render_mode, options
-        As for ``TactileEnv``, but without ``human``: a page shows one environment.
+        As for ``TactileEnv``, but without ``human``, because a page shows one environment.
     """
 
     def __init__(
@@ -237,7 +237,7 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
         return tuple(self.batch.picture(row) for row in range(self.num_envs)) if self.render_mode else None
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Nothing is held open."""
+        """Nothing is open, so nothing is closed."""
 
     def _restart(self, rows: np.ndarray, options: Mapping[str, Any] | None) -> None:
         for row in rows.tolist():
@@ -250,7 +250,7 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
 
 
 def _of_rows(told: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
-    """What some rows (B,) tell, as gymnasium gathers it: each array with the mask of the rows that tell it, if there are any."""
+    """Entries of ``info`` for some rows (B,), as gymnasium gathers them: each array with the mask of the rows that have a value."""
     info: dict[str, Any] = {}
     for name, values in told.items():
         has = rows & np.array([value is not None for value in values]) if values.dtype == object else rows.copy()
@@ -260,5 +260,5 @@ def _of_rows(told: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
 
 
 def _row(seen: Seen) -> Seen:
-    """What belongs to the only environment."""
+    """The observation of the only environment."""
     return {key: values[0] for key, values in seen.items()}

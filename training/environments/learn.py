@@ -1,7 +1,8 @@
-"""Learning a policy by proximal policy optimisation (stable-baselines3), and judging it on either backend.
+"""Learning of a policy by proximal policy optimisation (stable-baselines3), and judging it on either backend.
 
-The network does not see some hundred pins but the directions in which they move together most, found in random motions. In the same
-motions a second network learns to tell from these what only the simulation knows, such as place and force; the policy sees what it tells.
+The network's input is not the displacement of some hundred pins, but its principal components in random motions. From the same motions, a
+second network, the sight, learns to estimate the values that only the simulation knows, such as place and force. Its estimates are also an
+input of the policy.
 """
 
 import time
@@ -30,51 +31,51 @@ from twin.store import Layers, text_file, write_json, writes
 from twin.types import FloatArray
 
 COMPONENTS, ROUGH_COMPONENTS = 48, 24
-"""Directions of the pins' motion that a network sees, with and without sight."""
+"""Numbers of principal components of the pins' motion that a network gets, with and without sight."""
 RANDOM_STEPS = 400
-"""Steps of random motion of each environment, in which those directions are found, and what they tell is learnt."""
+"""Random steps of each environment, from which the components are computed and the sight is learnt."""
 SIGHT_LAYERS = (256, 256)
-"""Neurons of the hidden layers of the network that tells what only the simulation knows, with tanh. Of a rolling ball's place it is 0.09 mm
-off; with 24 components and 64 neurons, 0.22 mm."""
+"""Neurons of the hidden layers of the sight, with tanh. Its error in a rolling ball's place is 0.09 mm; with 24 components and 64 neurons
+it is 0.22 mm."""
 SIGHT_EPOCHS, SIGHT_BATCH, SIGHT_RATE = 30, 256, 2e-3
-"""How it learns, by Adam; the rate falls to nothing."""
+"""Training of the sight by Adam: epochs, batch, and learning rate, which falls to 0."""
 LEAST_DEVIATION = 1e-3
-"""What it tells is scaled by no less than this: a number that never changes tells nothing."""
+"""Least scale of a value that the sight estimates, so that a constant value does not lead to a division by 0."""
 LEAST_SPREAD, ROUGH_SPREAD = 0.01, 0.02
-"""With and without sight, directions are scaled by no less than this share of the largest one's spread: the rest is noise."""
+"""Least scale of a component, with and without sight, as a share of the largest component's spread. Smaller components are noise."""
 LAYERS = (64, 64)
-"""Neurons of the hidden layers, with tanh."""
+"""Neurons of the policy's hidden layers, with tanh."""
 ROLLOUT = 32
 """Steps of each environment between two updates."""
 WINDOW = 100
-"""Newest episodes over which success is counted while learning."""
+"""Number of newest episodes from which the share of success is computed during the learning."""
 ENOUGH = 0.97
-"""Share of them that ends the learning."""
+"""Share of success that ends the learning."""
 ROWS_JUDGED = 8
-"""Episodes that are judged together on the surrogate."""
+"""Number of episodes that are judged together on the surrogate."""
 
 
 @dataclass(frozen=True)
 class LearnPlan:
-    """What is learnt, and how long.
+    """Settings of the learning of a policy.
 
     Attributes
     ----------
     task : str
-        Name, of ``TASKS``.
+        Name of the task, of ``TASKS``.
     options : Options
     minutes : float
-        Most time.
+        Longest time.
     environments : int
-        Stepped together.
+        Number of environments that are stepped together.
     seed : int
     episodes : int
-        In which the policy is judged at the end, on the backend that it learnt on.
+        Number of episodes in which the policy is judged at the end, on the backend on which it learnt.
     fem_episodes : int
-        The same on finite elements, with drawn frames through the real pipeline; 0: not.
+        Number of episodes on finite elements, with drawn frames and the real pipeline; 0: none.
     sight : bool
-        First learn to tell what only the simulation knows. This makes a policy precise where it learnt, and depend on small motions of the
-        pins, in which a surrogate errs.
+        First learn to estimate the values that only the simulation knows. This makes a policy precise on the backend on which it learnt.
+        But the policy then depends on small motions of the pins, in which a surrogate has errors.
     """
 
     task: str
@@ -96,7 +97,7 @@ class LearnPlan:
 
 @dataclass(frozen=True)
 class Learnt:
-    """What came of it. ``curve`` holds (steps, seconds, share of success, mean reward) after each update."""
+    """The result of the learning. ``curve`` holds (steps, seconds, share of success, mean reward) after each update."""
 
     policy: Policy
     curve: list[tuple[int, float, float, float]]
@@ -104,14 +105,14 @@ class Learnt:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """The result in words."""
+        """The result as lines of text."""
         steps, seconds = self.curve[-1][:2] if self.curve else (0, 0.0)
         told = ", ".join(f"{share:.0%} of the episodes on {where}" for where, share in self.success.items())
         return [f"{steps} steps in {seconds / 60:.1f} min; solved {told}"]
 
 
 class SteppedTogether(VecEnv):
-    """A ``TactileVectorEnv`` as stable-baselines3 wants it, its observations reduced to what the network sees."""
+    """A ``TactileVectorEnv`` in stable-baselines3's interface, with observations reduced to the network's input."""
 
     def __init__(self, vector: TactileVectorEnv, policy: Policy) -> None:
         self.vector, self.policy = vector, policy
@@ -131,7 +132,7 @@ class SteppedTogether(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> Any:
-        """See ``VecEnv``: rows that end begin anew in the same step."""
+        """See ``VecEnv``. Rows whose episode ends begin again in the same step."""
         seen, reward, terminated, truncated, told = self.vector.step(self._actions)
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -166,7 +167,7 @@ class SteppedTogether(VecEnv):
 
 
 class _Watch(BaseCallback):
-    """Keeps the learning curve, and ends the learning when it is good enough or takes too long."""
+    """Records the learning curve, and ends the learning when the success is high enough or the time is over."""
 
     def __init__(self, plan: LearnPlan, step: Step, begun_s: float) -> None:
         super().__init__()
@@ -199,7 +200,7 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
     Raises
     ------
     OptionError
-        Something that is asked for can't be had.
+        An option can't be fulfilled.
     """
     torch.set_num_threads(1)
     begun_s, used_s = time.monotonic(), time.process_time()
@@ -227,7 +228,7 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
     used_s = time.process_time() - used_s
     made = replace(blank, layers=_layers_of([*ppo.policy.mlp_extractor.policy_net, ppo.policy.action_net]))
     written = [out / "policy.safetensors", out / "learning.csv", out / "learning.png", out / "result.json"]
-    made.save(written[0])  # before it is judged, which takes long and may be interrupted
+    made.save(written[0])  # saved before it is judged, because judging takes long and may be interrupted
     _write_curve(watch.curve, written[1], written[2])
     success: dict[str, float] = {
         str(plan.options.backend): judge_policy(made, plan.task, plan.options, plan.episodes, seed=10_000 + plan.seed)
@@ -245,7 +246,7 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
 
 
 def on_finite_elements(options: Options, objects: tuple[str, ...]) -> Options:
-    """The same environment on finite elements, with drawn frames through the real pipeline, of the same objects."""
+    """The same environment and objects on finite elements, with drawn frames and the real pipeline."""
     seen: Pictures = "preview" if options.observation != "oracle" else "none"
     return replace(options, backend="fem", surrogate=None, friction_memory=True, pictures=seen, objects=objects)
 
@@ -264,7 +265,8 @@ def _write_curve(curve: Sequence[tuple[int, float, float, float]], table: Path, 
 def judge_policy(policy: Policy, task: str, options: Options, episodes: int, *, seed: int = 0) -> float:
     """Share of episodes that a policy solves, with its mean action, eight at a time (one on finite elements).
 
-    Of B rows row k judges the episodes k, k + B, ...: if the first that end were counted, short failures would crowd out long successes.
+    Of B rows, row k judges the episodes k, k + B, ... If instead the first episodes that end were counted, short failures would replace
+    long successes.
     """
     rows = min(episodes, ROWS_JUDGED if options.backend == "surrogate" else 1)
     vector = TactileVectorEnv(task, rows, autoreset_mode="SameStep", **_given(options))
@@ -284,12 +286,12 @@ def _given(options: Options) -> dict[str, Any]:
 
 
 def _seen(observed: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
-    """The parts of an observation as a policy takes them."""
+    """The parts of an observation in the form of a policy's input."""
     return observed["tactile"], observed["goal"]
 
 
 def _untrained(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
-    """What the network of the actions sees, from random motions; that network itself is left out."""
+    """The policy's inputs (components and sight) from random motions, without the network of the actions."""
     batch, task = vector.batch, vector.batch.task
     rng = np.random.default_rng(plan.seed)
     vector.reset(seed=plan.seed)
@@ -327,7 +329,7 @@ def _untrained(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
 
 
 def _sight(given: Sequence[FloatArray], truth: FloatArray, seed: int) -> Layers:
-    """A network that tells what only a simulation knows (S, O), each about 1 in size, from what is given (S, ...)."""
+    """A network that estimates the values that only a simulation knows (S, O), scaled to about 1, from the inputs (S, ...)."""
     inputs = torch.tensor(np.concatenate(given, axis=1), dtype=torch.float32)
     wanted = torch.tensor((truth - truth.mean(axis=0)) / np.maximum(truth.std(axis=0), LEAST_DEVIATION), dtype=torch.float32)
     with torch.random.fork_rng():

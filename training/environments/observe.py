@@ -29,18 +29,18 @@ KINDS: tuple[str, ...] = get_args(Kind)
 """Names of the observations."""
 Pictures = Literal["none", "preview", "traced"]
 PICTURES: tuple[str, ...] = get_args(Pictures)
-"""How frames are made: not at all, drawn, or path-traced."""
+"""Ways to make frames: none, drawn, or path-traced."""
 IMAGE_PX = 128
-"""Side of the pictures that an agent sees, as in Tactile Gym."""
+"""Side of the pictures that an agent gets, px, as in Tactile Gym."""
 LARGEST = 10.0
-"""Observations are clipped to this: no pin moves by ten spacings."""
+"""Largest size of an observation. Larger values are clipped: no pin moves by ten spacings."""
 POSE_SCALES = {"mm": 1.0, "deg": 10.0, "N": 1.0, "Nmm": 10.0, "mm2": 100.0, "": 1.0}
-"""Estimates are divided by these numbers, by the labels' units."""
+"""Divisors of estimates, by the labels' units."""
 
 
 @dataclass(frozen=True)
 class View:
-    """How an episode's sensor sees: its specification as drawn, its frames' form, and how they are made."""
+    """The view of an episode's sensor: the drawn specification, the form of its frames, and how they are made."""
 
     sensor: SensorSpec
     form: Form
@@ -53,17 +53,17 @@ class View:
 
     @cached_property
     def paint(self) -> Callable[[PinState, np.random.Generator], Frame]:
-        """Makes a frame of a state."""
+        """Function that makes a frame of a state."""
         return _painter(self.sensor, self.form, self.pictures)
 
     @cached_property
     def pipeline(self) -> Pipeline:
-        """Finds the pins in the sensor's frames, counted from a frame without contact.
+        """The pipeline for the sensor's frames, with the pins at rest from a frame without contact.
 
         Raises
         ------
         OptionError
-            The pins can't be found at rest.
+            The pins can't be found in the frame at rest.
         """
         rest = self.paint(rest_pins(self.sensor.geometry), np.random.default_rng(0))
         try:
@@ -82,14 +82,15 @@ class Eye:
     sensor : SensorSpec
     kind : {"oracle", "pins", "graph", "image", "pose"}
     pictures : {"none", "preview", "traced"}
-        With pictures the pins are found by the real pipeline in frames, otherwise they are the projected caps. Kind "image" needs them.
+        With pictures, the pins are found by the real pipeline in frames. Otherwise they are the projected caps. Kind "image" needs
+        pictures.
     pin_noise_px : float
         Standard deviation of the noise of pins without pictures. Pins that are found in pictures have the noise of the pictures.
 
     Raises
     ------
     OptionError
-        The sensor has no estimator for kind "pose", or one that needs pictures.
+        Kind "pose" needs an estimator: the sensor has none, or one that needs pictures.
     """
 
     def __init__(self, sensor: SensorSpec, count: int, kind: Kind, *, pictures: Pictures, pin_noise_px: float) -> None:
@@ -114,7 +115,7 @@ class Eye:
 
     @property
     def _sees_light(self) -> bool:
-        """Whether the estimator sees the light on the caps."""
+        """Whether the estimator uses the light on the caps."""
         part = None if self._estimator is None else self._estimator.part
         return isinstance(part, PinModel) and part.sees_light
 
@@ -130,15 +131,15 @@ class Eye:
         return (pins, 2) if self.kind == "pins" else (pins, 5)
 
     def begin(self, row: int, sensor: SensorSpec) -> None:
-        """Look through the camera, in the light, that were drawn for an environment's episode."""
+        """Use the camera and light that were drawn for an environment's episode."""
         self._views[row] = self._nominal if sensor is self.sensor else View(sensor, self.form, self.pictures)
 
     def frame(self, row: int, pins: PinState, rng: np.random.Generator) -> Frame:
-        """The frame of one environment's sensor as drawn for the episode; a preview where no kind of pictures was chosen."""
+        """The frame of one environment's sensor as drawn for the episode; a preview if no kind of pictures was chosen."""
         return self._views[row].paint(pins, rng)
 
     def look(self, backend: Backend, rows: IntArray, rngs: list[np.random.Generator]) -> tuple[FloatArray | ImageArray, BoolArray]:
-        """Observations of some rows (R, ...), and which of them could be made (R,); the others are zero."""
+        """Observations of some rows (R, ...), and whether each could be made (R,). Failed observations are zero."""
         if self.kind == "image" or self.pictures != "none":
             frames = [self.frame(row, backend.attitude(row), rngs[row]) for row in rows.tolist()]
             if self.kind == "image":
@@ -158,7 +159,7 @@ class Eye:
         return np.stack([caps_px(self._views[row].sensor, self.form, seen) for row, seen in zip(rows.tolist(), caps, strict=True)])
 
     def _of_pins(self, pins_px: FloatArray, light: FloatArray | None = None) -> FloatArray:
-        """Observations (R, ...) of pins (R, N, 2) counted from the nominal layout, and of the light (R, N) on their caps."""
+        """Observations (R, ...) from pins (R, N, 2), relative to the nominal layout, and from the light (R, N) on their caps."""
         if self.kind == "pins":
             return np.clip((pins_px - self.reference.pins_px) / self._spacing, -LARGEST, LARGEST).astype(np.float32)
         graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost) for pins in pins_px]
@@ -183,7 +184,7 @@ class Eye:
         return self._scaled(told.mean, told.executed)
 
     def _of_frames(self, rows: IntArray, frames: list[Frame]) -> tuple[FloatArray, BoolArray]:
-        """The same from frames, through the real pipeline of each row's sensor."""
+        """Observations (R, ...) from frames, through the real pipeline of each row's sensor, and whether each could be made (R,)."""
         pipelines = [self._views[row].pipeline for row in rows.tolist()]
         seen = [pipeline(frame) for pipeline, frame in zip(pipelines, frames, strict=True)]
         valid = np.array([one.valid for one in seen])
@@ -209,7 +210,7 @@ def caps_px(sensor: SensorSpec, form: Form, caps_mm: FloatArray) -> FloatArray:
 
 
 def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[PinState, np.random.Generator], Frame]:
-    """Makes a frame of one environment's state."""
+    """Function that makes a frame of one environment's state."""
     recording = sensor.recording if form is Form.RECORDING else None
     window_px = recording.crop_px if recording else None
     preview = Preview(sensor, window_px=window_px)
@@ -225,7 +226,7 @@ def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[Pi
 
 
 def _small(image: ImageArray) -> ImageArray:
-    """The picture that an agent sees: gray, small and square."""
+    """The picture for the agent: gray, small and square."""
     gray = gray_levels(image)
     side = min(gray.shape)
     top, left = (gray.shape[0] - side) // 2, (gray.shape[1] - side) // 2

@@ -1,4 +1,4 @@
-"""The tasks: where an episode begins, what is wanted, and how good a state is. All for B environments at once."""
+"""The tasks: start of an episode, goal, and reward of a state. All are computed for B environments at once."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -13,27 +13,27 @@ from twin.rig.touch import Touch
 from twin.types import BoolArray, FloatArray
 
 LOST_MM = -1.0
-"""Indentation at which a sensor has lost its object: it is then 1 mm clear of it."""
+"""Indentation, mm, at which a sensor counts as having lost its object: it is 1 mm away from it."""
 DEEPEST_MM = 5.5
-"""Indentation at which an episode ends as failed. The published recordings go to 5 mm."""
+"""Indentation, mm, at which an episode ends as failed. The published recordings go to 5 mm."""
 STEEPEST_DEG = 40.0
-"""Angle from the surface's normal at which an episode ends as failed."""
+"""Angle from the surface's normal, deg, at which an episode ends as failed."""
 FORCE_N = 1.0
-"""Force that counts as 1 in observations."""
+"""Force, N, that is written as 1 in observations."""
 TURN_DEG = 10.0
-"""Angle that counts as 1 in observations and rewards."""
+"""Angle, deg, that is written as 1 in observations and rewards."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where an episode begins.
+    """The start of an episode.
 
     Attributes
     ----------
     T_work : (4, 4) float
         Work frame of the tool in the world; the object's frame is the world's at the start, unless ``T_object`` says otherwise.
     goal : tuple of float
-        What is wanted, by the task's ``goal_names``.
+        The goal, by the task's ``goal_names``.
     T_object : (4, 4) float
     """
 
@@ -44,17 +44,17 @@ class Start:
 
 @dataclass(frozen=True)
 class Seen:
-    """The world after a step, for a task to judge; rows are environments.
+    """The world after a step, for a task to judge. Rows are environments.
 
     Attributes
     ----------
     touch : Touch
-        What rigid sensors would touch.
+        Contact of the tools if the sensors were rigid.
     felt : Felt
     T_work, T_object : (B, 4, 4) float
     goal : (B, G) float
     action : (B, A) float
-        In [-1, 1].
+        Actions in [-1, 1].
     """
 
     touch: Touch
@@ -67,17 +67,17 @@ class Seen:
 
 @dataclass(frozen=True)
 class Judged:
-    """A task's opinion of a state.
+    """A task's judgement of a state.
 
     Attributes
     ----------
     reward : (B,) float
     failed : (B,) bool
-        The episode ends: the object is lost, or the sensor too deep.
+        Whether the episode ends as failed: the object is lost, or the sensor is too deep.
     reached : (B,) bool
-        The episode ends well.
+        Whether the episode ends as successful.
     good : (B,) bool
-        The state itself is as wanted. Most states of the second half of a successful episode are.
+        Whether the state itself is good. In a successful episode most states of the second half are good.
     """
 
     reward: FloatArray
@@ -87,25 +87,25 @@ class Judged:
 
 
 class Task(ABC):
-    """One task. What it remembers of an episode lies in ``kept`` (B, columns), which ``begin`` sets to zero.
+    """One task. Its memory of an episode is ``kept`` (B, columns), which ``begin`` sets to zero.
 
     Attributes
     ----------
     name : str
     experiment : str
-        Gives the approach, and so the work frame.
+        Experiment that defines the approach, and with it the work frame.
     objects : tuple of str
-        Of which one is drawn for each episode.
+        Objects of which one is drawn for each episode.
     axes : tuple of str
         Axes that an agent moves by default.
     goal_names, oracle_names : tuple of str
-        What the observations ``goal`` and ``oracle`` hold.
+        Names of the values in the observations ``goal`` and ``oracle``.
     steps : int
-        Of an episode.
+        Number of steps of an episode.
     feed_mm : (3,) float
         Motion in the work frame that every step adds to the agent's.
     success_share : float
-        Least share of good states in the second half of a successful episode; 0: only ``reached`` counts.
+        Least share of good states in the second half of a successful episode. With 0 only ``reached`` counts.
     """
 
     name: str
@@ -120,35 +120,35 @@ class Task(ABC):
     columns = 1
 
     def require(self, touched: ObjectSpec) -> None:
-        """Raise ``OptionError`` where the task can't be done with an object; most can be done with any."""
+        """Raise ``OptionError`` if the task can't be done with an object. Most tasks can be done with any object."""
         return
 
     def prepare(self, count: int) -> None:
-        """Make room for ``count`` environments."""
+        """Allocate the memory of ``count`` environments."""
         self.kept = np.zeros((count, self.columns))
 
     @abstractmethod
     def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
-        """Draw where an episode begins."""
+        """Draw the start of an episode."""
 
     @abstractmethod
     def judge(self, seen: Seen) -> Judged:
         """Judge the state after a step."""
 
     def pushed(self, felt: Felt, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
-        """How the object's pose answers to what the skin feels: poses (B, 4, 4) to try next, or None where the object is held."""
+        """Response of the object's pose to the skin's forces: poses (B, 4, 4) to try next, or None if the object is held."""
         return None
 
     def carried(self, felt: Felt, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
-        """The object's poses (B, 4, 4) after the tools, that felt ``felt``, moved from ``before`` to ``T_work``; held objects stay."""
+        """The object's poses (B, 4, 4) after tools that felt ``felt`` moved from ``before`` to ``T_work``. Held objects do not move."""
         return T_object
 
     def asked(self, goal: FloatArray, T_work: FloatArray) -> FloatArray:
-        """What the agents are told of their goals (B, G), by ``goal_names``, with the tools at ``T_work`` (B, 4, 4)."""
+        """The goals (B, G), by ``goal_names``, as the agents get them with the tools at ``T_work`` (B, 4, 4)."""
         return goal
 
     def oracle(self, seen: Seen) -> FloatArray:
-        """What a real sensor can't know, (B, K), by ``oracle_names``."""
+        """Values that a real sensor can't know, (B, K), by ``oracle_names``."""
         felt, touch = seen.felt, seen.touch
         columns = [touch.indent_mm, touch.angle_deg / TURN_DEG, felt.force_n / FORCE_N, felt.area_mm2 / 100.0, felt.slip]
         return np.column_stack(columns)
@@ -165,7 +165,7 @@ def out_of_touch(touch: Touch) -> BoolArray:
 
 
 class SurfaceFollow(Task):
-    """Follow a surface: hold depth and angle while the sensor is fed along it."""
+    """Follow a surface: hold depth and angle while the sensor moves along it."""
 
     name, experiment = "SurfaceFollow", "surface-2d"
     objects: tuple[str, ...] = ("plane", "can", "ball-80", "ball-40")
@@ -194,19 +194,21 @@ class SurfaceFollow(Task):
 
 
 class ContourFollow(SurfaceFollow):
-    """Go once around an object of the paper, holding depth and angle."""
+    """Go once around an object of the paper, and hold depth and angle."""
 
     name = "ContourFollow"
     objects = ("can", "mesh-can", "square", "prism", "tin-box")
     steps = 900
     feed_mm = (0.5, 0.0, 0.0)
-    """Half of a plain surface's: around a corner of 2 mm even a sensor that knows its angle lags by 31 deg with 1 mm, and by 16 deg so."""
+    """Half of the value for a plain surface, mm. Around a corner of 2 mm even a sensor that knows its angle lags by 31 deg with 1 mm, and
+    by 16 deg with this value."""
     indents_mm = (3.0, 3.0)
     beside_mm = 45.0
-    """Episodes begin on faces and corners alike: what lies beside an object counts as on it."""
+    """Largest distance, mm, of an episode's start from the object's origin along x. A start beside the object is moved onto its surface,
+    so that episodes begin on faces and corners alike."""
     covered_share = 0.98
     success_share = 0.0
-    columns = 4  # way covered, its length, and the place (x, z) that was touched last
+    columns = 4  # path length covered, total length, and the place (x, z) that was touched last
 
     def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
         start, surface = super().begin(row, tool, touched, surfaces, rng), surfaces[touched]
@@ -225,7 +227,7 @@ class ContourFollow(SurfaceFollow):
 
 
 class EdgeFollow(Task):
-    """Follow an edge that lies under the sensor: hold the place across it and its direction while the sensor is fed along it."""
+    """Follow an edge under the sensor: hold the place across it and its direction while the sensor moves along it."""
 
     name, experiment = "EdgeFollow", "edge-2d"
     objects = ("edge",)
@@ -250,7 +252,7 @@ class EdgeFollow(Task):
         return Start(T, (0.0, 0.0), np.eye(4))
 
     def place(self, seen: Seen) -> tuple[FloatArray, FloatArray]:
-        """Place of the dome's apex across the edge (B,), mm, and the sensor's direction against it (B,), deg."""
+        """Place of the dome's apex across the edge (B,), mm, and angle between the sensor and the edge (B,), deg."""
         turn = np.degrees(np.arctan2(seen.T_work[:, 1, 0], seen.T_work[:, 0, 0]))
         return seen.T_work[:, 0, 3], turn
 
@@ -268,7 +270,7 @@ class EdgeFollow(Task):
 
 
 class GentlePress(Task):
-    """Come to an object, reach a force and hold it, without slip."""
+    """Approach an object, reach a force and hold it without slip."""
 
     name, experiment = "GentlePress", "surface-2d"
     objects = ("plane", "can", "ball-40", "sphere", "cylinder")
@@ -279,7 +281,7 @@ class GentlePress(Task):
     off_deg = 10.0
     drift_mm = 0.25
     good_share, slip_share = 0.1, 0.5
-    columns = 1  # sideways drift of every step
+    columns = 1  # sideways drift per step
     success_share = 0.8
 
     def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
@@ -302,7 +304,7 @@ class GentlePress(Task):
 
 
 class ObjectRoll(Task):
-    """Roll a ball between the sensor and a table to a place under the dome; the ball rolls on both without sliding."""
+    """Roll a ball between the sensor and a table to a place under the dome. The ball rolls on both without sliding."""
 
     name, experiment = "ObjectRoll", "edge-2d"
     objects = ("ball-10", "sphere")
@@ -310,15 +312,16 @@ class ObjectRoll(Task):
     goal_names = ("x_mm", "y_mm")
     oracle_names = ("ball x_mm", "ball y_mm", *Task.oracle_names[2:])
     steps = 60
-    """A ball goes half as far as the tool: across all of the places it takes 16 steps at full speed."""
+    """Number of steps. A ball moves half as far as the tool, so it takes 16 steps at full speed to cross the range of places."""
     within_mm = 4.0
-    """Starts and goals lie up to so far from the apex."""
+    """Largest distance of starts and goals from the apex, mm."""
     indents_mm = (1.5, 2.5)
-    """Of a ball under the apex; at the ends of these places it is 0.4 mm less, and what is touched with less than 1 mm is hardly seen."""
+    """Indentations, mm, of a ball under the apex. At the ends of the range of places they are 0.4 mm smaller. Below 1 mm the contact is
+    hardly visible."""
     farthest_mm = 6.0
     near_mm = 0.6
     holds_n = 1e-3
-    """Least force of the skin on a ball that rolls with it."""
+    """Least force of the skin, N, on a ball that rolls with it."""
     columns = 1  # radius of the ball
 
     def require(self, touched: ObjectSpec) -> None:
@@ -334,14 +337,14 @@ class ObjectRoll(Task):
         start, goal = np.column_stack([away * np.cos(toward), away * np.sin(toward)])  # uniform in a disc
         T = np.eye(4)
         T[:3, 3] = [0.0, 0.0, indent - tool.mounting.skin_apex_mm] - tool.T_work_sensor[:3, 3]
-        T_object = np.eye(4)  # the ball lies beside the dome's apex, as deep as it would lie under it
+        T_object = np.eye(4)  # the ball lies beside the dome's apex, at the same depth as under it
         T_object[:2, 3] = start
         return Start(T, tuple(map(float, goal)), T_object)
 
     def carried(self, felt: Felt, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
         held = np.linalg.norm(felt.force_n, axis=1, keepdims=True) > self.holds_n
         moved = 0.5 * held * (T_work[:, :3, 3] - before[:, :3, 3])  # a ball between two plates moves half as far as the upper one
-        turn = np.cross([0.0, 0.0, -1.0], moved)  # about its middle, which lies a radius along z from its pole
+        turn = np.cross([0.0, 0.0, -1.0], moved)  # about its middle, which lies one radius along z from its pole
         step = np.concatenate([np.zeros_like(moved), np.degrees(turn / self.kept)], axis=1)
         out = T_object.copy()
         middle = T_object[:, :3, 3] + self.kept * T_object[:, :3, 2] + moved * [1.0, 1.0, 0.0]
@@ -350,7 +353,7 @@ class ObjectRoll(Task):
         return out
 
     def place(self, seen: Seen) -> FloatArray:
-        """Place of the ball's middle from the dome's apex, (B, 2) mm, in the work frame."""
+        """Place of the ball's middle relative to the dome's apex, (B, 2) mm, in the work frame."""
         middle = seen.T_object[:, :3, 3] + self.kept * seen.T_object[:, :3, 2]
         turned: FloatArray = np.einsum("bji,bj->bi", seen.T_work[:, :3, :3], middle - seen.T_work[:, :3, 3])
         return turned[:, :2] - self._apex
@@ -368,7 +371,7 @@ class ObjectRoll(Task):
 
 
 class ObjectPush(Task):
-    """Push a block over a table to a place, with the sensor held level; the block slides where the push overcomes its friction.
+    """Push a block over a table to a place with the sensor held level. The block slides if the push exceeds its friction.
 
     The friction of the block's support is an ellipsoid in the space of force and torque (Goyal, Ruina & Papadopoulos 1991): inside it
     the block rests; on it the block moves along the ellipsoid's normal.
@@ -383,12 +386,12 @@ class ObjectPush(Task):
     feed_mm = (0.0, 0.0, 1.0)
     near_mm = 3.0
     holds_n = (0.6, 1.5)
-    """Friction force of the support, drawn for each episode."""
+    """Range of the support's friction force, N. One value is drawn for each episode."""
     lever_mm = 15.0
-    """Torque of the support's friction, over its force."""
+    """Lever of the support's friction, mm: largest friction torque divided by the friction force."""
     give_mm_per_n = 0.7
-    """How far a block is moved for each N by which the push exceeds the support's friction, in one of the trials of a step."""
-    columns = 2  # friction force of the support, and how far the goal was in the last step
+    """Displacement of a block, mm, per N by which the push exceeds the support's friction, in one iteration of a step."""
+    columns = 2  # friction force of the support, and distance to the goal in the last step
     success_share = 0.0
     reached_reward = 5.0
 
@@ -399,7 +402,7 @@ class ObjectPush(Task):
         return Start(T, (float(goal[0]), float(goal[1])), np.eye(4))
 
     def asked(self, goal: FloatArray, T_work: FloatArray) -> FloatArray:
-        """The goals' places as seen from the tools, whose own place and turn a robot knows."""
+        """The goals' places relative to the tools, whose own poses a robot knows."""
         return _seen_in_plane(goal - T_work[:, [0, 2], 3], T_work)
 
     def pushed(self, felt: Felt, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
@@ -407,7 +410,7 @@ class ObjectPush(Task):
         force = np.einsum("bij,bj->bi", T_sensor[:, :3, :3], felt.force_n)
         torque = np.einsum("bij,bj->bi", T_sensor[:, :3, :3], felt.torque_nmm)
         middle = self._middle(T_object)
-        about = torque + np.cross(T_sensor[:, :3, 3] - middle, force)  # of the force on the object about its middle
+        about = torque + np.cross(T_sensor[:, :3, 3] - middle, force)  # torque on the object about its middle
         load = np.stack([force[:, 0], force[:, 2], about[:, 1] / self.lever_mm], axis=1)
         size = np.linalg.norm(load, axis=1)
         over = np.maximum(size - self.kept[:, 0], 0.0)
@@ -426,11 +429,11 @@ class ObjectPush(Task):
         return out
 
     def _middle(self, T_object: FloatArray) -> FloatArray:
-        """Where a block's weight rests: ``lever_mm`` behind its touched face, (B, 3)."""
+        """Centre of a block's weight: ``lever_mm`` behind its touched face, (B, 3)."""
         return T_object[:, :3, 3] + self.lever_mm * T_object[:, :3, 2]
 
     def place(self, seen: Seen) -> FloatArray:
-        """From the block's middle to the goal, (B, 2) mm: x and z of the world."""
+        """Vector from the block's middle to the goal, (B, 2) mm: x and z of the world."""
         return seen.goal - self._middle(seen.T_object)[:, [0, 2]]
 
     def judge(self, seen: Seen) -> Judged:
@@ -438,7 +441,7 @@ class ObjectPush(Task):
         beyond = self.place(seen)[:, 1] < -self.near_mm
         failed = out_of_touch(seen.touch) | beyond
         reached = (off <= self.near_mm) & ~failed
-        reward = self.kept[:, 1] - off + self.reached_reward * reached  # what is gained, so that waiting near the goal earns nothing
+        reward = self.kept[:, 1] - off + self.reached_reward * reached  # the progress, so that waiting near the goal gives no reward
         self.kept[:, 1] = off
         return Judged(np.where(failed, -5.0, reward), failed, reached, reached)
 
@@ -447,7 +450,7 @@ class ObjectPush(Task):
 
 
 def _seen_in_plane(away_mm: FloatArray, T_work: FloatArray) -> FloatArray:
-    """Shifts (B, 2) along x and z of the world as tools at ``T_work`` (B, 4, 4) see them, in cm."""
+    """Shifts (B, 2) along x and z of the world, relative to tools at ``T_work`` (B, 4, 4), in cm."""
     turned = np.column_stack([away_mm[:, 0], np.zeros(len(away_mm)), away_mm[:, 1]])
     here: FloatArray = np.einsum("bji,bj->bi", T_work[:, :3, :3], turned)
     return here[:, [0, 2]] / 10.0

@@ -1,4 +1,4 @@
-"""Where tools and objects are: the motions of a tool, and what a rigid sensor would touch."""
+"""Poses of tools and objects: the motions of a tool, and the contact of a rigid sensor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Tool:
 
     @classmethod
     def of(cls, sensor: SensorSpec, experiment: ExperimentSpec) -> "Tool":
-        """The tool of a sensor's own rig, approaching as an experiment does."""
+        """The tool of a sensor's own rig, with the approach of an experiment."""
         mounting = Mounting.of(sensor, experiment)
         return cls(mounting, np.linalg.inv(work_frame(mounting)) @ mounting.T_tool_sensor)
 
@@ -94,11 +94,11 @@ def standing_on(tool: Tool, surface: Surface, along_mm: float, indent_mm: float,
     Parameters
     ----------
     along_mm : float
-        How far beside, along the object's x.
+        Distance from the object's origin along its x.
     indent_mm : float
-        Of the dome.
+        Indentation of the dome.
     angle_deg : float
-        Of the tool from the surface's normal, about the work frame's y.
+        Angle of the tool from the surface's normal, about the work frame's y.
     """
     place, turned_deg = place_beside(surface, along_mm)
     outward = turn_about((0, 1, 0), turned_deg)[:3, :3] @ [0.0, 0.0, -1.0]
@@ -116,6 +116,6 @@ class Surfaces:
         self._built: dict[ObjectSpec, Surface] = {}
 
     def __getitem__(self, touched: ObjectSpec) -> Surface:
-        if touched not in self._built:  # by all that it is: two files in different folders may have one name
+        if touched not in self._built:  # the key is the whole specification, because two files in different folders may have one name
             self._built[touched] = Surface(touched)
         return self._built[touched]

@@ -1,4 +1,4 @@
-"""Simulated data sets: frames in the recordings' own format, with everything that is known about them beside."""
+"""Simulated data sets: frames in the recordings' own format, with the exact truth beside them."""
 
 from training.generation.config import DatasetError, GenerationConfig, require_count
 from training.generation.run import generate

@@ -23,11 +23,11 @@ Quality = Literal["drawn", "preview", "standard", "high"]
 
 
 MOST_CONTACTS = 1_000_000
-"""Contacts of a data set: at one second each, a core is at work for twelve days."""
+"""Most contacts of a data set. At one second each, a core needs twelve days for them."""
 
 
 def require_count(count: int, option: str = "--count") -> None:
-    """Raise ``DatasetError`` where a data set can't have so many contacts; ``option`` is where the number comes from."""
+    """Raise ``DatasetError`` if a data set can't have this number of contacts; ``option`` names the source of the number."""
     if not 1 <= count <= MOST_CONTACTS:
         raise DatasetError(f"{option} {count}: a data set has 1 to {MOST_CONTACTS} contacts")
 

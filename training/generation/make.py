@@ -1,4 +1,4 @@
-"""One contact of a data set: a worker process makes its pictures and its truth from its number."""
+"""Makes one contact of a data set: a worker process computes its pictures and its truth from its number."""
 
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -147,7 +147,7 @@ def _simulator(config: GenerationConfig, sensor: SensorSpec, shading: Shading | 
 
 
 def _shading(config: GenerationConfig, text: str, sensor: SensorSpec) -> Shading | None:
-    """The shading of the sensor as specified: it stands for that of the drawn sensor, of which nothing is traced."""
+    """The shading of the nominal sensor. It is used for the drawn sensor, too, for which nothing is path-traced."""
     if config.quality != "drawn" or config.images == "none":
         return None
     shading = _nominal(text).renderer.preview.shading

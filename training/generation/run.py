@@ -59,11 +59,11 @@ def generate(
     ------
     DatasetError
         The folder holds another data set or more contacts than wanted, can't be written to, the workers are lost, or a
-        contact can't be made; ``count`` is beyond ``MOST_CONTACTS``; no scheduler answers.
+        contact can't be made; ``count`` is larger than ``MOST_CONTACTS``; or no scheduler answers.
     RenderError
-        Nothing can be rendered there.
+        The machine can't render.
     StoreError
-        Another run is at work in the folder, or another version of the program made what it holds.
+        Another run uses the folder, or another version of the program made its content.
     """
     require_count(count)
     if scheduler:
@@ -128,12 +128,12 @@ def config_for(
     seed : int, optional
         Seed of all random numbers; the experiment's own by default.
     quality : {"drawn", "preview", "standard", "high"}, optional
-        By default ``drawn``: nearer to a converged picture than the few samples that a data set has time for.
+        By default ``drawn``, which is nearer to a converged picture than the few samples for which a data set has time.
 
     Raises
     ------
     FrameError
-        The sensor has no frames of the form that is asked for.
+        The sensor has no frames of the requested form.
     """
     thing = touched or load_object(experiment.object)
     config = GenerationConfig(
@@ -162,17 +162,17 @@ def simulate_dataset(
     also: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Simulated:
-    """Make a data set of ``count`` contacts, or continue the one in the folder; other parameters and errors as of ``generate``.
+    """Make a data set of ``count`` contacts, or continue the one in the folder; other parameters and errors as for ``generate``.
 
     Parameters
     ----------
     also : sequence of str
-        Further formats (``twin.records.ALSO``) that the finished data set is kept in, each in a subfolder.
+        Further formats (``twin.records.ALSO``) in which the finished data set is kept, each in a subfolder.
 
     Raises
     ------
     OptionError
-        A further format is wanted of pins without pictures.
+        A further format is requested for pins without pictures.
     RecordError
         There is no such format, or a library is missing.
     """

@@ -35,7 +35,7 @@ from twin.store import (
     written_by_us,
 )
 
-# Bytes of a JSON file of a data set: a sensor's measured tables are the most of it.
+# Largest size of a JSON file of a data set, bytes. A sensor's measured tables are its largest part.
 LARGEST_RECORD = 100_000_000
 # File of the data set's configuration.
 CONFIG = "generation.json"
@@ -127,7 +127,7 @@ class Store:
         Raises
         ------
         DatasetError
-            They can't be written: the disk is full, or the folder is gone.
+            The files can't be written: the disk is full, or the folder no longer exists.
         """
         try:
             self._keep(outcome)
@@ -214,12 +214,12 @@ class Store:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """What a JSON file of a data set says.
+    """Content of a JSON file of a data set.
 
     Raises
     ------
     DatasetError
-        It can't be read, or does not hold what it should.
+        The file can't be read, or holds something else.
     """
     try:
         found = json.loads(read_regular(path, LARGEST_RECORD).decode())
@@ -236,7 +236,7 @@ def refuse_foreign(folder: Path) -> None:
     found = contents(folder)
     if CONFIG in found:
         return
-    ours = written_by_us(folder)  # of a run that was killed before it wrote its configuration
+    ours = written_by_us(folder)  # files of a run that was killed before it wrote its configuration
     strange = [name for name in found if name not in ours]
     if strange:
         raise DatasetError(f"{folder}: holds something else ({', '.join(strange[:3])}); give an empty or a new folder with --out")

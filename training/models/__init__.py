@@ -1,4 +1,4 @@
-"""Every model by name. A new model is a package beside this file and one line below."""
+"""Register of all models by name. To add a model, add a package beside this file and one line below."""
 
 from dataclasses import asdict, fields
 

@@ -1,4 +1,4 @@
-"""The interface of a model to the rest of the code. Each model is an object of a class below, in its own package.
+"""The interface of a model for the rest of the code. Each model is an object of a class below, in its own package.
 
 A run calls these methods in this order: ``prepare`` (makes inputs of frames, and learns from the training frames what the networks
 need), ``build`` (makes a network with random weights), ``initialise`` (sets a network's constants from the training rows before the
@@ -25,9 +25,9 @@ from twin.pins import Pipeline
 from twin.pins.reference import Reference
 from twin.types import Frame, Observation
 
-LIKELY = 0.5  # probability of a contact below which a frame gives no estimate
-SEEN_DECIMALS = 3  # of pins (px) and areas (px^2) that tell frames apart: the last bits of a centroid may differ between machines
-Learnt = Mapping[str, Mapping[str, np.ndarray]]  # groups of named arrays that a model learnt before its networks did
+LIKELY = 0.5  # least probability of a contact for which a frame gets an estimate
+SEEN_DECIMALS = 3  # decimals of pins (px) and areas (px^2) that are compared: the last bits of a centroid may differ between machines
+Learnt = Mapping[str, Mapping[str, np.ndarray]]  # groups of named arrays that a model learnt before its networks
 Weights = dict[str, torch.Tensor]  # a network's state
 
 
@@ -73,9 +73,9 @@ class Prediction:
     executed : (B,) float
         Probability that the shear move was executed; NaN if the model does not estimate it.
     touched : float
-        Of a single frame, the probability that anything is touched; NaN if there is no frame without contact to tell it by.
+        For a single frame, the probability that anything is touched; NaN without a frame without contact to compare with.
     seen : Observation or None
-        Of a single frame, the pins that the labels were estimated from; None if the model looks at the picture itself.
+        For a single frame, the pins from which the labels were estimated; None if the model uses the picture itself.
     """
 
     mean: np.ndarray
@@ -88,8 +88,8 @@ class Prediction:
 
 @dataclass(frozen=True)
 class OneFrame:
-    """The pins of one frame, a table of one row; the probability that they show a contact, ``touched`` as in ``Prediction``; the share
-    of the pins in view that were not found; and what the pipeline saw in the frame, if it is known."""
+    """The pins of one frame: a table of one row, the probability ``touched`` of a contact as in ``Prediction``, the share of the pins in
+    view that were not found, and the pipeline's observation of the frame, if it is known."""
 
     pins: PinTable
     touched: float = float("nan")
@@ -99,7 +99,7 @@ class OneFrame:
 
 @dataclass(frozen=True)
 class Unseen:
-    """A frame that shows too little for an estimate, and the reason; ``touched`` and ``seen`` as in ``Prediction``."""
+    """A frame that shows too little for an estimate, with the reason; ``touched`` and ``seen`` as in ``Prediction``."""
 
     reason: str
     touched: float = float("nan")
@@ -123,7 +123,7 @@ class Modes:
 
 @dataclass(frozen=True)
 class Trained:
-    """What a trained model estimates with.
+    """Everything that a trained model needs for its estimates.
 
     Attributes
     ----------
@@ -137,8 +137,8 @@ class Trained:
     ensemble : callable
         ``ensemble(inputs, rows)`` gives the labels of rows (B,) of inputs.
     touched : callable, optional
-        ``touched(nodes_px, lost)`` gives the probability that a frame's pins (N, 2) show a contact (``training.touched``). It is there
-        where the pins at rest were measured in a frame without contact.
+        ``touched(nodes_px, lost)`` gives the probability that a frame's pins (N, 2) show a contact (``training.touched``). It is None
+        unless the pins at rest were measured in a frame without contact.
     """
 
     sensor: SensorSpec
@@ -149,7 +149,7 @@ class Trained:
     touched: Callable[[np.ndarray, np.ndarray], float] | None = None
 
     def likely_touched(self, nodes_px: np.ndarray, lost: np.ndarray) -> float:
-        """Probability that pins (N, 2), of which some are ``lost`` (N,), show a contact; NaN where nothing tells it."""
+        """Probability that pins (N, 2), of which some are ``lost`` (N,), show a contact; NaN if it is unknown."""
         return float("nan") if self.touched is None else self.touched(nodes_px, lost)
 
 
@@ -180,7 +180,7 @@ class Model(ABC):
     description : str
         One line.
     recipe : Recipe
-        Settings of its training, where the user gives no others.
+        Default settings of its training.
     variants : dict of str to Variant
         Variants by the name of the part that is left out. ``NAME-without-PART`` can be trained.
     published_mm_deg : (float, float), optional
@@ -192,7 +192,7 @@ class Model(ABC):
     has_modes : bool
         Whether it has ``modes``, so that a Gaussian process can be averaged with its networks.
     modes_scaled : bool
-        Whether the scales of its modes say how much they matter, so that the process needs one common length only.
+        Whether the scales of its modes show their importance, so that the process needs only one common length.
     """
 
     name: str
@@ -212,7 +212,7 @@ class Model(ABC):
 
     @abstractmethod
     def seen(self, data: Dataset) -> object:
-        """All that the model sees of a data set's frames, as ``inputs_digest`` takes it: frames with the same are the same to it."""
+        """All that the model uses of a data set's frames, as input of ``inputs_digest``. Frames with equal values are equal for it."""
 
     @abstractmethod
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> nn.Module:
@@ -239,14 +239,14 @@ class Model(ABC):
     def initialise(  # noqa: B027  (most take nothing)
         self, network: nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode
     ) -> None:
-        """Set what a network needs from the training rows (m,) before its first step. Most models need nothing.
+        """Set the parts of a network that follow from the training rows (m,), before its first step. Most models have none.
 
         Parameters
         ----------
         numbers : (M, E) float
             Standardised numbers of all frames' labels.
         code : LabelCode
-            Which labels they are.
+            Code of the labels.
         """
 
     def penalty(self, network: nn.Module) -> torch.Tensor | None:
@@ -270,7 +270,7 @@ class Model(ABC):
         Raises
         ------
         FrameError
-            The frame is not one of the model's sensor: wrong size, type or form.
+            The frame does not belong to the model's sensor: wrong size, type or form.
         """
 
     @abstractmethod
@@ -300,7 +300,7 @@ class PinModel(Model):
     sees_light : bool
         Whether it also uses the gray level at each pin.
     unmeasured_widens : float
-        Factor on the intervals where no frame without contact shows where the camera sits.
+        Factor on the intervals if no frame without contact shows the camera's place.
     """
 
     sees_light: ClassVar[bool] = False
@@ -315,14 +315,13 @@ class PinModel(Model):
         learnt : dict
             As in ``Prepared``.
         reference : Reference
-            The pins at rest in training; ``pins`` has those of the sensor in hand.
+            The pins at rest in training; ``pins`` has those of the present sensor.
         together : bool
-            Whether all frames are of one camera that did not move between them, and there is no frame without contact that shows
-            where it sits.
+            Whether all frames are of one camera that did not move between them, and no frame without contact shows its place.
         """
 
     def prepare_pins(self, pins: PinTable, train: np.ndarray) -> Prepared:
-        """See ``Model.prepare``; only the pins are given."""
+        """As ``Model.prepare``, from the pins alone."""
         return Prepared(self.inputs(pins, {}, pins.reference, together=False))
 
     def prepare(self, data: Dataset, train: np.ndarray) -> Prepared:
@@ -330,7 +329,7 @@ class PinModel(Model):
         return self.prepare_pins(data.pins, train)
 
     def seen(self, data: Dataset) -> object:
-        """See ``Model``: the pins, and where they are at rest."""
+        """See ``Model``: the pins, and their places at rest."""
         pins = data.pins
         places = [np.round(px, SEEN_DECIMALS) + 0.0 for px in (pins.nodes_px, pins.area_px2, pins.reference.pins_px)]
         return [*places, pins.lost, pins.measured]
@@ -375,8 +374,8 @@ class PinModel(Model):
     def estimate_pins(self, trained: Trained, pins: PinTable) -> Prediction:
         """Estimate the labels of the valid frames of one camera.
 
-        If the camera sits elsewhere than in training, its displacement is measured in the table's own frame without contact. If there
-        is none, it is the median over the frames.
+        If the camera sits at another place than in training, its displacement is measured in the table's own frame without contact. Without
+        such a frame it is the median over the frames.
         """
         return self._estimated(trained, pins, together=not pins.measured)
 

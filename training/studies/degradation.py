@@ -29,7 +29,7 @@ Estimates = tuple[np.ndarray, tuple[str, ...], bool]  # values, their units, whe
 
 @dataclass(frozen=True)
 class Plan:
-    """What is degraded, and what is judged.
+    """What is degraded, and which pipelines and models are judged.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Plan:
     models : tuple of Path
         Folders of runs.
     sweep : SweepPlan
-        Which conditions, and how severe.
+        The conditions and their severities.
     frames : Path or None
         Real frames instead of rendered ones.
     limit : int
@@ -47,7 +47,7 @@ class Plan:
     rendered : bool
         Also sweep rendered frames, to show them beside raw real ones.
     jobs : int
-        Processes.
+        Number of processes.
     """
 
     sensor: SensorSpec
@@ -62,7 +62,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Result:
-    """Where each pipeline and model fails under each condition, and the files, the page first."""
+    """The severities at which each pipeline and model fails under each condition, and the files, the page first."""
 
     envelopes: list[Envelope]
     written: list[Path]

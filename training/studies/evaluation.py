@@ -34,7 +34,7 @@ from twin.types import Frame
 ROWS = ("validation", "all")
 # Choices of the labels that count as truth.
 LABELS = ("corrected", "raw")
-# Length along which the direction of a shear traction is seen in the frame.
+# Length, mm, of the vector by which the direction of a shear traction is projected into the frame.
 ARROW_MM = 1e-3
 
 
@@ -60,7 +60,7 @@ class Predictions:
             warm = False
             for frame in self.recording:
                 if not warm:
-                    # loads or compiles code, which is no part of a frame's time, by a copy whose memory nobody uses
+                    # loads or compiles code, which must not count in a frame's time; a copy is used, so that no memory changes
                     self.estimator.remembering()(frame)
                     warm = True
                 if self.maps is None or not isinstance(self.estimator, PoseEstimator):
@@ -72,7 +72,7 @@ class Predictions:
                 yield frame.name, made
 
     def lines(self) -> Iterator[str]:
-        """Lines for people: what is odd in the recording, each frame's pose once it is estimated, and the frames that can't be read.
+        """Lines of text: irregularities of the recording, each frame's pose as soon as it is estimated, and the frames that can't be read.
 
         Raises
         ------
@@ -95,25 +95,25 @@ class Predictions:
 
 
 def models_of_kinds(run: str | Path, frames: str | Path) -> ContactEstimator | None:
-    """The models of several kinds of contact that a run holds, if the frames at a path are of their form; else None.
+    """The models of several kinds of contact in a run, if the frames at a path have their form; else None.
 
     Raises
     ------
     TrainingError
         The models can't be read.
     FrameError
-        There are no such frames, or they are of another sensor.
+        There are no such frames, or they belong to another sensor.
     """
     folder = contacts_folder(run)
     if folder is None:
         return None
     models = ContactEstimator.load(folder)
-    alone = folder == folder_of(run)  # no other model there that could take frames of another form
+    alone = folder == folder_of(run)  # there is no other model that could take frames of another form
     return models if alone or open_recording(frames, models.sensor).form == models.form else None
 
 
 def _slip_errors(estimator: PoseEstimator, parts: Sequence[Dataset], chosen: set[str]) -> dict[str, Any] | None:
-    """How well slip is told on the drags all of whose frames are ``chosen``, each gone through once at a random speed; None without one."""
+    """Errors of slip on the drags whose frames are all ``chosen``, each traversed once at a random speed; None if there is none."""
     assert estimator.slip is not None
     rng, ways = np.random.default_rng(0), []
     called = told_apart([part.folder.resolve() for part in parts]) if len(parts) > 1 else [""]
@@ -127,7 +127,7 @@ def _slip_errors(estimator: PoseEstimator, parts: Sequence[Dataset], chosen: set
 
 
 def write_frame_maps(folder: Path, estimator: PoseEstimator, frame: Frame, maps: ContactMaps) -> list[Path]:
-    """Write the contact maps of one frame: arrays as ``NAME.npz``, a picture as ``NAME.png``; NAME is the frame's without its ending.
+    """Write the contact maps of one frame: arrays as ``NAME.npz``, a picture as ``NAME.png``. NAME is the frame's name without suffix.
 
     The arrays are ``nodes_mm`` (G, 3), ``nodes_px`` (G, 2) in the frame, ``area_mm2`` (G,), ``force_n`` (G, 3), ``pressure_mpa`` (G,),
     ``traction_mpa`` (G, 3) and ``patch`` (G,), of the grid's nodes, and ``resultant_n`` (3,) and ``torque_z_nmm``.
@@ -148,27 +148,27 @@ def write_frame_maps(folder: Path, estimator: PoseEstimator, frame: Frame, maps:
 
 
 def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = None, sequence: bool = False) -> Predictions:
-    """Estimate the poses in the frames at a path by a trained model.
+    """Estimate the poses in the frames at a path with a trained model.
 
-    If the model uses displacements from rest and the recording has a frame without contact, displacements are counted from that frame.
+    If the model uses displacements from rest and the recording has a frame without contact, displacements are computed from that frame.
 
     Parameters
     ----------
     run : path
-        As ``PoseEstimator.load`` takes it.
+        Path or name as for ``PoseEstimator.load``.
     frames : path
-        As ``open_recording`` takes it.
+        Path as for ``open_recording``.
     maps : path, optional
         Folder for the contact maps of each frame.
     sequence : bool
-        The frames follow each other in time: slip is told, too (``PoseEstimator.remembering``).
+        The frames are consecutive, so slip is also estimated (``PoseEstimator.remembering``).
 
     Raises
     ------
     TrainingError
-        There is no such run, or it has no contact maps, or does not tell slip, and that is wanted.
+        There is no such run, or contact maps or slip are requested and the run has no model of them.
     FrameError
-        There are no such frames, or they are of another sensor.
+        There are no such frames, or they belong to another sensor.
     """
     several = models_of_kinds(run, frames)
     estimator = several or PoseEstimator.load(run)
@@ -195,7 +195,7 @@ def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = N
 
 
 def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
-    """A recording without a no-contact frame, counted from where its contacts tell that its pins are at rest; others as they are."""
+    """A recording without a no-contact frame, relative to the pins at rest estimated from its contacts; other recordings unchanged."""
     if not estimator.counts_from_rest or is_simulated(data.folder):
         return data
     if open_recording(data.folder, estimator.sensor, estimator.form).reference is not None:
@@ -224,9 +224,9 @@ class Evaluation:
     Attributes
     ----------
     metrics : dict
-        Content of ``metrics.json``; with models of several kinds of contact also ``taken_for``, the share of frames taken for each; of
-        simulated contacts and a run with contact maps also ``maps`` (see ``MapErrors``), and of a run that tells slip ``slip`` (see
-        ``SlipErrors``).
+        Content of ``metrics.json``. With models of several kinds of contact it includes ``taken_for``, the share of frames classified as
+        each kind. For simulated contacts and a run with contact maps it includes ``maps`` (see ``MapErrors``), and for a run that estimates
+        slip ``slip`` (see ``SlipErrors``).
     changes : list of dict
         Errors on changed images; empty if they were not asked for.
     units : dict of str to str
@@ -294,7 +294,7 @@ def evaluate_run(
     Parameters
     ----------
     run : path
-        As ``PoseEstimator.load`` takes it.
+        Path or name as for ``PoseEstimator.load``.
     recordings : sequence of Path
         Labelled recordings; for ``rows="validation"`` exactly those that the run was trained on.
     rows : {"validation", "all"}
@@ -314,8 +314,8 @@ def evaluate_run(
 
     Notes
     -----
-    With models of several kinds of contact (``ContactEstimator``) each frame is judged by the likeliest of those kinds whose labels the
-    recording varies, whatever it is taken for among all kinds; ``taken_for`` of the metrics tells that.
+    With models of several kinds of contact (``ContactEstimator``), each frame is judged by the most probable of those kinds whose labels
+    the recording varies. ``taken_for`` of the metrics shows the classification among all kinds.
     """
     for value, allowed, option in ((rows, ROWS, "--rows"), (labels, LABELS, "--labels")):
         if value not in allowed:

@@ -1,4 +1,4 @@
-"""Audit of a recording: do its labels agree with its pins? The result are tables, numbers, a picture and a page."""
+"""Audit of a recording: a test of whether its labels agree with its pins. The results are tables, numbers, a picture and a page."""
 
 import csv
 import io
@@ -30,7 +30,7 @@ LISTS = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_fr
 SAID = 3
 # Number of frames of each list that are named on the page; audit.json names all.
 NAMED = 8
-# Move in mm or deg above which a move is large. Some figures are of large moves alone, because a small move hardly changes the pins.
+# Move, mm or deg, above which a move is large. Some figures use large moves alone, because a small move hardly changes the pins.
 LARGE_MOVE = 1.0
 
 
@@ -53,7 +53,7 @@ class LabelAudit:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """Lines for people."""
+        """The result as lines of text."""
         if self.audit.untold:
             lines = [f"{self.frames} frames: {self.audit.untold}", "no labels_corrected.csv: whether the labels are right is not known"]
         else:
@@ -77,7 +77,7 @@ class LabelAudit:
 def audit_recording(data: Path, sensor: SensorSpec, out: Path, *, form: Form | None = None, progress: Progress = silent) -> LabelAudit:
     """Audit the labels of a recording of one object, and write the result to a folder.
 
-    A recording of too few frames is not judged: the result says so (``Audit.untold``), and no corrected labels are written.
+    A recording with too few frames is not judged. The result states this (``Audit.untold``), and no corrected labels are written.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def _pose_and_move(data: Dataset) -> np.ndarray:
 
 
 def _corrected(data: Dataset, executed: np.ndarray, depth_per_move: float) -> dict[str, np.ndarray]:
-    """The labels that vary, without moves that were not executed (M,), by their names."""
+    """The varying labels without moves that were not executed (M,), by their names."""
     pose, move = _pose_and_move(data)
     undone = (1 - executed)[:, None]
     before = pose - undone * move
@@ -144,9 +144,9 @@ def _moves(audit: Audit, data: Dataset) -> dict:
 
 
 def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[Path]:
-    """Write ``labels_corrected.csv``, ``audit.json``, ``audit.png`` and ``audit.html``; their paths.
+    """Write ``labels_corrected.csv``, ``audit.json``, ``audit.png`` and ``audit.html``, and return their paths.
 
-    Of frames that are too few to tell anything neither corrected labels nor a picture are written.
+    If there are too few frames, neither corrected labels nor a picture are written.
     """
     numbers = write_json(out / "audit.json", summary | {"made_by": made_by("training.audit")})
     page = Page(

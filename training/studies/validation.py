@@ -1,4 +1,4 @@
-"""Validation: the twin's pins are compared with those of labelled real frames. The result are tables and a page."""
+"""Validation: compares the twin's pins with those of labelled real frames. The results are tables and a page."""
 
 from dataclasses import dataclass
 from pathlib import Path

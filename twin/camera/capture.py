@@ -1,4 +1,4 @@
-"""The capture side: from light on the film to the frames that a camera and its recorder deliver.
+"""Conversion of light on the film to the frames that a camera and its recorder deliver.
 
 Cameras send luma and colour differences, which the computer converts to 8-bit colours. Luma is in the studio range 16 to 235, colour
 differences are in 16 to 240. The conversion uses the usual integer arithmetic (products with 256 times the coefficients, rounded). Only
@@ -35,13 +35,13 @@ CLIPPED = (2, 253)
 MOST_PIXELS = 20_000
 """Most pixels that are used to recognise a stream."""
 WIDE_PX = 8.0
-"""Standard deviation, px, from which on a blur is computed with the few cosines that it leaves, not with a kernel."""
+"""Standard deviation, px, above which a blur is computed with the few cosines that it leaves, not with a kernel."""
 LEAST_KEPT = 1e-5
-"""Cosines of which a blur leaves a smaller share are left out."""
+"""Least share of its size that a cosine must keep after a blur. Other cosines are left out."""
 JPEG_BLOCK_PX = 16
 """Side of the blocks of a JPEG whose chroma has half the resolution."""
 WEIGHTS = {"gaussian": cv2.ADAPTIVE_THRESH_GAUSSIAN_C, "mean": cv2.ADAPTIVE_THRESH_MEAN_C}
-"""OpenCV's names of the averages that a recorder's threshold may take."""
+"""OpenCV's names of the averages that a recorder's threshold may use."""
 
 
 def expose(
@@ -50,9 +50,8 @@ def expose(
     """The raw frame that gel, lens and camera make of the light.
 
     Gel haze, lateral chromatic aberration, blur and vignetting act on light. They are followed by gain, noise, sharpening of the luma,
-    the response curve, loss of colour detail, the video stream and its compression (`GelSpec`, `CameraSpec`, `ResponseSpec`). A residual
-    network that is switched on comes before the stream.
-    A step whose parameter is neutral changes nothing.
+    the response curve, loss of colour detail, the video stream and its compression (`GelSpec`, `CameraSpec`, `ResponseSpec`). If a residual
+    network is switched on, it acts before the stream. A step whose parameter is neutral changes nothing.
 
     Parameters
     ----------
@@ -81,7 +80,7 @@ def expose(
 def before_stream(
     linear: FloatArray, capture: CaptureSpec, rng: np.random.Generator | None = None, *, origin_px: tuple[int, int] = (0, 0)
 ) -> FloatArray:
-    """Gray levels (H, W[, 3]) float of a frame before columns share colour differences and a stream rounds them: as for ``expose``."""
+    """Gray levels (H, W[, 3]) float before columns share colour differences and a stream rounds them; parameters as for ``expose``."""
     return _developed_light(linear, capture, capture.response.model_copy(update={"chroma_columns": 1}), rng, origin_px)
 
 
@@ -202,7 +201,7 @@ def developed(light: FloatArray, grainy: FloatArray, response: ResponseSpec, ori
 
 
 def cleaned(chroma: FloatArray, response: ResponseSpec) -> FloatArray:
-    """Colour differences (H, W, 3), of which those of red and blue are the medians over squares; green's follow, because luma stays."""
+    """Colour differences (H, W, 3) after a median over squares for red and blue. Green follows, because the luma is not changed."""
     if response.chroma_median_px == 0:
         return chroma
     red, blue = (cv2.medianBlur(np.ascontiguousarray(chroma[..., k], np.float32), response.chroma_median_px) for k in (0, 2))
@@ -211,7 +210,7 @@ def cleaned(chroma: FloatArray, response: ResponseSpec) -> FloatArray:
 
 
 def shared(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:
-    """Chroma (H, W, 3) in which ``columns`` neighbouring columns have that of the first of them, as 4:2:2 streams sample it.
+    """Chroma (H, W, 3) in which each group of ``columns`` columns has the chroma of its first column, as 4:2:2 streams sample it.
 
     The groups begin at the full frame's first column; ``left_px`` is the first column's number in the full frame.
     """

@@ -1,8 +1,9 @@
-"""A small network that adds to a frame what the models of light and camera leave out: the texture of edges, colours and noise.
+"""A small network that adds to a frame the details that the models of light and camera do not describe: texture of edges, colours and
+noise.
 
-It changes each pixel by what stands around it and by random numbers of its own, with four convolutions; its middle two add to what they
-are given. It was taught against judges that tell real frames from rendered ones (`training.residual`). It works on luma and colour
-differences before the stream rounds them, within the lens disc, and only where ``response.residual.used`` is set.
+The change of each pixel depends on the pixels around it and on random numbers of its own. The network has four convolutions; the middle two
+add to their input. It was trained against judges that distinguish real frames from rendered ones (`training.residual`). It works on luma
+and colour differences before the stream rounds them, within the lens disc, and only if ``response.residual.used`` is set.
 """
 
 import numpy as np
@@ -12,13 +13,13 @@ from twin.errors import RenderError
 from twin.types import FloatArray
 
 LEVELS = 64.0
-"""Gray levels that the value 1 of the network's input stands for."""
+"""Number of gray levels that correspond to the value 1 of the network's input."""
 MIDDLE = (1.0, 0.0, 0.0)
-"""Offsets that are subtracted from the input's luma and colour differences, in ``LEVELS``."""
+"""Offsets that are subtracted from the input's luma and colour differences, in units of ``LEVELS``."""
 LEAK = 0.1
-"""Slope of a leaky rectifier below 0."""
+"""Slope of the leaky rectifier for negative values."""
 MOST_LEVELS, STEEPNESS = 16.0, 2.0
-"""Largest change of luma and colour differences, gray levels, and the factor before the tanh that bounds it."""
+"""Largest change of luma and colour differences, gray levels, and factor in front of the tanh's argument."""
 
 
 def with_residual(spec: SensorSpec) -> SensorSpec:
@@ -81,7 +82,7 @@ def differences(luma: FloatArray) -> FloatArray:
 
 
 def change(signal: FloatArray, noise: FloatArray, residual: ResidualSpec) -> FloatArray:
-    """What the network adds (H, W, 3) to luma and colour differences (H, W, 3), gray levels, given noise (H, W, noises)."""
+    """The change (H, W, 3), gray levels, that the network adds to luma and colour differences (H, W, 3), for noise (H, W, noises)."""
     first, second, third, last = layers(residual)
     seen = np.concatenate([signal / np.float32(LEVELS) - np.array(MIDDLE, np.float32), noise], axis=2)
     hidden = rectified(convolved(seen, *first))
@@ -101,7 +102,7 @@ def layers(residual: ResidualSpec) -> list[tuple[FloatArray, FloatArray]]:
 
 
 def convolved(signal: FloatArray, kernel: FloatArray, bias: FloatArray) -> FloatArray:
-    """Cross-correlation of a signal (H, W, in) with a kernel (out, in, k, k); zeros are around it."""
+    """Cross-correlation of a signal (H, W, in) with a kernel (out, in, k, k). The signal is padded with zeros."""
     height, width, channels = signal.shape
     side = kernel.shape[2]
     padded = np.pad(signal, ((side // 2, side // 2), (side // 2, side // 2), (0, 0)))
@@ -115,12 +116,12 @@ def convolved(signal: FloatArray, kernel: FloatArray, bias: FloatArray) -> Float
 
 
 def rectified(signal: FloatArray) -> FloatArray:
-    """The signal, its negative part times ``LEAK``."""
+    """The signal, with its negative part multiplied by ``LEAK``."""
     return np.maximum(signal, np.float32(LEAK) * signal)
 
 
 def averaged(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:
-    """Colour differences (H, W, 2) of which groups of columns of the full frame have their mean; ``left_px`` is the first one's number."""
+    """Colour differences (H, W, 2), averaged over groups of columns of the full frame; ``left_px`` is the number of the first column."""
     if columns == 1:
         return chroma
     group = (left_px + np.arange(chroma.shape[1])) // columns

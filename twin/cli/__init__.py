@@ -19,7 +19,7 @@ from typer.core import TyperGroup
 
 from twin.errors import OptionError, StoreError, TwinError
 
-# Modules of commands, in the order in which 'twin --help' lists them, and the title that their commands stand under there.
+# Modules of commands, in the order in which 'twin --help' lists them, each with the title above its commands.
 COMMANDS = {
     "start": "Begin",
     "studio": "Begin",
@@ -31,19 +31,19 @@ COMMANDS = {
     "live": "Cameras and arms",
 }
 
-# Exit codes: a failure, a wrong command line, an end by Ctrl-C (128 + the signal's number, as shells count).
+# Exit codes: a failure, a wrong command line, an end by Ctrl-C (128 + the signal's number, as in shells).
 FAILED, MISUSED, INTERRUPTED = 1, 2, 130
 
 
 class _Commands(TyperGroup):
-    """All commands, listed by the kind of work. After Ctrl-C typer alone would end the program without a word."""
+    """All commands, listed by the kind of work. It also prints a line after Ctrl-C; typer alone ends the program without one."""
 
     def titled(self, ctx: Any) -> dict[str, list[str]]:
         """Names of the commands under each title of ``COMMANDS``."""
         found: dict[str, list[str]] = {title: [] for title in COMMANDS.values()}
         for name in self.list_commands(ctx):
             command: Any = self.get_command(ctx, name)
-            while hasattr(command, "commands"):  # a group of commands stands where its own stand
+            while hasattr(command, "commands"):  # a group of commands is listed with the module of its first command
                 command = next(iter(command.commands.values()))
             found[COMMANDS[command.callback.__module__.rpartition(".")[2]]].append(name)
         return {title: names for title, names in found.items() if names}
@@ -73,7 +73,7 @@ class _Commands(TyperGroup):
 
 
 class FewCommands(TyperGroup):
-    """A group of commands of one kind. Where a name is none of them, the error says which there are."""
+    """A group of commands of one kind. For an unknown name the error lists the commands of the group."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args[0] not in self.list_commands(ctx) and not args[0].startswith("-") and not ctx.resilient_parsing:
@@ -115,13 +115,13 @@ def command_line() -> typer.Typer:
 def main() -> None:
     """Run the command line.
 
-    An error that a user can act on is printed as one line on stderr. The exit code is then 2 if the command line itself is wrong,
-    and 1 otherwise. Ctrl-C is one line, too, and exit code 130. A warning is one line without the place in the source.
+    An error that the user can correct is printed as one line on stderr. The exit code is then 2 if the command line itself is wrong, and 1
+    otherwise. Ctrl-C also prints one line; its exit code is 130. A warning is one line without the place in the source.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # a letter that the encoding lacks is printed by its number, as on stderr
+        sys.stdout.reconfigure(errors="backslashreplace")  # a letter that the encoding lacks is printed as its code, as on stderr
     warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {' '.join(str(message).split())}\n"
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where the home can't be written it is slower, and says so in four lines
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # without a writable home directory it prints four lines of warnings
     try:
         command_line()(prog_name="twin")
     except KeyboardInterrupt as interrupt:  # before a command runs
@@ -145,15 +145,15 @@ def _end_interrupted(interrupt: KeyboardInterrupt) -> NoReturn:
 
 
 def _end_without_room(error: OSError) -> NoReturn:
-    """End after a full disk that is not the output's: the standard output is written to it, or a library's cache lies on it."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what still waits to be printed would fail again at the end
+    """End after a full disk that holds no output file of the command, but the standard output or a library's cache."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # text that still waits to be printed would fail again at the end
     place = error.filename or "the standard output or a cache"
     print(f"twin: error: {place}: can't be written ({error.strerror}); free some space and give the same command again", file=sys.stderr)
     sys.exit(FAILED)
 
 
 def _print_unsaved(texts: Mapping[str, str]) -> None:
-    """Print what could not be written, each text below its file's name where there are several."""
+    """Print the texts that could not be written. If there are several, each follows its file's name."""
     try:
         for name, text in texts.items():
             print(text if len(texts) == 1 else f"--- {name}\n{text}", flush=True)
@@ -162,13 +162,13 @@ def _print_unsaved(texts: Mapping[str, str]) -> None:
 
 
 def _for_user(error: Exception) -> bool:
-    """Whether an error tells the user what to do. The specifications' error is imported only now, because their models load slowly."""
+    """Whether an error tells the user what to do. The specifications' error class is imported here, because its module loads slowly."""
     from scenes.base import SpecError
 
     return isinstance(error, TwinError | SpecError)
 
 
 def _print_notes(error: BaseException) -> None:
-    """Print each note of an error on stderr. Notes tell what failed after the error, for example that an arm could not be stopped."""
+    """Print each note of an error on stderr. A note states a failure after the error, for example that an arm could not be stopped."""
     for note in getattr(error, "__notes__", ()):
         print(f"twin: note: {' '.join(note.split())}", file=sys.stderr)

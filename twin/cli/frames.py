@@ -171,7 +171,7 @@ def tune_command(
     tell(found)
 
 
-# Exit code of 'twin check' where the sensor is not well. It differs from those of a failure (1) and of a wrong command line (2).
+# Exit code of 'twin check' if the sensor's condition is bad. It differs from those of a failure (1) and of a wrong command line (2).
 BAD = 3
 HELP_CHECK = """Check whether the sensor is well, and say what to do.
 

@@ -96,7 +96,7 @@ Examples:
 
 
 class Images(StrEnum):
-    """What pictures a data set holds."""
+    """The kinds of pictures in a data set."""
 
     RAW = "raw"
     GRAY = "gray"
@@ -105,7 +105,7 @@ class Images(StrEnum):
 
 
 class States(StrEnum):
-    """Which states of a contact become frames."""
+    """The states of a contact that become frames."""
 
     ALL = "all"
     END = "end"

@@ -104,7 +104,7 @@ def live(
 
 
 def tell_view(url: str) -> None:
-    """Say where the frames are shown."""
+    """Print where the frames are shown."""
     print(f"showing in {url}; Ctrl-C ends it", flush=True)
 
 
@@ -276,18 +276,18 @@ def run_along(
     also: list[AlsoFormat] | None,
     **options: Any,
 ) -> None:
-    """Run along an object's outline with a model or policy: from a command's options to what is said at the end.
+    """Follow an object's outline with a model or policy, from a command's options to the printed result.
 
     Parameters
     ----------
     follow : callable
         ``hardware.following.follow``.
     load, run : callable, Path
-        What loads the model, and from where.
+        Function that loads the model, and its path.
     kept_as : str
-        The name by which the results state ``run``.
+        Name of ``run`` in the results.
     **options
-        The others of ``FollowPlan``.
+        The other fields of ``FollowPlan``.
 
     Raises
     ------

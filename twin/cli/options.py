@@ -1,4 +1,4 @@
-"""Options that several commands have, and the printing of results."""
+"""Options that several commands share, and the printing of results."""
 
 import math
 import os
@@ -20,18 +20,18 @@ Spec = TypeVar("Spec")
 
 
 def usable_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 CORES = usable_cores()
-# The largest seed of weights and splits (the constant of training.run, which would load PyTorch).
+# The largest seed of weights and splits. It is the constant of training.run, which is not imported because it would load PyTorch.
 MOST_SEED = 2**32 - 1
-# More threads of a CPU than this have never made a training faster, and many more can't be started.
+# Largest number of CPU threads. More threads have never made a training faster, and many more can't be started.
 MOST_THREADS = 256
 
 Quality = Literal["drawn", "preview", "standard", "high"]
-"""Presets of the renderer (``twin.optics.render.Quality``, which would load the renderer)."""
+"""Presets of the renderer, as in ``twin.optics.render.Quality``. They are repeated here, because that import would load the renderer."""
 QUALITY = "drawn without noise, or path-traced with more and more samples"
 
 Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
@@ -44,7 +44,7 @@ Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch
 
 
 def each_once(text: str | None) -> str | None:
-    """The names between commas, if there are some and none is there twice; None if there is no text."""
+    """The comma-separated names, if there are some and none occurs twice; None if there is no text."""
     if text is None:
         return None
     names = names_in(text)
@@ -54,7 +54,7 @@ def each_once(text: str | None) -> str | None:
 
 
 def finite(value: float | None) -> float | None:
-    """The number, if it is one: comparisons with a least value let NaN pass."""
+    """The number, if it is not NaN or infinite. This is checked here, because a least value of an option lets NaN pass."""
     if value is not None and not math.isfinite(value):
         raise typer.BadParameter(f"give a number, got {value}")
     return value
@@ -84,7 +84,7 @@ ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, s
 
 
 class AlsoFormat(StrEnum):
-    """Formats that a record may be kept in besides its own (``twin.records.ALSO``, which would load the pin detection)."""
+    """Further formats in which a record can be kept, as in ``twin.records.ALSO``, whose import would load the pin detection."""
 
     LEROBOT = "lerobot"
     HUGGINGFACE = "huggingface"
@@ -120,12 +120,12 @@ Across = Annotated[int, typer.Option("--across", min=6, max=64, callback=_even, 
 
 
 def names_in(text: str) -> list[str]:
-    """The names between commas."""
+    """The comma-separated names."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
-    """The whole numbers between commas, none of them less than ``least`` or beyond a seed."""
+    """The comma-separated whole numbers, each at least ``least`` and at most the largest seed."""
     try:
         numbers = tuple(int(part) for part in names_in(text))
     except ValueError as error:
@@ -141,7 +141,7 @@ def if_given(load: Callable[[Given], Spec], name: Given | None) -> Spec | None:
 
 
 def sensor_with(name: str, tuning: Path | None) -> "SensorSpec":
-    """The sensor, its pins found as a file of 'twin tune' says where one is given."""
+    """The sensor, with the pin detection of a 'twin tune' file if one is given."""
     from scenes import load_sensor
     from twin.pins import load_detector, with_detector
 
@@ -150,14 +150,14 @@ def sensor_with(name: str, tuning: Path | None) -> "SensorSpec":
 
 
 def refined_if(wanted: bool, sensor: "SensorSpec") -> "SensorSpec":
-    """The sensor, its residual network switched on if this is wanted."""
+    """The sensor, with its residual network switched on if ``wanted``."""
     from twin.camera.residual import with_residual
 
     return with_residual(sensor) if wanted else sensor
 
 
 def one_recording(folders: list[Path], table: Path | None, no_contact: Path | None) -> list[Path]:
-    """The recordings; a table or a no-contact frame from elsewhere belongs to the only one."""
+    """The recordings. A table or a no-contact frame from elsewhere is allowed for a single recording only, and is attached to it."""
     from twin.frames import frames_at
 
     if len(folders) > 1 and (table or no_contact):
@@ -166,14 +166,14 @@ def one_recording(folders: list[Path], table: Path | None, no_contact: Path | No
 
 
 class Result(Protocol):
-    """What a function that does the work of a command returns."""
+    """The result of a function that does a command's work."""
 
     @property
     def written(self) -> Sequence[Path]:
-        """The files that it wrote."""
+        """The files that were written."""
 
     def lines(self) -> Iterable[str]:
-        """The result in words."""
+        """The result as lines of text."""
 
 
 def say(lines: Iterable[str]) -> None:

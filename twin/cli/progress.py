@@ -23,18 +23,18 @@ from rich.text import Text
 
 from twin.progress import Progress as Told
 
-LINE_S = 10.0  # between two lines where there is no terminal
+LINE_S = 10.0  # time between two lines without a terminal, s
 
 
 class _CountColumn(ProgressColumn):
-    """Done and total of what is counted; nothing for a fraction, which the bar shows."""
+    """Number done and total number of counted items; empty for a fraction, which the bar shows."""
 
     def render(self, task: Task) -> Text:
         return Text(f"{task.completed:.0f}/{task.total:.0f}" if task.total is not None and task.total > 1 else "")
 
 
 class _RateColumn(ProgressColumn):
-    """Items a second, or seconds an item where that reads better; nothing for a fraction."""
+    """Items per second, or seconds per item if that is easier to read; empty for a fraction."""
 
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed

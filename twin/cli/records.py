@@ -34,7 +34,7 @@ Examples:
 """
 
 
-# Formats that can be written (``twin.records.FORMATS``, which would load the pin detection).
+# Formats that can be written, as in ``twin.records.FORMATS``, whose import would load the pin detection.
 FORMATS = ("recording", *AlsoFormat)
 
 

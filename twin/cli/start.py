@@ -1,4 +1,4 @@
-"""Commands to begin with.
+"""Commands for the first steps.
 
 - ``twin sensors``, ``twin objects``, ``twin experiments``, ``twin randomisations``: what is shipped, and where a user's own files go.
 - ``twin doctor``: what this machine has, what is missing, and the remedy.

@@ -1,4 +1,4 @@
-"""``twin studio``: the page on which one moves the contact and sees everything that follows."""
+"""The command ``twin studio``: a page on which the user moves an object and sees the resulting contact, picture and estimate."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -75,12 +75,12 @@ def studio(
 
 
 def tell_page(url: str) -> None:
-    """Say where the page is."""
+    """Print the page's address."""
     print(f"open {url} in a browser; Ctrl-C ends it", flush=True)
 
 
 def models_when_asked(run: Path | None, sensor: str) -> Callable[[str], "PoseEstimator | None"]:
-    """``models_by_sensor``; without a run loaded when the first model is asked for, so that the page does not wait for PyTorch."""
+    """``models_by_sensor``. If no run is given, it loads when the first model is requested, so that the page does not wait for PyTorch."""
 
     def model_of(name: str) -> "PoseEstimator | None":
         from training.estimator import models_by_sensor

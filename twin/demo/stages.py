@@ -32,10 +32,10 @@ MOTIONS = (
     ("X: then dragged 3 mm along x", ContactPose(indent_mm=4.0, shear_mm=(3.0, 0.0))),
     ("Y: then dragged 3 mm along y", ContactPose(indent_mm=4.0, shear_mm=(0.0, 3.0))),
 )
-# Mean pin displacement of pure presses in the Tac-VGNN release's recordings (Apache-2.0), px of the uncropped camera frame,
-# for pose_2 in four 1 mm bins from -4 to 0; the indentation is about pose_2 + 5 mm.
+# Mean pin displacement of pure presses in the Tac-VGNN release's recordings (Apache-2.0), px of the uncropped camera frame, for pose_2 in
+# four 1 mm bins from -4 to 0. The indentation is about pose_2 + 5 mm.
 MEASURED_DISPLACEMENT_PX = {"mg400-331": (1.9, 3.4, 5.0, 7.5), "mg400-127": (2.2, 3.8, 6.0, 8.9)}
-# The middles of these bins as indentations.
+# Middles of these bins as indentations, mm.
 TABLE_INDENTS_MM = (1.5, 2.5, 3.5, 4.5)
 
 
@@ -67,7 +67,7 @@ class ContactResult:
 
 
 def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form: Form, *, progress: Step | None = None) -> ContactResult:
-    """Press, render, capture, detect, build the graph: one contact beside no contact."""
+    """Press, render, capture, detect, and build the graph, for one contact and for no contact."""
     timed = Timed()
     state = timed.run("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
     raw = timed.run("render", lambda: simulator.shoot(state))

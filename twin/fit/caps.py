@@ -30,7 +30,7 @@ LARGEST_STEP = 0.1
 SKIN_PERCENTILE = 10.0
 # Damping: exponent with which a correction factor of the reflectance is applied.
 DAMPING = 0.8
-# Weight of the prior of contrast and skin level. They are free, so it is only large enough to make the equations solvable.
+# Weight of the prior of contrast and skin level. Both are free, so the weight is only large enough to make the equations solvable.
 FREE = 1e-6
 
 # shoot(spec, frames) gives the captured renders (H, W[, 3]) uint8 of the frames' states, without noise.

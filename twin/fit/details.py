@@ -1,11 +1,11 @@
-"""Fit of what smooth models leave: a background that contacts do not change, and a tile of light fixed to each cap.
+"""Fit of the details that smooth models miss: a background that contacts do not change, and a tile of light fixed to each cap.
 
 Both are linear in light. They are found by simultaneous iterative reconstruction (SIRT; Gilbert 1972): the missing gray levels of the
 captured render, divided by the slope of the response curve, are spread over the values that each pixel sees. The camera's blur makes
 fine structure converge last, so that few rounds also keep noise out.
 
-A pixel shows the background and tiles. Where the same pixel lacks the same light in most frames, it is background; what moves with the
-caps is relief.
+A pixel shows the background and tiles. If the same pixel lacks the same light in most frames, that light belongs to the background. Light
+that moves with the caps belongs to the tiles (the relief).
 """
 
 from collections.abc import Iterator
@@ -24,30 +24,30 @@ from twin.optics.static_layer import BACKGROUND_POWER
 from twin.types import BoolArray, FloatArray, IntArray
 
 CELLS, REACH = 19, 1.8
-"""Cells along a tile's side, and the tile's reach, cap radii: cells are about a pixel apart, and neighbours' tiles meet."""
+"""Cells along a tile's side, and half of that side, cap radii. A cell is about one pixel wide, and the tiles of neighbours meet."""
 PRIOR_LEVELS, PRIOR_SHARE = 9.0, 0.2
-"""Prior of a tile: the gray levels of a pixel that tiles do not explain, and the standard deviation of a tile's values."""
+"""Prior of a tile: standard deviation of the gray levels that tiles do not explain, and standard deviation of a tile's values."""
 BACKGROUND_ROUNDS, TILE_ROUNDS = 4, 8
-"""Rounds of the reconstructions."""
+"""Numbers of iterations of the two reconstructions."""
 BACKGROUND_GAIN, TILE_GAIN = 0.7, 1.2
-"""Share of the missing light that a round adds."""
+"""Shares of the missing light that each iteration adds."""
 EDGE = (0.6, 1.5)
-"""Distances from a cap's middle, cap radii, between which a pixel tells nothing of the background before tiles are fitted."""
+"""Range of distances from a cap's middle, cap radii, whose pixels do not count for the background until tiles are fitted."""
 SURE_SDS, SURE_LEVELS = 3.0, 3.0
-"""Where caps pass, a background is believed from so many standard errors, plus so many gray levels, on."""
+"""Where caps pass, only the part of a background beyond so many standard errors plus so many gray levels is used."""
 GLINT_LIGHT, GLINT_PX = 0.004, 5
-"""Added light from which on a pixel where caps pass tells nothing of tiles; width of the surroundings that are left out, too."""
+"""Background light above which a pixel where caps pass is not used to fit tiles; width, px, of the square that is left out with it."""
 DARKEST = 2e-4
-"""Least light at which the slope of the response curve is taken, because the slope of a dark pixel has no bound."""
+"""Least light at which the slope of the response curve is computed, because the slope has no bound at light 0."""
 BRIGHTEST = 2.0
-"""Largest light of a background: it is saturated, so that more would not show."""
+"""Largest light of a background. It saturates the pixel, so a larger value would look the same."""
 LEAST_FRAMES = 2
-"""Number of frames from which on a tile counts as determined."""
+"""Least number of frames that determine a tile."""
 
 
 @dataclass(frozen=True)
 class _View:
-    """A frame with its render, and where its pixels lie on tiles."""
+    """A frame, its render, and the places of its pixels on the tiles."""
 
     image: FloatArray
     light: FloatArray
@@ -83,7 +83,7 @@ def fit_details(spec: SensorSpec, frames: list[Aligned], light: list[FloatArray]
 
 
 def undetermined_tiles(spec: SensorSpec, frames: list[Aligned]) -> int:
-    """Number of pins that fewer than ``LEAST_FRAMES`` of the frames show, so that their tiles hold the noise of one frame or nothing."""
+    """Number of pins that fewer than ``LEAST_FRAMES`` of the frames show. Their tiles hold the noise of one frame or nothing."""
     return int((sum(np.isfinite(frame.pins_px).all(axis=1).astype(int) for frame in frames) < LEAST_FRAMES).sum())
 
 
@@ -103,7 +103,7 @@ def _views(spec: SensorSpec, frames: list[Aligned], light: list[FloatArray]) -> 
 
 
 class _Fit:
-    """The values that are being fitted; ``background`` (H W, channels) is the added light."""
+    """The values of the fit; ``background`` (H W, channels) is the added light."""
 
     def __init__(self, spec: SensorSpec, views: list[_View]) -> None:
         self._spec, self._views = spec, views
@@ -133,7 +133,7 @@ class _Fit:
         return levels_slope(np.maximum(light, DARKEST), self._spec.response).astype(np.float32)
 
     def improve_background(self, tiles: FloatArray | None) -> None:
-        """Add what a pixel lacks in most frames. Without tiles, the pixels near a cap's edge tell nothing."""
+        """Add the light that a pixel lacks in most frames. Without tiles, the pixels near a cap's edge are not used."""
         for _ in range(BACKGROUND_ROUNDS):
             stack = np.stack([self._missing(view, self._lit(view, tiles)) for view in self._views])
             known = np.ones(stack.shape[:2], bool)
@@ -150,7 +150,7 @@ class _Fit:
             self.background = np.clip(self.background + more, -self._mean, BRIGHTEST).astype(np.float32)
 
     def tiles(self) -> FloatArray:
-        """The tiles (N cells^2, channels) that explain what is left."""
+        """The tiles (N cells^2, channels) that explain the remaining differences."""
         height, width, channels = self._views[0].image.shape
         bright = (self.background.max(axis=1) > GLINT_LIGHT) & self._passed
         glint = cv2.dilate(bright.reshape(height, width).astype(np.uint8), np.ones((GLINT_PX, GLINT_PX))).ravel() > 0

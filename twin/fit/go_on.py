@@ -20,9 +20,9 @@ from twin.progress import Progress, silent
 from twin.types import FINE, Form
 
 ALIKE = 0.6
-"""Least share of labels that a table's and an experiment's contacts have in common, of those that vary in either of them."""
+"""Least share of varying labels that a table and an experiment have in common, of the labels that vary in either of them."""
 VARIES = 1e-6
-"""A label varies if it changes by more than this, mm or deg."""
+"""Least change, mm or deg, of a label that counts as varying."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class WholeSensor:
     made : NewSensor
         Layout, camera and pin detection.
     experiment : ExperimentSpec or None
-        How the labelled contacts were taken to be made.
+        How the labelled contacts were made, as assumed in the fit.
     optics : OpticsCalibration or None
     contact : ContactCalibration or None
     """
@@ -46,12 +46,12 @@ class WholeSensor:
 
     @property
     def written(self) -> list[Path]:
-        """The specification, then the pages."""
+        """Paths of the specification and of the pages."""
         parts: Sequence[NewSensor | OpticsCalibration | ContactCalibration | None] = (self.made, self.optics, self.contact)
         return list(dict.fromkeys(path for part in parts if part is not None for path in part.written))
 
     def lines(self) -> list[str]:
-        """What was found, step by step."""
+        """The results, step by step."""
         lines = [line for line in self.made.lines() if not line.startswith("next:")]
         if self.optics is not None:
             lines += ["light and colours:", *self.optics.lines()]
@@ -79,7 +79,7 @@ def whole_sensor(
     limit: int = LIMIT,
     progress: Progress = silent,
 ) -> WholeSensor:
-    """Make a specification as ``new_sensor`` does, and go on to what labels and colour frames tell; ``out`` then holds all of it.
+    """Make a specification as ``new_sensor`` does, then fit what labels and colour frames determine. ``out`` holds the whole result.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def whole_sensor(
     optics : bool
         Also fit light and colours, see ``calibrate_optics``. It needs raw frames.
     experiment : ExperimentSpec, optional
-        How the labelled contacts were made. By default the one whose labels vary alike.
+        How the labelled contacts were made. By default the experiment in which the same labels vary.
     workers : int
         Processes for the simulated contacts.
     across : int
@@ -97,7 +97,7 @@ def whole_sensor(
     Raises
     ------
     FrameError, OptionError
-        As ``new_sensor``, ``calibrate_optics`` and ``calibrate_to_file``; or no experiment has labels like the table's.
+        As ``new_sensor``, ``calibrate_optics`` and ``calibrate_to_file``; or the labels of no experiment vary like the table's.
     """
     at = frames_at(frames, labels or table, no_contact)
     if optics and open_recording(at, form=form).form == Form.RECORDING:
@@ -117,7 +117,7 @@ def whole_sensor(
 
 
 def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
-    """The experiment whose labels vary as those of a table do.
+    """The experiment in which the same labels vary as in a table.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
     Raises
     ------
     OptionError
-        The table has no labels of contacts, or no experiment is like it.
+        The table has no labels of contacts, or no experiment has similar labels.
     """
     varying = {name for name in LABELS if _varies(labels.get(name))}
     if not varying:
@@ -138,7 +138,7 @@ def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
     for name in list_experiments():
         plan = load_experiment(name)
         own = {label for label, (low, high) in plan.ranges().items() if high - low > VARIES}
-        # of those that are equally like it, one that somebody recorded (it has a source); then the plainest
+        # of equally similar experiments, the recorded ones (with a source) come first, then the one with the shortest name
         found.append((len(own & varying) / len(own | varying), bool(plan.source), -len(name), name))
     share, *_, name = max(found, key=lambda each: each[:3])
     if share < ALIKE:

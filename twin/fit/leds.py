@@ -42,10 +42,10 @@ BEHIND_MM = (0.2, 4.0)
 # Bounds of the fitted quantities, whose logarithms are fitted: the LED's side in mm, the share of its light outside the core
 # (1 - core_share), the core's standard deviation in mm, and the radius relative to that of the reflections' middles.
 BOUNDS = {"size_mm": (0.3, 5.0), "rest": (5e-4, 1.0), "core_mm": (0.04, 2.0), "radius": (0.98, 1.02)}
-# Shares of an LED's light that show in its reflection: the housing may hide the rest. The others are tried if the first does not explain
-# the reflections as well, by the factor DIMMER_BETTER in the sum of squares.
+# Shares of an LED's light that its reflection shows, because the housing may hide the rest. They are tried in this order. A later share is
+# used only if it reduces the sum of squares to less than DIMMER_BETTER times that of the best share before it.
 MIRROR_SHARES, DIMMER_BETTER = (1.0, 0.1, 0.01), 0.8
-# Starting values of the first three. All combinations are tried, and the best one is refined.
+# Starting values of size, rest and core. All combinations are tried, and the best one is refined.
 START_SIZES_MM = (0.7, 1.0, 1.4, 2.0)
 START_RESTS = (0.005, 0.02, 0.1, 0.4)
 START_CORES_MM = (0.06, 0.2, 0.4)

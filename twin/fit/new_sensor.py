@@ -1,4 +1,4 @@
-"""A specification from the frames of an unknown sensor: layout, pins at rest, camera and pin detection."""
+"""Makes a specification from the frames of an unknown sensor: layout, pins at rest, camera and pin detection."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,42 +30,44 @@ from twin.store import output, writes_file
 from twin.types import Form, Frame
 
 LIMIT = 40
-"""Frames that are looked at, evenly spread: enough contacts to make a rest layout of."""
+"""Number of frames, evenly spread, from which the specification is made: enough contacts to estimate the pins at rest."""
 JUDGED = 40
-"""Frames on which the result is judged."""
+"""Number of frames on which the result is judged."""
 SHOWN_FRAMES = 4
-"""Frames whose pictures are shown."""
+"""Most frames whose overlay pictures are shown."""
 PINHOLE_MM, FISHEYE_MM = 45.0, 7.5
-"""Distance of the pupil from the dome's centre at which a fit starts: of two TacTips' cameras, with and without a wide-angle lens."""
+"""Distance of the pupil from the dome's centre, mm, at the start of a fit. The values are those of two TacTip cameras, without and with a
+wide-angle lens."""
 FITTED_PINHOLE = ("fx_px", "cx_px", "cy_px", "k1", "tilt_x_deg", "tilt_y_deg", "phase_deg")
-"""Parameters that pins at rest may tell (see ``twin.fit.camera_pose``)."""
+"""Parameters of a pinhole camera that pins at rest may determine (see ``twin.fit.camera_pose``)."""
 FITTED_FISHEYE = (*FITTED_PINHOLE, "k2")
-"""The same for a fisheye lens, whose distortion has a second coefficient."""
+"""Parameters of a fisheye camera that pins at rest may determine. Its distortion has a second coefficient."""
 UNTUNED_OFFSET = -12.0
-"""Threshold, gray levels above the local mean, for raw frames of a sensor of which only thresholded ones were seen."""
+"""Threshold, gray levels above the local mean, for raw frames if only thresholded frames of the sensor were given."""
 BETTER = 0.85
-"""A camera model is taken instead of a simpler one if its misfit is smaller by this factor."""
+"""Largest ratio of misfits at which a more complex camera model replaces a simpler one."""
 SIZE_SD = 0.05
-"""Standard deviation of a cap's diameter from that of the model, as a share: real prints, lit unevenly, in contact."""
+"""Standard deviation of a cap's diameter from the model's, as a share. It covers uneven prints, uneven light and contact."""
 MADE_SD = 0.1
-"""Standard deviation of pins at rest that were made from contacts, in spacings (see ``Rest.line``)."""
+"""Standard deviation, in spacings, of rest positions that were estimated from contacts (see ``Rest.line``)."""
 FAIR_SHARE = 0.9
-"""Least share of frames with all pins; with a smaller share the report says that pins are lost."""
+"""Least share of frames with all pins. If the share is smaller, the report advises to improve light, focus or exposure."""
 STEADILY_LOST = 0.5
-"""Share of the frames from which on a pin that should be in view counts as steadily lost."""
+"""Least share of the frames in which a pin that should be in view is missing, for the pin to count as steadily lost."""
 GIVEN_SHOWN = 0.9
-"""A layout that is given is doubted if it explains less than this share of what the frames show."""
+"""Least share of the pins and pin-like spots in the frames that a given layout must explain. With a smaller share the layout is doubted."""
 LEAST_SHOWN = 0.6
-"""A layout that is given must explain at least this share of what the frames show."""
+"""Least share of the pins and pin-like spots in the frames that a given layout must explain. A smaller share is an error."""
 FEW_FRAMES = 20
-"""With fewer frames the camera's model and the pins' places at rest are less sure."""
+"""Least number of frames from which the camera's model and the pins at rest are known well enough to give no warning."""
 MOST_AWAY = 0.2
-"""A camera that meets the pins at rest only within more than this, in spacings, does not suit them: no lens squeezes one direction."""
+"""Rms distance, in spacings, between projected and found pins at rest above which the camera does not fit. Frames stretched in one
+direction cause such a distance, because no lens model describes them."""
 
 
 @dataclass(frozen=True)
 class Health:
-    """How the new specification does on frames.
+    """How well the new specification finds pins in frames.
 
     Attributes
     ----------
@@ -77,11 +79,11 @@ class Health:
     valid : float
         Share of the frames that can be used.
     extra : float
-        Median number of pin-like spots that are no pins.
+        Median number of pin-like spots that belong to no pin.
     steadily_lost : tuple of int
-        Pins lost in at least half of the frames though they should be in view.
+        Pins that are lost in at least half of the frames although they should be in view.
     reasons : tuple of str
-        Why frames cannot be used, the first of each kind.
+        Reasons why frames cannot be used, one example of each kind.
     """
 
     frames: int
@@ -93,7 +95,7 @@ class Health:
     reasons: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """The same in words."""
+        """The same as lines of text."""
         lines = [
             f"all pins in view found in {100 * self.all_pins:.1f} % of {self.frames} frames, {100 * self.found:.2f} % of all pins; "
             f"{100 * self.valid:.0f} % of the frames can be used"
@@ -107,7 +109,7 @@ class Health:
 
 @dataclass(frozen=True)
 class NewSensor:
-    """A specification made from frames, and how sure it is.
+    """A specification made from frames, and how certain it is.
 
     Attributes
     ----------
@@ -119,9 +121,9 @@ class NewSensor:
     tuned : Tuned
     health : Health
     known, assumed, next_steps : tuple of str
-        What the frames tell, what was assumed instead, and what to do to know more.
+        What the frames determine, what is assumed instead, and how to learn more.
     odd : tuple of str
-        What was odd in the recording.
+        Irregularities of the recording.
     written : list of Path
     """
 
@@ -138,7 +140,7 @@ class NewSensor:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """What was found, and what speaks against it; for people."""
+        """The results and the doubts about them, as lines of text."""
         lines = [f"{'sure' if self.identified.sure else 'unsure'}: {self.identified.best.line()}"]
         lines += [f"doubt: {doubt}" for doubt in self.identified.doubts]
         if not self.identified.sure:
@@ -159,9 +161,9 @@ def new_sensor(
     limit: int = LIMIT,
     progress: Progress = silent,
 ) -> NewSensor:
-    """Make a specification from frames of a sensor of which nothing is known, and write it.
+    """Make a specification from frames of an unknown sensor, and write it.
 
-    Beside it a folder ``NAME-new`` gets the overlay pictures and the page.
+    A folder ``NAME-new`` beside the specification gets the overlay pictures and the page.
 
     Parameters
     ----------
@@ -170,20 +172,21 @@ def new_sensor(
     out : Path
         The ``.toml`` file to write.
     layout : PinsSpec, optional
-        The layout, where it is known. Otherwise it is identified.
+        The layout, if it is known. Otherwise it is identified.
     no_contact : Path, optional
-        A frame without contact. Otherwise a file ``init_*`` beside the frames, a frame that shows none, or a rest layout made of contacts.
+        A frame without contact. By default a file ``init_*`` beside the frames, else a frame that shows no contact, else an estimate from
+        the contacts.
     table : Path, optional
         A table of labels that also gives the frames' order.
     form : Form, optional
-        Thresholded (recording) or not (raw); told by the frames' content if not given.
+        Thresholded (recording) or not (raw); recognised by the frames' content if not given.
     limit : int
-        At most so many frames are looked at.
+        Most frames from which the specification is made.
 
     Raises
     ------
     FrameError
-        No frames, no layout in them, or ``out`` is no name of a ``.toml`` file.
+        There are no frames, they show no layout, or ``out`` is not the name of a ``.toml`` file.
     """
     folder = folder_beside(out, "new")
     with output(folder, "index.html", "overlay-*.png"):
@@ -220,7 +223,7 @@ def new_sensor(
 
 
 def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
-    """A layout that the user gives, as the frames show it."""
+    """The user's layout, compared with the frames."""
     shown = judge_layout(layout, images)
     if shown is not None and shown.explained >= GIVEN_SHOWN:
         return Identified((shown,), True, (), 0.0)
@@ -239,7 +242,7 @@ def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
 
 
 def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str) -> SensorSpec:
-    """A specification of the right layout and frame size, and a camera that sees the pins about where they are."""
+    """A specification with the right layout and frame size, and with a camera that sees the pins at about the right places."""
     height, width = frame.image.shape[:2]
     color = frame.image.ndim == 3 and frame.image.shape[2] == 3 and bool(np.ptp(frame.image.astype(int), axis=2).max() > 0)
     seen = rest.pins_px[np.isfinite(rest.pins_px[:, 0])]
@@ -271,7 +274,7 @@ def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str) -
 
 
 def _whole(width: int, height: int) -> RecordingSpec:
-    """A recorder that keeps the whole frame; how frames were thresholded is not known from them."""
+    """A recorder that keeps the whole frame. The frames do not show how they were thresholded."""
     return RecordingSpec(
         crop_px=(0, 0, width, height),
         width_px=width,
@@ -282,7 +285,7 @@ def _whole(width: int, height: int) -> RecordingSpec:
 
 
 def _sizes(layout: Candidate, images: list[np.ndarray]) -> np.ndarray:
-    """Diameters (N,) px of the caps, the median over some of the gray frames; NaN where a cap is never measured."""
+    """Diameters (N,) px of the caps: the median over some of the raw frames; NaN for a cap that is never measured."""
     chosen = spread(len(images), CAPS_MEASURED)
     found = np.stack([measure_caps(images[k], layout.seen[k].pins_px).diameter_px for k in chosen])
     some = np.isfinite(found).any(axis=0)
@@ -290,17 +293,18 @@ def _sizes(layout: Candidate, images: list[np.ndarray]) -> np.ndarray:
 
 
 def _camera(start: SensorSpec, pins_px: np.ndarray, source: str, sizes_px: np.ndarray | None) -> tuple[SensorSpec, CameraReport]:
-    """The camera, of pinhole and fisheye, and the spacing of the pins that meet pins at rest and caps' sizes best; the simpler of equals.
+    """The camera model and the pin spacing that explain the pins at rest and the caps' sizes best.
 
-    Pins at rest alone hardly tell rings evenly spaced on the dome from rings evenly spaced in plan under another lens, but the caps of
-    the two differ in size from the middle to the rim. The caps' diameter follows from their mean size.
+    Pinhole and fisheye lenses and both spacings are tried, and a simpler model is preferred (see ``BETTER``). Pins at rest alone hardly
+    distinguish rings evenly spaced on the dome from rings evenly spaced in plan under another lens. The two differ in how the size of the
+    caps changes from the middle to the rim. The caps' diameter in mm follows from their median size.
 
     Parameters
     ----------
     pins_px : (N, 2) float
         Pins at rest, NaN where unknown.
     source : str
-        Where they come from: ``Rest.source``.
+        Origin of these pins: ``Rest.source``.
     sizes_px : (N,) float, optional
         Diameters of the caps, NaN where unknown.
     """
@@ -323,7 +327,7 @@ def _camera(start: SensorSpec, pins_px: np.ndarray, source: str, sizes_px: np.nd
 
 
 def _with_sizes(sensor: SensorSpec, sizes_px: np.ndarray | None) -> tuple[SensorSpec, float]:
-    """The sensor with caps, and pins below them, of the mean measured size, and the spread of the sizes about its own, as a share."""
+    """The sensor with caps and pins scaled to the median measured size, and the relative spread of the measured sizes about the model's."""
     if sizes_px is None:
         return sensor, 0.0
     _, plane = cap_planes(sensor.view, sensor.pins, rest_pins(sensor.geometry))
@@ -338,13 +342,13 @@ def _with_sizes(sensor: SensorSpec, sizes_px: np.ndarray | None) -> tuple[Sensor
 
 
 def _scaled(sensor: SensorSpec, pins_px: np.ndarray) -> SensorSpec:
-    """The sensor with a camera whose view of the pins has the size and place of pins (N, 2), NaN where unknown."""
+    """The sensor with a camera that sees the pins at the place and in the size of pins (N, 2); NaN where unknown."""
     known = np.flatnonzero(np.isfinite(pins_px[:, 0]))
     return sensor.model_copy(update={"camera": camera_seeing(sensor, pins_px, known)})
 
 
 def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
-    """The specification with its pin detection; raw frames of a sensor that is known by thresholded ones get a usual threshold."""
+    """The specification with its pin detection. If only thresholded frames were given, raw frames get the threshold ``UNTUNED_OFFSET``."""
     tuned = with_detector(sensor, detector)
     if detector.form == Form.RAW:
         return tuned
@@ -361,7 +365,7 @@ def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
 
 
 def _with_usual_caps(sensor: SensorSpec, frames: list[Frame]) -> SensorSpec:
-    """The specification with light and focus of its caps as raw frames show them."""
+    """The specification with the usual light and focus of its caps, measured in raw frames."""
     form = frames[0].form
     if form != Form.RAW:
         return sensor
@@ -372,7 +376,7 @@ def _with_usual_caps(sensor: SensorSpec, frames: list[Frame]) -> SensorSpec:
 
 
 def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -> tuple[Health, list[Path]]:
-    """How a specification does on frames, and overlay pictures of some of them."""
+    """How well a specification finds pins in frames, and overlay pictures of some of them."""
     pipeline = Pipeline(sensor, form)
     seen = [pipeline(frame) for frame in frames]
     steadily = np.flatnonzero(lost_in_view(seen, pipeline)[0].mean(axis=0) >= STEADILY_LOST)
@@ -398,12 +402,12 @@ def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -
 
 
 def _enlarged(size_px: tuple[int, int]) -> int:
-    """Factor by which a frame is enlarged so that its pins can be looked at."""
+    """Factor by which a frame is enlarged so that its pins can be seen well."""
     return int(np.clip(round(900 / max(size_px)), 1, 6))
 
 
 def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
-    """What speaks against a camera that was fitted to the pins at rest, and what to do."""
+    """Doubts about a camera that was fitted to the pins at rest, and what to do."""
     notes = []
     seen = rest.pins_px[np.isfinite(rest.pins_px[:, 0])]
     away = camera.rms_px / usual_spacing(seen)
@@ -420,7 +424,7 @@ def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
 def _told(
     sensor: SensorSpec, found: Identified, rest: Rest, camera: CameraReport, tuned: Tuned, health: Health, labels: dict[str, np.ndarray]
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """What is known, what is assumed, and what to do to know more."""
+    """What the frames determine, what is assumed, and how to learn more."""
     lens = "fisheye" if sensor.camera.projection == "fisheye" else "pinhole"
     evidence = tuned.detector.evidence
     known = (
@@ -466,7 +470,7 @@ def _told(
 
 
 def sensor_blob(sensor: SensorSpec, tuned: Tuned) -> BlobSpec:
-    """How pins are found in the form of frames that was tuned on."""
+    """The pin detection's settings for the form of frames on which they were tuned."""
     form = tuned.detector.form
     return sensor.pipeline.recording if form == Form.RECORDING and sensor.pipeline.recording else sensor.pipeline.raw
 

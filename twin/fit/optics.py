@@ -1,4 +1,4 @@
-"""Calibration of camera and light by a folder of frames. The result are a specification and a page.
+"""Calibration of camera and light from a folder of frames. It gives a specification and a page.
 
 The calibration has stages. The result of each stage is stored, so that an interrupted run can be continued. The page shows renders before
 and after the fit, the remaining differences, and the changed values.
@@ -46,15 +46,15 @@ SAMPLES = 16
 CAP_ROUNDS = 2
 """Rounds of fitting caps and response alternately."""
 DETAIL_ROUNDS = 3
-"""Rounds of fitting the response to renders with details, and the details anew."""
+"""Rounds in which the response is fitted to renders with details, and the details are fitted again."""
 HAZE_SIGMA_PX = 40.0
 """Width of the haze, px, at the start of the fit if the specification has no haze."""
 LONGEST = 12
-"""Most numbers of a list that the page shows. Of longer lists it shows only the length."""
+"""Length of the longest list whose numbers the page shows. Of longer lists it shows only the length."""
 KINDS = {"real": "real", "before": "before", "after": "after", "residual": "what is left, twice amplified about middle gray"}
 """Kinds of pictures of a frame on the page, with their captions."""
 JUDGED = {"psnr_db": "PSNR, dB,", "ssim": "SSIM"}
-"""Figures that a fit may not lower without saying so, with their names."""
+"""Image figures that a fit may not make worse without a warning, with their names."""
 ALWAYS = (
     "the response curve (gamma, black level): held; photograph a gray card at several exposures to know it",
     "LED power, exposure and reflectance: only their product is seen; the caps' brightest channel is taken as white resin",
@@ -104,7 +104,7 @@ class Calibration:
 
     @property
     def warnings(self) -> list[str]:
-        """What is worse than before the fit; empty if nothing is."""
+        """The figures that are worse than before the fit; empty if none is."""
         return [
             f"the fit ended worse than it began: {name} {self.before[key]:.4g} -> {self.after[key]:.4g}; look at the page before you use it"
             for key, name in JUDGED.items()
@@ -235,7 +235,7 @@ def fit_optics(
     if spec.pipeline.raw.rest_origin == "contacts":
         notes.append(REST_MADE)
     first = studio.shots(spec, frames, "render the start")
-    spec = revised(without(spec, DETAILS), response={"residual": None})  # it belongs to the calibration that it was taught with
+    spec = revised(without(spec, DETAILS), response={"residual": None})  # the residual network was trained for the old calibration
     held = spec.housing
     for number, fit in enumerate(_stages(frames, inside, studio, bar)):
         spec = log.stage(f"{number:02d}-{fit.__name__}", fit, spec)
@@ -253,7 +253,7 @@ def _stages(frames: list[Aligned], inside: np.ndarray, studio: _Studio, bar: Bar
         with bar("fit the ring, the reflections, the specks") as step:
             try:
                 found = fit_surroundings(spec, np.stack([f.image for f in frames]), np.stack([f.pins_px for f in frames]), progress=step)
-            except NoRing:  # a crop, or a sensor without a ring: all else can still be fitted
+            except NoRing:  # a crop, or a sensor without a ring: everything else can still be fitted
                 found = spec
         return found if found.gel.haze else revised(found, gel={"haze_sigma_px": HAZE_SIGMA_PX})
 

@@ -23,7 +23,7 @@ BOUNDS = {
     "sharpening": (0.0, 4.0, 0.05),
     "sharpening_sigma_px": (0.5, 4.0, 0.05),
 }
-# The same for the further quantities of colour cameras: softness of colour (``[response]``) and fringes (``[camera]``).
+# Further fitted quantities of colour cameras: softness of colour (``[response]``) and fringes (``[camera]``). The numbers are as above.
 CHROMA = {"chroma_sigma_px": (0.05, 4.0, 0.05)}
 FRINGES = {"red_scale": (0.985, 1.015, 0.0003), "blue_scale": (0.985, 1.015, 0.0003)}
 SHIFTS = {f"{colour}_shift_px.{axis}": (-3.0, 3.0, 0.03) for colour in ("red", "blue") for axis in (0, 1)}
@@ -39,7 +39,7 @@ ROBUST_LEVELS = 10.0
 MOST_TRIES = 60
 # Most frames that the sharpness is fitted to; one pixel in EVERY is used in each direction.
 MOST_FRAMES, EVERY = 3, 3
-# How exactly the haze is found.
+# Tolerance of the search for the haze, as a share of light.
 HAZE_STEP = 5e-4
 # Largest aperture, mm. A larger one would need more samples per pixel than the frames for training have.
 MOST_APERTURE_MM = 3.0
@@ -112,10 +112,10 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
 
 
 def fit_haze(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], inside: np.ndarray) -> SensorSpec:
-    """Fit the share of light that the gel scatters, to light that has its background.
+    """Fit the share of light that the gel scatters, to light that includes its background.
 
-    The veil is made of the whole frame's light. A background that was added later, bright glare around the disc for example, makes the veil
-    brighter than it was when the haze was fitted, and nothing can be taken away where the light is 0.
+    The haze's veil is computed from the light of the whole frame. A background that was added after the haze was fitted, for example bright
+    glare around the disc, makes the veil brighter. A background cannot correct this where the light is already 0.
 
     Parameters
     ----------

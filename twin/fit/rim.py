@@ -13,7 +13,8 @@ from twin.optics.static_layer import RIM_UNIT, rim_places, static_layer
 INSIDE_MM, OUTSIDE_MM = 1.75, 0.4
 # Number of azimuths and of radii in the table. There are many radii, because the light changes steeply at the edge.
 AZIMUTHS, RADII = 240, 32
-# Rounds of correction, and share of the missing light that each round adds. Several are needed because blur and sharpening follow.
+# Rounds of correction, and share of the missing light that each round adds. Several rounds are needed, because blur and sharpening act
+# after the correction.
 ROUNDS, GAIN = 3, 0.9
 
 

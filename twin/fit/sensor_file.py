@@ -1,4 +1,4 @@
-"""A sensor's specification as files."""
+"""Writes a sensor's specification to files."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,26 +10,26 @@ from twin.store import write_result
 
 
 def write_sensor(path: Path, spec: SensorSpec, comment: str = "", notes: Mapping[str, str] | None = None) -> Path:
-    """Write a specification, its tables beside it, and return the path; ``comment`` and ``notes`` as ``sensor_files`` takes them.
+    """Write a specification and its tables, and return the path; ``comment`` and ``notes`` as for ``sensor_files``.
 
     Each file is written whole or not at all; the TOML file comes last.
 
     Raises
     ------
     StoreError
-        It can't be written; the error's ``unsaved`` has the texts.
+        The files can't be written; the error's ``unsaved`` has their texts.
     """
     write_result(path.parent, sensor_files(spec, path.stem, comment, notes))
     return path
 
 
 def folder_beside(out: Path, kind: str) -> Path:
-    """The folder for further files of a specification that will be written.
+    """The folder for further files of a specification that is still to be written.
 
     Raises
     ------
     OptionError
-        ``out`` is no name of a ``.toml`` file.
+        ``out`` is not the name of a ``.toml`` file.
     """
     if out.suffix != ".toml":
         raise OptionError(f"--out {out}: give the name of a .toml file")

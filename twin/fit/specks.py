@@ -25,7 +25,7 @@ BEHIND_SHARE = 0.28
 LEAST_FRAMES = 3
 # Number of neighbours of such a cap whose light is taken as that of the cap without the speck.
 NEIGHBOURS = 6
-# Side of the median filter that gives the ground, px; least difference of a speck from the ground, gray levels.
+# Side of the median filter that gives the background level, px; least difference of a speck from this level, gray levels.
 GROUND_PX, LEAST_RISE_LEVELS = 25, 8.0
 # Least and largest area of a speck, px^2.
 AREA_PX2 = (3, 90)

@@ -1,4 +1,4 @@
-"""Where in a folder a recording's frames lie."""
+"""Where a recording's frames and no-contact frames lie in a folder."""
 
 import os
 import re
@@ -12,11 +12,11 @@ from twin.types import Form
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"})
 IMAGE_FOLDERS = ("frames_bw", "sensor_images", "images", "processed_images")
-# Names of no-contact frames in use, beside init_*.
+# Names of no-contact frames in use, besides init_*.
 NO_CONTACT_NAME = re.compile(
     r"(init|rest|no[-_ ]?contact|undeformed|unloaded|background|reference)([-_ ]?(frame|image|raw|\d+))*", re.IGNORECASE
 )
-# Folders that are looked into, one inside the other, to say where pictures lie.
+# Greatest depth of subfolders that are searched for pictures; the error message names the folders found.
 SEARCH_DEPTH = 4
 
 
@@ -26,7 +26,7 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def distinct_stems(names: list[str]) -> list[str]:
-    """The frames' names without suffix, to name files after them; with the suffix where another frame has the same stem."""
+    """File names for the frames: each frame's name without suffix, or with it if another frame has the same stem."""
     stems = [Path(name).stem for name in names]
     count = Counter(stems)
     return [stem if count[stem] == 1 else Path(name).name for stem, name in zip(stems, names, strict=True)]
@@ -38,7 +38,7 @@ def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
 
 
 def odd_entries(folder: Path) -> list[str]:
-    """What has the name of a picture in a folder and is no file, one line each: links to nothing, folders, named pipes, devices."""
+    """Entries of a folder that are named like pictures but are no files, one line each: broken links, folders, named pipes, devices."""
     found = []
     for path in sorted(folder.iterdir(), key=lambda p: natural_key(p.name)):
         if path.suffix.lower() not in IMAGE_SUFFIXES or path.name.startswith("."):
@@ -66,7 +66,7 @@ def references_in(folder: Path) -> list[Path]:
 
 
 def image_folders(path: Path, form: Form | None) -> list[Path]:
-    """Folders that may hold the frames of the recording at ``path``, the likeliest first; empty if there are none.
+    """Folders that may hold the frames of the recording at ``path``, the most probable first; empty if there are none.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def image_folders(path: Path, form: Form | None) -> list[Path]:
         There are several folders that aren't parts of one recording.
     """
     known = [path / name for name in IMAGE_FOLDERS if (path / name).is_dir() and frames_in(path / name)]
-    if form == Form.RECORDING:  # where both are there, the processed pictures are the thresholded ones
+    if form == Form.RECORDING:  # if both folders exist, processed_images holds the thresholded pictures
         known.sort(key=lambda folder: folder.name != "processed_images")
     if frames_in(path):
         known.append(path)
@@ -92,7 +92,7 @@ def the_video_in(path: Path) -> Path:
     Raises
     ------
     FrameError
-        There is none or there are several; names what is there instead.
+        There is none or there are several; the message names what is there instead.
     """
     videos = _files(path, VIDEO_SUFFIXES)
     if len(videos) == 1:

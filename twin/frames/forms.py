@@ -20,8 +20,9 @@ from twin.types import Form
 
 # Share of black and white pixels above which a frame counts as thresholded. It is below 1, because resizing leaves gray edges.
 TWO_LEVEL_SHARE = 0.9
-# A thresholded frame of small caps that was resized has many gray edges. It is still mostly black, and of what is not black at least
-# the second share is white. (Measured: 0.16 and more in resized thresholded frames of three sensors, at most 0.04 in raw ones.)
+# A second criterion. A thresholded frame of small caps that was resized has many gray edges. It is mostly black (first share of all
+# pixels), and of its other pixels at least the second share is white. (Measured: 0.16 and more in resized thresholded frames of three
+# sensors, at most 0.04 in raw ones.)
 MOSTLY_BLACK, WHITE_OF_REST = 0.5, 0.1
 # Least share of black pixels, and least share of white pixels, in a thresholded frame.
 LEAST_OF_EACH_LEVEL = 0.005
@@ -71,7 +72,7 @@ def frame_size(spec: SensorSpec, form: Form) -> tuple[int, int]:
 
 
 def blob_spec(pipeline: PipelineSpec, form: Form) -> BlobSpec:
-    """How pins are found in frames of a form.
+    """The pin detection's settings for frames of a form.
 
     Raises
     ------
@@ -184,7 +185,7 @@ def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form 
 
 
 def common_kind(files: list[Path], known: KnownFrames | None, form: Form | None) -> FrameKind:
-    """The most frequent kind among up to ``VOTES`` usable frames spread over a recording; if two are equally frequent, the first.
+    """The most frequent kind among up to ``VOTES`` usable frames spread over a recording; of equally frequent kinds the first.
 
     Raises
     ------
@@ -224,5 +225,5 @@ def _size_px(image: np.ndarray) -> tuple[int, int]:
 
 
 def _most(things: list[Thing]) -> Thing:
-    """The most frequent thing; of equally frequent ones the first."""
+    """The most frequent thing; of equally frequent things the first."""
     return Counter(things).most_common(1)[0][0]

@@ -22,27 +22,27 @@ from twin.store import write_bytes
 PNG_START = b"\x89PNG\r\n\x1a\n"
 """First bytes of a PNG file."""
 PNG_CHUNK_FRAME = 12
-"""Bytes of a PNG's chunk besides its data: length, kind and checksum, 4 each."""
+"""Bytes of a PNG chunk without its data: length, kind and checksum, 4 bytes each."""
 LARGEST_BYTES = 500_000_000
-"""Bytes of a picture's file: ten times those of an uncompressed 16-bit colour picture of a 8-megapixel camera."""
+"""Largest size of a picture's file, bytes: ten times an uncompressed 16-bit colour picture of an 8-megapixel camera."""
 SEVERAL_FROM_START = (b"II*\0", b"MM\0*", b"RIFF")
-"""First bytes of TIFF and WebP files, which may hold several pictures."""
+"""First bytes of TIFF and WebP files, which can hold several pictures."""
 ADDED_BYTES = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
-"""What the JPEG decoder says of bytes behind a picture that is complete: some cameras add them."""
+"""The JPEG decoder's message about extra bytes after a complete picture. Some cameras add such bytes."""
 DAMAGE = re.compile(
     r"(?!.*before marker 0xd9)Corrupt JPEG data: (?!bad ICC)[\w ]+|Premature end of JPEG file|Inconsistent progression sequence"
     r"|Invalid SOS parameters|(?<=TIFF_Error )[^\n]+"
 )
-"""What decoders say of pictures of which they could read a part only, and give the rest all the same."""
+"""Decoders' messages about damaged pictures. The decoder read only a part of such a picture, but returns a whole one."""
 DEPTHS = (8, 10, 12, 14, 16)
-"""Bit depths that cameras deliver in 16-bit files."""
+"""Bit depths of camera levels stored in 16-bit files."""
 MOST_HEARD = 10_000
-"""Bytes of a decoder's messages that are kept: the first of them tells what is wrong."""
+"""Most bytes of a decoder's messages that are kept. The first message says what is wrong."""
 STDERR = 2
 """File descriptor of the process's stderr."""
 
 _lock = threading.Lock()
-_hearing = threading.Lock()  # one call at a time, so that what is heard is its own
+_hearing = threading.Lock()  # one decoder call at a time, so that the messages belong to this call
 _inside = 0  # number of calls that currently need stderr redirected
 _kept: int | None = None  # the original stderr while it is redirected
 
@@ -71,7 +71,7 @@ def picture_of(data: bytes) -> tuple[np.ndarray, str]:
     Raises
     ------
     FrameError
-        They are cut, damaged or no picture; the message names no file.
+        The bytes are truncated, damaged or no picture; the message names no file.
     """
     return _as_levels(*_decoded(data), 0)
 
@@ -107,7 +107,7 @@ def decode(path: Path) -> np.ndarray:
 
 
 def _stored(path: Path) -> tuple[np.ndarray, str]:
-    """Levels as of ``decode``, and what is odd in the file ("" if nothing)."""
+    """Levels as of ``decode``, and a note on irregularities of the file ("" if there are none)."""
     try:
         data = read_regular(path, LARGEST_BYTES)
     except OSError as error:
@@ -123,7 +123,7 @@ def _stored(path: Path) -> tuple[np.ndarray, str]:
 
 
 def _decoded(data: bytes) -> tuple[np.ndarray, str]:
-    """Levels as of ``decode`` from a picture's bytes, and what its decoder found odd ("" if nothing)."""
+    """Levels as of ``decode`` from a picture's bytes, and a note on irregularities that its decoder reported ("" if there are none)."""
     if data.startswith(PNG_START) and (torn := _png_fault(data)):
         raise FrameError(f"{torn}; copy it again")
     try:
@@ -151,7 +151,7 @@ def _holds_several(path: Path, data: bytes) -> bool:
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, start and end of each whole chunk of a PNG, up to its last; the chunk's own frame (length, kind, checksum) included."""
+    """Kind, start and end of each whole chunk of a PNG, up to IEND. A chunk includes its length, kind and checksum."""
     start = len(PNG_START)
     while start + PNG_CHUNK_FRAME <= len(data):
         end = start + PNG_CHUNK_FRAME + int.from_bytes(data[start : start + 4], "big")
@@ -165,7 +165,7 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
 
 
 def _png_fault(data: bytes) -> str:
-    """What is wrong with the chunks of a PNG; "" if they are whole. Data after its end does not matter."""
+    """The fault in the chunks of a PNG; "" if they are whole. Data after the last chunk are ignored."""
     kind = b""
     for kind, start, end in _png_chunks(data):
         critical = kind[:1].isupper()
@@ -229,14 +229,14 @@ def quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def overheard() -> Iterator[list[str]]:
-    """Context as ``quiet`` that gives a list; what was printed to stderr meanwhile is its one text, once the context has ended."""
+    """Context like ``quiet`` that gives a list of one text. When the context ends, the text is what was printed to stderr."""
     said = [""]
-    with _hearing, quiet():  # stderr is the null device, and stays it until this context ends
+    with _hearing, quiet():  # stderr is the null device until this context ends
         if _kept is None:
             yield said
             return
         heard, ear = os.pipe()
-        os.set_blocking(ear, False)  # what is longer than a pipe takes is dropped
+        os.set_blocking(ear, False)  # text beyond the pipe's capacity is dropped
         os.set_blocking(heard, False)
         nowhere = os.dup(STDERR)
         os.dup2(ear, STDERR)

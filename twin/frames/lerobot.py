@@ -1,6 +1,6 @@
-"""LeRobot data sets of version 3 as frames and labels: the tables in ``data``, and pictures in them or in videos.
+"""Reads LeRobot data sets of version 3 as frames and labels: tables in ``data``, and pictures in these tables or in videos.
 
-A column of a feature with several numbers is named after the feature and the number, as ``observation.state.x``.
+Each number of a feature becomes a column, named after the feature and the number: ``observation.state.x``.
 """
 
 import json
@@ -20,19 +20,19 @@ from twin.frames.tables import LARGEST_BYTES, called_here
 from twin.frames.videos import open_video
 
 INFO, DATA, EPISODES = Path("meta", "info.json"), "data/chunk-*/*.parquet", "meta/episodes/chunk-*/*.parquet"
-"""Places of a data set's description, its tables of frames and its tables of episodes."""
+"""Paths of a data set's description, of its tables of frames and of its tables of episodes."""
 RESTS = "rest"
-"""Folder of the pictures without contact in records that this program writes, whatever their format."""
+"""Folder of the no-contact frames in records that this program writes, in every format."""
 VERSION = "v3."
-"""Beginning of the version that is read."""
+"""Beginning of the format version that can be read."""
 PICTURES = ("image", "video")
-"""Types of features that are pictures."""
+"""Types of features that hold pictures."""
 OURS = ("tactip", "tactile", "tacpad")
-"""Words by which the name of a camera's feature shows that it is a tactile sensor. The first such camera is read."""
+"""Words in the name of a camera's feature that mark a tactile sensor. The first such camera is read."""
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
-"""LeRobot's own columns of whole numbers."""
+"""Columns of whole numbers that LeRobot adds itself."""
 NUMBERS = ("float", "int", "uint", "bool")
-"""Beginnings of the types of features that are labels."""
+"""Beginnings of the type names of numeric features, which become labels."""
 DAMAGED = "give the data set whole, as it was written"
 Episode = dict[str, Any]
 
@@ -45,10 +45,10 @@ class LeRobotFrames:
     ----------
     names : list of str
     first : (H, W) or (H, W, 3) uint8
-        The first frame. Pictures whose three channels are alike are gray.
+        The first frame. A picture whose three channels are equal counts as gray.
     labels : dict of str to (M,) float
     problems : list of str
-        What is odd, one line each.
+        Irregularities, one line each.
     """
 
     path: Path
@@ -58,13 +58,13 @@ class LeRobotFrames:
     first: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.uint8))
     _places: list[tuple[Path, int, int]] = field(
         default_factory=list, repr=False
-    )  # of each frame: file, row group or -1 (video), number in it
+    )  # of each frame: file, row group (-1 for a video), and row or frame number in it
     _feature: str = field(default="", repr=False)
     _group: tuple[Path, int] | None = field(default=None, repr=False)
     _cells: list[Any] = field(default_factory=list, repr=False)
 
     def frames(self, chosen: Collection[int]) -> Iterator[tuple[int, np.ndarray | str]]:
-        """Index and picture of chosen frames, in order; instead of the picture of a damaged frame how it is damaged."""
+        """Index and picture of chosen frames, in order. A damaged frame gives the reason, a text, instead of the picture."""
         wanted = sorted(chosen)
         if wanted and self._places[wanted[0]][1] < 0:
             yield from self._from_videos(wanted)
@@ -87,7 +87,7 @@ class LeRobotFrames:
                 yield index, f"{path.name} ends before it"
 
     def _stored(self, path: Path, group: int, row: int) -> bytes:
-        """A picture's file from a table."""
+        """The encoded bytes of a picture that a table holds or names."""
         if self._group != (path, group):
             columns = [self._feature]
             table = _read(path, lambda parquet: parquet.ParquetFile(path, page_checksum_verification=True).read_row_group(group, columns))
@@ -116,12 +116,12 @@ def is_lerobot(path: Path) -> bool:
 
 
 def open_lerobot(path: Path) -> LeRobotFrames:
-    """Open a data set; of a set that is still being written the episodes that it states.
+    """Open a data set. Of a data set that is still being written, only the episodes that its description counts are read.
 
     Raises
     ------
     FrameError
-        It is of another version, damaged or has no pictures; or pyarrow is missing.
+        It has another version, is damaged or has no pictures; or pyarrow is missing.
     """
     info = _info(path)
     _library("pyarrow.parquet")
@@ -171,7 +171,7 @@ def _info(path: Path) -> dict[str, Any]:
 
 
 def _rows(path: Path, info: dict[str, Any], numbered: list[str]) -> tuple[dict[str, list[Any]], list[tuple[Path, int, int]]]:
-    """Cells of the columns with numbers, and each row's file, row group and place in it; only of the episodes that the set states."""
+    """Cells of the numeric columns, and file, row group and row of each frame; only of the episodes that the description counts."""
     columns = ["episode_index", "frame_index", *numbered]
     rows: dict[str, list[Any]] = {name: [] for name in columns}
     places: list[tuple[Path, int, int]] = []
@@ -198,7 +198,7 @@ def _rows(path: Path, info: dict[str, Any], numbered: list[str]) -> tuple[dict[s
 
 
 def _in_videos(path: Path, info: dict[str, Any], feature: str, rows: dict[str, list[Any]]) -> list[tuple[Path, int, int]]:
-    """Each frame's video, -1, and number in it."""
+    """Video, -1, and number in the video of each frame."""
     episodes: dict[int, Episode] = {}
     at = f"videos/{feature}"
     keys = [f"{at}/chunk_index", f"{at}/file_index", f"{at}/from_timestamp"]
@@ -224,7 +224,7 @@ def _in_videos(path: Path, info: dict[str, Any], feature: str, rows: dict[str, l
 
 
 def _columns(feature: str, names: object, cells: list[Any]) -> dict[str, np.ndarray]:
-    """A feature's numbers as columns (M,); nothing for one of more than two dimensions, or whose length changes."""
+    """A feature's numbers as columns (M,). A feature of more than two dimensions, or of changing length, gives no columns."""
     if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}
         (names,) = names.values()
     try:
@@ -242,7 +242,7 @@ def _columns(feature: str, names: object, cells: list[Any]) -> dict[str, np.ndar
 
 
 def _read(file: Path, how: Any) -> Any:
-    """What ``how`` makes of pyarrow's reader of tables; a damaged file is an error in words."""
+    """The result of ``how``, applied to pyarrow's module for tables; a damaged file raises ``FrameError``."""
     parquet, arrow = _library("pyarrow.parquet"), _library("pyarrow")
     try:
         return how(parquet)

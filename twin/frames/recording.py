@@ -1,4 +1,4 @@
-"""A recording, opened from whatever the user gives and read frame by frame."""
+"""Opens a recording from a picture, a folder, a video or a data set, and reads it frame by frame."""
 
 import os
 from collections.abc import Collection, Iterator
@@ -19,19 +19,19 @@ from twin.frames.tables import TABLES, order_by_table, read_metadata
 from twin.frames.videos import Video, open_video
 from twin.types import Form, Frame
 
-MOST_NAMED = 20  # columns that a message names; the widest tables in use have about 40
+MOST_NAMED = 20  # most columns that a message names; the widest tables in use have about 40
 _ConcretePath: type[Path] = type(Path())
 
 
 class FramesAt(_ConcretePath):  # type: ignore[misc, valid-type]
-    """A path to frames, with the files that belong to them but do not lie beside them under a usual name. ``frames_at`` makes it.
+    """A path to frames, with a table and a no-contact frame that do not lie beside them under a usual name. ``frames_at`` makes it.
 
     Attributes
     ----------
     table : Path or None
-        Table of labels, in the place of the recording's own.
+        Table of labels that replaces the recording's own.
     no_contact : Path or None
-        Frame without contact, in the place of the recording's own.
+        No-contact frame that replaces the recording's own.
     """
 
     table: Path | None = None
@@ -39,7 +39,7 @@ class FramesAt(_ConcretePath):  # type: ignore[misc, valid-type]
 
 
 def frames_at(path: str | Path, table: Path | None = None, no_contact: Path | None = None) -> Path:
-    """A path to frames with a table and a no-contact frame from elsewhere. It stands wherever a path to frames does."""
+    """A path to frames with a table and a no-contact frame from elsewhere. It can be used wherever a path to frames is expected."""
     if table is None and no_contact is None:
         return Path(path)
     at = FramesAt(path)
@@ -103,7 +103,7 @@ class Recording:
         yield from self.some(range(len(self)))
 
     def some(self, chosen: Collection[int]) -> Iterator[Frame]:
-        """The readable frames of some indices of ``names``, in order; the others of these are added to ``failed``."""
+        """The readable frames of some indices of ``names``, in order; unreadable ones are added to ``failed``."""
         self.failed.clear()
         for index, frame in self._chosen(chosen):
             if isinstance(frame, str):
@@ -112,7 +112,7 @@ class Recording:
                 yield frame
 
     def read(self, index: int) -> Frame:
-        """Read frame ``index`` of ``names``. A video is read from its beginning for it.
+        """Read frame ``index`` of ``names``. A video is decoded from its beginning for this.
 
         Raises
         ------
@@ -128,11 +128,11 @@ class Recording:
         return self._frame(self._image(self._files[index]), index)
 
     def notes(self) -> list[str]:
-        """What is odd in the recording, and the frames that could not be read so far, one line each."""
+        """Irregularities of the recording, and the frames that could not be read so far, one line each."""
         return [*self.problems, *(f"skipped {bad['image_name']}: {bad['reason']}" for bad in self.failed)]
 
     def labels_found(self) -> str:
-        """What there is of labels, for a message: the table's columns, or why no table serves."""
+        """The available labels, in words for a message: the table's columns, or why no table can be used."""
         if self.labels:
             columns = list(self.labels)
             return f"found {', '.join(columns[:MOST_NAMED])}{', ...' if len(columns) > MOST_NAMED else ''}"
@@ -153,13 +153,13 @@ class Recording:
         return Frame(image, self.form, name, time_s, index)
 
     def _chosen(self, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
-        """Index and frame, or why it can't be read, of chosen frames, wherever they are kept."""
+        """Index and frame, or the reason why it can't be read, of chosen frames of any source."""
         if self._dataset is not None:
             return self._dataset_frames(self._dataset, chosen)
         return self._video_frames(self._video, chosen) if self._video is not None else self._pictures(chosen)
 
     def _dataset_frames(self, dataset: LeRobotFrames, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
-        """The same of a LeRobot data set."""
+        """Index and frame, or the reason why it can't be read, of chosen frames of a LeRobot data set."""
         for index, image in dataset.frames(chosen):
             try:
                 yield index, image if isinstance(image, str) else self._frame(image, index)
@@ -167,7 +167,7 @@ class Recording:
                 yield index, str(error)
 
     def _pictures(self, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
-        """Index and frame, or why it can't be read, of chosen pictures."""
+        """Index and frame, or the reason why it can't be read, of chosen pictures."""
         for index in sorted(chosen):
             try:
                 yield index, self.read(index)
@@ -175,7 +175,7 @@ class Recording:
                 yield index, str(error)
 
     def _video_frames(self, video: Video, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
-        """Index and frame, or why it can't be read, of chosen frames of a video."""
+        """Index and frame, or the reason why it can't be read, of chosen frames of a video."""
         for index, time_s, image in video.frames():
             if index not in chosen:
                 continue
@@ -199,12 +199,12 @@ class Recording:
             self.problems.append(f"no-contact frame {candidate.name}: {times(got)}, the frames are {times(self.size_px)}; ignored")
 
     def must_take_reference(self, file: Path) -> None:
-        """Take a picture that was given as the no-contact frame.
+        """Use the picture that the user gave as the no-contact frame.
 
         Raises
         ------
         FrameError
-            It cannot be read, or has another size than the frames.
+            The picture cannot be read, or its size differs from the frames'.
         """
         if not file.is_file():
             raise FrameError(f"{file}: no such no-contact frame; give the path of a picture with --no-contact")
@@ -215,7 +215,7 @@ class Recording:
             raise FrameError(f"{'; '.join(self.problems[before:])}; give another one with --no-contact")
 
     def take_metadata(self, homes: list[Path]) -> None:
-        """Read the JSON files of folders."""
+        """Read the JSON files of these folders."""
         for file in (file for home in homes for file in sorted(home.glob("*.json"))):
             if (content := read_metadata(file, self.problems)) is not None:
                 self.metadata[file.name] = content
@@ -269,7 +269,7 @@ def _open_folder(path: Path, known: KnownFrames | None, form: Form | None, table
     if folders:
         folder, files, kind = _choose_folder(path, folders, known, form, problems)
         problems += odd_entries(folder)
-        # given the inner folder of a recording, its table and no-contact frame lie beside it
+        # if ``path`` is the inner folder of a recording, table and no-contact frame lie in the folder above
         inner = folder == path and path.name in IMAGE_FOLDERS
         homes = list(dict.fromkeys([path, folder] + ([path.parent] if inner else [])))
         tables = [home / name for home in homes for name in TABLES if (home / name).is_file()] if table is None else [table]
@@ -299,14 +299,14 @@ def open_recording(
         A picture, a folder of pictures, a recording's folder, a LeRobot data set, or a video or a folder with one. ``frames_at`` adds
         a table and a no-contact frame from elsewhere.
     spec : SensorSpec, optional
-        The sensor; frames must have the size of one of its forms. The size of most frames is the recording's.
+        The sensor; frames must have the size of one of its forms. The recording's size is that of most frames.
     form : Form, optional
-        The frames' form; told by size and content if not given.
+        The frames' form; recognised by size and content if not given.
 
     Raises
     ------
     FrameError
-        Nothing there, or no usable frame.
+        There is nothing at ``path``, or no frame is usable.
     """
     table, no_contact = (path.table, path.no_contact) if isinstance(path, FramesAt) else (None, None)
     path = Path(path)
@@ -319,8 +319,8 @@ def open_recording(
 
 
 def _opened(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
-    """A recording with what lies beside it."""
-    if not os.path.exists(path):  # unlike ``Path.exists`` also False for what is no path at all
+    """The recording at ``path``, with the table and the other files that lie beside its frames."""
+    if not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
         link = "a link to nothing" if os.path.islink(path) else "no such file or folder"
         raise FrameError(f"{shown(path, LONGEST_PATH)}: {link}; give a picture, a folder of frames, a recording or a video")
     if path.is_dir() and is_lerobot(path):
@@ -343,9 +343,9 @@ def spread(count: int, wanted: int) -> list[int]:
 
 
 def evenly_read(recording: Recording, limit: int) -> list[Frame]:
-    """At most ``limit`` frames of a recording, evenly spread from its first to its last.
+    """At most ``limit`` frames of a recording, evenly spread from its first to its last frame.
 
-    Of these, a frame that can't be read is left out and added to ``failed``.
+    A frame that can't be read is left out and added to ``failed``.
 
     Raises
     ------

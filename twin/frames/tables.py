@@ -1,4 +1,4 @@
-"""Tables of labels and JSON metadata that lie beside the frames."""
+"""Reads tables of labels and JSON metadata that lie beside the frames."""
 
 import csv
 import json
@@ -12,9 +12,9 @@ import numpy as np
 from scenes.files import read_regular
 from twin.frames.folders import IMAGE_SUFFIXES
 
-# Names of a recording's table, the likelier first.
+# Names of a recording's table, in the order in which they are tried.
 TABLES = ("targets.csv", "targets_images.csv", "metadata.csv")
-# Names of the columns that hold pictures' names, in any case.
+# Names, in lower case, of the columns that hold pictures' names.
 NAME_COLUMNS = ("image_name", "sensor_image", "file_name")
 # Names of label columns in other conventions, in lower case, by those used here: poses in mm and deg, and moves before the frame was taken.
 # tactile_data has pose_x and shear_x, LeRobot the names of a state vector.
@@ -27,23 +27,23 @@ CALLED_HERE = {
     **{f"observation.state.{axis}.pos": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
     **{axis: f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
 }
-# What may stand between the cells of a row; the one that is most frequent in the header counts.
+# Characters that may separate the cells of a row. The most frequent one in the header is used.
 SEPARATORS = (",", ";", "\t")
-# Bytes of a table or of metadata: a million rows of a hundred characters.
+# Largest size of a table or of metadata, bytes: a million rows of a hundred characters.
 LARGEST_BYTES = 100_000_000
-# Columns of a table: the widest in use have about 40.
+# Most columns of a table. The widest tables in use have about 40.
 MOST_COLUMNS = 1000
-# Characters that are taken away around a cell.
+# Characters that are removed at both ends of a cell.
 AROUND_CELLS = " \t\"'"
 
 
 def base_name(path: str) -> str:
-    """The last part of a path written on any system."""
+    """The last part of a path, with Windows or POSIX separators."""
     return re.split(r"[\\/]", path.strip(AROUND_CELLS))[-1]
 
 
 def bare_name(name: str) -> str:
-    """A picture's name without its suffix, if it has one, and without regard to case."""
+    """A picture's name in lower case without its suffix, if it has one."""
     stem, dot, suffix = name.casefold().rpartition(".")
     return stem if dot + suffix in IMAGE_SUFFIXES else name.casefold()
 
@@ -59,7 +59,7 @@ def _text(path: Path) -> str:
 
 @dataclass
 class Table:
-    """A table: its file's name, its cells by column, and the columns that name pictures, as base names."""
+    """A table: its file's name, its cells by column, and the columns that name pictures. Pictures are named by their base names."""
 
     name: str
     columns: dict[str, list[str]]
@@ -80,7 +80,7 @@ def _cells(text: str) -> list[list[str]]:
     for number, line in enumerate(lines, 1):
         if line.count(separator) >= MOST_COLUMNS:
             raise csv.Error(f"row {number} has {line.count(separator) + 1} cells, a table has at most {MOST_COLUMNS}")
-        unclosed = line.count('"') % 2 == 1  # read as quoted, such a line would take in the lines after it
+        unclosed = line.count('"') % 2 == 1  # the csv reader would join such a line with the following lines
         if unclosed:
             (row,) = csv.reader([line], delimiter=separator, quoting=csv.QUOTE_NONE, skipinitialspace=True)
         else:
@@ -94,7 +94,7 @@ def _cells(text: str) -> list[list[str]]:
 
 
 def _distinct(header: list[str]) -> list[str]:
-    """Column names, those that came before with _2, _3, ... appended."""
+    """Column names. A repeated name gets _2, _3, ... appended."""
     distinct: list[str] = []
     taken: set[str] = set()
     tries: dict[str, int] = {}
@@ -111,7 +111,7 @@ def _distinct(header: list[str]) -> list[str]:
 def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are taken in natural order") -> Table | None:
     """A table; None if it names no pictures.
 
-    The reason and its consequence, ``otherwise``, are then added to ``problems``.
+    The reason, with its consequence ``otherwise``, is then added to ``problems``.
     """
     try:
         text = _text(path)
@@ -141,29 +141,29 @@ def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are 
 
 
 def _cut(text: str, rows: list[list[str]]) -> bool:
-    """Whether the text ends within the last row, and its last cell is no number though those above are."""
+    """Whether the text was cut within the last row: its last cell is no number, but the cells above it are."""
     ended = text.splitlines(keepends=True)[-1] != text.splitlines()[-1]
     *above, last = (np.isnan(_number(row[-1])) for row in rows or [["0"]])
     return not ended and last and not all(above or [False])
 
 
 def counted(count: int, things: str, names: list[str]) -> str:
-    """How many of what, with the first three named."""
+    """Number and kind of things, with the names of the first three."""
     return f"{count} {things} ({', '.join(names[:3])}{', ...' if count > 3 else ''})"
 
 
 @dataclass
 class Pairing:
-    """Rows of a table and pictures that belong together.
+    """Which row of a table belongs to which picture.
 
     Attributes
     ----------
     files : dict of int to Path
-        The picture of each row that has one of its own.
+        The picture of each row that has its own picture.
     loose : list of int
-        Those of these rows whose name differs in case or suffix.
+        The rows in ``files`` whose picture's name differs in case or suffix.
     doubled, missing : list of int
-        Rows whose picture belongs to an earlier row; rows without a picture.
+        Rows whose picture belongs to an earlier row; rows without any picture.
     """
 
     files: dict[int, Path]
@@ -173,7 +173,7 @@ class Pairing:
 
 
 def pair_rows(names: list[str], files: list[Path]) -> Pairing:
-    """Pair names and pictures: as written, then without regard to case, then without suffix."""
+    """Pair names and pictures: first by exact names, then without regard to case, then without suffix."""
     pairing = Pairing({}, [], [], list(range(len(names))))
     for key in (str, str.casefold, bare_name):
         taken = set(pairing.files.values())
@@ -197,9 +197,9 @@ def pair_rows(names: list[str], files: list[Path]) -> Pairing:
 
 
 def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -> tuple[list[Path], dict[str, np.ndarray]]:
-    """Frames in the order of the table that names most of them, those it doesn't name last, and its columns in that order.
+    """Frames in the order of the table that names most of them, and its columns in that order. Frames that it does not name come last.
 
-    Columns are empty for frames without a row. If no table names a frame, the order stays and there are no columns.
+    Cells are empty for frames without a row. If no table names a frame, the order is unchanged and there are no columns.
     """
     readable = [table for path in tables if (table := read_table(path, problems))]
     pairs = [(table, names, pair_rows(names, files)) for table in readable for names in table.name_lists]
@@ -226,7 +226,7 @@ def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -
 
 
 def called_here(labels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Columns (M,), those of other conventions also under the names used here."""
+    """Columns (M,). Columns with names of other conventions are also given under the names used here."""
     return labels | {here: cells for name, cells in labels.items() if (here := CALLED_HERE.get(name.casefold())) and here not in labels}
 
 
@@ -252,16 +252,16 @@ def _number(cell: str) -> float:
 
 
 def _written_number(cell: str) -> float:
-    """The number in a cell. Python would also read 1_5 as 15: a slip of the hand is no number."""
+    """The number in a cell. Unlike Python, this does not read 1_5 as 15, because such a cell is a typing error."""
     if "_" in cell:
         raise ValueError(cell)
     return float(cell)
 
 
 def read_metadata(path: Path, problems: list[str]) -> object | None:
-    """Content of a JSON file; None, with the reason in ``problems``, if it cannot be read.
+    """Content of a JSON file; None if it cannot be read, with the reason in ``problems``.
 
-    Files in use hold Windows paths with single backslashes, and NaN or Infinity: both are accepted and noted.
+    Some files in use hold Windows paths with single backslashes, and NaN or Infinity. Both are accepted and noted in ``problems``.
     """
     try:
         text = _text(path)
@@ -288,7 +288,7 @@ def read_metadata(path: Path, problems: list[str]) -> object | None:
 
 
 def _parsed_or_mended(name: str, text: str, constant: Callable[[str], float], problems: list[str]) -> object:
-    """Content of JSON text, if need be with its lone backslashes doubled; ``constant`` reads NaN and Infinity."""
+    """Content of JSON text. If necessary, single backslashes are doubled first. ``constant`` converts NaN and Infinity."""
     try:
         return json.loads(text, parse_constant=constant)
     except ValueError as error:

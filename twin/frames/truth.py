@@ -9,18 +9,18 @@ import zarr
 from twin.errors import FrameError
 from twin.types import Form
 
-# Zarr group of everything that is known about the frames.
+# Zarr group with the exact values of the frames.
 TRUTH = "truth.zarr"
 AGAIN = "copy the data set anew, or make it again"
 NEVER_ZERO = (
     "pins_px",
     "rest_px",
     "visible",
-)  # no part of these arrays is all zeros, so zarr, which reads a missing part as zeros, has all
+)  # arrays without any all-zero chunk. zarr reads a missing chunk as zeros, so a missing chunk of these arrays means damage.
 
 
 def image_name(index: int, state: int) -> str:
-    """Name of a contact's picture, in the way that recordings number them."""
+    """Name of a contact's picture, numbered as in recordings."""
     return f"frame_{index}_{state}.png"
 
 
@@ -30,12 +30,12 @@ def open_truth(folder: Path) -> tuple[zarr.Group, str, Form]:
     try:
         truth = zarr.open_group(path, mode="r")
         return truth, str(truth.attrs["sensor"]), Form(str(truth.attrs["form"]))
-    except Exception as error:  # damaged metadata raise whatever zarr runs into
+    except Exception as error:  # damaged metadata can raise any exception in zarr
         raise FrameError(f"{path}: damaged, or of no finished data set; {AGAIN}") from error
 
 
 def row_of(truth: zarr.Group) -> dict[str, int]:
-    """Row of each frame's name: the truth has the frames in the order of their contacts, whatever order the table has."""
+    """Row of each frame's name in the truth, which is in the order of the contacts. The table may have another order."""
     found: dict[str, int] = {}
     states: dict[int, int] = {}
     for row, contact in enumerate(arrays_of(truth, ("path_id",))["path_id"].tolist()):
@@ -52,7 +52,7 @@ def arrays_of(truth: zarr.Group, names: Sequence[str]) -> dict[str, np.ndarray]:
             array = truth.get(name)
             if isinstance(array, zarr.Array) and not (name in NEVER_ZERO and array.nchunks_initialized < array.nchunks):
                 found[name] = np.asarray(array[:])
-        except Exception as error:  # damaged bytes raise whatever zarr and its codecs run into
+        except Exception as error:  # damaged bytes can raise any exception in zarr and its codecs
             raise FrameError(f"{truth.store_path}: array '{name}' is damaged; {AGAIN}") from error
         if name not in found:
             raise FrameError(f"{truth.store_path}: array '{name}' is missing, or a part of it; {AGAIN}")

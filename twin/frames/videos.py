@@ -1,7 +1,7 @@
-"""Videos, read frame by frame: how many frames there are, and which of them can be used.
+"""Reads videos frame by frame, counts their frames, and finds out which frames can be used.
 
-Motion JPEG is read picture by picture, so that a damaged frame is noticed and left out: a video decoder would fill what is missing with
-what it guesses, and would not say so. A frame of another code cannot be checked in this way.
+Motion JPEG is read picture by picture, so that a damaged frame is noticed and left out. A video decoder would fill the missing part with a
+guess, without a message. A frame of another codec cannot be checked in this way.
 """
 
 from collections.abc import Iterator
@@ -16,9 +16,9 @@ from twin.errors import FrameError
 from twin.frames.images import picture_of, quiet
 
 MOTION_JPEG = "MJPG"
-"""Four letters that name the code of videos whose frames are JPEG pictures."""
+"""Four-letter code of the codec whose frames are JPEG pictures."""
 AS_STORED = -1.0
-"""Format in which OpenCV gives a video's frames without decoding them."""
+"""Value of OpenCV's format setting that gives a video's frames without decoding them."""
 MS_PER_S = 1e3
 
 
@@ -30,13 +30,14 @@ class Video:
     ----------
     path : Path
     count : int
-        Number of its frames; of a cut video without the last.
+        Number of frames; of a truncated video without the last one.
     first : (H, W) or (H, W, 3) uint8
-        Its first usable frame, RGB.
+        The first usable frame, RGB.
     problems : list of str
-        What was odd, one line each.
+        Irregularities, one line each.
     oddly_stored : bool
-        Whether most frames hold bytes that belong to no part of them, as some cameras write them. Where few do, these are damaged.
+        Whether most frames hold extra bytes that belong to no part of them, as some cameras write them. If only a few frames hold such
+        bytes, these frames are damaged.
     """
 
     path: Path
@@ -46,7 +47,7 @@ class Video:
     oddly_stored: bool = False
 
     def frames(self) -> Iterator[tuple[int, float, np.ndarray | str]]:
-        """Index, time (s) and picture of each frame, in order; instead of the picture of a damaged frame how it is damaged."""
+        """Index, time (s) and picture of each frame, in order. A damaged frame gives the reason, a text, instead of the picture."""
         for index, time_s, image, said in _read(self.path):
             if index >= self.count:
                 return
@@ -54,12 +55,12 @@ class Video:
 
 
 def open_video(path: Path) -> Video:
-    """Look through a video.
+    """Read a video once, to count its frames and to find irregularities.
 
     Raises
     ------
     FrameError
-        It can't be read, or has no usable frame.
+        The video can't be read, or has no usable frame.
     """
     try:
         require_regular(path)
@@ -80,7 +81,7 @@ def open_video(path: Path) -> Video:
     problems = [f"{path.name}: {said} ({len(odd)} such frames)" for said in list(odd.values())[:1] if oddly_stored]
     promised = _promised(path)
     if promised > count or is_cut(path):
-        # The decoder makes up what is missing of a frame that was cut, and does not say so.
+        # The decoder fills the missing part of a truncated frame with a guess, without a message.
         decoded = f"{count} of {max(promised, count)} frames can be decoded"
         problems.append(f"{path.name}: cut, {decoded}; the last of them may lack a part and is left out")
         count -= 1
@@ -90,7 +91,7 @@ def open_video(path: Path) -> Video:
 
 
 def is_cut(path: Path) -> bool:
-    """Whether an AVI or MP4 file is shorter than its own chunks say."""
+    """Whether an AVI or MP4 file is shorter than its own chunks state."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(8)
@@ -103,18 +104,18 @@ def is_cut(path: Path) -> bool:
             file.seek(start)
             head = file.read(16)
             length = int.from_bytes(head[:4], "big")
-            if length == 1:  # the length follows, in 8 bytes
+            if length == 1:  # the true length follows, in 8 bytes
                 length = int.from_bytes(head[8:], "big")
-            elif length == 0:  # up to the file's end
+            elif length == 0:  # this box extends to the end of the file
                 return False
-            if length < 8:  # no box
+            if length < 8:  # not a valid box
                 return True
             start += length
         return start > size
 
 
 def _promised(path: Path) -> int:
-    """Number of frames that the file states."""
+    """Number of frames that the file states in its header."""
     with quiet():
         capture = cv2.VideoCapture(str(path))
     try:
@@ -124,7 +125,7 @@ def _promised(path: Path) -> int:
 
 
 def _read(path: Path) -> Iterator[tuple[int, float, np.ndarray | None, str]]:
-    """Index, time (s) and picture (RGB) of each frame, and what was odd; of a frame that can't be used None and the reason."""
+    """Index, time (s), picture (RGB) and irregularities of each frame; None and the reason for a frame that can't be used."""
     with quiet():
         capture = cv2.VideoCapture(str(path))
     try:
@@ -152,7 +153,7 @@ def _gives_pictures(capture: cv2.VideoCapture) -> bool:
 
 
 def _picture(stored: np.ndarray) -> tuple[np.ndarray | None, str]:
-    """A frame (H, W) or (H, W, 3), RGB, from its bytes (1, n), and what was odd; None and the reason if it can't be used."""
+    """A frame (H, W) or (H, W, 3), RGB, from its bytes (1, n), and its irregularities; None and the reason if it can't be used."""
     try:
         image, note = picture_of(stored.tobytes())
     except FrameError as error:

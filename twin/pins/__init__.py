@@ -1,7 +1,7 @@
-"""From frames to labelled pins and their graphs.
+"""Finds pins in frames, labels them, and builds their graphs.
 
-`make_detector` gives the pipeline and other detectors with the same interface; `tune` finds their parameters from frames. `examine`
-checks the condition of a sensor by a few of its frames.
+`make_detector` gives the pipeline and other detectors with the same interface; `tune` finds their parameters from frames. `examine` checks
+the condition of a sensor from a few of its frames.
 """
 
 from twin.pins.check import Finding, Grade, examine

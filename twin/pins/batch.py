@@ -47,13 +47,14 @@ MADE_FROM_CONTACTS = (
 )
 """Note for a specification whose places at rest were estimated from contacts."""
 MEASURED_BEFORE = "measured before"
-"""Stands in place of a no-contact frame's name where the pins' measured places of the specification are the reference."""
+"""Text instead of a no-contact frame's name if the reference is the specification's measured places at rest."""
 MADE_OF_CONTACTS = "made from contacts"
-"""Stands there where the specification's places at rest come from contacts."""
+"""Text instead of a no-contact frame's name if the reference is the specification's places at rest that were estimated from contacts."""
 FARTHEST_PX = 1e4
 """Largest distance of a drawn point from the frame's origin, px. OpenCV's integers would overflow beyond it."""
 HALF, BRIGHTEST, DARKEST = 127.0, 98.0, 24.0
-"""In a picture this percentile of a frame's levels (at least the third number) is shown at half white, so that what is drawn is seen."""
+"""Brightness of a picture: the gray level ``HALF`` that is given to the frame's level at the percentile ``BRIGHTEST``. That level counts as
+``DARKEST`` at least. The frame is shown at half brightness, so that the drawing on it is visible."""
 UNMEASURED = "specification"
 """Text instead of the name of a no-contact frame if the reference is the specification's layout."""
 
@@ -83,7 +84,7 @@ def preprocess_recording(
     Returns
     -------
     dict
-        The summary; ``invalid`` and ``failed`` list the frames whose pins weren't found and those that couldn't be read.
+        The summary; ``invalid`` lists the frames whose pins were not found, ``failed`` those that could not be read.
         ``pins.npz`` has one row per readable frame, in the recording's order: ``image_name``, ``pins_px`` and
         ``predicted_px`` (M, N, 2), ``area_px2`` (M, N), ``found`` and ``valid`` (M,).
 
@@ -132,7 +133,7 @@ def preprocess_recording(
 
 
 def summary_lines(summary: dict[str, Any], pins: int) -> Iterator[str]:
-    """What ``summary.json`` says of a sensor of so many ``pins``, in words."""
+    """The content of ``summary.json`` in words, for a sensor with this number of ``pins``."""
     in_view = summary["in_view"]
     which = f"all {pins} pins" if in_view == pins else f"all pins in view ({in_view:g} of {pins}; the picture's border cuts the others off)"
     yield (
@@ -147,7 +148,7 @@ def summary_lines(summary: dict[str, Any], pins: int) -> Iterator[str]:
 def _observed(
     recording: Recording, pipeline: Pipeline, pictures_dir: Path | None, progress: Callable[[int, int], None] | None
 ) -> tuple[list[str], list[Observation], list[BadFrame]]:
-    """Names and observations of a recording's frames, and the frames that do not suit the pipeline. Writes pictures to a given folder."""
+    """Names and observations of a recording's frames, and the frames that do not suit the pipeline. Pictures go to the given folder."""
     names: list[str] = []
     observations: list[Observation] = []
     unfit: list[BadFrame] = []
@@ -155,7 +156,7 @@ def _observed(
     for frame in recording:
         try:
             if not observations:
-                pipeline(frame)  # loads or compiles code, which is no part of a frame's time
+                pipeline(frame)  # loads or compiles code, which must not count in the first frame's time
             observation = pipeline(frame)
         except FrameError as error:
             unfit.append({"image_name": frame.name, "reason": str(error).removeprefix(f"{frame.name}: ")})
@@ -170,7 +171,7 @@ def _observed(
 
 
 def recording_reference(spec: SensorSpec, recording: Recording, problems: list[str]) -> tuple[Reference, str]:
-    """The layout in the recording's no-contact frame and this frame's name; without a usable one the specification's layout.
+    """The layout in the recording's no-contact frame and this frame's name; without a usable frame the specification's layout.
 
     The reason why a no-contact frame cannot be used is added to ``problems``.
     """
@@ -209,7 +210,7 @@ def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> n
         cv2.circle(canvas, px, 5, LOST_RGB, 1, cv2.LINE_AA)
     for px in place(observation.extra_px):
         cv2.circle(canvas, px, 6, EXTRA_RGB, 1, cv2.LINE_AA)
-    name = frame.name.encode("ascii", "replace").decode()  # OpenCV's font has no other letters, and some end the process
+    name = frame.name.encode("ascii", "replace").decode()  # OpenCV's font has no other letters, and some of them crash the process
     outside = len(observation.pins_px) - observation.expected
     pins = f"{observation.found}/{observation.expected}" + (f" in view, {outside} outside" if outside else "")
     text = f"{name}  {pins}  {observation.reason}"
@@ -234,7 +235,7 @@ def voronoi_map(shape: tuple[int, int], seen: Observation, rest_area_px2: np.nda
 
 
 def overlay_name(frame_name: str, taken: set[str]) -> str:
-    """File name for a frame's picture that is not in ``taken`` (in lower case) yet; it is added to ``taken``."""
+    """File name for a frame's picture that is not in ``taken`` (lower case) yet. The name is added to ``taken``."""
     stem = Path(frame_name).stem
     tries = chain((f"{stem}.png", f"{frame_name}.png"), (f"{stem}_{k}.png" for k in count(2)))
     name = next(name for name in tries if name.casefold() not in taken)
@@ -243,7 +244,7 @@ def overlay_name(frame_name: str, taken: set[str]) -> str:
 
 
 def _timing(observations: list[Observation]) -> dict[str, dict[str, float]]:
-    """Median, 95 and 99 % of the milliseconds of each stage."""
+    """Median, 95th and 99th percentile of the milliseconds of each stage."""
     if not observations:
         return {}
     stages = {stage: [o.ms[stage] for o in observations] for stage in observations[0].ms}

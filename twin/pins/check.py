@@ -43,7 +43,7 @@ CAPS_MEASURED = 3
 LEAST_DEFORMED = 0.3
 """Share of the frames, those with the least contact, by which the camera's place is measured."""
 TOLD_BULGE = 0.002
-"""A contact that changes the rim's size by less than this share is not mentioned."""
+"""Change of the rim's size by a contact, as a share, below which a text does not mention it."""
 LAYOUT_JUDGED = 4
 """Most frames on which the layout is judged, evenly spread."""
 LISTED = 8
@@ -53,9 +53,9 @@ BRIGHT_PERCENTILE = 99
 USUAL_CAP_PX = 8.0
 """Assumed diameter of a cap, px, if none can be measured."""
 STRAY_PERCENTILE = 97
-"""Percentile of the skin's levels around the caps that is compared with their median: stray light falls on a part of the skin."""
+"""Percentile of the skin's levels around the caps that is compared with their median. Stray light falls on a part of the skin only."""
 GLARE_CAPS = 2
-"""Area in caps above which a white patch is glare."""
+"""Area of a white patch, in cap areas, above which it counts as glare."""
 
 
 class Grade(StrEnum):
@@ -103,7 +103,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
     Raises
     ------
     FrameError
-        A frame is not of this sensor.
+        A frame does not belong to this sensor.
     """
     form = frames[0].form
     detector = detector or shipped_detector(spec, form)
@@ -180,7 +180,7 @@ def _finding(name: str, value: float, limits: tuple[float, float], text: str, re
 
 
 def _layout(frames: list[Frame], spec: SensorSpec) -> Finding:
-    """Whether the frames show the sensor's layout of pins, wherever its camera is: only the layout of the specification is used."""
+    """Finding about the layout: whether the frames show the specification's layout, independent of the camera's place."""
     images = [gray_levels(frames[k].image) for k in spread(len(frames), LAYOUT_JUDGED)]
     layout = judge_layout(spec.pins, images)
     share = 0.0 if layout is None else layout.explained
@@ -192,13 +192,13 @@ def _layout(frames: list[Frame], spec: SensorSpec) -> Finding:
 
 
 def lost_in_view(seen: list[Observation], pipeline: Pipeline) -> tuple[np.ndarray, np.ndarray]:
-    """Pins (M, N) bool that are lost in M frames though the frame's border does not cut them off, and those that it does not cut off."""
+    """Pins (M, N) bool that are lost in M frames but not cut off by the frame's border, and all pins that it does not cut off."""
     in_view = ~np.stack([pipeline.out_of_view(o) for o in seen])
     return np.isnan(np.stack([o.pins_px[:, 0] for o in seen])) & in_view, in_view
 
 
 def _pins(seen: list[Observation], pipeline: Pipeline) -> Finding:
-    """Finding about lost pins, and pins that are lost in most frames; those that the frame's border cuts off are not lost."""
+    """Finding about lost pins, and about pins that are lost in most frames. Pins that the frame's border cuts off do not count as lost."""
     lost, in_view = lost_in_view(seen, pipeline)
     share = float(lost.sum() / max(in_view.sum(), 1))
     steady = np.flatnonzero(lost.mean(axis=0) >= STEADY)
@@ -231,7 +231,7 @@ def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
 
 
 def _place(seen: list[Observation], nominal: Reference) -> list[Finding]:
-    """Findings about the camera's place: the rim of pins, in the frames with the least contact, is compared with the ``nominal`` one."""
+    """Findings about the camera's place: in the frames with the least contact, the rim of pins is compared with the ``nominal`` one."""
     pitch = float(np.mean(nominal.spacing_px))
     found = [d for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost))]
     if not found:
@@ -299,7 +299,7 @@ def _light(frames: list[Frame], seen: list[Observation], expected: UsualCapsSpec
 
 
 def usual_caps(caps: list[Caps]) -> UsualCapsSpec | None:
-    """Light and focus that the caps of some frames show, medians over the frames; None where no cap can be measured."""
+    """Light and focus of the caps in some frames, medians over the frames; None if no cap can be measured."""
     measured = [c for c in caps if np.isfinite(c.contrast).any() and np.isfinite(c.edge_px).any()]
     contrast = float(np.median([np.nanmedian(c.contrast) for c in measured])) if measured else 0.0
     edge_px = float(np.median([np.nanmedian(c.edge_px) for c in measured])) if measured else 0.0
@@ -310,7 +310,7 @@ def usual_caps(caps: list[Caps]) -> UsualCapsSpec | None:
 
 @lru_cache(maxsize=2)
 def drawn_caps(spec: SensorSpec) -> UsualCapsSpec | None:
-    """The caps measured in the twin's frame at rest; None where it shows none."""
+    """The caps measured in the twin's frame at rest; None if that frame shows none."""
     twin = expose(Preview(spec).render(), spec.capture)
     return usual_caps([measure_caps(gray_levels(twin), Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px)])
 

@@ -1,6 +1,6 @@
 """Detectors: objects that find pins in a frame. All have the same interface, which gives places, labelled pins and a graph.
 
-There are this program's pipeline, the published method, and plain blob detectors of OpenCV and scikit-image.
+The detectors are this program's pipeline, the published method, and plain blob detectors of OpenCV and scikit-image.
 """
 
 from dataclasses import dataclass
@@ -44,21 +44,21 @@ SIMPLE_HIGHEST = 240.0
 MOST_CAPS = 4
 """Largest area of a blob, in units of the largest cap's area."""
 MOST_BLOBS = 4
-"""Number of blobs for each pin above which a frame is refused as clutter."""
+"""Number of blobs per pin above which a frame is refused as clutter."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a detector found in one frame.
+    """The pins that a detector found in one frame.
 
     Attributes
     ----------
     claims_px : (K, 2) float
-        Places where it claims pins, px of the frame, in any order.
+        Places at which the detector finds pins, px of the frame, in any order.
     pins_px : (N, 2) float or None
-        The same places in the specification's pin order, NaN where lost; None if it does not tell which pin is which.
+        The same places in the specification's pin order, NaN where lost; None if the detector does not identify the pins.
     graph : PinGraph or None
-        In the order of ``pins_px`` if it is given, else of the claims. None if the frame is not valid.
+        Graph in the order of ``pins_px`` if that is given, else in the order of ``claims_px``. None if the frame is not valid.
     expected : int
         Pins that should be in view.
     valid : bool
@@ -87,7 +87,7 @@ class Detector(Protocol):
 def make_detector(sensor: SensorSpec, detector: DetectorSpec, *, second_look: bool = True) -> Detector:
     """Make a detector from its parameters.
 
-    ``second_look`` as for `Pipeline`. It must be False if thresholds are compared, because a second look finds pins that a threshold
+    ``second_look`` is as for `Pipeline`. It must be False if thresholds are compared, because a second look finds pins that a threshold
     loses.
 
     Raises

@@ -1,4 +1,4 @@
-"""The parameters of a way to find pins: what ``twin tune`` writes and ``--pipeline`` takes."""
+"""The parameters of a pin detector, as ``twin tune`` writes them and ``--pipeline`` reads them."""
 
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -29,28 +29,29 @@ METHODS: dict[Method, str] = {
     "doh": "scikit-image's determinant of Hessian",
 }
 assert set(METHODS) == set(get_args(Method))
-# The threshold by which frames were made is not known from them; the recorder of the published TacTip recordings has this one.
+# Assumed block, px, and offset, gray levels, of a recorder's threshold, because frames do not show how they were thresholded. The values
+# are those of the published TacTip recordings' recorder.
 UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET = 61, -5.0
-LEAST_LEVEL = 0.5  # gray levels: no threshold goes below
+LEAST_LEVEL = 0.5  # smallest fixed threshold, gray levels
 
 
 class Evidence(Section):
-    """How sure a tuning is: what it saw.
+    """Evidence for the reliability of a tuning.
 
     Attributes
     ----------
     frames : int
-        Number of frames that were looked at.
+        Number of frames that were used.
     exact_rate : float
         Share of the frames in which all pins in view were found.
     low_rate : float
         Lower end of the 90 % interval of that share.
     threshold_slack : float
-        Gray levels by which the threshold may move either way at nearly the same rate.
+        Gray levels by which the threshold can change in both directions at nearly the same rate.
     mask_slack_px : float
-        Distance between the outermost pins seen and the mask.
+        Distance between the outermost found pins and the mask.
     sure : {"sure", "fairly sure", "unsure"}
-        These numbers in words.
+        The reliability that follows from these numbers.
     """
 
     frames: int
@@ -62,34 +63,34 @@ class Evidence(Section):
 
 
 class DetectorSpec(Section):
-    """One way to find the pins of one sensor in frames of one form.
+    """A method to find the pins of one sensor in frames of one form, with its parameters.
 
     Attributes
     ----------
     name : str
         The file's stem; not a key of the file.
     method : str
-        A key of ``METHODS``, which says what each does.
+        A key of ``METHODS``, which describes each method.
     form : {"raw", "recording"}
         Form of the frames.
     size_px : (width, height), optional
-        Of the frames; without it those of the sensor's specification.
+        Width and height of the frames; by default those of the sensor's specification.
     blob : BlobSpec
-        As in a sensor's ``[pipeline.raw]``. Its ``threshold`` is the contrast in gray levels that ``log``, ``dog`` and ``doh`` ask of a
-        blob, and the lowest level that ``simple`` looks at.
+        Parameters as in a sensor's ``[pipeline.raw]``. For ``log``, ``dog`` and ``doh``, ``threshold`` is the least contrast of a blob in
+        gray levels. For ``simple`` it is the lowest of the thresholds.
     radius_px : (smallest, largest)
-        Radii of the caps.
+        Smallest and largest radius of the caps, px.
     recording : RecordingSpec, optional
-        What the published method's recorder does to a raw frame.
+        Recorder with which the published method converts a raw frame first.
     pins_px : (N, 2) float
-        Where the tuning saw the pins at rest, in the specification's order; empty: the specification's own layout.
+        Pins at rest that the tuning found, in the specification's order; if empty, the specification's own layout is used.
     evidence : Evidence, optional
-        How sure the tuning is.
+        Evidence for the reliability of the tuning.
     """
 
     name: Name
     method: Method
-    form: Annotated[Form, Field(strict=False)] = Form.RAW  # files hold its text
+    form: Annotated[Form, Field(strict=False)] = Form.RAW  # not strict, because files hold the form as text
     size_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = None
     blob: BlobSpec
     radius_px: tuple[Positive, Positive] = (2.0, 8.0)
@@ -98,7 +99,7 @@ class DetectorSpec(Section):
     evidence: Evidence | None = None
 
     def stricter(self, levels: float) -> "DetectorSpec":
-        """The same with a threshold that many gray levels stricter."""
+        """The same parameters with a threshold that is stricter by this number of gray levels."""
         if not levels:
             return self
         if self.method == "legacy" and self.recording is not None:
@@ -110,20 +111,20 @@ class DetectorSpec(Section):
 
 
 def shipped_detector(spec: SensorSpec, form: Form, method: Method = "twin") -> DetectorSpec:
-    """What a sensor's specification says: this program's pipeline, or the published method where the sensor has recordings."""
+    """The detector with the parameters of a sensor's specification, for this program's pipeline or another method."""
     return DetectorSpec(name=method, method=method, form=form, blob=blob_spec(spec.pipeline, form), recording=spec.recording)
 
 
 def with_detector(spec: SensorSpec, detector: DetectorSpec) -> SensorSpec:
-    """A sensor whose pins are found as a tuning found best, in frames of the size and form that it was made on.
+    """A sensor with the parameters of a tuning, for frames of the size and form for which the tuning was made.
 
-    The tuning's places of the pins at rest become the specification's. Where the frames have another size, so does the camera (or the
-    recording), and the camera's focal lengths and principal point are scaled and shifted as its view of the pins is.
+    The tuning's pins at rest become the specification's. If the frames have another size, the size of the camera (or of the recording) is
+    changed, too. The camera's focal lengths and principal point are then scaled and shifted so that it sees the pins at these places.
 
     Raises
     ------
     FrameError
-        The tuning is one of another number of pins.
+        The tuning belongs to another number of pins.
     """
     if detector.pins_px and len(detector.pins_px) != spec.pins.count:
         raise FrameError(
@@ -136,7 +137,7 @@ def with_detector(spec: SensorSpec, detector: DetectorSpec) -> SensorSpec:
     if size is not None and size != known_frames(spec).size_px.get(detector.form):
         width, height = size
         if detector.form == Form.RAW:
-            changed["pipeline"] = pipeline.model_copy(update={"usual_caps": None})  # the caps' edges have another width in these frames
+            changed["pipeline"] = pipeline.model_copy(update={"usual_caps": None})  # caps have another edge width in frames of this size
             seen_px = np.array(detector.pins_px).reshape(-1, 2)
             changed["camera"] = camera_seeing(spec, seen_px, np.arange(len(seen_px))).model_copy(
                 update={"width_px": width, "height_px": height}
@@ -152,7 +153,7 @@ def with_detector(spec: SensorSpec, detector: DetectorSpec) -> SensorSpec:
 
 
 def camera_seeing(spec: SensorSpec, pins_px: np.ndarray, known: np.ndarray) -> CameraSpec:
-    """The camera, scaled and shifted so that it sees the ``known`` (n,) of the pins at rest where pins (N, 2) are, by least squares."""
+    """The camera, scaled and shifted by least squares to see the ``known`` (n,) pins at rest at their places in ``pins_px`` (N, 2)."""
     camera = spec.camera
     if not len(known):
         return camera
@@ -164,12 +165,12 @@ def camera_seeing(spec: SensorSpec, pins_px: np.ndarray, known: np.ndarray) -> C
 
 
 def load_detector(path: Path) -> DetectorSpec:
-    """Read what ``twin tune`` wrote.
+    """Read the parameters that ``twin tune`` wrote.
 
     Raises
     ------
     FrameError
-        It is no such file; names key and remedy.
+        The file does not hold such parameters; the message names the key and the remedy.
     """
     try:
         return read_section(path, DetectorSpec)
@@ -178,12 +179,12 @@ def load_detector(path: Path) -> DetectorSpec:
 
 
 def write_detector(path: Path, detector: DetectorSpec, comment: str = "") -> None:
-    """Write a detector's parameters for `load_detector`.
+    """Write a detector's parameters in the form that `load_detector` reads.
 
     Raises
     ------
     StoreError
-        They can't be written; the error's ``unsaved`` has them.
+        The file can't be written; the error's ``unsaved`` has its text.
     """
     document = tomlkit.document()
     for line in comment.splitlines():

@@ -22,7 +22,7 @@ def knn_edges(nodes_px: np.ndarray, k: int = KNN) -> np.ndarray:
         return np.zeros((0, 2), int)
     _, index = cKDTree(nodes_px).query(nodes_px, k=min(k + 1, n))
     others = index != np.arange(n)[:, None]
-    others[others.all(axis=1), -1] = False  # if nodes coincide, a node may not be its own nearest: then the farthest is dropped
+    others[others.all(axis=1), -1] = False  # if nodes coincide, a node may not be its own nearest; then the farthest one is left out
     return np.stack([np.repeat(np.arange(n), k), index[others].ravel()], axis=1)
 
 

@@ -25,7 +25,7 @@ from twin.types import Form, PinGraph
 PINS = ".npz"
 """Suffix of a file of found pins."""
 LARGEST_BYTES = 2_000_000_000
-"""Unpacked size of a file of found pins, bytes: a hundred thousand frames of 331 pins have 1.3 GB."""
+"""Largest unpacked size of a file of found pins, bytes. A hundred thousand frames of 331 pins have 1.3 GB."""
 PICTURE_INCH = 8
 """Side of a graph's picture, inch."""
 PICTURE_DPI = 120
@@ -45,7 +45,7 @@ class Graphs:
         Frames without a graph, and the reasons.
     written : list of Path
     notes : list of str
-        What was odd in the recording.
+        Irregularities of the recording.
     """
 
     names: list[str]
@@ -55,7 +55,7 @@ class Graphs:
     notes: list[str]
 
     def lines(self) -> list[str]:
-        """For people: what was odd, frames left out, and the size of the first graph."""
+        """The result as lines of text: irregularities, frames left out, and the size of the first graph."""
         first = self.graphs[0]
         counted = f"{len(self.graphs)} graphs; the first has {len(first.nodes_px)} nodes and {len(first.edges)} directed edges"
         return [*(f"note: {note}" for note in self.notes), *(f"skipped {reason}" for reason in self.left_out), counted]
@@ -187,7 +187,7 @@ def _arrays_of(path: Path, names: Sequence[str]) -> list[np.ndarray]:
     OSError
         It can't be read, or is no regular file.
     ValueError
-        It is damaged, lacks an array, holds pickles, or unpacks to more than ``LARGEST_BYTES``.
+        The file is damaged, lacks an array, holds pickles, or unpacks to more than ``LARGEST_BYTES``.
     """
     require_regular(path)
     try:
@@ -198,7 +198,7 @@ def _arrays_of(path: Path, names: Sequence[str]) -> list[np.ndarray]:
             return [data[name] for name in names]
     except OSError:
         raise
-    except Exception as error:  # damaged bytes raise whatever zipfile and numpy run into; one that claims too much, a MemoryError
+    except Exception as error:  # damaged bytes raise any exception in zipfile and numpy; too large a stated size raises MemoryError
         raise ValueError(str(error)) from error
 
 

@@ -24,22 +24,22 @@ MOST_RIM_LOST = 0.75
 MIN_FOUND = 0.8
 """Least share of the pins that must be found."""
 AT_BORDER = 1.0
-"""A pin is near the frame's border if it is less than this many spacings inside it at rest."""
+"""Distance of a pin at rest from the frame's border, in spacings, below which the pin counts as near the border."""
 CUT = 0.35
-"""A cap is cut off by the border if its middle is less than this many spacings inside it."""
+"""Distance of a cap's middle from the frame's border, in spacings, below which the border cuts the cap off."""
 MAX_EXTRA = 0.35
 """Most blobs among the pins that are not pins, as a share of the number of pins, in a frame in which pins are missing."""
 NEARLY_ALL = 0.97
-"""Share of found pins from which on no pin counts as missing. There may then be as many further blobs as pins."""
+"""Share of found pins above which no pin counts as missing. The frame may then have as many further blobs as pins."""
 MAX_FOLDED = 0.02
-"""Largest share of the reference's triangles that may be turned over. More of them mean that the labelling is wrong."""
+"""Largest share of the reference's triangles that may be turned over. If more are turned over, the labelling is wrong."""
 MAX_RIM_SCALE = 1.2
 """Largest ratio of the rim's radius to that at rest, and of the radius at rest to the rim's. The rim is clamped: contacts change it by
 a few percent."""
 MAX_SHIFT = 0.5
-"""Largest displacement of the layout, in its radii. A frame with a larger one is not of this sensor."""
+"""Largest displacement of the layout, in its radii. A frame with a larger displacement does not belong to this sensor."""
 MAX_BLOB_PITCHES2 = 3.0
-"""Largest area of a blob, in squared mean spacings. Larger ones are housing or glare."""
+"""Largest area of a blob, in squared mean spacings. Larger blobs are housing or glare."""
 SPLIT_ROUNDS = 3
 """Rounds of splitting caps that touch. Each split improves the predictions for the next."""
 ENOUGH = 0.985
@@ -48,20 +48,22 @@ OWN_SHARES = (1.0, 0.3)
 """Further thresholds, relative to the frame's own threshold between caps and skin. The low one finds caps that are much darker than
 most."""
 EXTRA_COST = 0.05
-"""Cost of a blob that is not a pin, in pins, when the results of several thresholds are compared. Noise and clutter make hundreds."""
+"""Cost of a blob that is not a pin, in units of a found pin, when the results of several thresholds are compared. Noise and clutter give
+hundreds of such blobs."""
 REMASK_PX = 2.0
 """Least displacement of the whole view, px, with which the mask is displaced, if a pin is close to the mask's edge."""
 MASK_MARGIN = 0.5
 """Distance from the mask's edge, in spacings, below which a pin may be cut off."""
 PLAUSIBLE = 0.5
-"""Share of the pins above which a labelling is taken as a basis for further steps."""
+"""Least share of labelled pins for a labelling to be improved by further steps."""
 NEAREST, DARKER, BRIGHT, LEAST_ABOVE = 6, 35, 75, 0.15
-"""A pin stands on a cap if it is brighter than this percentile (the second) of the middles between it and this many nearest pins, by at
-least the last share of what this percentile (the third) of the pins is."""
+"""Test of whether a pin stands on a cap or between caps. The pin's level is compared with the midpoints between it and its ``NEAREST``
+nearest pins: its height is its level above the percentile ``DARKER`` of these midpoints. A pin stands between caps if its height is at most
+the share ``LEAST_ABOVE`` of the percentile ``BRIGHT`` of all pins' heights."""
 MOST_BETWEEN = 0.2
-"""Largest share of pins that may stand between caps: caps that touch have bright middles."""
+"""Largest share of pins that may stand between caps. It is not 0, because the midpoints of touching caps are bright, too."""
 LEAST_COMPARED = 12
-"""Fewest pins of which that is asked."""
+"""Least number of found pins for this test."""
 PREDICTED_WEIGHT = 0.1
 """Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
 MOST_DENT = 0.008
@@ -190,7 +192,7 @@ class Pipeline:
         return despeckled(window) if self.blob_spec.threshold_block_px else window
 
     def _detect(self, frame: Frame, mask: Mask, blob: BlobSpec) -> Blobs:
-        """Blobs in the mask's window, those that are several caps in a row split; or spots."""
+        """Blobs in the mask's window, with chains of several caps split; or spots, if the parameters ask for spots."""
         if blob.spot_sigma_px:
             return find_spots(gray_levels(np.ascontiguousarray(frame.image[mask.window])), mask, blob)
         return split_chains(find_blobs(self._window(frame, mask), mask, blob, max_area_px2=self._max_area_px2))
@@ -246,21 +248,21 @@ class Pipeline:
         return nodes_px
 
     def _inside_px(self, px: np.ndarray) -> np.ndarray:
-        """How far inside the frame places (n, 2) are, px; negative outside."""
+        """Distance (n,) of places (n, 2) from the frame's border, px; negative outside the frame."""
         return np.minimum(px, np.array(self.size_px) - 1 - px).min(axis=1)
 
     def _cut_off(self, nodes_px: np.ndarray) -> np.ndarray:
-        """Which pins (N,) the frame's border cuts off: they are near it at rest, and not whole in this frame."""
+        """Pins (N,) bool that the frame's border cuts off: they are near it at rest, and not whole in this frame."""
         return self._at_border & (self._inside_px(nodes_px) < CUT * self.reference.spacing_px)
 
     def out_of_view(self, seen: Observation) -> np.ndarray:
-        """Which pins (N,) the frame's border cuts off, of what was seen in a frame: lost, and no fault of the sensor."""
+        """Pins (N,) bool that were lost in a frame because its border cuts them off, which is no fault of the sensor."""
         with np.errstate(invalid="ignore"):
             cut: np.ndarray = self._cut_off(seen.predicted_px)  # NaN where a pin was found
         return cut
 
     def _rim_lost(self, paired: np.ndarray, nodes_px: np.ndarray) -> str:
-        """Why a frame is no valid observation whose pins (N,) are found but for those of the rim; "" if it is one."""
+        """Reason why a frame with enough found pins (N,) is still not valid: too many of the rim's pins are lost. "" if it is valid."""
         rim = self.reference.outmost[~self._cut_off(nodes_px)[self.reference.outmost]]
         lost = int((~paired[rim]).sum())
         if lost <= MOST_RIM_LOST * len(rim):
@@ -271,7 +273,7 @@ class Pipeline:
         )
 
     def _between_caps(self, frame: Frame, pins_px: np.ndarray) -> float:
-        """Share of the found pins (N, 2), NaN where lost, that are no brighter than the places between them and their neighbours."""
+        """Share of the found pins (N, 2), NaN where lost, that are hardly brighter than the midpoints between them and their neighbours."""
         found = np.flatnonzero(np.isfinite(pins_px[:, 0]))
         if len(found) < LEAST_COMPARED:
             return 0.0
@@ -284,7 +286,7 @@ class Pipeline:
         return float(np.mean(above <= LEAST_ABOVE * np.percentile(above, BRIGHT))) if len(above) else 0.0
 
     def _reason(self, blobs: Blobs, found: int, n: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
-        """Why a frame, with ``n`` pins in view, is no valid observation; "" if it is one."""
+        """Reason why a frame with ``n`` pins in view is not a valid observation; "" if it is valid."""
         if len(blobs.px) < MIN_FOUND * n / 2:
             return f"no pins: {len(blobs.px)} blobs seen, {n} pins expected"
         if found < MIN_FOUND * n:
@@ -315,7 +317,7 @@ def _levels(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
 
 
 def lower_levels(levels: np.ndarray, percent: float) -> np.ndarray:
-    """Percentile of each row of (n, k) levels without its NaN, (n,): what ``np.nanpercentile`` gives, for all rows at once."""
+    """Percentile (n,) of each row of levels (n, k), without NaN: the same as ``np.nanpercentile``, for all rows at once."""
     rank = (np.isfinite(levels).sum(axis=1) - 1) * (percent / 100)
     low = np.floor(rank).astype(int)
     ordered, row = np.sort(levels, axis=1), np.arange(len(levels))  # NaN come last

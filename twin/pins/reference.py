@@ -16,9 +16,9 @@ from twin.types import Form
 
 # Number of neighbours of a pin: two rings of a triangular lattice. They are enough for a local affine fit without the pin itself.
 NEIGHBOURS = 18
-# Pins spread at least so far in every direction (smallest singular value of their places), px. Those of the shipped sensors: 460 to 1600.
+# Least spread of the pins in every direction (smallest singular value of their places), px. The shipped sensors have 460 to 1600 px.
 LEAST_SPREAD_PX = 1.0
-# Pins are at most so far from the frame's origin, px: farther than any camera sees.
+# Largest distance of a pin from the frame's origin, px. It is larger than any camera's frame.
 FARTHEST_PX = 1e6
 
 
@@ -54,7 +54,7 @@ class Reference:
 
 
 def spread_out(pins_px: np.ndarray) -> bool:
-    """Whether pins (N, 2) spread over an area, as those of every frame do: not in one place, on a line or farther than any camera sees."""
+    """Whether pins (N, 2) spread over an area, as in every real frame. They do not if they lie at one place, on a line, or too far away."""
     if not np.isfinite(pins_px).all() or np.abs(pins_px).max() > FARTHEST_PX:
         return False
     return bool(np.linalg.svd(pins_px - pins_px.mean(axis=0), compute_uv=False)[-1] > LEAST_SPREAD_PX)
@@ -66,7 +66,7 @@ def make_reference(pins_px: np.ndarray, pins: PinsSpec) -> Reference:
     Raises
     ------
     FrameError
-        The pins lie in one place, on a line, or farther off than any camera sees.
+        The pins lie at one place, on a line, or farther away than in any camera's frame.
     """
     lattice = pin_lattice(pins)
     pins_px = np.ascontiguousarray(pins_px, float)
@@ -80,7 +80,7 @@ def make_reference(pins_px: np.ndarray, pins: PinsSpec) -> Reference:
     triangles = Delaunay(pins_px).simplices.astype(np.int64)
     area = _double_areas(pins_px, triangles)
     triangles[area < 0] = triangles[area < 0][:, ::-1]
-    inner = ~np.isin(triangles, lattice.outmost).all(axis=1)  # thin triangles of outmost pins alone turn over without meaning
+    inner = ~np.isin(triangles, lattice.outmost).all(axis=1)  # thin triangles of three outmost pins turn over without a wrong labelling
     triangles = triangles[inner]
     area_px2 = voronoi(pins_px, outmost=lattice.outmost).area_px2
     neighbours = np.ascontiguousarray(index[:, 1:])

@@ -19,8 +19,8 @@ MIN_SEPARATION = 0.6
 MIN_PART = 0.4
 # Rounds of k-means.
 ROUNDS = 12
-# Number of parts from which on a component is a net of scratches or glare, and number of rounds of k-means for it. There are fewer
-# rounds, because such a component is large and each round is slow.
+# Number of parts above which a component is a net of scratches or glare, and number of k-means rounds for such a component. The number is
+# smaller, because the component is large and each round is slow.
 MANY, ROUNDS_OF_MANY = 24, 3
 # Shift of the parts' centres, px, below which k-means ends.
 SETTLED_PX = 1e-3

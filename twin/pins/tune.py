@@ -1,4 +1,4 @@
-"""Tuning: the parameters of a detector are found from frames and the pins' layout alone."""
+"""Tuning: finds the parameters of a detector from frames and the pins' layout alone."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -50,13 +50,15 @@ Z_90 = 1.645
 # A tuning is sure if the lower end of the interval of its exact rate is at least SURE_LOW_RATE, and its threshold may change by
 # SURE_SLACK gray levels.
 SURE_LOW_RATE, SURE_SLACK = 0.8, 1.0
-# A layout that explains less than this share of what the frames show is not seen in them; another one is named if it explains more by this.
+# Least share of the pins and spots in the frames that a layout must explain to count as seen; lead of another layout in this share above
+# which the other layout is named.
 LEAST_SHOWN, MORE_EXPLAINED = 0.6, 0.02
-# Fewest pixels around a pin that tell of its cap.
+# Least number of pixels around a pin from which its cap is measured.
 LEAST_PIXELS = 9
-# Sizes of spots that are tried (sd, in radii of the median cap); spots are preferred only if their rates, added, are better by this.
+# Sizes of spots that are tried (standard deviation, in radii of the median cap); least lead of spots over thresholds, in the sum of exact
+# rate and found share, for spots to be chosen.
 SPOT_SIZES, SPOTS_AHEAD = (0.55, 0.7, 0.9), 0.03
-# Exact rate from which on a tuning that is not sure is fairly sure.
+# Least exact rate of a tuning that counts as fairly sure.
 FAIR_RATE = 0.5
 
 # Share of the frames with exactly all pins, and mean share of the pins found.
@@ -84,7 +86,7 @@ class Tuned:
     notes : list of str
         Reasons to doubt the result, and what to do.
     rest : Rest
-        Where the detector's pins at rest come from.
+        Pins at rest that the detector uses, and their source.
     """
 
     detector: DetectorSpec
@@ -110,12 +112,12 @@ def tune(
     Parameters
     ----------
     known : Candidate, optional
-        What the very same frames show of this layout, where the layout was identified in them. Without it the frames are also looked
-        through for other layouts, and the tuning is unsure where another one explains more.
+        The result for this layout in exactly these frames, if the layout was identified in them. Without it the frames are also searched
+        for other layouts, and the tuning is unsure if another layout explains more.
     rest : Rest, optional
-        Where the pins of ``known`` are without contact, where that was found already.
+        Pins of ``known`` at rest, if they are known already.
     given : Frame, optional
-        A frame without contact. Otherwise one of the frames that shows none, or a rest layout made of contacts.
+        A frame without contact. By default a frame that shows none, else a rest layout estimated from contacts.
 
     Raises
     ------
@@ -168,7 +170,7 @@ def tune(
 
 
 def _at_rest(detector: DetectorSpec, pins: PinsSpec, rest: Rest, layout: Candidate) -> DetectorSpec:
-    """The detector with the pins' places at rest; pins out of view stand where most frames let expect them."""
+    """The detector with the pins at rest. A pin out of view gets its median place over the frames."""
     unseen = ~np.isfinite(rest.pins_px[:, 0])
     places = turned_as(pins, np.where(unseen[:, None], layout.rest_px, rest.pins_px))
     blob = detector.blob.model_copy(update={"rest_origin": "contacts" if rest.source == "made" else "measured"})
@@ -176,7 +178,7 @@ def _at_rest(detector: DetectorSpec, pins: PinsSpec, rest: Rest, layout: Candida
 
 
 def _shown_instead(images: list[np.ndarray]) -> str:
-    """What frames in which a layout is not seen do show, for an error; "" if nothing is recognised."""
+    """What the frames show instead of the expected layout, for an error message; "" if nothing is recognised."""
     try:
         return f"; they show {identify(images).best.pins.in_words()}"
     except FrameError:
@@ -184,7 +186,7 @@ def _shown_instead(images: list[np.ndarray]) -> str:
 
 
 def other_layout(layout: Candidate, images: list[np.ndarray]) -> list[str]:
-    """Why a layout that was given may be wrong: what it leaves unexplained, and which other one explains more."""
+    """Reasons to doubt a given layout: what it leaves unexplained, and which other layout explains more."""
     try:
         other = identify(images).best
     except FrameError:
@@ -204,7 +206,7 @@ def other_layout(layout: Candidate, images: list[np.ndarray]) -> list[str]:
 
 
 def turned_as(pins: PinsSpec, rest_px: np.ndarray) -> np.ndarray:
-    """Pins (N, 2), px, in that order, of those in which the layout looks the same, in which it is turned least from the specification's."""
+    """Pins (N, 2), px, in the one of the layout's symmetric orders whose turn from the specification is smallest."""
     places = pin_lattice(pins).places @ [1, 1j] * np.exp(1j * np.radians(pins.phase_deg))
     places -= places.mean()
     orders = [rest_px[order] for order in symmetries(pins)]
@@ -215,7 +217,7 @@ def turned_as(pins: PinsSpec, rest_px: np.ndarray) -> np.ndarray:
 def caps_in(gray: np.ndarray, pins_px: np.ndarray, spacing_px: np.ndarray) -> tuple[float, float]:
     """Median area, px^2, of the caps at pins (N, 2) of a gray frame, and median contrast, gray levels; NaN where no pin is seen.
 
-    A cap's area is that of the pixels nearer to the pin than half a spacing whose level is above the middle between cap and skin.
+    A cap's area is the area of the pixels within half a spacing of the pin whose level is above the middle between skin and cap.
     """
     areas, contrasts = [], []
     for (x, y), spacing in zip(pins_px, spacing_px, strict=True):
@@ -262,7 +264,7 @@ def _start(
 
 
 def _recorder(size_px: tuple[int, int], blob: BlobSpec, layout: Layout) -> RecordingSpec:
-    """The published recorder with a square crop that puts the mask where the published method looks."""
+    """The published recorder, with a square crop that puts the mask at the place where the published method expects it."""
     release = legacy_parameters(layout)
     half = release.size_px // 2
     side = 2 * blob.mask_radius_px * half / (half - release.mask_margin_px)
@@ -280,7 +282,7 @@ def _recorder(size_px: tuple[int, int], blob: BlobSpec, layout: Layout) -> Recor
 
 
 def _settings(start: DetectorSpec, reference: Reference, contrast: float, binary: bool) -> Iterator[DetectorSpec]:
-    """Every setting to try: thresholds in the caps' contrast (gray levels), blocks in pitches, spots in caps' sizes."""
+    """Every setting to try: thresholds as shares of the caps' ``contrast`` (gray levels), blocks in spacings, spots in cap sizes."""
     contrast = max(contrast, LEAST_CONTRAST)
     pitch = float(np.median(reference.spacing_px))
     levels = [round(share * contrast, 1) for share in STRICTNESS]
@@ -293,7 +295,7 @@ def _settings(start: DetectorSpec, reference: Reference, contrast: float, binary
             for level in levels:
                 recording = start.recording.model_copy(update={"threshold_block_px": block, "threshold_offset": -level})
                 yield start.model_copy(update={"recording": recording})
-    elif start.method == "legacy":  # the published threshold is part of the method
+    elif start.method == "legacy":  # the published threshold is a part of the method
         yield start
     elif binary or start.method in ("fixed", "simple"):
         for level in BINARY_LEVELS if binary else RAW_LEVELS:
@@ -314,7 +316,7 @@ def _with_blob(detector: DetectorSpec, **values: Any) -> DetectorSpec:
 
 
 def _rate(detect: Callable[[Frame], Found], frames: list[Frame]) -> Rate:
-    """Share of frames with exactly all pins in view, and mean share of them found; a blob too many counts as a pin lost."""
+    """Share of frames with exactly the expected number of blobs, and mean share of pins found. A surplus blob counts like a lost pin."""
     looks = [detect(frame) for frame in frames]
     found, count = np.array([len(look.claims_px) for look in looks]), np.array([look.expected for look in looks])
     return float(np.mean(found == count)), float(np.mean(1 - np.minimum(np.abs(found - count) / count, 1)))
@@ -331,12 +333,12 @@ def _threshold(detector: DetectorSpec) -> float:
 
 
 def _series_of(d: DetectorSpec) -> tuple[int, int, float]:
-    """What settings of one series have in common."""
+    """Parameters that all settings of one series have in common."""
     return _block(d), d.blob.erosion_px, d.blob.spot_sigma_px
 
 
 def _series(tried: list[DetectorSpec], k: int) -> list[int]:
-    """Settings that differ from the k-th in nothing but the threshold, in its order."""
+    """Indices of the settings that differ from the k-th only in the threshold, in the order of the thresholds."""
     same = [j for j, d in enumerate(tried) if (_block(d), d.blob.erosion_px, d.blob.spot_sigma_px) == _series_of(tried[k])]
     return sorted(same, key=lambda j: _threshold(tried[j]))
 
@@ -359,7 +361,7 @@ def _middle_of_plateau(tried: list[DetectorSpec], rates: list[Rate]) -> int:
     score = np.array([exact + share for exact, share in rates])
     spots = np.array([d.blob.spot_sigma_px > 0 for d in tried])
     if (~spots).any():
-        score = np.where(spots, score - SPOTS_AHEAD, score)  # a threshold's centroids are more exact
+        score = np.where(spots, score - SPOTS_AHEAD, score)  # centroids are more exact with a threshold
     best = np.flatnonzero(score >= score.max() - 1e-9)
     widest = max((_plateau(tried, rates, int(k)) for k in best), key=lambda p: abs(_threshold(tried[p[-1]]) - _threshold(tried[p[0]])))
     middle = (_threshold(tried[widest[0]]) + _threshold(tried[widest[-1]])) / 2

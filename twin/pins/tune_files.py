@@ -1,4 +1,4 @@
-"""Tuning of the pin detection on a folder of a user's own frames; the parameters are written to a file."""
+"""Tunes the pin detection on a folder of a user's own frames, and writes the parameters to a file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,11 +25,11 @@ class TunedOnFrames:
     ----------
     tuned : Tuned
     evidence : Evidence
-        How sure it is.
+        Evidence for the reliability of the tuning.
     written : list of Path
-        The file, where one was wanted.
+        The written file, if one was requested.
     odd : list of str
-        What was odd in the recording.
+        Irregularities of the recording.
     """
 
     tuned: Tuned
@@ -76,7 +76,7 @@ def tune_on_frames(
     Parameters
     ----------
     path : Path
-        As ``open_recording`` takes it. Its frame without contact, if there is one, tells the pins' places at rest.
+        Path as for ``open_recording``. If it has a frame without contact, this frame gives the pins at rest.
     sensor : SensorSpec
         Only the layout of its pins is used.
     out : Path, optional

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from twin.compiled import compiled
 
-# The outline is enlarged by this about its centroid: half way to the release's further sites, which stand at 1.1.
+# Factor by which the outline is enlarged about its centroid: half way to the release's additional sites, which lie at 1.1.
 BOUNDARY_SCALE = 1.05
 # The strip that replaces the hull of nodes on a line: its margin as a share of the length, and its least margin, px.
 STRIP_SHARE, LEAST_STRIP_PX = 0.05, 1.0
@@ -83,7 +83,7 @@ def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
 
 @compiled()
 def polygon_area(polygon: np.ndarray, count: int) -> float:
-    """Signed area (shoelace) of the first ``count`` vertices, relative to the first, because far from the origin digits would cancel."""
+    """Signed area (shoelace) of the first ``count`` vertices, relative to the first vertex, which avoids cancellation of digits."""
     total = 0.0
     x0, y0 = polygon[0, 0], polygon[0, 1]
     for k in range(1, count - 1):

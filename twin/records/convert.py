@@ -1,4 +1,4 @@
-"""Translation of records from any format into any other, and keeping a record in further formats while it is being made."""
+"""Translates records from any format into any other, and keeps a record in further formats while it is being made."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -37,16 +37,16 @@ WRITERS: dict[str, type[FolderWriter]] = {each.FORMAT: each for each in (Recordi
 FORMATS = tuple(READERS)
 """Formats that can be written."""
 ALSO = tuple(name for name in FORMATS if name != RecordingWriter.FORMAT)
-"""Formats that a record may be kept in besides its own."""
+"""Formats in which a record can be kept in addition to its own."""
 
 
 def open_records(path: Path) -> Records:
-    """Records of any format: a session, a recording or data set, or what a translation wrote.
+    """Records of any format: a session, a recording, a data set, or the result of a translation.
 
     Raises
     ------
     RecordError
-        There is nothing, or it is damaged.
+        There is nothing at ``path``, or it is damaged.
     FrameError
         A recording or session can't be read.
     """
@@ -67,17 +67,17 @@ def open_records(path: Path) -> Records:
 
 
 def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
-    """Records with the pins that are found in their pictures, if they have none. They are NaN where a pin is not found.
+    """Records with the pins that are found in their pictures, if they have none. A pin that is not found is NaN.
 
     Parameters
     ----------
     spec : SensorSpec, optional
-        The sensor. By default the one that the records name; without one, or if it is not known here, they stay as they are.
+        The sensor. By default the one that the records name. If they name none, or an unknown one, the records are returned unchanged.
 
     Raises
     ------
     FrameError
-        The pictures are not of this sensor.
+        The pictures were not made by this sensor.
     """
     if "pins" in records.about.numbers:
         return records
@@ -113,21 +113,21 @@ def _seen(episode: Episode, about: About, spec: SensorSpec, notes: list[str]) ->
 
 
 def open_writer(folder: Path, to: str, about: About, rate_hz: int, *, video: bool = False, at_once: bool = False) -> FolderWriter:
-    """The writer of a format for a folder; it is entered as a context.
+    """The writer of a format for a folder. It must be entered as a context.
 
     Parameters
     ----------
     to : str
         One of ``FORMATS``.
     video : bool
-        LeRobot's pictures as video, which loses detail.
+        Store LeRobot's pictures as video, which loses detail.
     at_once : bool
-        Finish a file for each episode, so that an episode is safe as soon as it is written, instead of larger files.
+        Finish a file for each episode instead of larger files, so that an episode is safe as soon as it is written.
 
     Raises
     ------
     RecordError
-        There is no such format, or it has no videos.
+        There is no such format, or the format has no videos.
     """
     if to not in FORMATS:
         raise RecordError(f"no format {shown(to)}; there are {', '.join(FORMATS)}")
@@ -153,9 +153,9 @@ class Converted:
     episodes, steps : int
         Number in the folder.
     before : int
-        Episodes that it held before.
+        Number of episodes in the folder before.
     notes : list of str
-        What was odd in the sources.
+        Irregularities of the sources.
     """
 
     folder: Path
@@ -171,7 +171,7 @@ class Converted:
         return [self.folder]
 
     def lines(self) -> list[str]:
-        """The result in words."""
+        """The result as lines of text."""
         new = f" ({self.episodes - self.before} new)" if self.before else ""
         return [*(f"note: {note}" for note in self.notes), f"{self.episodes} episodes, {self.steps} frames{new} as {self.to}"]
 
@@ -187,31 +187,31 @@ def convert(
     video: bool = False,
     progress: Progress = silent,
 ) -> Converted:
-    """Translate records into a format. A folder that holds such records already gets the episodes that it lacks.
+    """Translate records into a format. If the folder already holds such records, the missing episodes are added.
 
     Parameters
     ----------
     sources : sequence of Path
-        As of ``open_records``.
+        Paths as for ``open_records``.
     out : Path
-        New or empty folder, or one with records of the same format, sensor and numbers.
+        A new or empty folder, or one with records of the same format and sensor, and with the same numbers in each step.
     to : str
         One of ``FORMATS``.
     sensor : SensorSpec, optional
         The sensor whose pins are to be found, if a source does not name it.
     task : str
-        What all episodes do, in words; by default what each source says.
+        Description of the task of all episodes; by default what each source states.
     video : bool
-        LeRobot's pictures as video, which loses detail.
+        Store LeRobot's pictures as video, which loses detail.
 
     Raises
     ------
     RecordError
-        A source can't be read or does not fit to the others, the folder holds something else, or a library is missing.
+        A source can't be read or does not fit the others, the folder holds something else, or a library is missing.
     FrameError
         A recording or session can't be read, or is not of the sensor.
     StoreError
-        The folder can't be written to, or another run is at work there.
+        The folder can't be written to, or another run uses it.
     """
     opened = [with_pins(open_records(Path(source)), sensor).named(task) for source in sources]
     if not any(records.episodes for records in opened):
@@ -230,7 +230,7 @@ def convert(
 
 
 def _missing(opened: Sequence[Records], writer: FolderWriter, done: Callable[[int], object]) -> Iterator[Episode]:
-    """Episodes that a writer does not hold yet, each once."""
+    """Episodes that a writer does not hold yet. Each is given once."""
     given = set(writer.keys)
     for number, episode in enumerate((episode for records in opened for episode in records.episodes), 1):
         if episode.key not in given:
@@ -240,20 +240,20 @@ def _missing(opened: Sequence[Records], writer: FolderWriter, done: Callable[[in
 
 
 class KeptAlso:
-    """Keeps a record in further formats, each in a subfolder of its own, while the record grows. A context manager.
+    """Keeps a growing record in further formats, each in its own subfolder. A context manager.
 
-    The record itself is always complete, so what is missing here after a kill is made up for when the same command goes on, or by
-    ``convert``.
+    The record itself is always complete. If the process is killed, the missing episodes of the other formats are written when the same
+    command continues, or by ``convert``.
 
     Parameters
     ----------
     folder : Path
-        The record in its own format.
+        Folder of the record in its own format.
     formats : sequence of str
-        Some of ``ALSO``.
+        Formats, each of ``ALSO``.
     sensor : SensorSpec
     at_once : bool
-        As of ``open_writer``.
+        As for ``open_writer``.
 
     Raises
     ------
@@ -278,12 +278,12 @@ class KeptAlso:
         self._open.close()
 
     def catch_up(self) -> None:
-        """Write the episodes that the record has and the others lack.
+        """Write the episodes that the record has and the other formats lack.
 
         Raises
         ------
         TwinError
-            As of ``convert``.
+            As for ``convert``.
         """
         if not self.formats:
             return

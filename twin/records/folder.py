@@ -1,6 +1,6 @@
-"""A folder that a record is written to: what it says of itself, and how episodes come into it one after the other.
+"""Base of the writers that put a record into a folder: the folder's description, and the writing of one episode after the other.
 
-``tactip.json`` states the format and what all episodes have in common. A folder is gone on with only if both are the same.
+``tactip.json`` states the format and the common properties of all episodes. A folder is continued only if both are the same.
 """
 
 import json
@@ -25,51 +25,51 @@ from twin.store import contents, output, write_bytes, write_json
 from twin.types import ImageArray
 
 SIDECAR = "tactip.json"
-"""File that says what the folder is."""
+"""File with the folder's description."""
 VERSION = 1
-"""Version of what is written."""
+"""Version of the written format."""
 HELD_STEPS = 1000
-"""Pictures from which on formats of single pictures finish a folder or a table of several episodes."""
+"""Number of pictures after which a writer of single pictures finishes a folder or a table of several episodes."""
 LARGEST_BYTES = 100_000_000
-"""Bytes of a JSON file: a million steps' worth."""
+"""Largest size of a JSON file, bytes: enough for a million steps."""
 AGAIN = "copy it again, or translate it again"
-"""Remedy for damaged records."""
+"""What a message tells the user to do with damaged records."""
 
 
 class FolderWriter(ABC):
-    """Writes episodes into a folder. A context manager; the folder is held for this run meanwhile.
+    """Writes episodes into a folder. A context manager, which locks the folder for this run.
 
     Parameters
     ----------
     folder : Path
-        New, empty, or holding a record of this format with the same ``about``, which is gone on with.
+        A new or empty folder, or one with a record of this format and the same ``about``, which is continued.
     about : About
     rate_hz : int
-        Whole number of frames a second, for formats that state one. A record that is gone on with keeps its own.
+        Whole number of frames per second, for formats that state one. A record that is continued keeps its own number.
 
     Raises
     ------
     RecordError
-        On entering: the folder holds something else, or records that do not fit.
+        When the context is entered: the folder holds something else, or records that do not fit.
     StoreError
-        The folder can't be written to, or another run is at work there.
+        The folder can't be written to, or another run uses it.
     """
 
     FORMAT: ClassVar[str]
-    NAMES: ClassVar[tuple[str, ...]]  # of everything that is written right below the folder, beside the sidecar
-    FOLDERS: ClassVar[tuple[str, ...]] = ()  # that are there from the beginning
-    LIBRARIES: ClassVar[tuple[str, ...]] = ()  # that need not be installed
+    NAMES: ClassVar[tuple[str, ...]]  # of everything that is written directly in the folder, besides the description
+    FOLDERS: ClassVar[tuple[str, ...]] = ()  # subfolders that exist from the beginning
+    LIBRARIES: ClassVar[tuple[str, ...]] = ()  # optional libraries that the format needs
 
     def __init__(self, folder: Path, about: About, rate_hz: int) -> None:
         self.folder, self.about, self.rate_hz = folder, about, rate_hz
-        self.facts: list[dict[str, Any]] = []  # of the episodes that are there
+        self.facts: list[dict[str, Any]] = []  # of the episodes in the folder
         self.keys: set[str] = set()
         self._held = ExitStack()
 
     def __enter__(self) -> Self:
         for name in self.LIBRARIES:
             library(name)
-        fresh = not os.path.isfile(self.folder / SIDECAR)  # unlike ``Path.is_file`` False for what is no path at all
+        fresh = not os.path.isfile(self.folder / SIDECAR)  # unlike ``Path.is_file``, this returns False for a text that can be no path
         if fresh and contents(self.folder):
             raise RecordError(f"{self.folder}: holds something else; give a new or empty folder")
         with ExitStack() as held:
@@ -86,7 +86,7 @@ class FolderWriter(ABC):
         self._held.close()
 
     def write(self, episodes: Iterator[Episode]) -> int:
-        """Write episodes, and return how many. Those without a readable step are left out."""
+        """Write episodes, and return their number. Episodes without a readable step are left out."""
         before = len(self.facts)
         for group in self._groups(episodes):
             self.facts += group
@@ -95,14 +95,14 @@ class FolderWriter(ABC):
 
     @abstractmethod
     def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
-        """Write episodes, several at once where the format is the better for it, and give the facts of each group once it is whole."""
+        """Write episodes, several together if this suits the format, and give the facts of each group as soon as the group is complete."""
 
     @abstractmethod
     def _find(self) -> list[dict[str, Any]]:
-        """Facts of the episodes in the folder. What an interrupted run left unfinished is removed."""
+        """Facts of the episodes in the folder. Unfinished parts of an interrupted run are removed."""
 
     def _begin(self) -> None:
-        """Write what a new folder has before its first episode."""
+        """Write the parts that a new folder has before its first episode."""
         for name in self.FOLDERS:
             (self.folder / name).mkdir(exist_ok=True)
 
@@ -118,7 +118,7 @@ class FolderWriter(ABC):
         self.keys = {facts["key"] for facts in self.facts}
 
     def _facts(self, episode: Episode, length: int) -> dict[str, Any]:
-        """What is kept of an episode that turned out to have so many steps; its picture without contact is written."""
+        """Facts to store of an episode with ``length`` steps. Its picture without contact is written."""
         return episode.facts() | {"length": length, "rest": None if episode.rest is None else self._keep_rest(episode.rest)}
 
     def _keep_rest(self, image: ImageArray) -> str:
@@ -130,7 +130,7 @@ class FolderWriter(ABC):
         return name
 
     def _require_fitting(self, episode: Episode, step: Step) -> None:
-        """Raise ``RecordError`` if a step is not as ``about`` says, or its time is none."""
+        """Raise ``RecordError`` if a step does not agree with ``about``, or its time is not a valid number."""
         if not 0.0 <= step.time_s < float("inf"):
             raise RecordError(f"{episode.key}: a picture {step.time_s} s after its first; look at its times, or record it again")
         height, width = step.image.shape[:2]
@@ -142,12 +142,12 @@ class FolderWriter(ABC):
 
 
 def read_sidecar(folder: Path, form: str = "") -> tuple[About, dict[str, Any]]:
-    """What a folder says of itself.
+    """The description of a folder.
 
     Raises
     ------
     RecordError
-        It says nothing, is damaged, or of another format than ``form`` or another version.
+        The folder has no description, or a damaged one, or one of another format than ``form`` or of another version.
     """
     said = read_json(folder / SIDECAR)
     try:
@@ -163,7 +163,7 @@ def read_sidecar(folder: Path, form: str = "") -> tuple[About, dict[str, Any]]:
 
 
 def format_of(folder: Path) -> str:
-    """Format of the record that a folder says to hold; "" if it says none."""
+    """Format of the record in a folder, as the folder states it; "" if it states none."""
     return str(read_sidecar(folder)[1]["format"]) if (folder / SIDECAR).is_file() else ""
 
 
@@ -173,7 +173,7 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises
     ------
     RecordError
-        It can't be read or holds something else.
+        The file can't be read or holds something else.
     """
     try:
         found = json.loads(read_regular(path, LARGEST_BYTES))
@@ -187,19 +187,19 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def require_numbered(files: Sequence[Path], name: Callable[[int], str]) -> None:
-    """Raise ``RecordError`` if files, in order, do not have the names of 0, 1, 2 and so on."""
+    """Raise ``RecordError`` if the files, in order, do not have the names for the numbers 0, 1, 2 and so on."""
     for number, path in enumerate(files):
         if path.name != name(number):
             raise RecordError(f"{path.parent}: {name(number)} is missing; {AGAIN}")
 
 
 def episode_of(folder: Path, facts: dict[str, Any], steps: Any) -> Episode:
-    """An episode by what is kept of it.
+    """An episode from its stored facts.
 
     Raises
     ------
     RecordError
-        Something is damaged.
+        A part is damaged.
     """
     try:
         rest = None if facts["rest"] is None else read_image(folder / RESTS / str(facts["rest"]))[0]
@@ -221,7 +221,7 @@ def whole_steps(path: Path, facts: dict[str, Any], steps: Callable[[], Iterator[
     Raises
     ------
     RecordError
-        There are not as many as it had.
+        Their number is not the stored one.
     """
     count = 0
     for step in steps():
@@ -237,12 +237,12 @@ def png(image: ImageArray) -> bytes:
 
 
 def image_of(data: bytes, gray: bool, name: str) -> ImageArray:
-    """A picture from PNG; of a gray one that was kept with three equal channels, the first.
+    """A picture from PNG. Of a gray picture that was stored with three equal channels, the first channel is returned.
 
     Raises
     ------
     RecordError
-        It can't be decoded.
+        The picture can't be decoded.
     """
     stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if stored is None or stored.dtype != np.uint8:

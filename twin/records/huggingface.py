@@ -1,9 +1,10 @@
 """Records as a folder of pictures with metadata, which Hugging Face's ``datasets`` and its viewer read as ``imagefolder``.
 
-``data/NNNNNN/`` has the pictures of one or more episodes and ``metadata.parquet``, a row for each picture. Each of these folders appears
-whole. ``episodes/NNNNNN.json`` says what its episodes are.
+``data/NNNNNN/`` has the pictures of one or more episodes and ``metadata.parquet`` with a row for each picture. Each of these folders
+appears only when it is complete. ``episodes/NNNNNN.json`` lists its episodes.
 
-The metadata are no JSON lines, because pyarrow's reader of JSON, which ``datasets`` uses, loses nulls at the beginning of nested lists.
+The metadata are not stored as JSON lines, because pyarrow's JSON reader, which ``datasets`` uses, loses nulls at the beginning of nested
+lists.
 """
 
 from collections.abc import Iterator
@@ -45,9 +46,9 @@ class HuggingFaceWriter(FolderWriter):
     Parameters
     ----------
     folder, about, rate_hz
-        As of ``FolderWriter``.
+        As for ``FolderWriter``.
     held_steps : int
-        Pictures from which on a folder of several episodes is finished. 0: a folder for each, so that each is safe at once.
+        Number of pictures after which a folder of several episodes is finished. With 0 each episode has its own folder and is safe at once.
     """
 
     FORMAT = "huggingface"
@@ -94,7 +95,7 @@ class HuggingFaceWriter(FolderWriter):
         remove_parts(self.folder / DATA)
 
     def _line(self, name: str, episode: int, number: int, whole: Episode, step: Step) -> dict[str, Any]:
-        """One row of the metadata. Every row has the same keys, as the reader wants it."""
+        """One row of the metadata. Every row has the same keys, as the reader requires."""
         numbers = {CHANNELS[key].column: step.values[key].tolist() for key in self.about.numbers}
         head = {"file_name": name, "episode_index": episode, "frame_index": number, "task": whole.task}
         return head | {TIME: float(step.time_s)} | numbers
@@ -113,12 +114,12 @@ class HuggingFaceWriter(FolderWriter):
 
 
 def huggingface_records(folder: Path) -> Records:
-    """A folder that ``HuggingFaceWriter`` wrote.
+    """Records in a folder that ``HuggingFaceWriter`` wrote.
 
     Raises
     ------
     RecordError
-        It is damaged, or someone else wrote it.
+        The folder is damaged, or another program wrote it.
     """
     found = _facts_in(folder)
     return records_in(folder, HuggingFaceWriter.FORMAT, [facts for _, facts in found], partial(_reader, folder, found))
@@ -142,7 +143,7 @@ def _steps_of(folder: Path, about: About, index: int) -> Iterator[Step]:
 
 
 def _listed(folder: Path) -> list[Path]:
-    """Files that say which episodes are there, in their order.
+    """Files that list the episodes, in their order.
 
     Raises
     ------

@@ -1,8 +1,9 @@
 """Records as a LeRobotDataset of version 3, written with pyarrow alone.
 
-Each file is written whole under its name, and ``meta/info.json`` counts an episode only after its files. So a data set can be read after
-any end, up to its last finished episode. ``timestamp`` is the number of the frame divided by the whole number of frames a second, as
-LeRobot wants it; the true times are in ``observation.time_s``. Beside LeRobot's columns the table of episodes has ``tactip/facts``.
+Each file appears under its name only when it is complete, and ``meta/info.json`` counts an episode only after its files. Therefore the data
+set is readable after any interruption, up to its last finished episode. As LeRobot requires, ``timestamp`` is the frame's number divided by
+the whole number of frames per second. The true times are in ``observation.time_s``. In addition to LeRobot's columns, the table of episodes
+has ``tactip/facts``.
 """
 
 import json
@@ -24,27 +25,27 @@ from twin.store import write_json, write_text, write_with
 from twin.types import Form
 
 CODEBASE = "v3.0"
-"""Version of LeRobot's format."""
+"""Version of LeRobot's format that is written."""
 INFO, STATS, TASKS, CARD = "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "README.md"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 FACTS = "tactip/facts"
-"""Column of the table of episodes that holds what the other formats keep, too."""
+"""Column of the table of episodes with the facts that the other formats also store."""
 CHUNK_FILES = 1000
-"""Files in a folder, LeRobot's own number."""
+"""Number of files in a folder, as LeRobot itself has it."""
 DATA_MB, VIDEO_MB = 100, 200
-"""Most megabytes of a data file that holds several episodes, and what LeRobot states for videos."""
+"""Largest size, MB, of a data file with several episodes, and the size that is stated for videos."""
 ROWS = 64
-"""Rows that are written at once."""
+"""Number of rows that are written together."""
 SAMPLED = 100
-"""Pictures of an episode from which its statistics are made."""
+"""Number of an episode's pictures from which its statistics are computed."""
 PIXEL_STEP = 4
-"""Statistics of pictures use every fourth pixel in each direction."""
+"""Step between the pixels, in each direction, from which the statistics of pictures are computed."""
 QUANTILES = {"q01": 1.0, "q10": 10.0, "q50": 50.0, "q90": 90.0, "q99": 99.0}
-"""Names of the quantiles that LeRobot's statistics have, in %."""
+"""Names and percentages of the quantiles in LeRobot's statistics."""
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
-"""Columns of whole numbers that LeRobot wants."""
+"""Columns of whole numbers that LeRobot requires."""
 FOURCC = "mp4v"
 """Codec of videos that every build of OpenCV has (MPEG-4 part 2)."""
 
@@ -55,11 +56,11 @@ class LeRobotWriter(FolderWriter):
     Parameters
     ----------
     folder, about, rate_hz
-        As of ``FolderWriter``.
+        As for ``FolderWriter``.
     video : bool
-        Keep pictures in videos, which lose detail, instead of PNG in the tables.
+        Store pictures in videos, which lose detail, instead of as PNG in the tables.
     held_mb : float
-        Size from which on a file of several episodes is finished. 0: a file for each, so that each is safe at once.
+        Size, MB, after which a file of several episodes is finished. With 0 each episode has its own file and is safe at once.
     """
 
     FORMAT = "lerobot"
@@ -69,7 +70,7 @@ class LeRobotWriter(FolderWriter):
     def __init__(self, folder: Path, about: About, rate_hz: int, *, video: bool = False, held_mb: float = DATA_MB) -> None:
         super().__init__(folder, about, rate_hz)
         self.video, self.held_bytes = video, held_mb * 1e6
-        self._file = self._frames = 0  # number of the next file, and of frames
+        self._file = self._frames = 0  # number of the next file, and number of frames so far
         self._tasks: list[str] = []
         self._stats: dict[str, dict[str, np.ndarray]] = {}
 
@@ -87,7 +88,7 @@ class LeRobotWriter(FolderWriter):
             self._tasks = _tasks(self.folder)
             stats = read_json(self.folder / STATS)
             self._stats = {key: {k: np.asarray(v, float) for k, v in each.items()} for key, each in stats.items()}
-        for pattern in (DATA_PATH, EPISODES_PATH, VIDEO_PATH.replace("{video_key}", IMAGE)):  # of a run that was killed
+        for pattern in (DATA_PATH, EPISODES_PATH, VIDEO_PATH.replace("{video_key}", IMAGE)):  # files of a run that was killed
             for path in self.folder.glob(pattern.partition("/chunk")[0] + "/chunk-*/file-*"):
                 chunk, file = (int(part.split("-")[1].split(".")[0]) for part in path.parts[-2:])
                 if chunk * CHUNK_FILES + file >= self._file:
@@ -101,7 +102,7 @@ class LeRobotWriter(FolderWriter):
                 yield [facts for _, facts, _ in group]
 
     def _write_group(self, waiting: "_Peeked") -> list[tuple[dict[str, Any], dict[str, Any], dict[str, dict[str, np.ndarray]]]]:
-        """Write a file of episodes, then what the data set says of them. Returns a row, the facts and the statistics of each."""
+        """Write a file of episodes, then the data set's description. Returns row, facts and statistics of each episode."""
         group: list[tuple[dict[str, Any], dict[str, Any], dict[str, dict[str, np.ndarray]]]] = []
         at = {"chunk_index": self._file // CHUNK_FILES, "file_index": self._file % CHUNK_FILES}
         path = _made(self.folder / DATA_PATH.format(**at))
@@ -182,7 +183,7 @@ class LeRobotWriter(FolderWriter):
         return [*picture, *named, (TIME, pa.float64()), ("timestamp", pa.float32()), *((name, pa.int64()) for name in COUNTERS)]
 
     def _features(self) -> dict[str, dict[str, Any]]:
-        """The columns as LeRobot describes them."""
+        """LeRobot's description of the columns."""
         width, height = self.about.size_px
         image: dict[str, Any] = {"dtype": "image", "shape": [height, width, 3], "names": ["height", "width", "channels"]}
         if self.video:
@@ -197,7 +198,7 @@ class LeRobotWriter(FolderWriter):
         return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
 
     def _hf_features(self) -> dict[str, Any]:
-        """The columns as Hugging Face's library describes them in a file's own metadata."""
+        """Description of the columns for Hugging Face's library, which a file's own metadata hold."""
         found: dict[str, Any] = {}
         for name, feature in self._features().items():
             value = {"dtype": feature["dtype"], "_type": "Value"}
@@ -227,7 +228,7 @@ class LeRobotWriter(FolderWriter):
         return row
 
     def _write_meta(self, group: list, at: dict[str, int], stats: dict[str, dict[str, np.ndarray]]) -> None:
-        """Write what the data set says of itself; the number of episodes comes last."""
+        """Write the data set's description. The number of episodes comes last."""
         parquet, pa = library("pyarrow.parquet"), library("pyarrow")
         index = {"name": None, "field_name": "__index_level_0__", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
         column = {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None}
@@ -266,7 +267,7 @@ class LeRobotWriter(FolderWriter):
 
 
 class _Peeked(Iterator[Episode]):
-    """An iterator that says whether there is one more."""
+    """An iterator that can tell whether there is one more episode."""
 
     def __init__(self, episodes: Iterator[Episode]) -> None:
         self._episodes = iter(episodes)
@@ -274,7 +275,7 @@ class _Peeked(Iterator[Episode]):
 
     @property
     def has_next(self) -> bool:
-        """Whether there is one more. It is taken only now."""
+        """Whether there is one more episode. It is taken from the source only now."""
         if self._next is None:
             self._next = next(self._episodes, None)
         return self._next is not None
@@ -287,7 +288,7 @@ class _Peeked(Iterator[Episode]):
 
 
 class _Gathered:
-    """What an episode's statistics are made from."""
+    """Data from which an episode's statistics are computed."""
 
     def __init__(self, about: About) -> None:
         self._values: dict[str, list[np.ndarray]] = {name: [] for name in about.numbers}
@@ -296,7 +297,7 @@ class _Gathered:
         self._every = 1
 
     def add(self, step: Step, number: int) -> None:
-        """Take a step. Of a long episode every second, then every fourth picture is kept, and so on."""
+        """Add a step. Of a long episode only every second picture is kept, then every fourth, and so on."""
         for name, values in self._values.items():
             values.append(np.asarray(step.values[name], np.float32))
         self._times.append(step.time_s)
@@ -306,7 +307,7 @@ class _Gathered:
             self._pictures, self._every = self._pictures[::2], 2 * self._every
 
     def stats(self, rate_hz: int, number: int, start: int, task: int) -> dict[str, dict[str, np.ndarray]]:
-        """Statistics of each column, in the shapes that LeRobot has: of pictures (3, 1, 1) within 0 to 1, of pins (2,)."""
+        """Statistics of each column, in LeRobot's shapes: (3, 1, 1) for pictures, with values from 0 to 1, and (2,) for pins."""
         length = len(self._times)
         pixels = np.stack(self._pictures).reshape(-1, 3) / 255.0
         found = {IMAGE: {key: value.reshape(-1, 1, 1) for key, value in _spread(pixels).items()}}
@@ -321,7 +322,7 @@ class _Gathered:
 
 
 def _spread(rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Statistics (K,) of rows (M, K) without those that are NaN; 0 where there are no others."""
+    """Statistics (K,) of rows (M, K), without NaN; 0 for a column of NaN only."""
     known = np.isfinite(rows)
     some = known.any(axis=0)
     safe = np.where(some, rows, 0.0)
@@ -336,7 +337,7 @@ def _spread(rows: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _together(a: dict[str, dict[str, np.ndarray]], b: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
-    """Statistics of two sets of rows together. Quantiles are averaged with the numbers of rows as weights, as LeRobot does."""
+    """Statistics of the union of two sets of rows. As in LeRobot, quantiles are averaged with the numbers of rows as weights."""
     found = {}
     for key, new in b.items():
         old = a.get(key)
@@ -358,7 +359,7 @@ def _together(a: dict[str, dict[str, np.ndarray]], b: dict[str, dict[str, np.nda
 
 
 class _Film:
-    """A video that frames are written to."""
+    """A video to which frames are written."""
 
     def __init__(self, path: Path, rate_hz: int, size_px: tuple[int, int]) -> None:
         self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*FOURCC), float(rate_hz), size_px)
@@ -373,12 +374,12 @@ class _Film:
 
 
 def lerobot_records(folder: Path) -> Records:
-    """A data set that ``LeRobotWriter`` wrote.
+    """Records in a data set that ``LeRobotWriter`` wrote.
 
     Raises
     ------
     RecordError
-        It is damaged, or LeRobot or someone else wrote it.
+        The data set is damaged, or LeRobot or another program wrote it.
     """
     rows = _episode_rows(folder)
     return records_in(folder, LeRobotWriter.FORMAT, [_facts_of(row) for row in rows], partial(_reader, folder, rows))
@@ -427,7 +428,7 @@ def _film_pictures(folder: Path, row: dict[str, Any], about: About) -> Iterator[
 
 
 def _episode_rows(folder: Path) -> list[dict[str, Any]]:
-    """The table of episodes without statistics, up to the number of them that the data set states."""
+    """The table of episodes without statistics, up to the number of episodes that the description states."""
     if not (folder / INFO).is_file():
         if len(list(folder.glob("data/chunk-*/file-*.parquet"))) > 1:  # only the first file is there before it
             raise RecordError(f"{folder}: {INFO} is missing; {AGAIN}")
@@ -472,7 +473,7 @@ def _colour(image: np.ndarray) -> np.ndarray:
 
 
 def _made(path: Path) -> Path:
-    """The path, its folder made if missing."""
+    """The path. Its folder is made if it does not exist."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 

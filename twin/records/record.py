@@ -1,8 +1,8 @@
-"""Records: episodes of steps, each with a picture and numbers, independent of the file format.
+"""Records: episodes of steps, independent of the file format. A step has a picture and numbers.
 
-The tables here are the only place that names the numbers, their columns in LeRobot's and Hugging Face's formats and their topics in ROS 2.
-Numbers are kept as 32-bit floats (a pose of 300 mm to 0.00003 mm) and times as 64-bit floats in every format, so a record that is read
-back equals the one that was written.
+Only the tables in this module define the numbers, their columns in LeRobot's and Hugging Face's formats, and their topics in ROS 2. In
+every format numbers are stored as 32-bit floats (a pose of 300 mm to 0.00003 mm) and times as 64-bit floats. Therefore a record that is
+read equals the record that was written.
 """
 
 import hashlib
@@ -24,15 +24,15 @@ POSE_AXES = ("x", "y", "z", "rx", "ry", "rz")
 WRENCH_AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 """Names of the numbers of a wrench: N and N mm."""
 NOMINAL_HZ = 10.0
-"""Frames a second of a record whose times are not known."""
+"""Assumed frames per second of a record whose times are not known."""
 FASTEST_HZ = 1000
-"""Highest whole number of frames a second that a record is said to have."""
+"""Largest whole number of frames per second that a record states."""
 DIGEST = 16
 """Hexadecimal digits of the digest in an episode's key: 64 bits."""
 
 
 class RecordError(TwinError):
-    """A record can't be read, written or translated. The message says what came and what to do."""
+    """A record can't be read, written or translated. The message says what was found and what to do."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Channel:
     Attributes
     ----------
     name : str
-        In this program, and the first part of column names in the recordings' table.
+        Name in this program, and first part of the column names in the recordings' table.
     column : str
         Name in LeRobot's and Hugging Face's formats.
     topic : str
@@ -50,7 +50,7 @@ class Channel:
     axes : tuple of str
         Names of the numbers. () if the record itself names them.
     meaning : str
-        What they are, with unit and frame.
+        Meaning of the numbers, with unit and frame.
     """
 
     name: str
@@ -81,13 +81,13 @@ CHANNELS = {
 }
 """All channels, in the order in which formats have them."""
 IMAGE, TIME = "observation.images.tactip", "observation.time_s"
-"""Columns of the picture and of the time of its exposure (s, from the episode's first one on)."""
+"""Columns of the picture and of the time of its exposure (s, from the episode's first exposure)."""
 _NAMED_HERE = {name for name, channel in CHANNELS.items() if not channel.axes and name != "pins"}
 
 
 @dataclass(frozen=True)
 class About:
-    """What all episodes of a record have in common.
+    """Common properties of all episodes of a record.
 
     Attributes
     ----------
@@ -103,9 +103,9 @@ class About:
     estimates : tuple of str
         Names of the estimated labels.
     frame : str
-        In which frame poses and actions are: ``base`` (of the arm) or ``work`` (of the experiment).
+        Frame of poses and actions: ``base`` (of the arm) or ``work`` (of the experiment).
     robot : str
-        What the arm is; "" if unknown.
+        Description of the arm; "" if unknown.
     """
 
     sensor: str
@@ -129,7 +129,7 @@ class About:
         return (count // 2, 2) if channel == "pins" else (count,)
 
     def plain(self) -> dict[str, Any]:
-        """As JSON."""
+        """The properties as JSON."""
         return {
             "sensor": self.sensor,
             "form": str(self.form),
@@ -144,7 +144,7 @@ class About:
 
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> "About":
-        """From what ``plain`` gives.
+        """The properties from the result of ``plain``.
 
         Raises
         ------
@@ -167,7 +167,7 @@ class About:
         )
 
     def differs(self, other: "About") -> list[str]:
-        """What speaks against episodes of another record beside those of this one."""
+        """Reasons why episodes of another record do not fit into this one."""
         mine, its = self.plain(), other.plain()
         return [
             f"{key} {its[key]!r} instead of {mine[key]!r}" for key in mine if key not in ("channels", "robot") and mine[key] != its[key]
@@ -182,7 +182,7 @@ class Step:
     ----------
     image : (H, W) or (H, W, 3) uint8
     time_s : float
-        Time of the exposure, from the episode's first one on.
+        Time of the exposure, s, from the episode's first exposure.
     values : dict of str to array of float32
         The numbers of each channel; shapes as ``About.shape``.
     """
@@ -199,11 +199,11 @@ class Episode:
     Attributes
     ----------
     key : str
-        Tells it from all others: readable, with a digest of what it holds.
+        Unique name of the episode: readable, with a digest of its content.
     task : str
-        In words.
+        Description of what is done.
     steps : callable
-        Gives the steps from the first on, reading each when it is needed.
+        Function that gives the steps from the first one. Each step is read when it is needed.
     length : int
         Number of steps.
     rest : array or None
@@ -211,7 +211,7 @@ class Episode:
     started_s : float
         Unix time of the first exposure; 0 if unknown.
     T_tool_sensor : (4, 4) float or None
-        Where the sensor is on the tool, mm.
+        Pose of the sensor on the tool, mm.
     """
 
     key: str
@@ -223,13 +223,13 @@ class Episode:
     T_tool_sensor: np.ndarray | None = field(default=None, compare=False)
 
     def facts(self) -> dict[str, Any]:
-        """What is kept of it beside its steps, as JSON."""
+        """The stored facts of the episode without its steps, as JSON."""
         T = None if self.T_tool_sensor is None else np.asarray(self.T_tool_sensor, float).tolist()
         return {"key": self.key, "task": self.task, "length": self.length, "started_s": self.started_s, "T_tool_sensor": T}
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any], steps: Callable[[], Iterator[Step]], rest: ImageArray | None) -> "Episode":
-        """From what ``facts`` gives.
+        """An episode from the result of ``facts``.
 
         Raises
         ------
@@ -249,7 +249,7 @@ class Records:
     about : About
     episodes : list of Episode
     notes : list of str
-        What was odd, one line each.
+        Irregularities, one line each.
     """
 
     about: About
@@ -257,11 +257,11 @@ class Records:
     notes: list[str] = field(default_factory=list)
 
     def named(self, task: str) -> "Records":
-        """The same records with another task; as they are for ""."""
+        """The same records with another task; unchanged for ""."""
         return self if not task else replace(self, episodes=[replace(episode, task=task) for episode in self.episodes])
 
     def rate_hz(self) -> int:
-        """Whole number of frames a second, from the times of the first episode of several steps."""
+        """Whole number of frames per second, from the times of the first episode with several steps."""
         for episode in self.episodes:
             if episode.length > 1:
                 *_, last = episode.steps()
@@ -271,20 +271,20 @@ class Records:
 
 
 class RecordWriter(Protocol):
-    """Where episodes are written to. Each format has one."""
+    """Destination of episodes. Each format has its own writer."""
 
     folder: Path
 
     @property
     def keys(self) -> set[str]:
-        """Keys of the episodes that are there."""
+        """Keys of the episodes that are already stored."""
 
     def write(self, episodes: Iterator[Episode]) -> int:
-        """Write episodes, and return how many. Those that are not finished when the process ends are not there afterwards."""
+        """Write episodes, and return their number. Episodes that are unfinished when the process ends are not stored."""
 
 
 def digest(*parts: object) -> str:
-    """A short digest of bytes, and of what JSON can hold, for an episode's key."""
+    """A short digest of bytes and of values that JSON can hold, for an episode's key."""
     found = hashlib.sha256()
     for part in parts:
         found.update(part if isinstance(part, bytes) else json.dumps(part, sort_keys=True, default=str).encode())
@@ -292,7 +292,7 @@ def digest(*parts: object) -> str:
 
 
 def float32(numbers: object, count: int | None = None) -> np.ndarray:
-    """Numbers as a channel has them; None and missing ones at the end become NaN."""
+    """Numbers as a channel stores them; None, and missing numbers at the end, become NaN."""
     values = np.array([np.nan if value is None else value for value in np.ravel(np.asarray(numbers, object))], np.float32)
     if count is not None and len(values) != count:
         values = np.concatenate([values[:count], np.full(max(0, count - len(values)), np.nan, np.float32)])
@@ -300,17 +300,17 @@ def float32(numbers: object, count: int | None = None) -> np.ndarray:
 
 
 def seconds(time_s: float) -> float:
-    """A time to the nanosecond, as every format can hold it."""
+    """A time rounded to the nanosecond, which every format can hold."""
     return round(float(time_s), 9)
 
 
 def library(name: str) -> ModuleType:
-    """A library that formats need and that need not be installed.
+    """An optional library that formats need.
 
     Raises
     ------
     RecordError
-        It is missing.
+        The library is not installed.
     """
     try:
         return import_module(name)

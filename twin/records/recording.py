@@ -1,6 +1,7 @@
-"""Records in the recordings' own format: pictures, ``targets.csv``, ``init_0.png``, and beside them what else is known.
+"""Records in the recordings' own format: pictures, ``targets.csv``, ``init_0.png``, and further files with what else is known.
 
-Read are recordings of any origin, collections, and simulated data sets with their truth. A frame is an episode of its own unless a column
+Recordings of any origin, collections, and simulated data sets with their truth can be read. Each frame is its own episode, unless a column
+``path_id`` states which frames are states of one contact.
 ``path_id`` says which frames are states of one contact.
 """
 
@@ -31,15 +32,15 @@ from twin.types import Form
 
 TABLE, PINS, EPISODES, META, REST = "targets.csv", "pins.npz", "episodes.json", "meta.json", "init_0.png"
 MADE, TRUTH, LOG = "generation.json", "truth.zarr", "contacts.jsonl"
-"""Files of simulated data sets (how it was made, what is known) and of collections (what was asked for, and when)."""
+"""Files of simulated data sets (how the set was made, exact truth) and of collections (requested poses and their times)."""
 PATH, TIME_S = "path_id", "time_s"
-"""Columns of the table: the episode that a frame belongs to, and its time."""
+"""Columns of the table for the frame's episode and the frame's time."""
 NOT_CARRIED = {"image_name", "sensor_image", "file_name", "data_name", "obj_id", "pose_id", "fraction", PATH, TIME_S}
-"""Columns that records do not have as numbers, and nobody misses."""
+"""Columns that records do not carry as numbers, because they are not needed."""
 
 
 def columns_of(channel: Channel, axes: tuple[str, ...]) -> list[str]:
-    """Columns of a channel in the table. Poses and moves have those that recordings have."""
+    """Columns of a channel in the table. Poses and moves have the columns that recordings have."""
     if channel.name in ("pose", "move"):
         return [f"{channel.name}_{k}" for k in range(1, 7)]
     return [f"{channel.name}_{axis}" for axis in axes]
@@ -51,9 +52,9 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
     Raises
     ------
     FrameError
-        As of ``open_recording``, or what lies beside the frames is damaged.
+        As for ``open_recording``, or a file beside the frames is damaged.
     RecordError
-        The folder holds pins alone, or is damaged.
+        The folder holds only pins, or is damaged.
     """
     if path.is_dir() and (path / TRUTH).is_dir() and not any((path / name).is_dir() for name in ("images", "frames_bw")):
         raise RecordError(f"{path}: holds pins without pictures; make the data set with --images raw, gray or recording")
@@ -91,7 +92,7 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
         times_s = _times(recording, rows, notes)
         steps = partial(_steps_of, recording, values, rows, times_s, notes)
         if own:
-            if number == len(facts):  # what follows was being written when a run was killed
+            if number == len(facts):  # the rest was unfinished when a run was killed
                 break
             records.episodes.append(replace(episode_of(path, facts[number] | {"rest": None}, steps), rest=rest))
             continue
@@ -125,7 +126,7 @@ def _paths(recording: Recording) -> list[np.ndarray]:
 
 
 def _times(recording: Recording, rows: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Times (n,) of an episode's frames. Where the table has none, or such as can't be, which is noted, they are nominal."""
+    """Times (n,) of an episode's frames. If the table has no times, or impossible ones (which are noted), nominal times are used."""
     if TIME_S in recording.labels:
         times_s = numbers(recording.labels[TIME_S][rows])
         if np.isfinite(times_s).all() and (np.diff(times_s) >= 0).all():
@@ -139,7 +140,7 @@ def _times(recording: Recording, rows: np.ndarray, notes: list[str]) -> np.ndarr
 
 
 def _table_values(recording: Recording) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """What the table has of each channel, and the names of estimated labels."""
+    """The table's numbers of each channel, and the names of estimated labels."""
     labels = recording.labels
     estimates = tuple(name.removeprefix("estimate_") for name in labels if name.startswith("estimate_"))
     found = {}
@@ -155,7 +156,7 @@ def _table_values(recording: Recording) -> tuple[dict[str, np.ndarray], tuple[st
 
 
 def _pins_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
-    """Pins that ``twin preprocess`` or a translation found, for the recording's frames; NaN for frames without."""
+    """Pins that ``twin preprocess`` or a translation found, for the recording's frames; NaN for frames without pins."""
     if not (path / PINS).is_file():
         return {}
     try:
@@ -169,7 +170,7 @@ def _pins_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
 
 
 def _truth_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
-    """Pins, wrench and the pose to which the arm was sent, of a simulated data set."""
+    """Pins, wrench, and the pose that the arm was commanded to, of a simulated data set."""
     if not (path / TRUTH).is_dir():
         return {}
     from twin.frames.truth import arrays_of, open_truth, row_of
@@ -185,7 +186,7 @@ def _truth_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
 
 
 def _asked_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
-    """The poses that a collection asked for."""
+    """The poses that a collection requested."""
     if not (path / LOG).is_file():
         return {}
     asked = {}
@@ -200,13 +201,13 @@ def _asked_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
 
 
 def _said_beside(path: Path) -> dict[str, Any]:
-    """Sensor, arm, task and ``T_tool_sensor`` of a recording, as far as its files tell."""
+    """Sensor, arm, task and ``T_tool_sensor`` of a recording, if its files state them."""
     told: dict[str, Any] = {"task": "touch"}
     for name in (META, MADE):
         if path.is_dir() and (path / name).is_file():
             try:
                 content = read_json(path / name)
-            except RecordError:  # a recording of someone else, whose metadata are noted when it is opened
+            except RecordError:  # a recording of another program. Its metadata are noted when it is opened
                 continue
             told |= {key: content[key] for key in ("arm", "sensor", "experiment") if key in content}
             if isinstance(content.get("comments"), str) and content["comments"]:
@@ -230,16 +231,16 @@ def _own_facts(path: Path) -> list[dict[str, Any]]:
 
 
 class RecordingWriter(FolderWriter):
-    """Writes records as a recording, with the numbers that recordings do not have in further columns and in ``pins.npz``.
+    """Writes records as a recording. Numbers that recordings do not have go into further columns and into ``pins.npz``.
 
-    A recording has one picture without contact: that of the first episode with one.
+    A recording has one picture without contact: that of the first episode that has one.
 
     Parameters
     ----------
     folder, about, rate_hz
-        As of ``FolderWriter``.
+        As for ``FolderWriter``.
     held_steps : int
-        Frames from which on the table is written anew. 0: after each episode, so that each is safe at once.
+        Number of frames after which the table is written again. With 0 this happens after each episode, so that each is safe at once.
     """
 
     FORMAT = "recording"
@@ -259,7 +260,7 @@ class RecordingWriter(FolderWriter):
         self._pictures.mkdir(exist_ok=True)
 
     def _find(self) -> list[dict[str, Any]]:
-        """The episodes that are listed, and their rows. Pictures and rows of others are written over."""
+        """The listed episodes and their rows. Pictures and rows of other episodes are overwritten."""
         self._begin()
         if not (self.folder / EPISODES).is_file():
             return []
@@ -307,7 +308,7 @@ class RecordingWriter(FolderWriter):
         return {name: columns_of(CHANNELS[name], self.about.axes(name)) for name in self.about.numbers if name != "pins"}
 
     def _commit(self, group: list[dict[str, Any]], rows: list[list[str]], pins: list[np.ndarray]) -> list[dict[str, Any]]:
-        """Write the table, the pins and, last, the list of episodes, each anew and whole."""
+        """Write the table, the pins and, last, the list of episodes. Each file is replaced as a whole."""
         self._rows += rows
         self._pins += pins
         text = io.StringIO(newline="")

@@ -1,8 +1,8 @@
 """Records as MCAP files with ROS 2 messages, one file for each episode.
 
-Foxglove, PlotJuggler and ``ros2 bag play`` open them. Topics and their units are those of the public TacTip stack (tactip-main) where it
-has them: six numbers of a pose are a ``TwistStamped`` in mm and deg. What ROS itself defines has ROS's units: ``/tf`` and ``/tf_static``
-(m, quaternions) and ``/tactip/wrench`` (N, N m).
+Foxglove, PlotJuggler and ``ros2 bag play`` can open these files. Where the public TacTip stack (tactip-main) has a topic, its name and unit
+are used: the six numbers of a pose are a ``TwistStamped`` in mm and deg. Types that ROS itself defines have ROS's units: ``/tf`` and
+``/tf_static`` (m, quaternions) and ``/tactip/wrench`` (N, N m).
 """
 
 import json
@@ -29,7 +29,7 @@ NS_PER_S = 1_000_000_000
 MOST_SAID = 200
 """Most characters of a library's error that a message repeats."""
 TOUCHES_N = 1e-6
-"""Force in N from which on ``/tactip/contact`` is 1."""
+"""Force, N, above which ``/tactip/contact`` is 1."""
 
 _HEADER = "std_msgs/Header header\n"
 _LINE = "=" * 80
@@ -51,7 +51,7 @@ MESSAGES = {
     f"std_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n{_DIMENSION}",
     "std_msgs/msg/Int8": "int8 data\n",
 }
-"""Definitions of the messages, as ROS 2 states them."""
+"""Definitions of the messages as in ROS 2."""
 
 
 class Ros2Writer(FolderWriter):
@@ -93,7 +93,7 @@ class _Bag:
         self._start_ns = round(episode.started_s * NS_PER_S)
 
     def add(self, step: Step) -> None:
-        """Write a step's messages, all with the time of its exposure."""
+        """Write the messages of a step. All have the time of its exposure."""
         at_ns = self._start_ns + round(step.time_s * NS_PER_S)
         send = partial(self._send, at_ns=at_ns)
         header = {"stamp": {"sec": at_ns // NS_PER_S, "nanosec": at_ns % NS_PER_S}, "frame_id": SENSOR_FRAME}
@@ -125,7 +125,7 @@ class _Bag:
         self.count += 1
 
     def finish(self, facts: dict[str, Any]) -> None:
-        """Write what the file says of itself, and its end."""
+        """Write the file's description, and its end."""
         said = {"version": str(VERSION), "facts": json.dumps(facts), "about": json.dumps(self._about.plain())}
         self._writer.add_metadata(METADATA, said)
         if self._episode.rest is not None:
@@ -137,12 +137,12 @@ class _Bag:
 
 
 def ros2_records(path: Path) -> Records:
-    """A folder of MCAP files that ``Ros2Writer`` wrote, or one of them.
+    """Records in a folder of MCAP files that ``Ros2Writer`` wrote, or in one such file.
 
     Raises
     ------
     RecordError
-        A file is damaged, or someone else wrote it.
+        A file is damaged, or another program wrote it.
     """
     files = _files(path) if path.is_dir() else [path]
     if not files:
@@ -163,7 +163,7 @@ def ros2_records(path: Path) -> Records:
 
 
 def _said(path: Path) -> tuple[About, dict[str, Any], bytes | None]:
-    """What a file says of itself, and its picture without contact."""
+    """The description of a file, and its picture without contact."""
     reader = library("mcap.reader")
     try:
         with path.open("rb") as file:
@@ -183,7 +183,7 @@ def _said(path: Path) -> tuple[About, dict[str, Any], bytes | None]:
 
 
 def _steps_of(path: Path, about: About) -> Iterator[Step]:
-    """The steps of a file: messages of one sequence number belong together."""
+    """The steps of a file. Messages with the same sequence number belong to one step."""
     reader, decoder = library("mcap.reader"), library("mcap_ros2.decoder").DecoderFactory()
     named = {CHANNELS[name].topic: name for name in about.numbers}
     topics = [IMAGE_TOPIC, *named]
@@ -240,7 +240,7 @@ def _transform(T_mm: np.ndarray, header: dict[str, Any], child: str) -> dict[str
 
 
 def _array(values: np.ndarray, label: str) -> dict[str, Any]:
-    """Numbers as an array message, which names its dimensions."""
+    """Numbers as an array message with named dimensions."""
     labels = (label, "axis")[: values.ndim]
     dim = [
         {"label": each, "size": n, "stride": int(np.prod(values.shape[k:]))}

@@ -1,8 +1,8 @@
-"""A live session on disk: every frame as it was, and a line of JSON for each step.
+"""A live session on disk: every frame as the camera delivered it, and a line of JSON for each step.
 
-``session.json`` says what the session is. ``steps.jsonl`` has one line a step, ``frames/`` the pictures (PNG, lossless). A picture is
-written before its line, so every picture that a line names exists, and the session can be read up to its last complete line at any
-time. ``rest.png`` is the frame without contact that pins were counted from, if one was taken.
+``session.json`` describes the session. ``steps.jsonl`` has one line for each step, ``frames/`` the pictures (PNG, lossless). A picture is
+written before its line, so every picture that a line names exists. Therefore the session can be read up to its last complete line at any
+time. ``rest.png`` is the no-contact frame from which pin displacements were computed, if one was taken.
 """
 
 import json
@@ -31,8 +31,8 @@ from twin.types import Form, Frame
 ABOUT, STEPS, FRAMES, REST = "session.json", "steps.jsonl", "frames", "rest.png"
 SESSION_FILES = (ABOUT, STEPS, FRAMES, REST)
 VERSION = 1
-LARGEST_BYTES = 1_000_000_000  # of the steps: a million of them, which a day at 10 Hz has
-LARGEST_ABOUT_BYTES = 1_000_000  # of what the session is
+LARGEST_BYTES = 1_000_000_000  # of the steps: enough for a million of them, more than one day at 10 Hz
+LARGEST_ABOUT_BYTES = 1_000_000  # of the description
 
 
 def is_session(path: str | Path) -> bool:
@@ -46,7 +46,7 @@ class SessionWriter:
     Parameters
     ----------
     folder : path
-        A new or empty folder, or the folder of a session that ended before its first step. Such a session is begun anew.
+        A new or empty folder, or the folder of a session that ended before its first step. Such a session is started again.
     about : dict
         Sensor, camera, model and arm, in types that JSON can hold.
 
@@ -63,10 +63,10 @@ class SessionWriter:
             raise StoreError(f"{self.folder}: not empty; give a new folder for the session")
         (self.folder / FRAMES).mkdir(parents=True, exist_ok=True)
         (self.folder / REST).unlink(missing_ok=True)
-        clock = {"unix_s": time.time(), "monotonic_s": time.monotonic()}  # the same moment on the clock of the frames
+        clock = {"unix_s": time.time(), "monotonic_s": time.monotonic()}  # the same moment on both clocks; frames use the second
         write_json(self.folder / ABOUT, {"version": VERSION, "clock": clock, **about})
         self._lines = (self.folder / STEPS).open("a", encoding="utf-8")
-        self._written: dict[int, str] = {}  # the newest picture by its number: a frame may serve several steps
+        self._written: dict[int, str] = {}  # the newest picture by its number, because several steps may use one frame
         self.count = 0
 
     def append(self, frame: Frame, step: dict) -> None:
@@ -86,11 +86,11 @@ class SessionWriter:
         self.count += 1
 
     def keep_rest(self, frame: Frame) -> None:
-        """Keep the frame without contact that pins are counted from."""
+        """Keep the no-contact frame from which pin displacements are computed."""
         write_image(self.folder / REST, frame.image)
 
     def close(self) -> None:
-        """End the session; the lines of whole steps are on disk already.
+        """End the session. The lines of complete steps are already on disk.
 
         Raises
         ------
@@ -110,7 +110,7 @@ class SessionWriter:
 
 
 class _FrameLine(BaseModel):
-    """What a step's line says about its frame."""
+    """The part of a step's line that describes its frame."""
 
     file: Name
     name: str
@@ -120,7 +120,7 @@ class _FrameLine(BaseModel):
 
 
 class _StepLine(BaseModel):
-    """What a replay needs of a step's line."""
+    """The part of a step's line that a replay needs."""
 
     step: int
     frame: _FrameLine
@@ -128,7 +128,7 @@ class _StepLine(BaseModel):
 
 
 def read_steps(folder: str | Path) -> list[dict]:
-    """Every complete step of a session; a line that was being written when it ended is left out, with all after it.
+    """Every complete step of a session. An incomplete last line, and everything after it, is left out.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def read_steps(folder: str | Path) -> list[dict]:
 
 
 def _steps_and_note(folder: Path) -> tuple[list[dict], str]:
-    """A session's complete steps, and what is wrong with the line after them ("" if there is none)."""
+    """The complete steps of a session, and the fault in the line after them ("" if there is none)."""
     try:
         text = read_regular(folder / STEPS, LARGEST_BYTES).decode("utf-8", "replace")
     except OSError as error:
@@ -168,18 +168,17 @@ class Session:
     Attributes
     ----------
     about : dict
-        What the session is.
+        Description of the session.
     steps : list of dict
-        Its complete steps.
+        The complete steps.
     form : Form
     notes : list of str
-        What is odd, one line each.
+        Irregularities, one line each.
 
     Raises
     ------
     FrameError
-        The folder holds no session, one of another version, or a damaged one. A line that was being written when the session ended is
-        no damage.
+        The folder holds no session, one of another version, or a damaged one. An incomplete last line does not count as damage.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -224,7 +223,7 @@ class Session:
         return line
 
     def _picture(self, name: str) -> np.ndarray:
-        """A picture of the session by its path in the folder; one that lies elsewhere is not read, even where a link leads to it."""
+        """A picture of the session by its path in the folder. A picture outside the folder is not read, even if a link leads to it."""
         path = self.folder / name
         if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(self.folder)):
             raise FrameError(f"{self.folder}: {name} is a link to outside the session; put the picture itself there")
@@ -235,13 +234,13 @@ class Session:
 
     @property
     def rest(self) -> Frame | None:
-        """The frame without contact that pins were counted from; None if they were counted from the nominal layout."""
+        """The no-contact frame from which displacements were computed; None if they were computed from the nominal layout."""
         if not (self.folder / REST).is_file():
             return None
         return Frame(self._picture(REST), self.form, REST)
 
     def frame(self, index: int) -> Frame:
-        """The frame of a step. A frame that served several steps is given for each.
+        """The frame of a step. A frame that several steps used is returned for each of them.
 
         Raises
         ------
@@ -258,7 +257,7 @@ def session_records(folder: Path) -> Records:
     Raises
     ------
     FrameError
-        As of ``Session``, or its first picture can't be read.
+        As for ``Session``, or the first picture can't be read.
     """
     session = Session(folder)
     first, first_s, image = session.steps[0], session.frame(0).time_s, session.frame(0).image
@@ -289,7 +288,7 @@ def session_records(folder: Path) -> Records:
     return Records(about, [episode], list(session.notes))
 
 
-# Keys of a step's line that hold what a channel holds.
+# Keys of a step's line that hold the numbers of a channel.
 _POSES = {"pose": "exposed_pose", "action": "sent"}
 _ESTIMATES = {"estimate": "value", "low": "low", "high": "high"}
 
@@ -308,7 +307,7 @@ def _steps_of(session: Session, about: About, first_s: float) -> Iterator[Step]:
 
 
 def _started_s(session: Session) -> float:
-    """Unix time of the session's first frame; 0 if it says no clock or a damaged one."""
+    """Unix time of the session's first frame; 0 if the session states no clock or a damaged one."""
     try:
         clock = session.about["clock"]
         started_s = float(clock["unix_s"]) + session.frame(0).time_s - float(clock["monotonic_s"])
@@ -318,7 +317,7 @@ def _started_s(session: Session) -> float:
 
 
 def _sensor_on_tool(about: dict[str, Any]) -> np.ndarray | None:
-    """``T_tool_sensor`` (4, 4) of a session that says its sensor and its servo; None if it says neither or they are not known here."""
+    """``T_tool_sensor`` (4, 4) of a session that states its sensor and its servo; None if it states neither, or they are not known."""
     try:
         return Mounting.of(load_sensor(about["sensor"]), load_experiment(about["servo"]["experiment"])).T_tool_sensor
     except (KeyError, TypeError, SpecError):
@@ -326,7 +325,7 @@ def _sensor_on_tool(about: dict[str, Any]) -> np.ndarray | None:
 
 
 def plain(value: object) -> object:
-    """The value as JSON can hold it: an array becomes a list, a number that is not finite becomes null."""
+    """The value in a form that JSON can hold: an array becomes a list, a number that is not finite becomes null."""
     if isinstance(value, dict):
         return {key: plain(part) for key, part in value.items()}
     if isinstance(value, np.ndarray | list | tuple):

@@ -1,4 +1,4 @@
-"""A picture of what presses on the skin: over the frame that shows it, and on the deformed skin."""
+"""Draws pressure and shear on the skin: over the frame, and on the deformed skin."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,18 +10,18 @@ from twin.report.charts import ink, save_figure, sequential, sized_figure
 from twin.types import FloatArray, ImageArray
 
 SIZE_INCH = (12.0, 5.2)
-"""Width and height of the picture."""
+"""Width and height of the picture, inch."""
 SHOWN_SHARE = 0.02
-"""Share of the largest pressure from which on a place is coloured over the frame."""
+"""Share of the largest pressure above which a place is coloured over the frame."""
 ARROW_EVERY = 2
-"""Nodes of the grid for one arrow of shear."""
+"""Number of grid nodes in each direction for one arrow of shear."""
 ARROW_SHARE = 0.06
-"""Length of the longest arrow, in widths of the frame."""
+"""Length of the longest arrow, as a share of the frame's width."""
 
 
 @dataclass(frozen=True)
 class SkinPicture:
-    """What is drawn: values on a square grid of S x S nodes of the skin, row by row.
+    """The data to draw: values on a square grid of S x S nodes of the skin, row by row.
 
     Attributes
     ----------

@@ -1,9 +1,10 @@
 """Pictures of the deformed skin in 3D, drawn by PyVista in a separate process.
 
-VTK kills the whole process if it finds neither a display nor EGL. Therefore it is used in a child process. If that ends with an error, a
-simpler picture is drawn by matplotlib, and the caller gets the reason.
+VTK kills the whole process if it finds neither a display nor EGL. Therefore it runs in a child process. If the child ends with an error,
+matplotlib draws a simpler picture, and the caller gets the reason.
 
-PyVista and matplotlib are imported by what draws with them: they take half a second, and many who import this module do not draw.
+PyVista and matplotlib are imported only by the functions that draw with them. The import takes half a second, and many users of this module
+do not draw.
 """
 
 import subprocess
@@ -34,7 +35,7 @@ WINDOW_PX = (1100, 900)
 CHILD_TIMEOUT_S = 120
 # Normal and a point (mm) of the plane whose front is cut away, so that the pins are visible.
 CUT_NORMAL, CUT_ORIGIN = (0.0, -1.0, 0.0), (0.0, -0.01, 0.0)
-# Advice in the message that VTK can't draw.
+# Remedy in the message that VTK can't draw.
 REMEDY = "install libegl1 and libgl1 (apt-get install libegl1 libgl1) for shaded 3D pictures"
 
 

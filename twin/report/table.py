@@ -20,7 +20,7 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Column:
-    """How the values of one key of the rows are shown.
+    """Format of a column: how the values of one key of the rows are shown.
 
     Attributes
     ----------

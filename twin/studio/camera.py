@@ -1,4 +1,4 @@
-"""The studio's camera: the picture of the dome alone is drawn or traced, and put into a frame whose rest no contact changes."""
+"""Draws or traces the picture of the dome alone, and inserts it into a frame whose other pixels no contact changes."""
 
 from dataclasses import replace
 
@@ -16,13 +16,13 @@ from twin.store import cached_arrays
 from twin.types import FloatArray, Form, Frame, ImageArray, PinState
 
 MARGIN_PX = 8
-"""Width of the border around the pipeline's mask that is drawn as well. Blur and thresholds look that far."""
+"""Width, px, of the border around the pipeline's mask that is also drawn, because blur and thresholds use pixels at this distance."""
 PARTS = (4, 2, 2)
-"""The passes of a path-traced picture: each takes the renderer's samples divided by this. The first is shown at once, then the mean."""
+"""Divisors of the renderer's samples, one for each pass of a path-traced picture. The first pass is shown at once, then the mean of all."""
 
 
 def dome_window(spec: SensorSpec) -> tuple[int, int, int, int]:
-    """The part (x0, y0, x1, y1) of the raw frame, end exclusive, in which contact changes anything that the pipeline looks at."""
+    """The part (x0, y0, x1, y1) of the raw frame, end exclusive, in which a contact changes pixels that the pipeline uses."""
     mask = spec.pipeline.raw
     x, y, reach = *mask.mask_center_px, mask.mask_radius_px + MARGIN_PX
     box = [x - reach, y - reach, x + reach, y + reach]
@@ -34,7 +34,7 @@ def dome_window(spec: SensorSpec) -> tuple[int, int, int, int]:
 
 
 def dome_part(spec: SensorSpec, image: ImageArray, form: Form) -> ImageArray:
-    """The dome's part of a raw frame; a recording's frame shows nothing else."""
+    """The dome's part of a raw frame. A recording's frame is returned whole, because it shows nothing else."""
     if form is Form.RECORDING:
         return image
     x0, y0, x1, y1 = dome_window(spec)
@@ -42,7 +42,7 @@ def dome_part(spec: SensorSpec, image: ImageArray, form: Form) -> ImageArray:
 
 
 def static_light(spec: SensorSpec) -> tuple[FloatArray, FloatArray]:
-    """Light and cover of the whole raw frame that no contact changes (``static_layer``), kept between runs."""
+    """Light and cover of the whole raw frame that no contact changes (``static_layer``). The result is stored for later runs."""
 
     def compute() -> dict[str, np.ndarray]:
         light, cover = static_layer(spec, (0, 0, spec.camera.width_px, spec.camera.height_px))
@@ -53,18 +53,18 @@ def static_light(spec: SensorSpec) -> tuple[FloatArray, FloatArray]:
 
 
 def dome_shading(spec: SensorSpec) -> Shading:
-    """The preview's shading by a path-traced frame at rest, kept between runs.
+    """The preview's shading, from a path-traced frame at rest. The result is stored for later runs.
 
     Raises
     ------
     RenderError
-        Nothing can be path-traced here.
+        This machine cannot path-trace.
     """
     return traced_shading(Preview(spec, window_px=dome_window(spec), static=in_window(static_light(spec), dome_window(spec))))
 
 
 def dome_renderer(spec: SensorSpec) -> Renderer:
-    """A path tracer of the dome's part of the frame, for contacts on the usual mesh or a finer one."""
+    """A path tracer of the dome's part of the frame, for contacts on the usual mesh or on a finer one."""
     return Renderer(spec, mesh=build_mesh(spec.geometry), window_px=dome_window(spec))
 
 
@@ -75,7 +75,7 @@ def in_window(planes: tuple[FloatArray, FloatArray], window_px: tuple[int, int, 
 
 
 class DomeCamera:
-    """Draws the dome, and makes frames of drawn or traced light.
+    """Draws the dome, and makes frames from drawn or traced light.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class DomeCamera:
         Raises
         ------
         FrameError
-            The sensor has no recordings' form.
+            The sensor has no recording form.
         """
         if self.spec.recording is None:
             raise FrameError(f"{self.spec.name} has no recordings' form; show raw frames")

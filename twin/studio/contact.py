@@ -1,7 +1,7 @@
-"""An object that is moved against a sensor, wish by wish: what the page shows, without the page.
+"""An object that is moved against a sensor according to the user's wishes. The module computes what the page shows, without the page.
 
-While the object moves, contacts are solved on the usual mesh and drawn. When it stands still, the same way is gone again on the fine
-mesh, and the picture is path-traced. Every answer belongs to one pose and says which of them it is.
+While the object moves, contacts are solved on the usual mesh and drawn. When it stands still, the same path is repeated on the fine mesh,
+and the picture is path-traced. Every answer belongs to one pose and states which mesh and which kind of picture it has.
 """
 
 import time
@@ -34,27 +34,27 @@ from twin.studio.pose import ObjectPose, bend_mm, motion_mm
 from twin.types import FINE, ContactState, FloatArray, Form, Frame, Observation
 
 RIM_MARGIN_MM = 5.0
-"""The object's deepest place stays this far above the rim's plane, where the skin is clamped."""
+"""Least height, mm, of the object's deepest point in contact above the rim's plane, where the skin is clamped."""
 MOST_LIFT_MM = 60.0
-"""Farthest that an object in an impossible place is lifted along the sensor's z until its place is possible."""
+"""Largest distance, mm, by which an object in an impossible place is lifted along the sensor's z."""
 HALVINGS = 14
-"""Halvings by which that lift is found: to 4 um."""
+"""Number of bisections by which this lift is found. They give it to 4 um."""
 SHELL_MM = 1.0
-"""Distance of the shells on which it is looked whether the object is deeper in the gel than it may be. Thinner objects slip through."""
+"""Distance, mm, of the shells inside the gel that are searched for objects that are too deep. Thinner objects are not noticed."""
 SHELL_POINTS = 800
-"""Places on the whole sphere of such a shell."""
+"""Number of points on each such shell, counted for the whole sphere."""
 SAME_MM = 1e-6
-"""Two poses whose matrices differ by less are one."""
+"""Largest difference of two pose matrices at which the poses count as equal."""
 FINE_STEP_MM = 1.0
-"""Longest piece of the way that the fine mesh goes in one load step."""
+"""Longest part of the path, mm, that the fine mesh covers in one load step."""
 FINE_BEND_MM = 0.05
-"""Farthest that poses of the way may lie from such a piece."""
+"""Largest distance, mm, of the path's poses from the straight motion over such a part."""
 KEPT_WAY = 2000
-"""Poses of a contact's way that are kept for the fine mesh. A longer way stays with the usual mesh."""
+"""Most poses of a contact's path that are stored for the fine mesh. A contact with a longer path has no answer on the fine mesh."""
 
 
 class Light(StrEnum):
-    """How a picture was made."""
+    """The method by which a picture was made."""
 
     DRAWN = "drawn"
     ROUGH = "path-traced, first pass"
@@ -62,7 +62,7 @@ class Light(StrEnum):
 
 
 class Mesh(StrEnum):
-    """On which mesh a contact was solved."""
+    """The mesh on which a contact was solved."""
 
     USUAL = "usual mesh"
     FINE = "fine mesh"
@@ -75,34 +75,34 @@ class Answer:
     Attributes
     ----------
     setup : Setup
-        What was moved against what.
+        The sensor, the object and the settings.
     number : int
-        Counts the answers.
+        Number of the answer.
     solved : int
-        Counts the solved contacts: answers with the same number differ in light, form or model alone.
+        Number of the solved contact. Answers with the same number differ only in light, form or model.
     pose : ObjectPose
-        Where the object is.
+        The object's pose.
     indent_mm : float
-        How deep the rigid object is inside the undeformed dome, negative outside it.
+        Depth of the rigid object inside the undeformed dome, negative outside it.
     state : ContactState
     light : (h, w) or (h, w, 3) float
         Linear light of the dome's part of the frame.
     raw : Frame
         The whole raw frame.
     frame, seen : Frame, Observation
-        The frame in the form that is shown, and what the pipeline saw in it.
+        The frame in the form that is shown, and the pipeline's observation of it.
     caps_px : (N, 2) float
-        Where the caps are in that frame.
+        Positions of the caps in that frame.
     estimate : Estimate or None
         None without a model.
     labels : dict of str to float
-        The true value of each estimated label that has one here.
+        The true value of each estimated label for which it is known.
     lit, mesh : Light, Mesh
-        How picture and contact were made.
+        How the picture and the contact were made.
     arrived : bool
-        Whether the object is where it was wished, or as near as it may go.
+        Whether the object has reached the wished pose, or the nearest possible one.
     stopped : str
-        Why it is not where it was wished ("" if it is, or is on the way).
+        Why it is not at the wished pose ("" if it is, or is still moving).
     ms : dict of str to float
         Time of each stage.
     """
@@ -129,14 +129,14 @@ class Answer:
 
 @dataclass(frozen=True)
 class Setup:
-    """What is moved against what, and what is looked at.
+    """The sensor, the object that is moved against it, and the settings of the view.
 
     Attributes
     ----------
     sensor : SensorSpec
     touched : ObjectSpec
     friction : float or None
-        In place of the object's own.
+        Value that replaces the object's own friction.
     form : Form
         Form of the frames that are shown.
     """
@@ -148,25 +148,25 @@ class Setup:
 
     @property
     def law(self) -> ContactLaw:
-        """How the two rub and give way: no arm holds the object."""
+        """The contact law of the pair. No arm holds the object, so nothing else gives way."""
         return ContactLaw.of_object(self.touched).override(friction=self.friction)
 
 
 class MovingContact:
-    """A sensor, an object, and where the object is.
+    """A sensor, an object, and the object's pose.
 
-    Not for several threads at once: the worker of the page owns it.
+    It is not thread-safe: only the page's worker may use it.
 
     Parameters
     ----------
     setup : Setup
     model : SensorModel, optional
-        Estimates the pose in each frame; it must be of the same sensor.
+        Estimates the pose in each frame; it must belong to the same sensor.
 
     Attributes
     ----------
     pose : ObjectPose
-        Where the object is.
+        The object's pose.
     """
 
     def __init__(self, setup: Setup, model: SensorModel | None = None) -> None:
@@ -178,7 +178,7 @@ class MovingContact:
         self._apex_mm = skin.apex_mm
         depths_mm = np.arange(deepest_mm(setup.sensor.geometry), max(skin.apex_mm, skin.apex_mm - setup.sensor.lens.z_mm), SHELL_MM)
         places = shape.even(SHELL_POINTS)
-        self._deep_mm = np.concatenate([shape.beneath(places, depth) for depth in depths_mm])  # where no object may reach
+        self._deep_mm = np.concatenate([shape.beneath(places, depth) for depth in depths_mm])  # points that no object may reach
         self._experiment: ExperimentSpec | None = None
         self.model: SensorModel | None = None
         self._count, self._solved = 0, 0
@@ -189,21 +189,21 @@ class MovingContact:
             self.use(model)
 
     def use(self, model: SensorModel) -> None:
-        """Estimate with a model from now on.
+        """Use this model for estimates from now on.
 
         Raises
         ------
         FrameError
-            The model is of another sensor.
+            The model belongs to another sensor.
         """
         model.check(self.setup.sensor, model.form)
         self.model = model
         self._experiment = experiment_of(model)
 
     def change(self, *, touched: ObjectSpec | None = None, friction: float | None = None, form: Form | None = None) -> None:
-        """Take another object, friction or form of the frames; what is not given stays. A contact is begun anew.
+        """Use another object, friction or form of the frames. Arguments that are not given stay as they are. A contact starts again.
 
-        With another object its own friction counts until one is given again.
+        Another object has its own friction until a friction is given again.
         """
         setup = self.setup
         if touched is not None:
@@ -213,7 +213,7 @@ class MovingContact:
         if form is not None:
             setup = replace(setup, form=form)
         if setup.form is Form.RECORDING and setup.sensor.recording is None:
-            self.camera.recorded(Frame(np.zeros((1, 1), np.uint8), Form.RAW))  # says that there is no such form
+            self.camera.recorded(Frame(np.zeros((1, 1), np.uint8), Form.RAW))  # raises the error that there is no such form
         pressed_anew = setup.touched != self.setup.touched or setup.friction != self.setup.friction
         if pressed_anew:
             self._take_up(setup)
@@ -227,7 +227,7 @@ class MovingContact:
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        """Forget the contact and its friction. The next move presses the object straight down to where it is."""
+        """Forget the contact and its friction. The next move presses the object straight down to its pose."""
         self._follower = Follower(self.solver, self.setup.touched, self.setup.law)
         self._T: FloatArray | None = None
         self._blocked: FloatArray | None = None
@@ -239,13 +239,13 @@ class MovingContact:
         self._refined, self._restarts = False, 0
 
     def warm_up(self) -> None:
-        """Load compiled code, so that the first move takes no longer than others."""
+        """Load compiled code, so that the first move is as fast as later ones."""
         self._follower.warm_up()
 
-    # where the object may go
+    # possible poses of the object
 
     def refusal(self, T: FloatArray) -> str:
-        """Why the object may not stand at ``T`` (4, 4), "" if it may."""
+        """Why the object may not have the pose ``T`` (4, 4); "" if it may."""
         if (self._field.distance((self._deep_mm - T[:3, 3]) @ T[:3, :3]) < 0).any():
             limit = deepest_mm(self.setup.sensor.geometry)
             return f"it would be more than {limit:.1f} mm inside the skin, which is half the gel's depth"
@@ -257,9 +257,9 @@ class MovingContact:
         return ""
 
     def admissible(self, wished: ObjectPose) -> tuple[FloatArray, str]:
-        """Where the object goes for a wish: ``T_sensor_object`` (4, 4), and why it is not the wish itself ("" if it is).
+        """The pose to which a wish moves the object: ``T_sensor_object`` (4, 4), and why it is not the wished pose ("" if it is).
 
-        An object in an impossible place is lifted along the sensor's z until its place is possible.
+        An object at an impossible place is lifted along the sensor's z until its place is possible.
         """
         within, reason = wished.within_limits()
         T = within.matrix(self._apex_mm)
@@ -273,7 +273,7 @@ class MovingContact:
         return _lifted(T, high), "; ".join(part for part in (reason, f"the object stops here: {why}") if part)
 
     def arrived(self, wished: ObjectPose) -> bool:
-        """Whether the object is where a wish takes it, or the solver found no way there."""
+        """Whether the object is at the pose to which a wish moves it, or the solver found no path there."""
         goal, _ = self.admissible(wished)
         return self._is_there(goal)
 
@@ -282,7 +282,7 @@ class MovingContact:
         return any(np.abs(T - goal).max() < SAME_MM for T in near)
 
     def _next(self, goal: FloatArray) -> FloatArray:
-        """The next pose (4, 4) on the straight way to a goal: in contact one load step on, in the free as far as nothing is touched."""
+        """The next pose (4, 4) on the straight path to a goal: one load step further in contact, else as far as nothing touches."""
         if self._T is None:
             return goal
         gap_mm = self._follower.gap_mm(self._T)
@@ -298,7 +298,7 @@ class MovingContact:
     # answers
 
     def step(self, wished: ObjectPose) -> Answer:
-        """Go one load step towards a wish, draw, and look. Where the solver finds nothing, the object stays and the answer says why."""
+        """Move one load step towards a wish, draw, and observe. If the solver finds nothing, the object stays and the answer says why."""
         started = time.perf_counter()
         goal, reason = self.admissible(wished)
         T, now = self._next(goal), time.monotonic()
@@ -319,7 +319,7 @@ class MovingContact:
         return self._answer(T, state, Mesh.USUAL, arrived=arrived, stopped=stopped, ms={"contact": solved_ms})
 
     def traced(self, solved: int, light: FloatArray, lit: Light, traced_ms: float) -> Answer | None:
-        """The newest answer with path-traced light (h, w) or (h, w, 3) of a contact; None if it is no longer the newest contact."""
+        """The newest answer with path-traced light (h, w) or (h, w, 3) of a contact; None if a newer contact was solved since."""
         last = self._last
         if last is None or last.solved != solved:
             return None
@@ -327,7 +327,7 @@ class MovingContact:
         return self.again()
 
     def refine(self) -> Answer | None:
-        """Go one piece of the contact's way on the fine mesh; at its end the fine answer, None before."""
+        """Cover one part of the contact's path on the fine mesh. Returns the answer at the path's end; None before."""
         if self.refined or self._last is None or self._T is None:
             return None
         if self._fine_solver is None:
@@ -358,17 +358,17 @@ class MovingContact:
 
     @property
     def refined(self) -> bool:
-        """Whether there is nothing to do on the fine mesh: no contact, done, lost, or a way that is too long."""
+        """Whether there is nothing to do on the fine mesh: no contact, or a finished or failed one, or a path that is too long."""
         free = self._T is None or self._last is None or not len(self._last.state.contact_mm)
         return free or self._refined or bool(self._fine_lost)
 
     @property
     def fine_lost(self) -> str:
-        """Why this contact has no answer on the fine mesh, "" if it has or may have one."""
+        """Why this contact has no answer on the fine mesh; "" if it has one or may still get one."""
         return self._fine_lost
 
     def again(self) -> Answer | None:
-        """The newest answer anew: after a change of form or model; None before the first."""
+        """The newest answer, computed again after a change of form or model; None before the first answer."""
         last = self._last
         if last is None:
             return None
@@ -377,7 +377,7 @@ class MovingContact:
         return self._answer(T, last.state, last.mesh, traced, arrived=last.arrived, stopped=last.stopped, ms=last.ms)
 
     def _remember(self, T: FloatArray) -> None:
-        """Keep the way for the fine mesh. A contact's way begins at the last free pose, or where the contact was begun anew."""
+        """Store the path for the fine mesh. A contact's path begins at the last free pose, or where the contact was started again."""
         begun_anew = self._T is None or self._blocked is not None or self._follower.restarts != self._restarts
         self._blocked, self._refined, self._restarts = None, False, self._follower.restarts
         if begun_anew or self._follower.gap_mm(T) >= 0:
@@ -436,7 +436,7 @@ class MovingContact:
         return self._last
 
     def labels(self, T: FloatArray) -> dict[str, float]:
-        """The true value of each of the model's labels that has one with the object at ``T`` (4, 4); empty without a model."""
+        """The true values of the model's labels with the object at ``T`` (4, 4), as far as they are defined; empty without a model."""
         experiment, sensor = self._experiment, self.setup.sensor
         if experiment is None or self.model is None:
             return {}
@@ -447,9 +447,9 @@ class MovingContact:
 
 
 def experiment_of(model: SensorModel) -> ExperimentSpec | None:
-    """The first shipped experiment whose labels are those that a model estimates; None if there is none.
+    """The first shipped experiment with a plane whose labels are those that a model estimates; None if there is none.
 
-    Its axes and zero say what the labels mean.
+    Its axes and its zero define the labels.
     """
     names = set(getattr(model, "names", ()))
     for name in sorted(list_experiments()):

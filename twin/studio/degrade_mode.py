@@ -1,4 +1,4 @@
-"""The mode 'Degrade': the contact of the mode 'Twin', seen by a sensor that something is wrong with."""
+"""The mode 'Degrade': the contact of the mode 'Twin', seen by a degraded sensor."""
 
 import time
 from dataclasses import dataclass
@@ -24,28 +24,28 @@ from twin.studio.twin_mode import TwinMode
 from twin.types import Form, Frame, Observation
 
 SLIDERS = 3
-"""Conditions that can act at once, each at a severity of its own."""
+"""Number of conditions that can act at once, each with its own severity."""
 NO_CONDITION = "nothing"
-"""Choice of a slider that does nothing."""
+"""Name of the choice for a slider without a condition."""
 FIRST = ("defocus", "caps-missing", "camera-rolled")
-"""Conditions that are offered at first, where they exist."""
+"""Conditions that are selected at first, if they exist."""
 
 
 def offered() -> dict[str, Condition]:
-    """The conditions that can act on a contact as it is, by their titles: not those of the mechanics and of the pipeline's settings."""
+    """The selectable conditions by title. Those that change mechanics or pipeline settings are left out, as the contact is given."""
     return {f"{c.title} ({c.family})": c for c in CONDITIONS.values() if not c.solves and c.setting is None}
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A degraded frame, and what pipeline and model make of it.
+    """A degraded frame, and the results of pipeline and model for it.
 
     Attributes
     ----------
     shot : DegradedShot
     seen : Observation
     figures : dict of str to float
-        By the names of ``MEASURES``.
+        Values by the names of ``MEASURES``.
     failed : tuple of str
         Titles of the measures beyond their limits.
     estimate : Estimate or None
@@ -59,12 +59,12 @@ class Judged:
 
 
 class Judge:
-    """Degrades contacts of one sensor and judges what is found, as ``twin robustness`` does.
+    """Degrades contacts of one sensor and judges the results as ``twin robustness`` does.
 
     Parameters
     ----------
     mode : TwinMode
-        Whose contact it is.
+        The mode whose contact is used.
     """
 
     def __init__(self, mode: TwinMode) -> None:
@@ -77,7 +77,7 @@ class Judge:
         self.limits = {m.name: m.limit * (pitch_px if m.in_pitches else 1.0) for m in MEASURES}
 
     def __call__(self, answer: Answer, cases: list[tuple[Case, float]], shading: Shading) -> Judged:
-        """A contact under cases, each at its severity."""
+        """Judge a contact with cases, each at its severity."""
         touched = bool(len(answer.state.contact_mm))
         shot = degraded_state(self.spec, answer.state, cases, shading=shading, touched=touched)
         figures = judge_shot(self._detector, self._detector(shot.frame), shot)
@@ -133,7 +133,7 @@ class DegradeMode(PageMode):
         self._wanted.give(None)
 
     def follow(self, answer: Answer) -> None:
-        """The twin's contact has changed."""
+        """Use the twin's new contact."""
         if self._active:
             if answer.pose != self._pose:
                 self._edge = ""
@@ -167,7 +167,7 @@ class DegradeMode(PageMode):
         self._pose = answer.pose
         if self._finding:
             self._edge = self._edge_of(judge, answer, shading)
-            self._finding = not self._edge  # something newer came: again for that
+            self._finding = not self._edge  # a newer contact came, so the search must be repeated for it
         cases = self.cases()
         judged = judge(answer, cases, shading)
         ms = 1e3 * (time.perf_counter() - started)
@@ -188,7 +188,7 @@ class DegradeMode(PageMode):
         self.put_up((camera, cells), "camera, raw frame, degraded", numbers)
 
     def _edge_of(self, judge: Judge, answer: Answer, shading: Shading) -> str:
-        """Where this contact leaves the envelope as the first chosen condition grows, in words."""
+        """The severity of the first chosen condition at which this contact leaves the envelope, in words."""
         cases = self.cases()
         if not cases:
             self._finding = False

@@ -1,6 +1,6 @@
-"""Episodes of an environment on a page: each step's picture, pins, object, force and reward as they come.
+"""Shows episodes of an environment on a page: picture, pins, object, force and reward of each step.
 
-Steps are handed in; this package knows no environment.
+The caller hands in the steps; this package does not depend on the environments.
 """
 
 from contextlib import ExitStack
@@ -24,25 +24,25 @@ from twin.types import FloatArray, Form, Frame, PinState
 
 @dataclass(frozen=True)
 class EpisodeStep:
-    """What is shown of a step.
+    """The shown data of a step.
 
     Attributes
     ----------
     number : int
-        Steps done in the episode; 0 is its beginning.
+        Number of steps done in the episode; 0 at its beginning.
     frame : Frame
         The sensor's picture.
     pins : PinState
     touched : ObjectSpec
     T_sensor_object : (4, 4) float
     force_n : (3,) float
-        Of the skin on the object.
+        Force of the skin on the object.
     foot_mm : (3,) float
-        Where its arrow begins.
+        Start of the force's arrow.
     reward : float
-        Of this step.
+        Reward of this step.
     told : dict of str to str
-        Names and values that are told besides.
+        Names and values of further data to show.
     """
 
     number: int
@@ -57,14 +57,14 @@ class EpisodeStep:
 
 
 class EpisodeMode(PageMode):
-    """The mode 'Episode'. Of several steps that come at once the newest is shown.
+    """The mode 'Episode'. If several steps arrive at once, only the newest is shown.
 
     Parameters
     ----------
     page : Page
     sensor : SensorSpec
     form : Form
-        Of the frames.
+        Form of the frames.
     """
 
     title = "Episode"
@@ -73,7 +73,7 @@ class EpisodeMode(PageMode):
         super().__init__(page)
         self._sensor, self._rest = sensor, rest_pins(sensor.geometry)
         self._pipeline, self._reference = Pipeline(sensor, form), nominal_reference(sensor, form)
-        self._skin = SkinSurface(sensor.skin, self._rest.base_mm)  # between the pins' feet: not every backend knows the skin
+        self._skin = SkinSurface(sensor.skin, self._rest.base_mm)  # interpolated between the pins' feet, because some backends give no skin
         self._scene = PinScene(page.server, sensor, Surface(self._skin.rest_mm.astype(np.float32), self._skin.faces), self._rest)
         self._touched: ObjectSpec | None = None
         self._last: EpisodeStep | None = None
@@ -83,12 +83,12 @@ class EpisodeMode(PageMode):
             self._forces = Chart(page.gui, "force on the object, N", ("x", "y", "z"))
 
     def give(self, step: EpisodeStep) -> None:
-        """Show a step next; returns at once."""
+        """Give the next step to show. Returns at once."""
         self._last = step
         self._steps.give(step)
 
     def show(self) -> None:
-        """Show the newest step again, or that there is none yet."""
+        """Show the newest step again, or a message that there is none yet."""
         if self._last is None:
             self._page.show_nothing("Waiting for the first step.")
         else:
@@ -121,14 +121,14 @@ class EpisodeMode(PageMode):
 
 
 class EpisodePage:
-    """A page that shows the steps of episodes, to any number of browsers. A context manager.
+    """A page that shows the steps of episodes to any number of browsers. A context manager.
 
     Parameters
     ----------
     title : str
     sensor : SensorSpec
     form : Form
-        Of the frames.
+        Form of the frames.
     host, port : str, int
         As for ``Page``.
 
@@ -140,7 +140,7 @@ class EpisodePage:
     Raises
     ------
     TwinError
-        On entering: nothing can listen there.
+        When the context is entered: the server can't listen on this host and port.
     """
 
     def __init__(self, title: str, sensor: SensorSpec, form: Form, *, host: str = "127.0.0.1", port: int = 0) -> None:

@@ -1,6 +1,6 @@
-"""The mode 'Live': a real camera, and an arm if there is one, on the same page.
+"""The mode 'Live': a real camera and, if there is one, an arm.
 
-Camera and arm are handed in (``LiveFeed``, ``LiveArm``); this package knows no device.
+Camera and arm are handed in (``LiveFeed``, ``LiveArm``); this package does not depend on the devices.
 """
 
 import threading
@@ -20,11 +20,11 @@ from twin.studio.pictures import badge, paragraph
 from twin.studio.twin_mode import TwinMode
 
 NUDGES = ("x -1", "x +1", "y -1", "y +1", "z -1", "z +1")
-"""Moves of an armed arm, mm in its base frame."""
+"""Moves that an armed arm can be given, mm in its base frame."""
 
 
 class LiveArm(Protocol):
-    """An arm that is watched, and moved only while it is armed."""
+    """An arm that is shown, and that moves only while it is armed."""
 
     name: str
 
@@ -33,10 +33,10 @@ class LiveArm(Protocol):
         """Whether the user has armed it."""
 
     def words(self) -> str:
-        """Where it is and how it is, for people."""
+        """The arm's pose and state, as text."""
 
     def limits(self) -> str:
-        """What it may do once it is armed, for people."""
+        """The arm's limits once it is armed, as text."""
 
     def arm(self) -> None:
         """Enable it. Raises ``TwinError`` if it refuses."""
@@ -52,30 +52,30 @@ class LiveArm(Protocol):
 
 
 class LiveFeed(Protocol):
-    """A camera that delivers, with the model that looks at its frames."""
+    """A camera that delivers frames, with a model that evaluates them."""
 
     name: str
     model: SensorModel
 
     @property
     def robot(self) -> LiveArm | None:
-        """The arm, if there is one."""
+        """The arm; None if there is none."""
 
     def start(self, on_shot: Callable[[LiveShot], None], on_end: Callable[[str], None]) -> None:
-        """Connect and deliver from a thread; ``on_end`` is told why it ended."""
+        """Connect, and deliver frames from a thread. When it ends, ``on_end`` is called with the reason."""
 
     def stop(self) -> None:
-        """End, and let go of camera and arm."""
+        """End, and release camera and arm."""
 
     def record(self, folder: Path) -> None:
-        """Keep every frame and estimate from now on in a new folder."""
+        """Store every frame and estimate from now on in a new folder."""
 
     def end_record(self) -> str:
-        """End that; what was written, in words."""
+        """End the recording; returns what was written, in words."""
 
 
 FeedOpener = Callable[[str, str, SensorModel], LiveFeed]
-"""From what a user writes for camera and arm ("" for none), and a model, to a feed that is not started yet."""
+"""Function from the user's texts for camera and arm ("" for none) and a model to a feed that is not started yet."""
 
 
 class LiveMode(PageMode):
@@ -85,12 +85,12 @@ class LiveMode(PageMode):
     ----------
     page : Page
     twin : TwinMode
-        Whose model is used.
+        The mode whose model is used.
     open_feed : callable
     out : Path
         Folder for sessions.
     camera, arm : str
-        What to offer at first.
+        Texts that are offered at first.
     """
 
     title = "Live"
@@ -99,7 +99,7 @@ class LiveMode(PageMode):
         super().__init__(page)
         self._twin, self._open_feed, self._out = twin, open_feed, out
         self._feed: LiveFeed | None = None
-        self._connecting = threading.RLock()  # the page calls from many threads, and a feed that is forgotten keeps its arm
+        self._connecting = threading.RLock()  # the page calls from many threads, and a feed that is forgotten would keep its arm
         self._pipeline: Pipeline | None = None
         self._health: list[str] = []
         self._last: LiveShot | None = None
@@ -128,22 +128,22 @@ class LiveMode(PageMode):
         self._chart = live_chart(page)
 
     def stop(self) -> None:
-        """End; camera and arm are let go of."""
+        """End, and release camera and arm."""
         self.disconnect()
         super().stop()
 
     def show(self) -> None:
-        """Show the camera, which is connected now if the command named it."""
+        """Show the camera. If the command named a camera, it is connected now."""
         self._page.show_nothing("Give a camera and press 'Connect'.")
         with self._connecting:
             absent = self._feed is None and bool(self._camera.value)
             if absent:
                 self._page.guarded(self.connect)(self)
-        if not absent and self._last is not None:  # it came before the mode was entered, or since the mode was left
+        if not absent and self._last is not None:  # this frame came before the mode was entered, or after it was left
             self._shots.give(self._last)
 
     def connect(self) -> None:
-        """Connect what the user has written.
+        """Connect the camera and the arm that the user named.
 
         Raises
         ------
@@ -164,13 +164,13 @@ class LiveMode(PageMode):
             self._limits.content = "" if feed.robot is None else paragraph(f"{feed.robot.name}: {feed.robot.limits()}", "note")
 
     def disconnect(self) -> None:
-        """Let go of camera and arm."""
+        """Release camera and arm."""
         with self._connecting:
             feed, self._feed, self._last = self._feed, None, None
             try:
                 if feed is not None and self._record.value:
                     self._page.say(feed.end_record())
-            finally:  # a recording that can't be ended leaves no arm armed
+            finally:  # even if the recording can't be ended, the arm does not stay armed
                 for control in (self._record, self._armed):
                     put(control, False)
                 self._nudges.visible = False
@@ -178,7 +178,7 @@ class LiveMode(PageMode):
                     feed.stop()
 
     def emergency_stop(self) -> None:
-        """Stop the arm. It is never refused."""
+        """Stop the arm. This is never refused."""
         if self._feed is None or self._feed.robot is None:
             raise TwinError("no arm is connected")
         self._feed.robot.emergency_stop()
@@ -187,7 +187,7 @@ class LiveMode(PageMode):
         self._page.say("The arm was stopped and its power cut. Look at it, then arm it again.", bad=True)
 
     def check_health(self) -> None:
-        """Say how the sensor is, from the newest frame."""
+        """Show the sensor's condition, judged from the newest frame."""
         if self._last is None or self._feed is None:
             raise TwinError("there is no frame yet; connect a camera first")
         findings = examine([self._last.frame], self._feed.model.sensor)

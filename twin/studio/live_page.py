@@ -1,6 +1,7 @@
-"""Live frames on a page: pictures, estimate and rates as they come. ``twin live`` opens it; the studio's mode 'Live' shows the same.
+"""Shows live frames on a page: pictures, estimate and rates as they arrive. ``twin live`` opens it; the studio's mode 'Live' shows the
+same.
 
-Frames and estimates are handed in; this package knows no device.
+Frames and estimates are handed in; this package does not depend on the devices.
 """
 
 from contextlib import ExitStack
@@ -20,7 +21,7 @@ CHARTED = 3
 
 @dataclass(frozen=True)
 class LiveShot:
-    """A live frame, what the model makes of it, and lines about rates and losses."""
+    """A live frame, the model's estimate, and lines about rates and losses."""
 
     frame: Frame
     estimate: Estimate
@@ -35,13 +36,13 @@ def shot_pictures(sensor: SensorSpec, reference: Reference, frame: Frame, seen: 
 
 
 def shot_numbers(shot: LiveShot, seen: Observation) -> list[str]:
-    """HTML of the estimate, the pins that were found, and the lines."""
+    """HTML of the estimate, the number of found pins, and the lines."""
     found = f"pins found: {seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}")
     return [estimate_table(shot.estimate, {}), *(paragraph(line, "note") for line in (found, *shot.lines))]
 
 
 def charted(estimate: Estimate) -> list[float]:
-    """The values that the chart shows, NaN where there is none."""
+    """The values for the chart; NaN where there is none."""
     values = [float(value) for value in estimate.value[:CHARTED]] if estimate.valid else []
     return values + [float("nan")] * (CHARTED - len(values))
 
@@ -53,21 +54,21 @@ def live_chart(page: Page) -> Chart:
 
 
 class LivePage:
-    """A page that shows what it is given, to any number of browsers. A context manager.
+    """A page that shows live frames to any number of browsers. A context manager.
 
     Parameters
     ----------
     title : str
     sensor : SensorSpec
     reference : Reference
-        Where the pins are without contact.
+        Pins at rest.
     host, port : str, int
         As for ``Page``.
 
     Raises
     ------
     TwinError
-        On entering: nothing can listen there.
+        When the context is entered: the server can't listen on this host and port.
     """
 
     def __init__(self, title: str, sensor: SensorSpec, reference: Reference, *, host: str = "127.0.0.1", port: int = 0) -> None:
@@ -87,7 +88,7 @@ class LivePage:
         self._stack.close()
 
     def show(self, shot: LiveShot, seen: Observation) -> None:
-        """Show a frame with what the pipeline saw in it; browsers get pictures and numbers together."""
+        """Show a frame with the pipeline's observation of it. Browsers get pictures and numbers together."""
         pictures = shot_pictures(self._sensor, self._reference, shot.frame, seen)
         numbers = [badge("live", "moving"), paragraph(self._title, "note"), *shot_numbers(shot, seen)]
 

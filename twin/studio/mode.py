@@ -1,4 +1,4 @@
-"""Base of the page's modes: a folder of controls, threads, and whether the mode shows its pictures."""
+"""Base class of the page's modes: it holds the mode's controls and threads, and its pictures are shown only while the mode is chosen."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class PageMode(ABC):
-    """One of the page's modes. It works in threads of its own, and shows something only while it is the one that the user has chosen.
+    """One of the page's modes. It works in its own threads, and shows results only while the user has chosen it.
 
     Parameters
     ----------
@@ -21,9 +21,9 @@ class PageMode(ABC):
     Attributes
     ----------
     title : str
-        By which the user chooses it.
+        Name by which the user chooses the mode.
     folder : viser.GuiFolderHandle
-        Its controls, seen only while it is chosen.
+        The mode's controls, visible only while it is chosen.
     """
 
     title: ClassVar[str]
@@ -34,13 +34,13 @@ class PageMode(ABC):
         self._threads: list[Newest[Any]] = []
 
     def newest(self, take: Callable[[T], None], name: str) -> Newest[T]:
-        """A thread ``studio-NAME`` that begins and ends with the mode; what ``take`` finds wrong is said on the page."""
+        """A thread ``studio-NAME`` that starts and stops with the mode. Errors of ``take`` are shown on the page."""
         thread = Newest(take, f"studio-{name}", self.complain)
         self._threads.append(thread)
         return thread
 
     def start(self) -> None:
-        """Begin to work."""
+        """Start to work."""
         for thread in self._threads:
             thread.start()
 
@@ -50,20 +50,20 @@ class PageMode(ABC):
             thread.stop()
 
     def enter(self) -> None:
-        """The user has chosen the mode: the pictures are its own from now on."""
+        """The user has chosen the mode. From now on the pictures are those of this mode."""
         self._active = True
         self.show()
 
     def leave(self) -> None:
-        """The user has chosen another mode. What is going on goes on, unseen."""
+        """The user has chosen another mode. Work in progress continues, but is not shown."""
         self._active = False
 
     @abstractmethod
     def show(self) -> None:
-        """Show what there is."""
+        """Show the newest results."""
 
     def complain(self, text: str) -> None:
-        """Say what is wrong."""
+        """Show an error."""
         self._page.say(text, bad=True)
 
     def put_up(
@@ -75,7 +75,7 @@ class PageMode(ABC):
         below: str = CELLS,
         also: Callable[[], None] = lambda: None,
     ) -> None:
-        """Show two pictures (h, w, 3) RGB and numbers, and do ``also``, if the mode is still chosen. Browsers get all of it together."""
+        """Show two pictures (h, w, 3) RGB and numbers, and call ``also``, if the mode is still chosen. Browsers get all of it together."""
 
         def change() -> None:
             if self._active:

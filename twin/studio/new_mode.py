@@ -1,4 +1,4 @@
-"""The mode 'Your own sensor': from a folder of frames to a specification, with the layout drawn over the frames, and corrected by hand."""
+"""The mode 'Your own sensor': it makes a specification from a folder of frames, and the user can correct the layout."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +20,12 @@ from twin.studio.state import next_path
 from twin.studio.twin_mode import TwinMode
 
 LARGER, SMALLER = "one larger", "one smaller"
-"""Corrections of a layout: a ring more or less; for a grid a row and a column."""
+"""Corrections of a layout: one ring more or less, or for a grid one row and one column."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """What to make a specification of.
+    """The user's input for a specification.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Wish:
     no_contact : str
         A frame without contact, "" for none.
     layout : str
-        As ``layout_from`` takes it, "" to have it identified.
+        Text for ``layout_from``; "" to have the layout identified.
     """
 
     frames: str
@@ -43,12 +43,12 @@ class Wish:
 
 
 def corrected(pins: PinsSpec, by: int) -> str:
-    """A layout like another one, larger or smaller by one ring (a grid: by one row and column), as ``layout_from`` takes it.
+    """A layout that is larger or smaller by one ring (a grid: by one row and column), as text for ``layout_from``.
 
     Raises
     ------
     SpecError
-        The layout is a list of positions, or there is none so small.
+        The layout is a list of positions, or would become too small.
     """
     if pins.layout == "positions":
         raise SpecError("a layout of given positions has no rings; correct its CSV file")
@@ -56,7 +56,7 @@ def corrected(pins: PinsSpec, by: int) -> str:
         text = f"grid:{(pins.columns or 0) + by}x{(pins.rows or 0) + by}"
     else:
         text = f"{pins.layout}:{(pins.rings or 0) + by}"
-    layout_from(text)  # raises an error if there is none
+    layout_from(text)  # raises an error if there is no such layout
     return text
 
 
@@ -67,7 +67,7 @@ class NewMode(PageMode):
     ----------
     page : Page
     twin : TwinMode
-        Takes the new sensor up.
+        The mode in which the new sensor is used.
     out : Path
         Folder for specifications.
     """
@@ -104,7 +104,7 @@ class NewMode(PageMode):
             self._looking.give(int(self._number.value))
 
     def propose(self) -> None:
-        """Make a specification from what the user has written. The answer takes from some seconds to half a minute.
+        """Make a specification from the user's input. This takes some seconds to half a minute.
 
         Raises
         ------
@@ -116,7 +116,7 @@ class NewMode(PageMode):
         self._making.give(Wish(self._frames.value.strip(), self._no_contact.value.strip(), self._layout.value.strip()))
 
     def correct(self, by: int) -> None:
-        """Propose anew with a layout that is larger or smaller by ``by``.
+        """Propose again with a layout that is larger or smaller by ``by``.
 
         Raises
         ------
@@ -127,7 +127,7 @@ class NewMode(PageMode):
         self.propose()
 
     def use(self) -> None:
-        """Take the proposed sensor up in the mode 'Twin'.
+        """Use the proposed sensor in the mode 'Twin'.
 
         Raises
         ------
@@ -144,7 +144,7 @@ class NewMode(PageMode):
         return self._made
 
     def _slid(self, event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
-        if event.client is not None:  # else it is this program that moves the slider
+        if event.client is not None:  # otherwise this program moved the slider
             self._looking.give(int(event.target.value))
 
     def _make(self, wish: Wish) -> None:
@@ -182,7 +182,7 @@ class NewMode(PageMode):
 
 
 def _numbers(made: NewSensor, frame: str, found: str, sensor: SensorSpec) -> list[str]:
-    """HTML of a proposal: how sure it is, what speaks against it, how it does on the frames, and what to do next."""
+    """HTML of a proposal: how certain it is, doubts, its results on the frames, and the next steps."""
     sure = made.identified.sure
     rows = {"layout": sensor.pins.in_words(), "frame": frame, "pins found": found, "file": made.written[0].name}
     lines = made.lines()

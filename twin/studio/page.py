@@ -1,4 +1,4 @@
-"""The page's frame: server, panels, pictures, numbers, charts, and the choice of the mode."""
+"""The page: server, panels, pictures, numbers, charts, and the choice of the mode."""
 
 import errno
 import socket
@@ -27,33 +27,33 @@ from twin.types import ImageArray
 LOCAL = ("127.0.0.1", "localhost", "::1")
 """Hosts that only this machine reaches."""
 PORTS_TRIED, MOST_PORT = 100, 65535
-"""Number of ports that are tried one after the other, and the largest port."""
+"""Number of consecutive ports that are tried, and the largest port."""
 PICTURES_PX, CONTROLS_PX = 330, 350
-"""Widths of the panels with the pictures and with the controls."""
+"""Widths, px, of the panels with the pictures and with the controls."""
 JPEG_QUALITY = 88
 """Quality of the JPEG pictures in the page."""
 CELLS = "Voronoi cells: blue smaller, red larger"
-"""Content of the second picture at the start."""
+"""Caption of the second picture at the start."""
 SPAN_S = 20.0
 """Time that the charts show, s."""
 CHART_S = 0.25
 """Shortest interval in s between two drawings of the charts."""
 CHART_PX = 165
-"""Height of a chart."""
+"""Height of a chart, px."""
 LINES = ("#4dabf7", "#ff922b", "#51cf66", "#f06595", "#ffd43b", "#845ef7")
 """Colours of a chart's lines."""
 CHANGE_S = 10.0
-"""Longest wait in s for changes of the page."""
+"""Longest wait, s, for changes of the page."""
 SAID_S = 12.0
-"""Time in s for which a message stays."""
+"""Time, s, for which a message is shown."""
 
 
 class Mode(Protocol):
-    """What the page knows of a mode."""
+    """Interface of a mode for the page."""
 
     @property
     def title(self) -> str:
-        """By which the user chooses it."""
+        """Name by which the user chooses the mode."""
 
     folder: viser.GuiFolderHandle
 
@@ -70,17 +70,17 @@ def put(control: viser.GuiInputHandle[Any], value: object) -> None:
 
 
 class _Server(viser.ViserServer):
-    """viser's server without its tunnel to a server elsewhere."""
+    """viser's server without its tunnel to an external server."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """No address outside this machine is ever made."""
+        """Does nothing, so that the page never gets an address outside this machine."""
         return None
 
 
 def refuse_foreign_pages(server: viser.ViserServer, hosts: Sequence[str]) -> None:
-    """Close connections of pages that other sites have served, or that reached this server under a foreign name.
+    """Close connections of pages that come from other sites, or that used a host name not in ``hosts``.
 
-    A browser lets any site open a websocket to this machine, and it tells in ``Origin`` which site it is.
+    A browser lets any site open a websocket to this machine. It states the site in the header ``Origin``.
     """
     websocket_server = server._websock_server
 
@@ -99,9 +99,10 @@ def refuse_foreign_pages(server: viser.ViserServer, hosts: Sequence[str]) -> Non
 
 @contextmanager
 def told_addresses(tell: Callable[[str], None]) -> Iterator[None]:
-    """A server of viser that is made here tells the address of each page that is loaded, if it has a query: viser itself reads none.
+    """Context in which a new viser server reports the address of each loaded page that has a query.
 
-    A page of another site is not heard: it could load this page with any query, unseen. A browser tells so in ``Sec-Fetch-Site``.
+    viser itself ignores queries. Requests from pages of other sites are ignored, because such a page could load this page with any query
+    without the user's knowledge. The browser states the origin in ``Sec-Fetch-Site``.
     """
     serve = websockets.asyncio.server.serve
 
@@ -122,9 +123,9 @@ def told_addresses(tell: Callable[[str], None]) -> Iterator[None]:
 
 
 def free_port(host: str, port: int) -> int:
-    """The port, or the next one above it on which this machine can listen; 0 stays 0.
+    """The port, or the next larger one on which this machine can listen; 0 stays 0.
 
-    viser itself would try a thousand ports, and then wait for ever.
+    viser itself would try a thousand ports, and then wait forever.
 
     Raises
     ------
@@ -142,7 +143,7 @@ def free_port(host: str, port: int) -> int:
 
 
 class Chart:
-    """Lines over the last seconds.
+    """Chart of lines over the last seconds.
 
     Parameters
     ----------
@@ -150,7 +151,7 @@ class Chart:
     title : str
     names : sequence of str
     dashed : sequence of str
-        Those of them that are drawn dashed.
+        Names of the lines that are drawn dashed.
     """
 
     def __init__(self, gui: viser.GuiApi, title: str, names: Sequence[str], *, dashed: Sequence[str] = ()) -> None:
@@ -172,7 +173,7 @@ class Chart:
         self._count = len(names)
 
     def add(self, values: Sequence[float]) -> None:
-        """Add the values of now, NaN where there is none."""
+        """Add the present values, NaN where there is none."""
         now = time.monotonic()
         self._points.append((now, list(values)))
         while self._points[0][0] < now - SPAN_S:
@@ -190,30 +191,30 @@ class Chart:
 
 
 class Page:
-    """The page, served to any number of browsers, which all see the same state. A context manager.
+    """The page, served to any number of browsers, which all show the same state. A context manager.
 
     Parameters
     ----------
     title : str
     host, port : str, int
-        Where to listen. If the port is taken, the next free one is used, see ``url``.
+        Address on which to listen. If the port is used already, the next free one is taken, see ``url``.
 
     Attributes
     ----------
     on_address : callable
-        Called with path and query of the address of each page that is loaded with a query; in the server's event loop.
+        Called in the server's event loop with path and query of the address of each page that is loaded with a query.
 
     Raises
     ------
     TwinError
-        Nothing can listen there.
+        The server can't listen on this host and port.
     """
 
     def __init__(self, title: str, *, host: str, port: int) -> None:
         self.on_address: Callable[[str], None] = lambda address: None
         try:
             port = free_port(host, port)
-            with redirect_stdout(StringIO()), told_addresses(lambda address: self.on_address(address)):  # it prints its own addresses
+            with redirect_stdout(StringIO()), told_addresses(lambda address: self.on_address(address)):  # viser prints its own addresses
                 self.server = _Server(host=host, port=port, label=title, verbose=False)
         except (OSError, RuntimeError) as error:
             raise TwinError(f"--host {host} --port {port}: can't listen there ({error}); give another --host or --port") from error
@@ -250,7 +251,7 @@ class Page:
         return self._modes[self._mode]
 
     def set_modes(self, modes: Sequence[Mode]) -> None:
-        """Offer modes; the first one is entered."""
+        """Offer these modes, and enter the first one."""
         self._modes = {mode.title: mode for mode in modes}
         if self._choice is not None:
             self._choice.options = tuple(self._modes)
@@ -262,7 +263,7 @@ class Page:
         self.choose(modes[0].title)
 
     def add_mode_choice(self, titles: Sequence[str]) -> None:
-        """Put the control in which the user chooses a mode here."""
+        """Create the control in which the user chooses a mode."""
         self._choice = self.gui.add_dropdown("mode", tuple(titles), initial_value=titles[0])
 
     def choose(self, title: str) -> None:
@@ -279,26 +280,26 @@ class Page:
         self.mode.enter()
 
     def show_pictures(self, camera: ImageArray, below: ImageArray, label: str, label_below: str = CELLS) -> None:
-        """Show two pictures (h, w, 3) RGB with what they are."""
+        """Show two pictures (h, w, 3) RGB with their captions."""
         self._camera.label, self._cells.label = label, label_below
         self._camera.image, self._cells.image = camera, below
 
     def show_nothing(self, why: str) -> None:
-        """Take pictures and numbers of another mode away, and say what is to come."""
+        """Remove pictures and numbers of another mode, and show the reason or what will follow."""
         empty = np.zeros((8, 8, 3), np.uint8)
         self.show_pictures(empty, empty, "no picture yet", "")
         self.show_numbers(paragraph(why, "note"))
 
     def show_numbers(self, *parts: str) -> None:
-        """Show pieces of HTML above the controls."""
+        """Show parts of HTML above the controls."""
         self._numbers.content = boxed(*parts)
         if self._said.visible and time.monotonic() > self._forget_s:
             self._said.visible = False
 
     def together(self, change: Callable[[], None]) -> None:
-        """Make changes that all browsers get at once, never a part of them, and wait until they are made.
+        """Make changes that all browsers get at once, and wait until they are made.
 
-        They are made in the server's event loop, which therefore can't send in between.
+        They are made in the server's event loop. Therefore the server can't send a part of them in between.
         """
         done: Future[None] = Future()
 
@@ -317,7 +318,7 @@ class Page:
         self.server.flush()
 
     def guarded(self, action: Callable[[], None]) -> Callable[[object], None]:
-        """A callback of a control that does an action, and says what the user did wrong. Changes by this program do nothing."""
+        """A callback of a control that calls ``action`` and shows the user's errors. Changes that this program makes do nothing."""
 
         def called(event: object) -> None:
             if getattr(event, "client", self) is None:
@@ -330,7 +331,7 @@ class Page:
         return called
 
     def say(self, text: str, *, bad: bool = False) -> None:
-        """Show a line for some seconds."""
+        """Show a message for some seconds."""
         self._said.content = boxed(paragraph(text, "stop" if bad else "said"))
         self._said.visible = True
         self._forget_s = time.monotonic() + SAID_S
@@ -339,5 +340,5 @@ class Page:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with redirect_stdout(StringIO()):  # it says that it has stopped
+        with redirect_stdout(StringIO()):  # viser prints that it has stopped
             self.server.stop()

@@ -1,4 +1,4 @@
-"""The pictures and numbers of the page, free of the browser."""
+"""Makes the pictures and numbers of the page, without a browser."""
 
 from collections.abc import Mapping
 from enum import StrEnum
@@ -14,13 +14,13 @@ from twin.types import FloatArray, Frame, ImageArray, Observation
 UNITS = {"1": "mm", "2": "mm", "3": "mm", "4": "deg", "5": "deg", "6": "deg"}
 """Unit of a label by its axis."""
 ARROW_RGB = (255, 140, 40)
-"""Colour of the pins' ways."""
+"""Colour of the arrows of the pins' displacements."""
 TOLD_APART_PX = 0.7
-"""Shorter ways of pins are not drawn."""
+"""Length, px, below which displacements of pins are not drawn."""
 
 
 class Drawn(StrEnum):
-    """What is drawn over the camera's picture."""
+    """Choices of what is drawn over the camera's picture."""
 
     NOTHING = "picture alone"
     GRAPH = "pins and graph"
@@ -28,7 +28,7 @@ class Drawn(StrEnum):
 
 
 def camera_picture(frame: Frame, seen: Observation, rest_px: FloatArray, drawn: Drawn) -> ImageArray:
-    """(H, W, 3) uint8 RGB: the frame with what was found in it."""
+    """(H, W, 3) uint8 RGB: the frame alone, or with found pins and graph, or with the displacements of the pins."""
     if drawn is Drawn.GRAPH:
         return draw_overlay(frame, seen, scale=1)
     image = frame.image if frame.image.ndim == 3 else cv2.cvtColor(frame.image, cv2.COLOR_GRAY2RGB)
@@ -51,13 +51,13 @@ def cell_picture(frame: Frame, seen: Observation, rest_px2: FloatArray) -> Image
 
 
 def label_name(name: str) -> tuple[str, str]:
-    """A label for people, and its unit: ``pose_2`` is ('pose 2', 'mm')."""
+    """A label's readable name, and its unit: ``pose_2`` gives ('pose 2', 'mm')."""
     kind, _, axis = name.rpartition("_")
     return f"{kind} {axis}".strip(), UNITS.get(axis, "")
 
 
 def estimate_table(estimate: Estimate | None, truth: Mapping[str, float], *, missing: str = "no model") -> str:
-    """HTML of the estimate with its 90 % interval against the truth; outside the interval it is marked."""
+    """HTML of the estimate with its 90 % interval and the true value. A true value outside the interval is marked."""
     if estimate is None:
         return f"<p class='note'>Estimate: {escape(missing)}</p>"
     if not estimate.valid:
@@ -92,7 +92,7 @@ STYLE = """<style>
 .studio .stop{background:#e0313122;border-left:3px solid #e03131;padding:2px 6px;margin:3px 0}
 .studio .said{border-left:3px solid #1c7ed6;padding:2px 6px;margin:3px 0}
 </style>"""
-"""Look of the numbers, in light and dark pages."""
+"""CSS of the numbers, for light and dark pages."""
 
 
 def boxed(*parts: str) -> str:

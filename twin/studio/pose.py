@@ -1,4 +1,4 @@
-"""Where the object stands before the sensor, in six numbers that a person can type."""
+"""Pose of the object relative to the sensor, as six numbers that a user can type."""
 
 from dataclasses import asdict, dataclass, fields
 
@@ -17,16 +17,16 @@ LIMITS: dict[str, tuple[float, float, str]] = {
     "tilt_y_deg": (-60.0, 60.0, "the dome reaches no farther"),
     "twist_deg": (-90.0, 90.0, "a quarter turn"),
 }
-"""Lowest and highest value of each number, and why it ends there."""
+"""Lowest and highest value of each number, and the reason for the limits."""
 STRAIGHT_POINTS_MM = 8.0 * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
-"""Points (5, 3) of the object frame, about as far apart as a contact is wide, by whose ways two motions are compared."""
+"""Points (5, 3) of the object frame at which two motions are compared. Their distances are about the width of a contact."""
 
 
 @dataclass(frozen=True)
 class ObjectPose:
     """The object's pose relative to the sensor.
 
-    The object's origin (where a sensor that comes straight touches it first) stands at ``x_mm``, ``y_mm`` and ``depth_mm`` below the
+    The object's origin (the point that touches first if the sensor approaches straight) is at ``x_mm``, ``y_mm`` and ``depth_mm`` below the
     dome's tip, so that positive depths press. The object is turned about the sensor's x by ``tilt_x_deg``, then about its y by
     ``tilt_y_deg``, then about its z by ``twist_deg`` (right-handed).
     """
@@ -39,7 +39,7 @@ class ObjectPose:
     twist_deg: float = 0.0
 
     def matrix(self, apex_mm: float) -> FloatArray:
-        """``T_sensor_object`` (4, 4) before a skin with its apex at a z."""
+        """``T_sensor_object`` (4, 4) for a skin whose apex is at the height ``apex_mm``."""
         T = np.eye(4)
         T[:3, :3] = Rotation.from_euler("xyz", [self.tilt_x_deg, self.tilt_y_deg, self.twist_deg], degrees=True).as_matrix()
         T[:3, 3] = self.x_mm, self.y_mm, apex_mm - self.depth_mm
@@ -52,7 +52,7 @@ class ObjectPose:
         return cls(*map(float, (T[0, 3], T[1, 3], apex_mm - T[2, 3], tilt_x, tilt_y, twist)))
 
     def within_limits(self) -> tuple["ObjectPose", str]:
-        """The nearest pose whose numbers are within ``LIMITS``, and why it is another one ("" if it is not).
+        """The nearest pose whose numbers are within ``LIMITS``, and why it differs ("" if it does not).
 
         Raises
         ------
@@ -76,27 +76,27 @@ class ObjectPose:
 
 @dataclass(frozen=True)
 class PressedPose(ObjectPose):
-    """A pose with how deep the rigid object is in it inside the undeformed dome, as a saved contact keeps it."""
+    """A pose with the depth of the rigid object inside the undeformed dome, as a saved contact stores it."""
 
     indent_mm: float = 0.0
 
 
 NAMES = tuple(field.name for field in fields(ObjectPose))
-"""The six numbers, in their order."""
+"""Names of the six numbers, in their order."""
 
 
 def spoken(name: str) -> str:
-    """A number's name for people: ``tilt_x_deg`` is 'tilt x'."""
+    """A number's readable name: ``tilt_x_deg`` gives 'tilt x'."""
     return name.rpartition("_")[0].replace("_", " ")
 
 
 def unit_of(name: str) -> str:
-    """A number's unit, which ends its name."""
+    """A number's unit, which is the end of its name."""
     return name.rpartition("_")[2]
 
 
 def bend_mm(way: list[FloatArray]) -> float:
-    """How far the poses (4, 4) of a way lie from the straight motion between its ends, at ``STRAIGHT_POINTS_MM``."""
+    """Largest distance of the poses (4, 4) of a path from the straight motion between its ends, at ``STRAIGHT_POINTS_MM``."""
     start, stop = (points @ T[:3, :3].T + T[:3, 3] for points, T in ((STRAIGHT_POINTS_MM, way[0]), (STRAIGHT_POINTS_MM, way[-1])))
     along = stop - start
     length2 = np.maximum((along**2).sum(axis=1, keepdims=True), 1e-12)
@@ -109,5 +109,5 @@ def bend_mm(way: list[FloatArray]) -> float:
 
 
 def motion_mm(places_mm: FloatArray, start: FloatArray, stop: FloatArray) -> float:
-    """Largest way of places (k, 3) that move with an object from one pose (4, 4) to another; 0 for no places."""
+    """Largest displacement of points (k, 3) that move with an object from one pose (4, 4) to another; 0 for no points."""
     return float(np.linalg.norm(carried(places_mm, start, stop), axis=1).max(initial=0.0))

@@ -1,4 +1,4 @@
-"""The mode 'Recording': frames of a real sensor, their labels against the estimates, and the twin's own picture of each contact."""
+"""The mode 'Recording': frames of a real sensor, estimates compared with labels, and the twin's picture of each labelled contact."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,12 +23,12 @@ from twin.studio.twin_mode import TwinMode
 from twin.types import FloatArray, Form, Frame, Observation
 
 UNSURE = 0.5
-"""A move is doubted if the model gives its execution a smaller probability than this."""
+"""Probability below which the model doubts that a move was executed."""
 
 
 @dataclass(frozen=True)
 class Looked:
-    """One frame of a recording.
+    """One frame of a recording, with the results for it.
 
     Attributes
     ----------
@@ -39,9 +39,9 @@ class Looked:
     label : ArmLabel or None
         None where the recording has no labels.
     told : dict of str to float
-        The labels' values by the names that the model estimates.
+        The labels' values by the names of the model's estimates.
     doubts : tuple of str
-        What speaks against the label.
+        Reasons to doubt the label.
     """
 
     index: int
@@ -54,19 +54,19 @@ class Looked:
 
 
 class RecordingView:
-    """Frames of one recording, looked at one by one.
+    """Frames of one recording, evaluated one at a time.
 
     Parameters
     ----------
     path : path
-        As ``open_recording`` takes it.
+        Path as for ``open_recording``.
     contact : MovingContact
-        Whose sensor, solver and camera are used.
+        Its sensor, solver and camera are used.
 
     Raises
     ------
     FrameError
-        There is no such recording, or it is another sensor's.
+        There is no such recording, or it belongs to another sensor.
     """
 
     def __init__(self, path: str | Path, contact: MovingContact) -> None:
@@ -90,7 +90,7 @@ class RecordingView:
         return len(self.recording)
 
     def _fitting(self, model: SensorModel | None) -> SensorModel | None:
-        """The model for this recording's frames, counting pins from its frame without contact where both allow that."""
+        """The model for this recording's frames. It uses the recording's no-contact frame if both allow this."""
         if model is None:
             self.notes.append("no estimates: there is no model of this sensor")
             return None
@@ -105,12 +105,12 @@ class RecordingView:
         return model
 
     def look(self, index: int) -> Looked:
-        """A frame, what is found in it, and what its label says.
+        """A frame, what is found in it, and its label.
 
         Raises
         ------
         FrameError
-            It can't be read, or is another sensor's.
+            The frame can't be read, or belongs to another sensor.
         """
         frame = self.recording.read(index)
         estimate = None if self._model is None else self._model(frame)
@@ -128,7 +128,7 @@ class RecordingView:
         return Looked(index, frame, seen, estimate, label, told, tuple(doubts))
 
     def twin_light(self, looked: Looked) -> FloatArray | None:
-        """The twin's linear light of a frame's labelled contact; None without labels, or without an experiment that tells their axes.
+        """The twin's linear light of a frame's labelled contact; None without labels, or without an experiment that defines their axes.
 
         Raises
         ------
@@ -142,7 +142,7 @@ class RecordingView:
         return self.contact.camera.draw(self._rig.end(looked.label))
 
     def twin_frame(self, light: FloatArray) -> Frame:
-        """A frame of such light in the recording's form."""
+        """A frame in the recording's form, made from the light of ``twin_light``."""
         raw = self.contact.camera.raw(light, seed=0)
         return raw if self.recording.form is Form.RAW else self.contact.camera.recorded(raw)
 
@@ -152,7 +152,7 @@ class RecordingView:
 
 
 def _told(label: ArmLabel) -> dict[str, float]:
-    """A label's values by the tables' names: the pose that the arm had, which is another one where the move was not executed."""
+    """A label's values by the tables' names: the arm's real pose, which differs from the table's if the move was not executed."""
     pose = label.pose if label.executed else label.pose - label.move
     return {f"pose_{axis + 1}": float(value) for axis, value in enumerate(pose)} | {
         f"move_{axis + 1}": float(value) for axis, value in enumerate(label.move)
@@ -167,7 +167,7 @@ class RecordingMode(PageMode):
     page : Page
     twin : TwinMode
     first : str
-        Recording to offer at first.
+        Recording that is offered at first.
     """
 
     title = "Recording"
@@ -192,17 +192,17 @@ class RecordingMode(PageMode):
         self._against.on_update(lambda event: self._wanted.give(int(self._number.value)))
 
     def show(self) -> None:
-        """Show the recording; the one given to the command is opened now."""
+        """Show the recording. The recording that the command named is opened now."""
         self._page.show_nothing("Give a recording's folder or video and press 'Open'.")
         if self._view is None and self._first:
             self.open(self._first)
-        elif self._view is not None and self._view.contact is not self._twin.contact:  # the sensor has been changed
+        elif self._view is not None and self._view.contact is not self._twin.contact:  # the user has changed the sensor
             self.open(self._path.value)
         elif self._view is not None:
             self._wanted.give(int(self._number.value))
 
     def open(self, path: str) -> None:
-        """Show another recording; what is wrong with it is said on the page."""
+        """Show another recording. Errors are shown on the page."""
         try:
             if not path.strip():
                 raise TwinError("give a recording's folder or video first")
@@ -215,7 +215,7 @@ class RecordingMode(PageMode):
         self._go(0)
 
     def _slid(self, event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
-        if event.client is not None:  # else it is this program that moves the slider
+        if event.client is not None:  # otherwise this program moved the slider
             self._wanted.give(int(event.target.value))
 
     def _go(self, index: int) -> None:
@@ -246,7 +246,7 @@ class RecordingMode(PageMode):
             )
 
     def _next_doubt(self, view: RecordingView) -> Looked | None:
-        """The next frame whose label is doubted, after the shown one and then from the beginning."""
+        """The next frame with a doubtful label, searched after the shown frame and then from the beginning."""
         at = int(self._number.value)
         for step in range(1, len(view) + 1):
             if self._wanted.overtaken:

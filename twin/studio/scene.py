@@ -1,4 +1,4 @@
-"""The 3D scene of the page: skin, pins, object, force, and the gizmo that moves the object."""
+"""The 3D scene of the page: skin, pins, object, force, and the gizmo with which the user moves the object."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -20,30 +20,30 @@ from twin.report.skin3d import object_surface
 from twin.types import ContactState, FloatArray, IntArray, PinState
 
 FINER = 2
-"""The drawn skin has this many pieces along each side of an element of the mesh."""
+"""Number of parts along each side of a mesh element in the drawn skin."""
 OBJECT_BOX_MM = (-22.0, 22.0, -22.0, 22.0, -1.0, 20.0)
-"""Box of the object's frame whose part of the object is shown: many objects have no end."""
+"""Box of the object's frame, mm, whose part of the object is shown, because many objects are infinite."""
 OBJECT_SAMPLES = 44
-"""Samples along each side of that box. Its surface then has some thousand corners."""
+"""Number of samples along each side of that box. The surface then has some thousand vertices."""
 SIDES = 8
-"""Sides of a drawn pin."""
+"""Number of sides of a drawn pin."""
 FORCE_MM_PER_N = 4.0
-"""Length of the force arrow."""
+"""Length of the force's arrow, mm per N."""
 LEAST_FORCE_N = 0.01
-"""A smaller force has no arrow."""
+"""Least force, N, for which an arrow is drawn."""
 NEAR_FOOT_MM = 2.5
-"""A place in contact belongs to the nearest pin's foot within this distance; the foot is on the skin's inside."""
+"""Largest distance, mm, of a point in contact from the pin's foot to which it belongs. The foot is on the skin's inside."""
 HOLDER_MM = 14.0
-"""Height of the drawn holder."""
+"""Height of the drawn holder, mm."""
 SKIN_RGB, OBJECT_RGB, HOLDER_RGB, FORCE_RGB = (128, 146, 184), (120, 168, 232), (78, 85, 98), (255, 176, 32)
 GIZMO_MM = 16.0
-"""Size of the gizmo."""
+"""Size of the gizmo, mm."""
 GLOW = cv2.applyColorMap(np.linspace(0.22 * 255, 0.97 * 255, 256).astype(np.uint8)[:, None], cv2.COLORMAP_INFERNO)[:, 0, ::-1]
-"""Colours (256, 3) RGB of pins, the smallest value first."""
+"""Colours (256, 3) RGB of pins, for increasing values."""
 
 
 class Shown(StrEnum):
-    """What the colours of the pins tell."""
+    """Quantities that the pins' colours can show."""
 
     DISPLACEMENT = "displacement"
     PRESSURE = "pressure"
@@ -56,14 +56,14 @@ FULL_SCALE = {Shown.DISPLACEMENT: (4.0, "mm"), Shown.PRESSURE: (0.05, "MPa"), Sh
 
 @dataclass(frozen=True)
 class Surface:
-    """A triangle mesh: corners (v, 3) in mm and faces (f, 3)."""
+    """A triangle mesh: vertices (v, 3) in mm and faces (f, 3)."""
 
     corners_mm: FloatArray
     faces: IntArray
 
 
 class SkinShape:
-    """The outer skin's surface from the nodes of the mesh, smooth between them.
+    """The outer skin's surface, smoothly interpolated between the nodes of the mesh.
 
     Parameters
     ----------
@@ -85,20 +85,20 @@ class SkinShape:
             self.rest = Surface(self.rest.corners_mm, faces[:, ::-1])
 
     def corners(self, nodes_mm: FloatArray) -> FloatArray:
-        """Corners (v, 3) float32 for nodes (n, 3) of the mesh."""
+        """Vertices (v, 3) float32 for nodes (n, 3) of the mesh."""
         rows, columns = self._grid
         outer = nodes_mm[: rows * columns].reshape(rows, columns, 3)
         return np.einsum("ai,ijk,bj->abk", self._down, outer, self._right, optimize=True).reshape(-1, 3).astype(np.float32)
 
 
 def _finer(count: int) -> FloatArray:
-    """Matrix (FINER (count - 1) + 1, count) from values at nodes to a cubic spline through them, at the nodes and between."""
+    """Matrix (FINER (count - 1) + 1, count) from values at nodes to a cubic spline through them, at the nodes and between them."""
     at = np.arange(count)
     return np.asarray(make_interp_spline(at, np.eye(count), k=3)(np.linspace(0, count - 1, FINER * (count - 1) + 1)))
 
 
 def pin_values(state: ContactState, rest: ContactState, shown: Shown) -> FloatArray:
-    """What is shown of each pin, (N,): way of its cap in mm, mean pressure in MPa or slipping share of the skin at its foot."""
+    """The shown value of each pin, (N,): displacement of its cap, mm, or mean pressure, MPa, or slipping share of the skin at its foot."""
     if shown is Shown.DISPLACEMENT:
         return np.linalg.norm(state.caps_mm - rest.caps_mm, axis=1)
     count = len(state.base_mm)
@@ -138,7 +138,7 @@ def matrix(wxyz: FloatArray, position: FloatArray) -> FloatArray:
 
 
 def pin_shape(pins: PinsSpec) -> Surface:
-    """A pin that points along -z, its cap's centre at the origin; stem and cap are tubes."""
+    """A pin that points along -z, with the centre of its cap at the origin; stem and cap are tubes."""
     half, length = pins.cap_height_mm / 2, pins.length_mm + pins.cap_height_mm / 2
     around = np.arange(SIDES) * 2 * np.pi / SIDES
     circle = np.stack([np.cos(around), np.sin(around)], axis=1)
@@ -161,7 +161,7 @@ def pin_shape(pins: PinsSpec) -> Surface:
 
 
 class PinScene:
-    """Skin, pins, object and force in the scene of a server, shared by all browsers.
+    """Skin, pins, object and force in a server's scene, which all browsers share.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ class PinScene:
         )
 
     def show_pins(self, pins: PinState, skin_mm: FloatArray, colour: np.ndarray) -> None:
-        """Show pins with their colours (N, 3) uint8, and the skin's corners (v, 3)."""
+        """Show pins with their colours (N, 3) uint8, and the skin's vertices (v, 3)."""
         self._skin.vertices = skin_mm
         self._pins.batched_positions = pins.caps_mm.astype(np.float32)
         self._pins.batched_wxyzs = turned(pins.axis)
@@ -238,14 +238,14 @@ class PinScene:
             self._object.position, self._object.wxyz = T[:3, 3], quaternion(T)
 
     def show_force(self, foot_mm: FloatArray, force_n: FloatArray) -> None:
-        """Show the force (3,) on the object at a place (3,), unless it is too small."""
+        """Show the force (3,) on the object as an arrow at a place (3,), unless the force is too small."""
         self._force.visible = bool(np.linalg.norm(force_n) > LEAST_FORCE_N)
         if self._force.visible:
             self._force.points = np.stack([foot_mm, foot_mm + FORCE_MM_PER_N * force_n])[None].astype(np.float32)
 
 
 class Scene(PinScene):
-    """The scene of a contact that is moved: with the solved skin, and the gizmo.
+    """The scene of a moving contact: it also has the solved skin and the gizmo.
 
     Parameters
     ----------
@@ -262,19 +262,19 @@ class Scene(PinScene):
         self.dragging = False
 
     def on_drag(self, moved: Callable[[FloatArray, bool], None]) -> None:
-        """Call a function with each pose (4, 4) of the gizmo that a user drags, and whether this is the drag's end.
+        """Call a function with each pose (4, 4) of the gizmo that a user drags, and whether the drag ends with it.
 
-        It is called in the server's event loop, in order, so it must return at once.
+        It is called in the server's event loop, in order. Therefore it must return at once.
         """
 
         @self.gizmo.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
             self.dragging = event.phase != "end"
-            with suppress(ValueError):  # a quaternion without length, which no gizmo sends
+            with suppress(ValueError):  # a quaternion of length zero, which no gizmo sends
                 moved(matrix(event.target.wxyz, event.target.position), event.phase == "end")
 
     def place_gizmo(self, T: FloatArray) -> None:
-        """Put the gizmo to a pose (4, 4), unless a user drags it."""
+        """Move the gizmo to a pose (4, 4), unless a user drags it."""
         if not self.dragging:
             self.gizmo.position, self.gizmo.wxyz = T[:3, 3], quaternion(T)
 

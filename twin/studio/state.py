@@ -1,4 +1,4 @@
-"""Files of the studio: its whole state, and a path of the object."""
+"""Files of the studio: its whole state, and paths of the object."""
 
 import csv
 import io
@@ -20,19 +20,19 @@ from twin.studio.scene import Shown
 from twin.types import Form
 
 MOST_BYTES = 4_000_000
-"""A larger file is none of the studio's."""
+"""Largest size of a file, bytes. The studio writes no larger ones."""
 MOST_SHOWN = 80
-"""Most characters of a link that an error repeats."""
+"""Most characters of a link that an error message repeats."""
 MOST_ROWS = 20_000
-"""Most poses of a way."""
+"""Most poses of a path."""
 FIRST_DEPTH_MM = 2.0
-"""How deep the object is at first, so that there is something to see."""
+"""Depth of the object at first, mm, so that a contact is visible."""
 COLUMNS = ("time_s", *NAMES)
-"""Columns of a way's file."""
+"""Columns of a path's file."""
 
 
 class StudioState(Section):
-    """Everything that makes the page what it is; opened again, the page shows the same.
+    """Everything that determines what the page shows. The page shows the same when the state is opened again.
 
     Attributes
     ----------
@@ -41,11 +41,11 @@ class StudioState(Section):
     sensor, object : str
         Names or files, as the command line takes them.
     friction : float or None
-        In place of the object's own.
+        Value that replaces the object's own friction.
     pose : dict of str to float
         The object's six numbers (``ObjectPose``).
     form, colour, drawn : str
-        What is shown: the frame's form, what the pins' colours tell, and what is drawn over the picture.
+        The frame's form, the quantity that the pins' colours show, and what is drawn over the picture.
     """
 
     studio: int = 1
@@ -58,7 +58,7 @@ class StudioState(Section):
     drawn: str = str(Drawn.GRAPH)
 
     def object_pose(self) -> ObjectPose:
-        """Where the object is."""
+        """The object's pose."""
         return ObjectPose(**self.pose)
 
     @classmethod
@@ -68,7 +68,7 @@ class StudioState(Section):
         Raises
         ------
         TwinError
-            It is no state of this version's studio.
+            It is not a state of this version's studio.
         """
         if len(content) > MOST_BYTES:
             raise TwinError(f"{name}: {len(content)} bytes are no state of the studio; {remedy}")
@@ -86,14 +86,14 @@ class StudioState(Section):
 
     @classmethod
     def load(cls, path: Path) -> "StudioState":
-        """Read a state's file; errors as ``read``."""
+        """Read a state's file; raises as ``read``."""
         try:
             return cls.read(read_regular(path, MOST_BYTES), str(path))
         except OSError as error:
             raise TwinError(f"{path}: can't be read ({error.strerror}); give a file that 'Save state' wrote") from error
 
     def link(self, page: str = "") -> str:
-        """The state as a link to a page of the studio, which then shows it; without a page the link's query alone."""
+        """The state as a link to a page of the studio, which then shows it. Without ``page`` it is the link's query alone."""
         numbers = {name: f"{value:.4f}".rstrip("0").rstrip(".") for name, value in self.pose.items()}
         friction = {} if self.friction is None else {"friction": f"{self.friction:g}"}
         shown = {"form": self.form, "colour": self.colour, "drawn": self.drawn}
@@ -101,12 +101,12 @@ class StudioState(Section):
 
     @classmethod
     def of_link(cls, link: str) -> "StudioState":
-        """The state that ``link`` wrote. What a link leaves out is as at first.
+        """The state of a link from ``link``. Values that the link leaves out have their defaults.
 
         Raises
         ------
         TwinError
-            It is no such link.
+            It is not such a link.
         """
         remedy = "copy the link from the page's folder 'Save'"
         name = f"link {link[:MOST_SHOWN]}{'...' if len(link) > MOST_SHOWN else ''}".replace("\n", " ")
@@ -120,12 +120,12 @@ class StudioState(Section):
         return cls.read(json.dumps({**given, **friction, "pose": pose}).encode(), name, remedy)
 
     def save(self, path: Path) -> Path:
-        """Write the state."""
+        """Write the state to a file."""
         return write_json(path, self.model_dump(mode="json"))
 
 
 def first_state(saved: str | Path | None, sensor: str, touched: str) -> StudioState:
-    """The state of a file or link, else a sensor that is pressed a little.
+    """The state of a file or link, else that of a sensor with a small indentation.
 
     Raises
     ------
@@ -141,11 +141,11 @@ def first_state(saved: str | Path | None, sensor: str, touched: str) -> StudioSt
 
 
 Way = list[tuple[float, ObjectPose]]
-"""Poses with their times in s, rising from 0."""
+"""Poses with their times in s, increasing from 0."""
 
 
 def way_text(way: Way) -> str:
-    """A way as a CSV table (``COLUMNS``)."""
+    """A path as a CSV table (``COLUMNS``)."""
     out = io.StringIO()
     writer = csv.DictWriter(out, COLUMNS, lineterminator="\n")
     writer.writeheader()
@@ -154,17 +154,17 @@ def way_text(way: Way) -> str:
 
 
 def save_way(path: Path, way: Way) -> Path:
-    """Write a way."""
+    """Write a path to a file."""
     return write_text(path, way_text(way))
 
 
 def read_way(content: bytes, name: str) -> Way:
-    """Read a way from a CSV table with ``time_s`` and any of the object's six numbers; those that are missing are zero.
+    """Read a path from a CSV table with ``time_s`` and any of the object's six numbers. Missing numbers are zero.
 
     Raises
     ------
     TwinError
-        It is no such table, or its times do not rise.
+        It is not such a table, or its times do not increase.
     """
     if len(content) > MOST_BYTES:
         raise TwinError(f"{name}: {len(content)} bytes; a way has at most {MOST_ROWS} rows")
@@ -183,12 +183,12 @@ def read_way(content: bytes, name: str) -> Way:
         raise TwinError(f"{name}: time_s does not rise; sort the rows by time")
     poses = [ObjectPose(**({"depth_mm": 0.0} | row)) for row in rows]
     for pose in poses:
-        pose.within_limits()  # refuses what is no finite number
+        pose.within_limits()  # raises an error if a number is not finite
     return [(at - times[0], pose) for at, pose in zip(times, poses, strict=True)]
 
 
 def tap_and_shear(pose: ObjectPose, *, depth_mm: float = 3.0, shear_mm: float = 3.0) -> Way:
-    """A tap from 2 mm above the tip down to a depth, a shear along x and back, and the way up; tilts and twist stay as they are."""
+    """A tap from 2 mm above the tip down to a depth, a shear along x and back, and the way up. Tilts and twist are not changed."""
     knots = [
         (0.0, -2.0, 0.0),
         (1.5, depth_mm, 0.0),
@@ -208,7 +208,7 @@ def tap_and_shear(pose: ObjectPose, *, depth_mm: float = 3.0, shear_mm: float = 
 
 
 def next_path(folder: Path, stem: str, suffix: str) -> Path:
-    """A path ``STEM-NUMBER`` in a folder that does not exist yet; the folder is made if there is none.
+    """A path ``STEM-NUMBER`` in a folder that is not in use yet. The folder is made if it does not exist.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""``run_studio``: from a plan to a page that is served until it is ended."""
+"""``run_studio``: serves the page of a plan until it is ended."""
 
 import time
 from collections.abc import Callable
@@ -18,27 +18,27 @@ from twin.studio.twin_mode import ModelOf, TwinMode
 PORT = 8090
 """Port of the page."""
 LOOK_S = 0.2
-"""Interval in s at which it is looked whether the studio shall end."""
+"""Interval, s, at which the end condition is checked."""
 
 
 @dataclass(frozen=True)
 class StudioPlan:
-    """What the studio shows at first, and where it listens.
+    """The studio's state at the start, and the address on which it listens.
 
     Attributes
     ----------
     state : StudioState
     out : Path
-        Folder for what is saved; made when it is needed.
+        Folder for saved files; made when it is needed.
     host, port : str, int
     traces : bool
         Whether pictures are path-traced when the object stands still.
     recording : str
         Recording that the mode 'Recording' opens first.
     camera, arm : str
-        What the mode 'Live' connects first.
+        Camera and arm that the mode 'Live' connects first.
     seconds : float or None
-        End after this time in s.
+        Time, s, after which the studio ends.
     """
 
     state: StudioState
@@ -53,7 +53,7 @@ class StudioPlan:
 
     @property
     def warnings(self) -> list[str]:
-        """What the user must know of the host; nothing for this machine."""
+        """Warnings about the host; none for this machine."""
         if self.host in LOCAL:
             return []
         return [
@@ -69,7 +69,7 @@ class Studio:
     ----------
     plan : StudioPlan
     model_of : callable
-        From a sensor's name to a trained model, or None.
+        Function from a sensor's name to a trained model, or None.
     open_feed : callable
         Opens a camera, and an arm, for the mode 'Live'.
     """
@@ -94,7 +94,7 @@ class Studio:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._open.close()  # all of them, even if one fails: an arm is let go of in any case
+        self._open.close()  # closes all, even if one fails, so that an arm is always released
 
 
 def run_studio(plan: StudioPlan, model_of: ModelOf, open_feed: FeedOpener, *, on_open: Callable[[str], None] = lambda url: None) -> None:
@@ -103,14 +103,14 @@ def run_studio(plan: StudioPlan, model_of: ModelOf, open_feed: FeedOpener, *, on
     Parameters
     ----------
     plan, model_of, open_feed
-        As ``Studio`` takes them.
+        As for ``Studio``.
     on_open : callable
         Called with the page's address once it can be opened.
 
     Raises
     ------
     TwinError
-        Nothing can listen at the plan's host and port.
+        The server can't listen on the plan's host and port.
     """
     with Studio(plan, model_of, open_feed) as studio:
         on_open(studio.page.url)

@@ -1,4 +1,4 @@
-"""Path tracing in a process of its own: the page and the moving object never wait for it, and its failure ends neither."""
+"""Path tracing in a separate process. The page and the moving object never wait for it, and continue if it fails."""
 
 import signal
 import subprocess
@@ -25,9 +25,9 @@ from twin.studio.pose import PressedPose
 from twin.types import ContactState, FloatArray, Form
 
 SHOWN_S = 0.15
-"""Time in s for which the first pass is left to be shown before the next one takes all cores."""
+"""Time, s, after the first pass in which it can be shown before the next pass uses all cores."""
 END_S = 3.0
-"""Longest wait in s for the process to end by itself."""
+"""Longest wait, s, for the process to end by itself."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Traced:
         Number of the contact.
     light : (h, w) or (h, w, 3) float
     ms : float
-        Time since the job was begun.
+        Time since the start of the job.
     rough : bool
-        Whether this is the first pass, which a better picture follows unless a newer contact comes.
+        Whether this is the first pass. A better picture follows unless a newer contact comes.
     """
 
     solved: int
@@ -60,7 +60,7 @@ class Saved:
 
 @dataclass(frozen=True)
 class Failed:
-    """A job that could not be done; ``tracing`` says whether nothing at all can be path-traced here."""
+    """A job that failed; ``tracing`` states whether path tracing as such does not work on this machine."""
 
     reason: str
     tracing: bool = False
@@ -85,9 +85,9 @@ Outcome = Shading | Traced | Saved | Failed
 
 
 class Tracer:
-    """Path-traces contacts of one sensor. Of several asked at once only the newest is traced. A context manager.
+    """Path-traces contacts of one sensor. Of several waiting contacts only the newest is traced. A context manager.
 
-    The first outcome is the preview's shading. Of a contact there are two: the first pass, and the mean of all.
+    The first outcome is the preview's shading. Each contact has two outcomes: the first pass, and the mean of all passes.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class Tracer:
     Attributes
     ----------
     on_outcome : callable
-        Called when something has come back, in a thread of its own.
+        Called in a separate thread when an outcome has arrived.
     """
 
     def __init__(self, spec: SensorSpec) -> None:
@@ -111,9 +111,9 @@ class Tracer:
         self._next: _Trace | None = None
 
     def start(self) -> None:
-        """Start the process, if it has not been started. It needs some seconds until it is ready."""
+        """Start the process, if it is not running yet. It is ready after some seconds."""
         if self._process is None:
-            # not by ``multiprocessing``: that would run the user's own program again in the new process
+            # ``multiprocessing`` is not used, because it would run the user's own program again in the new process
             number = self._there.fileno()
             self._process = subprocess.Popen([sys.executable, "-c", f"from {__name__} import serve; serve({number})"], pass_fds=[number])
             self._there.close()
@@ -121,7 +121,7 @@ class Tracer:
             threading.Thread(target=self._receive, name="studio-tracer", daemon=True).start()
 
     def trace(self, solved: int, state: ContactState) -> None:
-        """Ask for a contact's light. One is traced at a time; of those that are asked for until its first pass only the newest is."""
+        """Request a contact's light. One contact is traced at a time. Of further requests before its first pass only the newest is kept."""
         with self._one:
             if self._tracing:
                 self._next = _Trace(solved, state)
@@ -130,18 +130,18 @@ class Tracer:
         self._send(_Trace(solved, state))
 
     def save(self, out: Path, touched: ObjectSpec, pose: PressedPose, state: ContactState, form: Form) -> None:
-        """Ask for a contact's files in a folder that exists."""
+        """Request a contact's files in a folder that exists."""
         self._send(_Save(out, touched, pose, state, form))
 
     def outcomes(self) -> list[Outcome]:
-        """What has come back since the last call; never waits."""
+        """Outcomes that have arrived since the last call; never waits."""
         found: list[Outcome] = []
         while self._found:
             found.append(self._found.popleft())
         return found
 
     def _receive(self) -> None:
-        """Take what comes back as it comes: a process that waits to be heard would not hear the next job, and both would wait forever."""
+        """Receive outcomes as they arrive. A process that waits to send does not read the next job, so both sides would wait forever."""
         try:
             while True:
                 outcome = self._here.recv()
@@ -153,7 +153,7 @@ class Tracer:
                         self._tracing = job is not None
                     if job is not None:
                         self._send(job)
-        except (EOFError, OSError, TypeError):  # the other end, or this one, has been closed
+        except (EOFError, OSError, TypeError):  # this end of the connection, or the other, was closed
             if not self._ended:
                 self._ended = True
                 self._found.append(Failed("the path tracer's process has ended; pictures stay drawn. Start the studio again", tracing=True))
@@ -164,13 +164,13 @@ class Tracer:
     def __exit__(self, *_: object) -> None:
         self._ended = True
         with suppress(OSError):
-            self._here.send(None)  # a closed socket alone does not wake the thread that reads from it
+            self._here.send(None)  # closing the socket alone does not wake the thread that reads from it
         if self._process is None:
             self._there.close()
             return
         try:
             self._process.wait(END_S)
-        except subprocess.TimeoutExpired:  # it traces or writes
+        except subprocess.TimeoutExpired:  # it is still tracing or writing
             self._process.kill()
             self._process.wait()
         self._here.close()
@@ -184,8 +184,8 @@ class Tracer:
 
 
 def serve(number: int) -> None:
-    """Be the process: the sensor and then jobs come in by a file descriptor, outcomes go out, until the other end is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in the terminal is for the studio, which then ends this process
+    """Run the process: receive the sensor and then jobs through a file descriptor, and send outcomes, until that is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in the terminal ends the studio, which then ends this process
     there = Connection(number)
     try:
         spec: SensorSpec = there.recv()
@@ -207,7 +207,7 @@ def serve(number: int) -> None:
 
 
 class _Maker:
-    """Does the jobs; renderer and simulator are built when they are first needed. What is ``overtaken`` is not refined."""
+    """Does the jobs. Renderer and simulator are built when they are first needed. A picture that is ``overtaken`` is not refined."""
 
     def __init__(self, spec: SensorSpec, overtaken: Callable[[float], bool]) -> None:
         self._spec, self._overtaken = spec, overtaken
@@ -244,5 +244,5 @@ def _tried(make: Callable[[], Iterator[Outcome]], *, tracing: bool = False) -> I
         yield Failed(str(error), tracing)
     except TwinError as error:
         yield Failed(str(error))
-    except (RuntimeError, OSError, ValueError) as error:  # what Mitsuba, LLVM and a full disk raise
+    except (RuntimeError, OSError, ValueError) as error:  # raised by Mitsuba and LLVM, and if the disk is full
         yield Failed(f"{type(error).__name__}: {error}", tracing)

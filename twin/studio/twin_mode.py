@@ -1,4 +1,4 @@
-"""The mode 'Twin': the user moves the object, and everything that follows from it is shown."""
+"""The mode 'Twin': the user moves the object and sees the resulting contact, picture and estimate."""
 
 import threading
 import time
@@ -31,7 +31,7 @@ ModelOf = Callable[[str], SensorModel | None]
 """Function from a sensor's name to a trained model of it, or None."""
 
 STEPS = {"mm": 0.25, "deg": 1.0}
-"""How far a key moves the object."""
+"""Step by which a key moves or turns the object, mm and deg."""
 KEYS = {
     "arrowleft": ("x_mm", -1),
     "arrowright": ("x_mm", +1),
@@ -51,11 +51,11 @@ TURN_KEYS = {
 }
 """Keys that turn the object together with ctrl (or cmd) and shift: the angle that changes, and its direction."""
 ONE_GESTURE_S = 0.8
-"""Wishes that follow one another faster are one gesture: 'Undo' takes them back together."""
+"""Longest time, s, between two wishes of one gesture. 'Undo' takes back a whole gesture."""
 MOST_UNDO = 100
-"""Gestures that can be taken back."""
+"""Most gestures that can be taken back."""
 MOST_FRICTION = 2.0
-"""End of the friction's slider."""
+"""Largest friction of the slider."""
 
 
 class TwinMode(PageMode):
@@ -65,9 +65,9 @@ class TwinMode(PageMode):
     ----------
     page : Page
     state : StudioState
-        What to begin with.
+        The state at the start.
     out : Path
-        Folder for what is saved.
+        Folder for saved files.
     model_of : callable
     traces : bool
         Whether pictures are path-traced when the object stands still.
@@ -75,7 +75,7 @@ class TwinMode(PageMode):
     Attributes
     ----------
     followers : list of callable
-        Called with each answer once it has been shown: modes that look at the same contact.
+        Functions of modes that use the same contact. They are called with each answer after it was shown.
     """
 
     title = "Twin"
@@ -93,7 +93,7 @@ class TwinMode(PageMode):
         self._film: FilmWriter | None = None
         self.followers: list[Callable[[Answer], None]] = []
         self._rebuilding = threading.Lock()
-        self._showing = threading.Lock()  # held while the scene is changed or made anew
+        self._showing = threading.Lock()  # held while the scene is changed or built again
         self._take_up(*self._prepare(state))
         self._publisher = self.newest(self._publish, "page")
         self._links = self.newest(self._open_link, "link")
@@ -104,28 +104,28 @@ class TwinMode(PageMode):
             self._estimates = Chart(page.gui, "estimates less truth", ("1", "2", "3"))
             self._depths = Chart(page.gui, "indentation, mm", ("indentation",))
 
-    # life
+    # start and end
 
     def _prepare(self, state: StudioState) -> tuple[MovingContact, Tracer | None]:
-        """The contact of a state and its tracer. The page stays as it is."""
+        """The contact of a state and its tracer. The page is not changed."""
         sensor = load_sensor(state.sensor)
         contact = MovingContact(Setup(sensor, load_object(state.object), state.friction, Form(state.form)))
         return contact, Tracer(sensor) if self._traces else None
 
     def _take_up(self, contact: MovingContact, tracer: Tracer | None) -> None:
-        """Show another contact from now on: its scene is made. No worker may be at work."""
+        """Show another contact from now on, and build its scene. No worker may be running."""
         setup = contact.setup
         with self._showing:
             self.contact, self._tracer = contact, tracer
             self.worker = Worker(contact, tracer, self._answered, self._said)
             self._rest = nominal_reference(setup.sensor, setup.form)
             self._scene = Scene(self._page.server, setup.sensor, contact.solver.mesh, contact.solver.rest())
-            if self._loading:  # else ``_load_rest`` puts it
+            if self._loading:  # otherwise ``_load_rest`` shows the object
                 self._scene.put_object(setup.touched)
             self._scene.on_drag(self._dragged)
 
     def start(self) -> None:
-        """Begin to answer. The first wish is the state's pose; the model is loaded beside it."""
+        """Start to answer. The first wish is the state's pose. The model is loaded at the same time."""
         super().start()
         self._begin()
 
@@ -179,7 +179,7 @@ class TwinMode(PageMode):
     # wishes
 
     def ask(self, wished: ObjectPose, *, gesture: bool = True) -> None:
-        """Wish the object to be somewhere. With ``gesture``, 'Undo' can take it back."""
+        """Wish a pose of the object. With ``gesture``, 'Undo' can take it back."""
         now = time.monotonic()
         if gesture and now - self._wished_s > ONE_GESTURE_S:
             self._undo = [*self._undo[-MOST_UNDO:], self._wish]
@@ -187,7 +187,7 @@ class TwinMode(PageMode):
         self.worker.ask(wished)
 
     def undo(self) -> None:
-        """Take the last gesture back."""
+        """Take back the last gesture."""
         if self._undo:
             self._wish = self._undo.pop()
             self.worker.ask(self._wish)
@@ -200,7 +200,7 @@ class TwinMode(PageMode):
         self.ask(replace(self._wish, **{name: value}).within_limits()[0])
 
     def play(self, way: Way) -> None:
-        """Let the object follow a path. A contact begins anew where the path leaves the skin."""
+        """Move the object along a path. A contact starts again where the path leaves the skin."""
         self._undo = [*self._undo[-MOST_UNDO:], self._wish]
         self._wish = way[-1][1]
         self.worker.play(way)
@@ -268,14 +268,14 @@ class TwinMode(PageMode):
         for modifier, keys in (("shift", KEYS), ("cmd/ctrl+shift", TURN_KEYS)):
             for key, (name, sign) in keys.items():
                 label = f"{spoken(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
-                command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # a literal of viser's
+                command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # viser defines it as a literal
                 command.on_trigger(self._key(name, sign))
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
         gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(lambda: self.play(tap_and_shear(self._wish))))
 
     def _slid(self, name: str) -> Callable[[viser.GuiEvent[viser.GuiSliderHandle[float]]], None]:
         def moved(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
-            if event.client is not None:  # else it is this program that moves the slider
+            if event.client is not None:  # otherwise this program moved the slider
                 self.ask(replace(self._wish, **{name: float(event.target.value)}))
 
         return moved
@@ -288,7 +288,7 @@ class TwinMode(PageMode):
         return min(MOST_FRICTION, setup.touched.friction if setup.friction is None else setup.friction)
 
     def begin_anew(self) -> None:
-        """Press the object straight down to where it is, its friction's history forgotten."""
+        """Press the object straight down to its pose, without the friction's history."""
         self.worker.do(self.contact.begin_anew)
         self.worker.ask(self._wish)
 
@@ -329,12 +329,12 @@ class TwinMode(PageMode):
         self.open(self.state.model_copy(update={"sensor": self._sensor.value, "form": str(Form.RAW)}))
 
     def open(self, state: StudioState) -> None:
-        """Show another state. With another sensor everything is built anew, which takes some seconds.
+        """Show another state. With another sensor everything is built again, which takes some seconds.
 
         Raises
         ------
         TwinError, SpecError
-            There is no such sensor or object; the page then stays as it is.
+            There is no such sensor or object; the page is then not changed.
         """
         with self._rebuilding:
             self._page.say(f"opening {state.sensor} against {state.object} ...")
@@ -357,7 +357,7 @@ class TwinMode(PageMode):
             self._begin()
 
     def _open_link(self, link: str) -> None:
-        """Show the state of a link, unless it is the one that is shown."""
+        """Show the state of a link, unless the page shows it already."""
         if link.partition("?")[2] == self.state.link().partition("?")[2]:
             return
         try:
@@ -376,21 +376,21 @@ class TwinMode(PageMode):
         self._publisher.give(answer)
 
     def _load_rest(self) -> None:
-        """Load what the first picture does not need: the object's shape in the scene, and the model."""
+        """Load the parts that the first picture does not need: the object's shape in the scene, and the model."""
         self._loading = True
         self.worker.do(self._put_object)
         threading.Thread(target=self._load_model, args=(self._state.sensor,), name="studio-model", daemon=True).start()
 
     def _put_object(self) -> None:
-        """Show the object in the scene. Only for the worker's thread."""
+        """Show the object in the scene. Only the worker's thread may call this."""
         with self._showing:
             self._scene.put_object(self.contact.setup.touched)
         self.worker.show_again()
 
     def _publish(self, answer: Answer) -> None:
-        """Show an answer: scene, pictures and numbers belong to one pose, and browsers get them together."""
+        """Show an answer. Scene, pictures and numbers belong to one pose, and browsers get them together."""
         with self._showing:
-            if answer.setup.sensor is not self.contact.setup.sensor:  # the page shows another sensor since
+            if answer.setup.sensor is not self.contact.setup.sensor:  # the page now shows another sensor
                 return
             self._show_answer(answer)
         if not self._loading:
@@ -427,7 +427,7 @@ class TwinMode(PageMode):
         return answer.pose.matrix(self.contact.setup.sensor.skin.apex_mm)
 
     def _follow_sliders(self, answer: Answer) -> None:
-        """Put the sliders to where the object came to stand, unless the user has wished on meanwhile."""
+        """Set the sliders to the object's final pose, unless the user has made a new wish."""
         wishing = self.worker.newest is not answer or time.monotonic() - self._wished_s < ONE_GESTURE_S
         if wishing and not self._scene.dragging and not answer.stopped:
             return

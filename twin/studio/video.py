@@ -1,4 +1,4 @@
-"""A short video of what the page shows."""
+"""Writes a short video of what the page shows."""
 
 import time
 from pathlib import Path
@@ -12,13 +12,13 @@ from twin.store import write_bytes
 from twin.types import ImageArray
 
 RATE_HZ = 15.0
-"""Pictures of a video in a second."""
+"""Pictures per second of a video."""
 LONGEST_S = 300.0
-"""A video ends by itself after this time."""
+"""Time, s, after which a video ends by itself."""
 
 
 class FilmWriter:
-    """Writes pictures as an MP4, each as long as it was shown. The file appears when it is complete.
+    """Writes pictures as an MP4, each for the time for which it was shown. The file appears when it is complete.
 
     Parameters
     ----------
@@ -36,12 +36,12 @@ class FilmWriter:
         self._last: ImageArray | None = None
 
     def add(self, picture: ImageArray, *, at_s: float | None = None) -> None:
-        """Show a picture (h, w, 3) RGB from now on, or from a time in s since the beginning.
+        """Show a picture (h, w, 3) RGB from now on, or from ``at_s``, s after the beginning.
 
         Raises
         ------
         TwinError
-            OpenCV can write no MP4 here.
+            OpenCV can't write MP4 files on this machine.
         """
         at_s = time.monotonic() - self._begun_s if at_s is None else at_s
         if at_s > LONGEST_S:
@@ -66,7 +66,7 @@ class FilmWriter:
         self._count += 1
 
     def close(self) -> str:
-        """End the video; a line that says what was written.
+        """End the video, and return a line that states what was written.
 
         Raises
         ------

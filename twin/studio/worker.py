@@ -1,4 +1,4 @@
-"""One thread that owns the contact: it always goes towards the newest wish, and refines the answer when there is nothing to go to."""
+"""The thread that owns the contact. It always moves towards the newest wish, and refines the answer when no wish is open."""
 
 import logging
 import threading
@@ -16,15 +16,15 @@ from twin.studio.tracing import Failed, Outcome, Saved, Traced, Tracer
 
 LOG = logging.getLogger(__name__)
 STILL_S = 0.04
-"""The object stands still once no wish has come for this time, in s."""
+"""Time, s, without a wish after which the object counts as standing still."""
 REFINE_S = 1.0
-"""Time in s without a wish after which the fine mesh follows. A step on it takes some 0.1 s, for which a new wish has to wait."""
+"""Time, s, without a wish after which the fine mesh follows. A step on it takes some 0.1 s, and a new wish must wait for it."""
 LOOK_S = 0.02
-"""Interval in s at which it is looked for what is due."""
+"""Interval, s, at which due work is looked for."""
 
 
 def told(error: Exception) -> str:
-    """An error in words for the page. A fault of this program is also logged with its traceback: the thread goes on."""
+    """An error as text for the page. A fault of this program is also logged with its traceback, and the thread continues."""
     if isinstance(error, TwinError):
         return str(error)
     LOG.error("a fault of this program", exc_info=error)
@@ -32,16 +32,16 @@ def told(error: Exception) -> str:
 
 
 Wish = tuple[ObjectPose, float]
-"""A pose, and the time (``time.monotonic``) at which it was wished."""
+"""A pose, and the time (``time.monotonic``) of the wish."""
 
 
 class _OwnThread(ABC):
-    """Work in a thread of its own, which waits for news.
+    """A thread that waits for work.
 
     Parameters
     ----------
     name : str
-        Of the thread.
+        Name of the thread.
     """
 
     def __init__(self, name: str) -> None:
@@ -50,11 +50,11 @@ class _OwnThread(ABC):
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End; waits for what is being done."""
+        """End the thread after its present work."""
         with self._news:
             self._ended = True
             self._news.notify()
@@ -63,21 +63,21 @@ class _OwnThread(ABC):
 
     @abstractmethod
     def _run(self) -> None:
-        """Work until it is ended."""
+        """Work until the thread is ended."""
 
 
 class Worker(_OwnThread):
-    """Moves a contact in a thread of its own. A context manager.
+    """Moves a contact in its own thread. A context manager.
 
     Parameters
     ----------
     contact : MovingContact
     tracer : Tracer or None
-        None: pictures stay drawn.
+        If it is None, pictures stay drawn.
     on_answer : callable
         Called with each answer, in the worker's thread.
     on_message : callable
-        Called with a line for the user: what was saved, or what failed.
+        Called with a line for the user about saved files or failures.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Worker(_OwnThread):
             tracer.on_outcome = self._wake
 
     def _wake(self) -> None:
-        """Look for outcomes of the tracer at once."""
+        """Take the tracer's outcomes at once."""
         with self._news:
             self._news.notify()
 
@@ -112,31 +112,31 @@ class Worker(_OwnThread):
 
     @property
     def playing(self) -> bool:
-        """Whether a way is being played."""
+        """Whether a path is being played."""
         return bool(self._way)
 
     def ask(self, wished: ObjectPose) -> None:
-        """Go to a pose from now on. Earlier wishes, and a way that is played, are forgotten."""
+        """Move to a pose from now on. Earlier wishes, and a path that is being played, are dropped."""
         with self._news:
             self._way.clear()
             self._wish = (wished, time.monotonic())
             self._news.notify()
 
     def play(self, way: list[tuple[float, ObjectPose]]) -> None:
-        """Go through poses, each at its time in s from now or, where the contact takes longer, as soon as it can."""
+        """Move through poses. Each has its time in s from now. If the contact takes longer, the next pose follows as soon as possible."""
         begin = time.monotonic()
         with self._news:
             self._way = deque((pose, begin + at) for at, pose in way)
             self._news.notify()
 
     def do(self, job: Callable[[], None]) -> None:
-        """Call a function in the worker's thread, between two steps. Its error becomes a message."""
+        """Call a function in the worker's thread, between two steps. An error of it becomes a message."""
         with self._news:
             self._jobs.append(job)
             self._news.notify()
 
     def show_again(self) -> None:
-        """Make the newest answer anew: after a change of form or model. Only for the worker's thread."""
+        """Compute the newest answer again after a change of form or model. Only the worker's thread may call this."""
         answer = self._contact.again()
         if answer is not None:
             self._publish(answer)
@@ -163,11 +163,11 @@ class Worker(_OwnThread):
                 with self._news:
                     if self._wish is wish:
                         self._wish = None
-                self._moved_s = time.monotonic()  # so that what fails on the fine mesh is not tried without a pause
+                self._moved_s = time.monotonic()  # so that a failed step on the fine mesh is not repeated without a pause
                 self._on_message(told(error))
 
     def _due(self) -> Wish | None:
-        """The wish to go to now. A pose of a way that is played waits for its time, and for the one before."""
+        """The wish to move to now. A pose of a played path waits for its time, and for the pose before it."""
         if self._way and self._way[0][1] <= time.monotonic() and self._wish is None:
             self._wish = self._way.popleft()
         return self._wish
@@ -193,14 +193,14 @@ class Worker(_OwnThread):
             refined = self._contact.refine()
             if refined is not None and self._traces and self._tracer is not None:
                 self._asked_trace = refined.solved
-                self._tracer.trace(refined.solved, refined.state)  # it is shown with its own picture
+                self._tracer.trace(refined.solved, refined.state)  # the answer is shown together with its traced picture
             elif refined is not None:
                 self._publish(refined)
         if wish is None:
             self._ask_trace()
 
     def _ask_trace(self) -> None:
-        """Ask for the path-traced picture of an answer that stands still."""
+        """Request the path-traced picture of an answer that stands still."""
         newest = self._newest
         if newest is None or not self._traces or self._tracer is None or self._way:
             return
@@ -231,7 +231,7 @@ class Worker(_OwnThread):
 
     def _publish(self, answer: Answer) -> None:
         if self._newest is None and self._tracer is not None:
-            self._tracer.start()  # only now, so that the first picture does not wait for it
+            self._tracer.start()  # not earlier, so that the first picture does not wait for it
         self._newest = answer
         self._on_answer(answer)
 
@@ -240,15 +240,15 @@ T = TypeVar("T")
 
 
 class Newest(_OwnThread, Generic[T]):
-    """Calls a function with the newest of the things it is given, in a thread of its own, one at a time.
+    """Calls a function in its own thread with the newest thing that was given. Calls do not overlap.
 
     Parameters
     ----------
     take : callable
     name : str
-        Of the thread.
+        Name of the thread.
     failed : callable, optional
-        Called with the text of an error of ``take``. The thread goes on.
+        Called with the text of an error of ``take``. The thread continues.
     """
 
     def __init__(self, take: Callable[[T], None], name: str, failed: Callable[[str], None] = lambda text: None) -> None:
@@ -257,14 +257,14 @@ class Newest(_OwnThread, Generic[T]):
         self._waiting: list[T] = []
 
     def give(self, thing: T) -> None:
-        """Take this next; what has not been taken yet is forgotten."""
+        """Use this thing next. A thing that still waits is dropped."""
         with self._news:
             self._waiting = [thing]
             self._news.notify()
 
     @property
     def overtaken(self) -> bool:
-        """Whether something newer waits. For a ``take`` that can stop early."""
+        """Whether a newer thing waits. For a ``take`` that can stop early."""
         return bool(self._waiting) or self._ended
 
     def _run(self) -> None:

@@ -1,4 +1,4 @@
-"""The interface of ``cri``, so that scripts written for it drive our arms. Only their imports change:
+"""The interface of ``cri``, with which scripts written for ``cri`` drive our arms. Only their imports change:
 
     from hardware.arms.cri import SyncRobot, MG400Controller as Controller
 

@@ -21,15 +21,15 @@ from hardware.arms.open_arm import open_arm
 from hardware.errors import DeviceError, leave
 from hardware.newest import NewestTarget
 
-# Speeds at the start: % of the MG400's fastest, mm/s and deg/s of other arms. They are cri's.
+# Speeds at the start, as in cri: % of the MG400's largest speed, mm/s and deg/s for other arms.
 START_SPEED = 20.0
-# A move may take this time (s), and this number of times as long as its way and speed give.
+# Time limit of a move: the first number (s), plus the second number times the duration that its path and speed give.
 PATIENCE_S, PATIENCE = 10.0, 5.0
 NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 class Closing(ABC):
-    """What ``cri`` closes at the end of a ``with`` block."""
+    """An object that ``cri`` closes at the end of a ``with`` block."""
 
     def __repr__(self) -> str:
         return f"{type(self).__name__} ({self.info})"
@@ -43,15 +43,15 @@ class Closing(ABC):
     @property
     @abstractmethod
     def info(self) -> str:
-        """Which arm it is."""
+        """Name of the arm."""
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of the arm."""
+        """Release the arm."""
 
 
 class RobotController(Closing):
-    """An arm with the interface of ``cri``. It is connected and enabled when it is made.
+    """An arm with the interface of ``cri``. The constructor connects and enables it.
 
     Parameters
     ----------
@@ -61,7 +61,8 @@ class RobotController(Closing):
     Attributes
     ----------
     servo_delay : (float, float) or None
-        With a delay a move does not wait for its end: the arm goes towards the newest pose. The call returns after the first number (s).
+        With a delay, a move does not wait for its end: the arm moves towards the newest pose, and the call returns after the first number
+        (s).
     tolerance : float or None
         With a tolerance (mm and deg) a move ends as soon as the arm is that near. Otherwise it ends when the arm is at rest there.
     """
@@ -70,7 +71,7 @@ class RobotController(Closing):
         self.arm = open_arm(arm) if isinstance(arm, str) else arm
         self._linear = self._angular = START_SPEED
         self._overall: float | None = None
-        self._tilt_deg = np.zeros(2)  # last commanded tilt; poses are returned with it, as an arm of four axes does not report it
+        self._tilt_deg = np.zeros(2)  # last commanded tilt. It is part of returned poses, because an arm of four axes does not report it
         self._tcp = np.array(NO_POSE)
         self._servo_delay: tuple[float, float] | None = None
         self._newest: NewestTarget | None = None
@@ -92,7 +93,7 @@ class RobotController(Closing):
 
     @property
     def tcp(self) -> np.ndarray:
-        """The place (7,) on the flange whose pose is told and commanded."""
+        """The tool frame (7,) on the flange, whose pose is reported and commanded."""
         return self._tcp
 
     @tcp.setter
@@ -121,7 +122,7 @@ class RobotController(Closing):
 
     @property
     def speed(self) -> float:
-        """% of everything. Until it is set it is what an MG400 tells, and 100 for other arms."""
+        """Overall speed, %. Before it is set, it is the value that an MG400 reports, and 100 for other arms."""
         if self._overall is not None:
             return self._overall
         return self.arm.overall_percent if isinstance(self.arm, MG400) else 100.0
@@ -178,7 +179,7 @@ class RobotController(Closing):
         self.commanded_joint_angles = self.arm.move_joints(joints, timeout_s=PATIENCE_S + PATIENCE * way_deg / self._speeds()[1])
 
     def move_linear(self, pose: Numbers, elbow: float | None = None) -> None:
-        """Move the tool straight to a pose (7,). Arms of four and six axes have no elbow."""
+        """Move the tool straight to a pose (7,). ``elbow`` is ignored, because arms of four and six axes have none."""
         flange = self._flange(pose)
         if self._servo_delay is not None:
             self._follow(flange, self._servo_delay[0])
@@ -198,11 +199,11 @@ class RobotController(Closing):
         self.arm.disconnect()
 
     def _flange(self, pose: Numbers) -> np.ndarray:
-        """The flange's pose (6,) in Euler angles for one (7,) of the tcp."""
+        """The flange's pose (6,) in Euler angles for a pose (7,) of the tool frame."""
         return mat2euler(quat2mat(pose) @ np.linalg.inv(quat2mat(self._tcp)))
 
     def _go(self, poses: list[np.ndarray]) -> None:
-        """Go through poses (6,) without a stop, and wait for the last one."""
+        """Move through poses (6,) without a stop, and wait for the last one."""
         self._end_servo()
         here, time_s = self.arm.state().pose, 0.0
         linear_mm_s, angular_deg_s = self._speeds()

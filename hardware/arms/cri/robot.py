@@ -31,17 +31,17 @@ class InvalidJointAngles(DeviceError, ValueError):  # noqa: N818  (cri's name)
 
 
 class AsyncBusy(DeviceError):  # noqa: N818  (cri's name)
-    """A move goes on; call ``async_result`` first."""
+    """A move is in progress; call ``async_result`` first."""
 
 
 class AsyncNotBusy(DeviceError):  # noqa: N818  (cri's name)
-    """No move was begun."""
+    """No move was started."""
 
 
 class SyncRobot(Closing):
     """An arm with a tool and a work frame; poses are 6-tuples in mm and deg.
 
-    As in ``cri``, the flange goes to ``coord_frame * pose * tcp``: ``tcp`` is where the flange sits seen from the tool's tip.
+    As in ``cri``, the flange moves to ``coord_frame * pose * tcp``: ``tcp`` is the flange's pose in the frame of the tool's tip.
     """
 
     EULER_AXES = EULER_AXES
@@ -77,7 +77,7 @@ class SyncRobot(Closing):
 
     @property
     def tcp_controller(self) -> np.ndarray:
-        """The controller's own tool (6,), whose pose the controller tells and commands."""
+        """The controller's own tool (6,), whose pose the controller reports and commands."""
         return quat2euler(self.controller.tcp, self._axes)
 
     @tcp_controller.setter
@@ -131,7 +131,7 @@ class SyncRobot(Closing):
 
     @property
     def target_pose(self) -> np.ndarray | None:
-        """The pose last asked for, None if there was none."""
+        """The last requested pose; None before the first one."""
         commanded = self.controller.commanded_pose
         return None if commanded is None else self._seen(commanded)
 
@@ -178,12 +178,12 @@ class SyncRobot(Closing):
 
 
 class AsyncRobot(SyncRobot):
-    """A ``SyncRobot`` with moves that go on while the program does something else: begin one, then ask for its result.
+    """A ``SyncRobot`` whose moves run while the program does something else: start a move, then ask for its result.
 
     Parameters
     ----------
     sync_robot : SyncRobot
-        Its frames, tool and axes are taken over. It isn't used on its own any more.
+        Its frames, tool and axes are used. It must not be used on its own any more.
     """
 
     def __init__(self, sync_robot: SyncRobot) -> None:
@@ -211,7 +211,7 @@ class AsyncRobot(SyncRobot):
         Raises
         ------
         AsyncNotBusy
-            No move was begun.
+            No move was started.
         """
         if self._worker is None:
             raise AsyncNotBusy("no move was begun; call async_move_linear or its like first")
@@ -221,13 +221,13 @@ class AsyncRobot(SyncRobot):
             raise error
 
     def async_done(self) -> bool:
-        """Whether the move has ended; ``AsyncNotBusy`` if none was begun."""
+        """Whether the move has ended; ``AsyncNotBusy`` if none was started."""
         if self._worker is None:
             raise AsyncNotBusy("no move was begun; call async_move_linear or its like first")
         return not self._worker.is_alive()
 
     def close(self) -> None:
-        """Stop what goes on, and disconnect."""
+        """Stop the present move, and disconnect."""
         if self._worker is not None and self._worker.is_alive():
             self.controller.arm.stop()
             self._worker.join()

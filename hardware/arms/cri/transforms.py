@@ -1,4 +1,4 @@
-"""Poses as the sensor group's ``cri`` writes them, and frames within frames. The names are those of ``cri.transforms``.
+"""Poses in the form of the sensor group's ``cri``, and their conversion between frames. The names are those of ``cri.transforms``.
 
 A pose in Euler angles is ``x, y, z`` in mm and three angles in deg; ``axes`` names their convention: ``s`` static or ``r`` rotating, and
 the order. A pose as a quaternion is ``x, y, z`` in mm and ``w, x, y, z`` of the turn.
@@ -67,12 +67,12 @@ def quat2euler(pose: Numbers, axes: str = "sxyz") -> np.ndarray:
 
 
 def transform(pose: Numbers, frame: Numbers) -> np.ndarray:
-    """A pose (7,) as it is seen from a frame (7,); both are given in the same frame."""
+    """A pose (7,) relative to a frame (7,); both are given in the same frame."""
     return mat2quat(np.linalg.inv(quat2mat(frame)) @ quat2mat(pose))
 
 
 def inv_transform(pose: Numbers, frame: Numbers) -> np.ndarray:
-    """A pose (7,) that is given in a frame (7,), in the frame in which that frame is given."""
+    """A pose (7,) that is given relative to a frame (7,), in the frame in which that frame is given."""
     return mat2quat(quat2mat(frame) @ quat2mat(pose))
 
 

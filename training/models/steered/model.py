@@ -42,7 +42,7 @@ class Displacements:
 
 
 class SteeredModel(PinModel):
-    """See the module. Unlike ``vgnn`` it does not notice that the camera sits elsewhere than in training."""
+    """See the module. Unlike ``vgnn``, it does not detect that the camera sits at another place than in training."""
 
     counts_from_rest = True
     has_modes = True
@@ -57,7 +57,7 @@ class SteeredModel(PinModel):
         return Displacements((pins.nodes_px - pins.reference.pins_px) / reference.spacing_px.mean())
 
     def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
-        """See ``Model``. Sets the principal components, and in which sense the direction's label grows.
+        """See ``Model``. Sets the principal components, and the turning sense in which the direction's label grows.
 
         Raises
         ------
@@ -71,14 +71,14 @@ class SteeredModel(PinModel):
         cast(Steered, network).prepare(cast(Displacements, inputs).moved[rows], numbers[rows], code)
 
     def modes(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> Modes:
-        """See ``Model``. The inputs are the network's own numbers, and the first components of the field as turned to its direction."""
+        """See ``Model``. The inputs are the network's estimates, and the first components of the field after it is turned by them."""
         with torch.no_grad():
             numbers, seen = cast(Steered, network).view(*inputs.batch(rows))
         found = torch.cat([numbers, seen[:, :PROCESS_MODES]], dim=1).double().numpy()
         return Modes(found, np.zeros(len(found)))
 
     def pack(self, weights: Weights) -> Weights:
-        """See ``Model``. Leaves out what follows from the pins at rest."""
+        """See ``Model``. Leaves out the arrays that follow from the pins at rest."""
         return {key: value for key, value in weights.items() if key not in DERIVED}
 
     def unpack(self, packed: Weights, blank: Weights) -> Weights:

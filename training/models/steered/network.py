@@ -1,10 +1,10 @@
-"""The network of ``steered``: a first guess of the direction from the whole field, then a second look at the field turned to it.
+"""The network of ``steered``: a first guess of the direction from the whole field, then a second look at the field turned by this guess.
 
-Both looks are multi-layer perceptrons on the principal components of the field's coefficients (``field``). In training the first look sees
-every frame turned by a random angle, and its answer is turned back: it need not learn the same contact anew for each direction. The
-second look sees the field turned back by the first guess and some degrees of error. It estimates the rest of the direction and the other
-labels. In this view all contacts are alike, so that few principal components tell small differences. Both also know how far they
-were turned, because no sensor is quite the same all around.
+Both looks are multi-layer perceptrons on the principal components of the field's coefficients (``field``). In training, the first look gets
+every frame turned by a random angle, and its answer is turned back. Therefore it need not learn the same contact again for each direction.
+The second look gets the field turned back by the first guess and an error of some degrees. It estimates the rest of the direction and the
+other labels. In this view all contacts are similar, so that few principal components show small differences. Both looks also get the angle
+of the turn as an input, because no sensor is exactly the same all around.
 """
 
 from dataclasses import dataclass
@@ -16,21 +16,21 @@ from torch import nn
 from training.label_code import LabelCode
 from training.models.steered.field import Waves
 
-# Turns of a frame over which the first look's answers are averaged in use.
+# Number of turns of a frame over which the first look's answers are averaged in use.
 TURNS = 6
-# Looks at the turned field in use: the second one begins at the first one's direction.
+# Number of second looks in use. The first one uses the first look's direction, each further one that of the one before.
 LOOKS = 2
 # Standard deviation of the error that is added to the first guess in training, rad: 4 deg, some times the usual error.
 GUESS_ERROR_RAD = 0.07
 # Copies of each training frame, turned at random, from which the principal components are computed.
 COPIES = 3
-# Numbers by which a network knows a turn: sine and cosine of the turn and of twice the turn.
+# Number of inputs that describe a turn: sine and cosine of the turn and of twice the turn.
 KNOWN_OF_TURN = 4
 
 
 @dataclass(frozen=True)
 class SteeredSize:
-    """Sizes: principal components of both looks, width and depth of both perceptrons."""
+    """Sizes: principal components of each look, width and depth of each perceptron."""
 
     modes: int = 80
     width: int = 192
@@ -156,7 +156,7 @@ class Steered(nn.Module):
         return {"mean": mean, "log_scale": scale, "first": first}
 
     def view(self, moved: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The estimated numbers (B, E) of displacements (B, N, 2), and the components (B, modes) of the field as turned to them."""
+        """The estimated numbers (B, E) of displacements (B, N, 2), and the components (B, modes) of the field turned by the estimate."""
         mean = self(moved)["mean"]
         return mean, self.second.amplitudes(self.turned(self.coefficients(moved), -self._direction(mean)))
 

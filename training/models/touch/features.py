@@ -1,9 +1,9 @@
-"""Features of ``touch``: what a frame's pins say, as a few numbers.
+"""Features of ``touch``: the information in a frame's pins as a few numbers.
 
 - modes: amplitudes of the principal components of all displacements, in rest spacings;
-- relative modes: the same of the displacements divided by their size plus a little. They tell where and how a light touch presses, which
-  is lost among the modes of deep contacts;
-- light: amplitudes of the principal components of the caps' brightness. A cap brightens as it comes towards the LEDs, and the whole
+- relative modes: the same for the displacements divided by their size plus a small number. They show place and kind of a light contact,
+  which is small among the modes of deep contacts;
+- light: amplitudes of the principal components of the caps' brightness. A cap brightens as it moves towards the LEDs, and the whole
   picture darkens as the LEDs warm up.
 
 Mode k is scaled to the standard deviation sqrt(s_k / s_0), with s_k the singular values: small modes carry finer detail.
@@ -19,7 +19,7 @@ SMALL = 0.15
 """Size, in rest spacings times the root of the number of coordinates, below which displacements are noise rather than a contact."""
 
 MOST_LOST = 0.1
-"""Share of the training frames in which a pin that counts may be lost."""
+"""Largest share of the training frames in which a used pin may be lost."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Bases:
     small : (1,) float
         Norm of the displacements that is added before the division, rest spacings.
     seen : (N,) float
-        1 for pins that were found in most training frames, 0 for those whose place is mostly a guess; these are left out.
+        1 for pins that were found in most training frames, 0 for the others. These are left out, because their places are mostly guesses.
     """
 
     moved_mean: np.ndarray
@@ -69,7 +69,7 @@ class Bases:
 
     @classmethod
     def learnt(cls, moved: np.ndarray, light: np.ndarray, lost: np.ndarray, *, modes: int, light_modes: int) -> "Bases":
-        """From displacements (m, 2 N), levels (m, N) and lost pins (m, N) of training frames."""
+        """Learn the bases from displacements (m, 2 N), levels (m, N) and lost pins (m, N) of training frames."""
         seen = (lost.mean(axis=0) <= MOST_LOST).astype(float)
         if not seen.any():
             seen[:] = 1.0
@@ -85,7 +85,7 @@ class Bases:
 
 
 def _directions(centred: np.ndarray, count: int) -> np.ndarray:
-    """Directions (D, count) of the largest modes of centred rows (m, D), scaled as the module says; missing modes are 0."""
+    """Directions (D, count) of the largest modes of centred rows (m, D), scaled as in the module's docstring; missing modes are 0."""
     _, sizes, rows = np.linalg.svd(centred, full_matrices=False)
     found = np.zeros((centred.shape[1], count))
     if sizes.size and sizes[0] > 0:

@@ -1,7 +1,7 @@
 """``touch``, our model of contacts with forces: modes of the pins, relative modes, light of the caps; an ensemble and a Gaussian process.
 
-It needs a few hundred labelled frames and trains in minutes. Where ``vgnn`` looks at depth and angles of a surface, ``touch`` also tells
-light contacts apart, in which all pins move little, and uses the caps' brightness where there are pictures.
+It needs a few hundred labelled frames and trains in minutes. ``vgnn`` estimates depth and angles of a surface. ``touch`` also distinguishes
+light contacts, in which all pins move little, and uses the caps' brightness if there are pictures.
 """
 
 from collections.abc import Mapping
@@ -21,23 +21,23 @@ from training.recipes import Recipe, TrainingError
 from twin.pins.reference import Reference
 
 SIZES = {"modes": 40, "light_modes": 20, "width": 256, "depth": 3}
-"""Modes of displacements (and as many relative ones), modes of light, and the network's layers."""
+"""Numbers of modes of displacements (and of relative modes) and of modes of light; width and depth of the network."""
 GAIN = 3.0
-"""Factor on all features: with it the network learns fastest from their small modes."""
+"""Factor on all features. With it, the network learns fastest from their small modes."""
 
 
 HEADROOM = 1.2
-"""A feature may be this much larger than in training before intervals grow."""
+"""Size of a feature, relative to its largest size in training, above which intervals grow."""
 LEAST_FEATURE = 1e-3
-"""Size of a feature that is the same in all training frames."""
+"""Least size of a feature, for features that are constant in training."""
 FAR = 0.08
-"""Distance of a pin from where the modes of all pins put it, in rest spacings, from which on it is not a pin."""
+"""Distance, in rest spacings, between a pin and its place by the modes of all pins above which it is not a pin."""
 ROUNDS = 2
-"""Rounds in which the modes are learnt; pins that the round before did not trust are filled in."""
+"""Rounds in which the modes are learnt. Pins that were not trusted in the round before are filled in."""
 LIGHT_WEIGHT = 0.2
-"""Weight of the light among the inputs of the Gaussian process: it tells little but the state of the lamps."""
+"""Weight of the light among the inputs of the Gaussian process. Light mostly shows the state of the lamps."""
 LIGHT_DECIMALS = 4
-"""Decimals of the caps' light, logarithms of levels, that tell frames apart."""
+"""Decimals of the caps' light (logarithms of levels) that are compared between frames."""
 
 
 class TouchInputs:
@@ -61,17 +61,17 @@ class TouchModel(PinModel):
     has_modes = True
     modes_scaled = True
     sees_light = True
-    unmeasured_widens = 2.0  # errors of a camera that moved by 3 px, 1 deg and 1 % in the twin: 1.0 to 2.2 times those of one that did not
+    unmeasured_widens = 2.0  # in the twin, a camera moved by 3 px, 1 deg and 1 % has errors 1.0 to 2.2 times those of an unmoved one
 
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> TouchNetwork:
-        """See ``Model``; width and depth can be chosen. The modes are learnt before, with the numbers in ``SIZES``."""
+        """See ``Model``; width and depth can be chosen. The modes are learnt before; their numbers are those of ``SIZES``."""
         refuse_sizes(self, size, ("width", "depth"))
         sizes = SIZES | dict(size)
         features = 2 * sizes["modes"] + sizes["light_modes"]
         return TouchNetwork(features, outputs, width=sizes["width"], depth=sizes["depth"])
 
     def prepare_pins(self, pins: PinTable, train: np.ndarray) -> Prepared:
-        """See ``Model``. The modes are learnt from the training rows, and how a contact changes the similarity to the layout at rest."""
+        """See ``Model``. Learns from the training rows the modes, and how a contact changes the similarity to the layout at rest."""
         nodes_px, lost = pins.nodes_px, pins.lost
         for _ in range(ROUNDS):
             registration, _ = fit_registration(nodes_px[train], pins.reference.pins_px)
@@ -85,11 +85,11 @@ class TouchModel(PinModel):
         return Prepared(TouchInputs(bases(moved, pins.light)), learnt)
 
     def seen(self, data: Dataset) -> object:
-        """See ``Model``: the pins, where they are at rest, and the light of the caps."""
+        """See ``Model``: the pins, their places at rest, and the light of the caps."""
         return [super().seen(data), np.round(data.pins.light, LIGHT_DECIMALS) + 0.0]
 
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> TouchInputs:
-        """See ``PinModel``. If a frame without contact shows where the camera sits, no displacement of the camera is estimated."""
+        """See ``PinModel``. If a frame without contact shows the camera's place, no displacement of the camera is estimated."""
         pins = pins.seen_from(reference) if pins.measured else pins
         registration, bases = Registration(**learnt["registration"]), Bases(**learnt["bases"])
         if bases.light_mean.any() and not pins.light.any():
@@ -98,17 +98,17 @@ class TouchModel(PinModel):
         return TouchInputs(bases(moved, pins.light))
 
     def initialise(self, network: torch.nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
-        """See ``Model``. Sets how large the features may be."""
+        """See ``Model``. Sets the largest size of each feature in training."""
         cast(TouchNetwork, network).limit.copy_(HEADROOM * inputs.batch(rows)[0].abs().amax(dim=0).clamp(min=LEAST_FEATURE))
 
     def modes(self, network: torch.nn.Module, inputs: Inputs, rows: torch.Tensor) -> Modes:
-        """See ``Model``. The inputs are all features, the light with less weight."""
+        """See ``Model``. The inputs are all features; the light has a smaller weight."""
         x = inputs.batch(rows)[0].double().numpy() / GAIN
         weight = np.repeat([1.0, LIGHT_WEIGHT], [2 * SIZES["modes"], SIZES["light_modes"]])
         return Modes(x * weight, np.zeros(len(x)))
 
     def pack(self, weights: Weights) -> Weights:
-        """See ``Model``: all of them."""
+        """See ``Model``: all weights."""
         return weights
 
     def unpack(self, packed: Weights, blank: Weights) -> Weights:
@@ -117,7 +117,7 @@ class TouchModel(PinModel):
 
 
 def _moved(registration: Registration, pins: PinTable, reference: Reference, lost: np.ndarray, *, together: bool) -> np.ndarray:
-    """Displacements (M, 2 N) in rest spacings, lost pins filled in, without the displacement of a camera that sits elsewhere."""
+    """Displacements (M, 2 N) in rest spacings, with lost pins filled in, without the displacement of a moved camera."""
     nodes_px = pins.nodes_px.copy()
     for k in np.flatnonzero(lost.any(axis=1)):
         nodes_px[k] = registration.fill(nodes_px[k], lost[k])
@@ -127,7 +127,7 @@ def _moved(registration: Registration, pins: PinTable, reference: Reference, los
 
 
 def _untrusted(registration: Registration, pins: PinTable, reference: Reference) -> np.ndarray:
-    """Pins (M, N) that are lost, or so far from where the modes of all pins put them that they are something else: a reflection."""
+    """Pins (M, N) that are lost, or so far from their places by the modes of all pins that they are something else (reflections)."""
     aligned, _ = align(pins.nodes_px, reference.pins_px)
     away = aligned.reshape(len(aligned), -1) - registration.mean
     directions = registration.components / np.maximum(np.linalg.norm(registration.components, axis=0), 1e-12)

@@ -1,14 +1,14 @@
-"""The network of ``touch``: a multi-layer perceptron beside a linear map.
+"""The network of ``touch``: the sum of a multi-layer perceptron and a linear map.
 
-Outside of what it was trained on a network's own error scale means nothing. So the distance by which a feature is beyond its largest value
-in training is added to it, in standard deviations of the label.
+Outside the range of its training data, a network's own error scale has no meaning. Therefore the distance by which a feature exceeds its
+largest value in training is added to the error scale, in standard deviations of the label.
 """
 
 import torch
 from torch import nn
 
 LEAST_BEYOND = 1e-6
-"""Distance that counts as none."""
+"""Distance that counts as zero."""
 
 
 class TouchNetwork(nn.Module):

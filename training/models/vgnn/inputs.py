@@ -16,7 +16,7 @@ class PinInputs:
     features : (M, N, 3) float
     lost : (M, N) bool
     displaced : (M,) float, optional
-        Share, 0 to 1, of each frame's difference from the expected camera that was taken out; 0 for all frames if not given.
+        Share, 0 to 1, of each frame's difference from the expected camera that was removed; 0 for all frames if not given.
     """
 
     def __init__(self, features: np.ndarray, lost: np.ndarray, displaced: np.ndarray | None = None) -> None:
@@ -57,6 +57,6 @@ def seated_inputs(
     *,
     together: bool = False,
 ) -> PinInputs:
-    """Inputs of frames (see ``filled``) with the camera's displacement taken out; ``together`` as in ``Registration``."""
+    """Inputs of frames (see ``filled``) without the camera's displacement; ``together`` as in ``Registration``."""
     nodes, area, _, share = registration(nodes_px, area_px2, together=together)
     return PinInputs(pin_features(nodes, area, reference), lost, share)

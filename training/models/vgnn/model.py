@@ -43,7 +43,7 @@ class VgnnModel(PinModel):
     def prepare_pins(self, pins: PinTable, train: np.ndarray) -> Prepared:
         """See ``Model``. How a contact changes a frame's similarity to the layout at rest is learnt from the training rows.
 
-        In view 1 the whole difference of each frame from the expected camera is taken out, as for a camera that sits elsewhere.
+        In view 1 the whole difference of each frame from the expected camera is removed, as for a camera at another place.
         """
         registration, left = fit_registration(pins.nodes_px[train], pins.reference.pins_px)
         nodes_px, area_px2 = filled(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
@@ -56,7 +56,7 @@ class VgnnModel(PinModel):
         return Prepared(inputs, {"registration": registration.arrays()}, views=2)
 
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> PinInputs:
-        """See ``PinModel``. If a frame without contact shows where the camera sits, no displacement of the camera is estimated."""
+        """See ``PinModel``. If a frame without contact shows the camera's place, no displacement of the camera is estimated."""
         registration = Registration(**learnt["registration"])
         pins = pins.seen_from(reference) if pins.measured else pins
         nodes_px, area_px2 = filled(registration, pins.nodes_px, pins.area_px2, pins.lost, reference)
@@ -78,7 +78,7 @@ class VgnnModel(PinModel):
         return Modes(seen, pins.displaced[rows].numpy())
 
     def pack(self, weights: Weights) -> Weights:
-        """See ``Model``. Leaves out what follows from the pins' graph, and attention between pins that are not neighbours."""
+        """See ``Model``. Leaves out arrays that follow from the pins' graph, and attention between pins that are not neighbours."""
         kept = {key: value for key, value in weights.items() if key not in DERIVED}
         if "attention" in kept:
             kept["attention"] = kept["attention"][weights["adjacency"] > 0]
@@ -100,7 +100,7 @@ VGNN = VgnnModel(
     recipe=Recipe(kernel=True),
     variants={
         "graph": Variant(size={"layers": 0}),
-        "modes": Variant(size={"modes": 0, "area_modes": 0}, recipe={"kernel": False}),  # the process sees the modes only
+        "modes": Variant(size={"modes": 0, "area_modes": 0}, recipe={"kernel": False}),  # without modes the process has no inputs
         "kernel": Variant(recipe={"kernel": False}),
     },
 )

@@ -1,13 +1,13 @@
-"""Registration: is a frame shifted, turned or scaled as a whole because the camera sits elsewhere than in training, or by contact?
+"""Registration: separates the shift, turn and scale of a frame by a moved camera from those by the contact.
 
 A contact also changes the similarity (shift, turn, scale) between the pins and their layout at rest, but not independently of the other
-displacements. The best similarity is taken out of the pins, and the expected similarity is predicted from the displacements that are
-left. If the observed similarity differs from the expected one by far more than in training, the difference comes from the camera and is
-taken out of the frame. All frames of one recording are of one camera, so the median over many frames gives its displacement much more
-precisely than one frame.
+displacements. The best similarity is removed from the pins, and the remaining displacements predict the expected similarity. If the
+observed similarity differs from the expected one by far more than in training, the camera causes the difference, and it is removed from the
+frame. All frames of one recording are of one camera, so the median over many frames gives its displacement much more precisely than one
+frame.
 
-Taking the difference out also removes a small part of the contact. Therefore a model is also trained on frames with the whole difference
-taken out, and loses little accuracy on such frames.
+Removing the difference also removes a small part of the contact. Therefore a model is also trained on frames with the whole difference
+removed, and loses little accuracy on such frames.
 """
 
 from dataclasses import dataclass
@@ -26,13 +26,13 @@ LEAST_SIZE = 1e-5
 FILL_RIDGE = 1e-3
 # Rounds of filling in. There are several, because the similarity changes with the pins that were filled in.
 FILL_ROUNDS = 3
-# Number of frames from which on the median of their differences is used as the difference of their common camera.
+# Least number of frames for which the median of their differences is used as the difference of their common camera.
 MANY = 30
-# Median difference, relative to the usual one, above which the camera is taken to be displaced.
+# Median difference, relative to the usual one, above which the camera counts as displaced.
 COMMON = 1.5
-# Difference of a single frame, relative to the usual one, up to which nothing is taken out.
+# Difference of a single frame, relative to the usual one, up to which nothing is removed.
 FREE = 6.0
-# Difference of a single frame, relative to the usual one, from which on the whole difference is taken out.
+# Difference of a single frame, relative to the usual one, above which the whole difference is removed.
 FULL = 9.0
 
 
@@ -48,7 +48,7 @@ class Registration:
     weight : (q, 4) float
         Coefficients for the logarithm of scale, turn (rad), shift in x and y (px).
     usual : (4,) float
-        Root mean square difference between observed and expected similarity; the fit that predicts a training frame leaves it out.
+        Root mean square difference between observed and expected similarity. Each training frame is predicted by a fit without this frame.
     """
 
     rest_px: np.ndarray
@@ -58,7 +58,7 @@ class Registration:
     usual: np.ndarray
 
     def __call__(self, nodes_px: np.ndarray, area_px2: np.ndarray, *, together: bool = False) -> tuple:
-        """Take the camera's displacement out of frames.
+        """Remove the camera's displacement from frames.
 
         Parameters
         ----------
@@ -72,9 +72,9 @@ class Registration:
         nodes_px, area_px2
             Unchanged if the camera sits as in training.
         taken : (M, 4) float
-            What was taken out: logarithm of scale, turn (rad), shift (px).
+            The removed similarity: logarithm of scale, turn (rad), shift (px).
         share : (M,) float
-            Share of the frame's own difference that was taken out, 0 to 1.
+            Share of the frame's own difference that was removed, 0 to 1.
         """
         difference = self.difference(nodes_px)
         common = np.zeros(4)
@@ -146,7 +146,7 @@ def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[Registr
 
 
 def align(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Take the least-squares similarity to the layout at rest out of frames.
+    """Remove the least-squares similarity to the layout at rest from frames.
 
     Parameters
     ----------

@@ -11,11 +11,11 @@ from training.recipes import TrainingError
 from training.studies.sim_to_real.twins import contact_of
 from twin.types import FINE
 
-# Added to the seed of the contacts that are judged, so that none of them is also trained on.
+# Difference between the seeds of the judged contacts and of the training contacts, so that no judged contact is trained on.
 TESTS_APART = 1000
 # Name of the model that is trained on all objects of ``Plan.train``.
 MIXED = "mixed"
-# Largest ratio of the error on an unseen object to the error on the first object at which the aim is met.
+# Largest ratio of the error on an unseen object to the error on the first object for which the aim counts as reached.
 TIMES = 1.5
 
 
@@ -27,17 +27,17 @@ class Plan:
     ----------
     sensor : SensorSpec
     experiment : ExperimentSpec
-        Contacts whose labels lie within its ranges are judged. Training uses the experiment that it names as wider, else itself.
+        Its ranges contain the labels of the judged contacts. Training uses the experiment that it names as wider, else itself.
     randomisation : RandomisationSpec
     train, unseen : tuple of ObjectSpec
-        The first of ``train`` is the one that is also trained on alone.
+        Objects. The first of ``train`` is also trained on alone.
     count, tests : int
         Contacts to train on, and to judge on, for each object.
     seed, across : int
     epochs : int or None
         Epochs of both trainings; None: the model's own number.
     workers : int
-        Processes that simulate.
+        Number of simulating processes.
     """
 
     sensor: SensorSpec

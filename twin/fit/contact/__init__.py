@@ -1,4 +1,4 @@
-"""Contact of a sensor fitted to labelled frames: the rig, what of material and pins the frames tell, and friction."""
+"""Fit of a sensor's contact to labelled frames: the rig, friction, and the properties of material and pins that the frames determine."""
 
 from twin.fit.contact.fit import ContactFit, fit_contact
 from twin.fit.contact.parameters import PARAMETERS, Parameter

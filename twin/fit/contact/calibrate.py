@@ -1,4 +1,4 @@
-"""A contact calibration from a folder of frames to a page."""
+"""Contact calibration from a folder of frames, with a page as its result."""
 
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, replace
@@ -27,9 +27,9 @@ from twin.store import output, writes_file
 from twin.types import FINE, Form
 
 LABELS = 20
-"""Frames to which the contact is fitted."""
+"""Number of frames to which the contact is fitted."""
 MOST_HELD_OUT = 20
-"""Most frames that are kept out of the fit; the error on them is stated."""
+"""Most frames that are kept out of the fit. The report states the error on them."""
 
 
 def calibrate_contact(
@@ -47,9 +47,9 @@ def calibrate_contact(
     form: Form | None = None,
     progress: Step | None = None,
 ) -> tuple[SensorSpec, dict, Path]:
-    """Fit ``parameters`` to ``count`` random frames of a recording, and judge the result on others.
+    """Fit ``parameters`` to ``count`` random frames of a recording, and judge the result on other frames.
 
-    Everything is written to ``folder``; contacts that lie there from an earlier run are not computed again.
+    Everything is written to ``folder``. Contacts that an earlier run stored there are not computed again.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def calibrate_contact(
     Raises
     ------
     FrameError
-        No labels, no pins, too few frames.
+        There are no labels, no pins or too few frames.
     """
     measured = measure_frames(frames, spec, count + min(count, MOST_HELD_OUT), seed, experiment=experiment, form=form)
     order = np.random.default_rng(seed).permutation(len(measured))  # the frames come in the order of the recording's table
@@ -79,9 +79,10 @@ def calibrate_contact(
 def weighed(
     frames: Path, sensor: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, seed: int, *, across: int, form: Form | None = None
 ) -> Newtons:
-    """The scale of a sensor's forces from all frames of a recording that have one, ``MOST_PRESSES`` at most.
+    """The scale of a sensor's forces, from all frames of a recording with a measured force, ``MOST_PRESSES`` at most.
 
-    Its contact should be fitted before. The forces are along the approach, in N: the column that ``rig.force_sensor`` names, else ``Fz``.
+    The contact should be fitted before. Forces are in N along the approach. They come from the rig's force sensor (``rig.force_sensor``) if
+    the specification has one, else from the column ``Fz``.
     """
     recording = open_recording(frames, sensor, form)
     measured = pressed_n(recording, sensor, experiment)

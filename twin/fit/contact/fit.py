@@ -1,4 +1,4 @@
-"""Fit of contacts to labelled frames if it is not known whether each frame's move was executed.
+"""Fit of the contact to labelled frames when it is unknown whether each frame's move was executed.
 
 d_k1 and d_k0 are the mean squared pin errors of frame k after the move and after the tap alone, s^2 the median squared error, w the share
 of executed moves, and theta the parameters with their prior:
@@ -10,8 +10,8 @@ n is the number of independent observations in a frame. It is smaller than the n
 pins. c_k is smaller for frames that neither story (move executed, or not) fits. The M-step is one Gauss-Newton step with difference
 quotients. The uncertainty is the inverse of its matrix at the end.
 
-Where no frame shows the pins at rest, their places are fitted, too: for every theta they are the mean over the frames of what the simulated
-displacements miss, so errors and slopes are counted from their means over the frames.
+If no frame shows the pins at rest, their places are fitted, too. For every theta, they are the mean over the frames of measured places
+minus simulated displacements. Therefore errors and slopes are taken relative to their means over the frames.
 """
 
 from dataclasses import dataclass
@@ -66,13 +66,13 @@ class ContactFit:
     executed : (M,) float
         Probability that each frame's move was executed.
     trust : (M,) float
-        1 for a frame that one story fits; near 0 for a frame that none fits.
+        1 for a frame that one of the two stories explains; near 0 for a frame that neither explains.
     before_px, after_px : (M,) float
         Mean pin error of each frame for the story that fits it better.
     share : float
         Share of the moves that were executed.
     rest_px : (N, 2) float
-        Pins at rest, from which displacements are counted. If no frame shows them, they are fitted, and ``sensor`` has them.
+        Pins at rest, from which displacements are computed. If no frame shows them, they are fitted, and ``sensor`` contains them.
     """
 
     sensor: SensorSpec

@@ -1,9 +1,10 @@
-"""The scale of forces. Pins do not tell how stiff a sensor is: one that is twice as stiff moves its pins alike and pushes twice as hard.
+"""Determination of the scale of forces from measured forces.
 
-Some weighed presses fix it. With the contact fitted to the pins, each press is simulated, and the logarithm of measured over simulated
-force has the mean ln(s) and the standard error e. Both moduli are multiplied by s, and what gives way under forces is divided by it, so
-that the pins stay where they are. Forces are then known within a factor exp(t e) either way, with t the 95 % quantile of Student's
-distribution: 90 % of such intervals hold the truth.
+Pins do not determine how stiff a sensor is: a sensor that is twice as stiff moves its pins in the same way, with twice the force. Some
+presses with measured forces determine the scale. With the contact fitted to the pins, each press is simulated. The logarithm of measured
+over simulated force has the mean ln(s) and the standard error e. Both moduli are multiplied by s, and the compliances of the rig are
+divided by s, so that the pins do not move. Forces are then known within a factor exp(t e) in both directions, with t the 95 % quantile of
+Student's distribution: 90 % of such intervals contain the true force.
 """
 
 from collections.abc import Sequence
@@ -28,31 +29,31 @@ from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
 
 FEWEST_PRESSES = 3
-"""Presses that are needed: of two nobody can say how far they are apart by chance."""
+"""Fewest presses from which a scale is computed. Two presses do not show how large the random error is."""
 MOST_PRESSES = 20
-"""Presses that are simulated; each takes a second or two."""
+"""Most presses that are simulated. Each takes a second or two."""
 LEAST_N = 0.2
-"""Force from which on a press counts: scales and zeros are wrong by some hundredths of a newton."""
+"""Least force, N, of a press that is used, because scales and zero readings of force sensors are wrong by some hundredths of a newton."""
 COVERED = 0.95
 """Quantile of Student's distribution at each end of the interval."""
 ALONG = ("Fz", "force_z")
-"""Columns of the force along the approach, in N, where the rig has no force sensor of its own."""
+"""Columns of the force along the approach, N, if the specification's rig has no force sensor."""
 
 
 @dataclass(frozen=True)
 class Newtons:
-    """How stiff a sensor is, as forces tell it.
+    """The stiffness of a sensor, determined from forces.
 
     Attributes
     ----------
     presses : int
-        Presses that were compared; 0 where the stiffness is assumed.
+        Number of presses that were compared; 0 if the stiffness is assumed.
     scale : float
-        Measured over simulated force.
+        Measured force divided by simulated force.
     factor : float
-        Forces may be this factor larger or smaller.
+        The true forces may be larger or smaller by this factor.
     said : str
-        The same in words.
+        The result in words.
     """
 
     presses: int
@@ -61,7 +62,7 @@ class Newtons:
     said: str
 
     def of(self, sensor: SensorSpec) -> SensorSpec:
-        """The sensor with this stiffness; what gives way does so by as much as before."""
+        """The sensor with this stiffness. The rig's compliances are scaled so that the pins move as before."""
         skin = sensor.skin.model_copy(
             update={"young_modulus_mpa": self.scale * sensor.skin.young_modulus_mpa, "stiffness_factor": self.factor}
         )
@@ -76,7 +77,7 @@ class Newtons:
 
 
 def assumed(sensor: SensorSpec, why: str) -> Newtons:
-    """Where no forces were measured: the specification's own stiffness."""
+    """The result if no forces were measured: the specification's own stiffness."""
     skin, gel, factor = sensor.skin.young_modulus_mpa, sensor.gel.young_modulus_mpa, sensor.skin.stiffness_factor
     return Newtons(
         0,
@@ -88,7 +89,7 @@ def assumed(sensor: SensorSpec, why: str) -> Newtons:
 
 
 def compared(measured_n: ArrayLike, simulated_n: ArrayLike, sensor: SensorSpec) -> Newtons:
-    """The stiffness from measured and simulated forces (K,) along the approach; presses below ``LEAST_N`` do not count."""
+    """The stiffness from measured and simulated forces (K,) along the approach. Presses below ``LEAST_N`` are not used."""
     measured, simulated = np.abs(np.asarray(measured_n, float)), np.abs(np.asarray(simulated_n, float))
     usable = (measured >= LEAST_N) & (simulated >= LEAST_N / ASSUMED_FACTOR**2)
     count = int(usable.sum())
@@ -107,7 +108,7 @@ def compared(measured_n: ArrayLike, simulated_n: ArrayLike, sensor: SensorSpec) 
 
 
 def pressed_n(recording: Recording, sensor: SensorSpec, experiment: ExperimentSpec) -> np.ndarray:
-    """Measured forces (M,) along the approach, N, of a recording's frames; NaN where none was measured."""
+    """Measured forces (M,) along the approach, N, of a recording's frames; NaN for a frame without a measured force."""
     reads = None if sensor.rig is None else sensor.rig.force_sensor
     if reads is None:
         name = next((name for name in ALONG if name in recording.labels), "")
@@ -116,7 +117,7 @@ def pressed_n(recording: Recording, sensor: SensorSpec, experiment: ExperimentSp
 
 
 def _read(recording: Recording, reads: ForceSensorSpec, axis: int) -> np.ndarray:
-    """Forces (M,) along an axis of the rig from what its force sensor reads."""
+    """Forces (M,) along an axis of the rig, computed from the readings of its force sensor."""
     name = reads.columns[axis]
     if name not in recording.labels:
         return np.full(len(recording), np.nan)

@@ -23,7 +23,7 @@ TOLD = 0.5
 TRUSTED = 0.5
 """Trust below which a frame is listed as not trusted, and not drawn."""
 ALIKE = 0.9
-"""Absolute correlation from which on two parameters are listed as hardly distinguishable."""
+"""Absolute correlation above which two parameters are listed as hardly distinguishable."""
 
 
 def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out: tuple | None, held_frames: int) -> dict:
@@ -62,7 +62,7 @@ def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out
 
 
 def warnings_of(fit: ContactFit, held_out: tuple | None, held_frames: int) -> list[str]:
-    """What is worse than before the fit, or not known; empty if nothing is."""
+    """Warnings about everything that is worse than before the fit, or unknown; empty if there are none."""
     found = []
     if not held_out:
         found.append(

@@ -127,19 +127,16 @@ class _StepLine(BaseModel):
     value: list[float | None] = []
 
 
-def read_steps(folder: str | Path) -> list[dict]:
-    """Every complete step of a session; a line that was being written when it ended is left out, with all after it.
+def _steps_and_note(folder: Path) -> tuple[list[dict], str]:
+    """A session's complete steps, and what is wrong with the line after them ("" if there is none).
+
+    A line that was being written when the session ended is left out, with all after it.
 
     Raises
     ------
     FrameError
         The file can't be read.
     """
-    return _steps_and_note(Path(folder))[0]
-
-
-def _steps_and_note(folder: Path) -> tuple[list[dict], str]:
-    """A session's complete steps, and what is wrong with the line after them ("" if there is none)."""
     try:
         text = read_regular(folder / STEPS, LARGEST_BYTES).decode("utf-8", "replace")
     except OSError as error:

@@ -31,9 +31,10 @@ def pytest_sessionstart(session):
 
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(tmp_path_factory):
-    """The tests keep their arrays apart from the user's."""
+    """The tests keep their arrays apart from the user's; what one worker has computed, the others read."""
+    base = tmp_path_factory.getbasetemp()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TACTIP_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("TACTIP_CACHE", str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"))
         yield
 
 

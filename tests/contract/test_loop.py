@@ -18,7 +18,7 @@ from hardware.session import SessionSource
 from hardware.step import LoopSettings
 from hardware.trajectory import measure, trajectory_of, write_csv
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
-from twin.records.session import SessionWriter, read_steps
+from twin.records.session import Session, SessionWriter
 from twin.rig.mounting import Mounting
 
 SPEED = 20.0  # of the simulated arm, times real
@@ -336,7 +336,7 @@ def test_a_replayed_session_decides_the_same(rig, tmp_path):
             except EOFError:
                 break
     np.testing.assert_array_equal(np.array(again), live)
-    steps = read_steps(tmp_path / "s")
+    steps = Session(tmp_path / "s").steps
     np.testing.assert_array_equal([step["value"] for step in steps], live)
     np.testing.assert_array_equal([step["sent"] for step in steps], [record.sent for record in loop.records])
 

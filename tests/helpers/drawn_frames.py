@@ -9,32 +9,43 @@ from twin.pins import nominal_reference
 from twin.types import Form, Frame
 
 SUBPIXELS = 16  # per pixel and axis: places are drawn to 1/16 px or better
+HALF_DIAGONAL_PX = 0.708  # of a pixel
 
 
 def draw_discs(size_px, centers_px, radius_px, *, level=(15, 200), blur_px=0.0, noise_sd=0.0, rng=None) -> np.ndarray:
     """(H, W) uint8 picture of bright discs on a dark ground; coverage computed by supersampling."""
-    width, height = size_px
-    coverage = np.zeros((height, width))
-    radii = np.broadcast_to(radius_px, len(centers_px))
-    offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
-    for (x, y), radius in zip(centers_px, radii, strict=True):
-        reach = int(np.ceil(radius)) + 1
-        columns = np.arange(max(int(round(x)) - reach, 0), min(int(round(x)) + reach + 1, width))
-        rows = np.arange(max(int(round(y)) - reach, 0), min(int(round(y)) + reach + 1, height))
-        if not len(columns) or not len(rows):
-            continue
-        dx2 = ((columns[:, None] + offsets).ravel() - x) ** 2
-        dy2 = ((rows[:, None] + offsets).ravel() - y) ** 2
-        inside = dx2[None] + dy2[:, None] < radius**2
-        part = inside.reshape(len(rows), SUBPIXELS, len(columns), SUBPIXELS).mean(axis=(1, 3))
-        patch = coverage[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        np.maximum(patch, part, out=patch)
+    coverage = _coverage(size_px, np.reshape(centers_px, (-1, 2)), np.broadcast_to(radius_px, len(centers_px)))
     image = level[0] + (level[1] - level[0]) * coverage
     if blur_px:
         image = cv2.GaussianBlur(image, (0, 0), blur_px)
     if noise_sd:
         image = image + rng.normal(0, noise_sd, image.shape)
     return np.clip(np.round(image), 0, 255).astype(np.uint8)
+
+
+def _coverage(size_px, centers_px, radii_px) -> np.ndarray:
+    """(H, W) share of each pixel that the largest of the discs covers; only pixels on a disc's edge are divided into smaller ones."""
+    width, height = size_px
+    coverage = np.zeros((height, width))
+    if not len(centers_px):
+        return coverage
+    reach = int(np.ceil(max(radii_px))) + 1
+    around = np.arange(-reach, reach + 1)
+    columns, rows = (np.round(centers_px).astype(int)[:, k, None] + around for k in (0, 1))
+    dx, dy = columns - centers_px[:, :1], rows - centers_px[:, 1:]
+    beyond = np.hypot(dx[:, None, :], dy[:, :, None]) - radii_px[:, None, None]  # of a pixel's middle: (discs, rows, columns)
+    seen = ((columns >= 0) & (columns < width))[:, None, :] & ((rows >= 0) & (rows < height))[:, :, None]
+    disc, j, i = np.nonzero((beyond < HALF_DIAGONAL_PX) & seen)
+    part = np.ones(len(disc))
+    edge = np.flatnonzero(beyond[disc, j, i] > -HALF_DIAGONAL_PX)
+    of = disc[edge]
+    offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
+    dx2 = (columns[of, i[edge], None] + offsets - centers_px[of, :1]) ** 2
+    dy2 = (rows[of, j[edge], None] + offsets - centers_px[of, 1:]) ** 2
+    inside = dx2[:, None, :] + dy2[:, :, None] < (radii_px[of] ** 2)[:, None, None]
+    part[edge] = np.count_nonzero(inside.reshape(-1, SUBPIXELS**2), axis=1) / SUBPIXELS**2
+    np.maximum.at(coverage, (rows[disc, j], columns[disc, i]), part)
+    return coverage
 
 
 def cap_radii_px(spec: SensorSpec, form: Form) -> np.ndarray:

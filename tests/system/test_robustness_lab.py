@@ -33,7 +33,7 @@ def test_tune_check_and_robustness_from_the_command_line(tmp_path):
     source = RenderedSource(spec, CONTACTS[:1])
     frames = tmp_path / "frames"
     frames.mkdir()
-    for k, name in enumerate(("noise", "defocus", "motion-blur")):
+    for k, name in enumerate(("noise", "motion-blur")):
         shot = source.shoot(Case((CONDITIONS[name],)), 0.01)[0]
         write_image(frames / f"{k}.png", shot.frame.image)
     tuned = run("tune", "--sensor", "mg400-127", "--frames", frames, "--out", tmp_path / "mine.toml")

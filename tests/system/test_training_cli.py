@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from drawn_frames import drawn_frame
 from drawn_recording import drawn_pins
-from small_generation import ACROSS, EXPERIMENT, SENSOR
+from small_generation import EXPERIMENT, SENSOR
 from typer.testing import CliRunner
 
 from scenes import load_experiment, load_sensor
@@ -23,6 +23,7 @@ from twin.pins import nominal_reference
 from twin.types import Form
 
 FRAMES = 70
+ACROSS = 6  # elements: the coarsest grid, as the commands are tried and not the mechanics
 
 
 def twin(*arguments):

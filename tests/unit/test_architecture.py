@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -54,16 +55,23 @@ NAMED_OTHERWISE = {"rerun": "rerun-sdk"}  # imported under another name than it 
 COMPOSITION_ROOTS = ("twin/cli/",)  # the outermost layer may join everything; nothing joins it (test_command_line)
 
 
-def imports_of(path: Path) -> set[str]:
+@cache
+def nodes_of(source: str) -> tuple[ast.AST, ...]:
+    """Every node of a module's code, which is read once for all tests."""
+    return tuple(ast.walk(ast.parse(source)))
+
+
+@cache
+def imports_of(path: Path) -> frozenset[str]:
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes_of(path.read_text(encoding="utf-8")):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module in MAY_IMPORT:  # "from twin import store" names twin.store
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             found.add(node.module)
-    return found
+    return frozenset(found)
 
 
 def sources(package: str) -> list[Path]:
@@ -114,7 +122,7 @@ def test_twin_itself_imports_nothing_of_ours():
 def test_imports_name_their_package_in_full():
     for package in MAY_IMPORT:
         for path in sorted((ROOT / package).rglob("*.py")):
-            relative = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.ImportFrom) and n.level]
+            relative = [n for n in nodes_of(path.read_text(encoding="utf-8")) if isinstance(n, ast.ImportFrom) and n.level]
             assert not relative, f"{path.relative_to(ROOT)}: line {relative[0].lineno} imports relatively"
 
 
@@ -138,7 +146,7 @@ RENAMING = {"replace", "rename", "renames"}  # functions of os
 
 def renames_files(source: str) -> bool:
     """Whether a module gives files their names by ``os.replace`` or ``os.rename``, however it imports them."""
-    tree = list(ast.walk(ast.parse(source)))
+    tree = nodes_of(source)
     called = {n.attr for n in tree if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name) and n.value.id == "os"}
     imported = {alias.name for n in tree if isinstance(n, ast.ImportFrom) and n.module == "os" for alias in n.names}
     return bool((called | imported) & RENAMING)
@@ -153,13 +161,13 @@ def test_renames_are_recognised(source, found):
 
 def test_only_the_store_gives_files_their_names():
     modules = [path for package in MAY_IMPORT for path in sorted((ROOT / package).rglob("*.py"))]
-    assert {path.parent for path in modules if renames_files(path.read_text())} == {ROOT / "twin" / "store"}
+    assert {path.parent for path in modules if renames_files(path.read_text(encoding="utf-8"))} == {ROOT / "twin" / "store"}
 
 
 def left_to_the_locale(source: str) -> list[int]:
     """Lines on which a text file is read or written in an encoding that the user's locale chooses."""
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         if not isinstance(node, ast.Call) or "encoding" in {keyword.arg for keyword in node.keywords}:
             continue
         name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
@@ -226,11 +234,12 @@ def test_the_repository_holds_no_foreign_data():
     assert not too_large
 
 
-def declared(*extras: str) -> set[str]:
+@cache
+def declared(*extras: str) -> frozenset[str]:
     """Distributions that pyproject.toml asks for, with those of some of its extras."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     asked = project["dependencies"] + [line for extra in extras for line in project["optional-dependencies"][extra]]
-    return {re.split(r"[><=!\[ ]", line)[0].lower() for line in asked}
+    return frozenset(re.split(r"[><=!\[ ]", line)[0].lower() for line in asked)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from twin.types import Form, Frame
 
 # scale spaces give whole pixels; DoH, from an integral image, is off by about one
 CENTROID_PX = {"twin": 0.1, "legacy": 0.6, "adaptive": 0.6, "fixed": 0.6, "simple": 0.6, "log": 1.0, "dog": 1.0, "doh": 1.8}
+FOREIGN_PX = (400, 300)
 
 
 @pytest.fixture(scope="module")
@@ -31,16 +32,16 @@ def flat_layout(spec):
 
 @pytest.fixture(scope="module")
 def foreign(spec):
-    """Frames of a sensor like ours whose camera nobody knows: larger, displaced, turned, brighter ring around; and their pins."""
+    """Frames of a sensor like ours whose camera nobody knows: of another size, displaced, turned, brighter ring around; and their pins."""
     flat = flat_layout(spec)
     turn = np.radians(8.0)
     turning = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    center, frames, truths = np.array([300.0, 255.0]), [], []
+    center, frames, truths = np.array([187.5, 159.0]), [], []
     for k in range(2):
-        rest = center + 165.0 * (flat @ turning) * (1 - 0.08 * np.linalg.norm(flat, axis=1, keepdims=True))
-        truth = smooth_warp(rest, 6.0, np.random.default_rng(k))
-        image = draw_discs((640, 480), truth, 6.0, level=(20, 120), blur_px=0.8, noise_sd=1.0, rng=np.random.default_rng(k))
-        cv2.circle(image, (300, 255), 205, 180, 14)
+        rest = center + 103.0 * (flat @ turning) * (1 - 0.08 * np.linalg.norm(flat, axis=1, keepdims=True))
+        truth = smooth_warp(rest, 3.8, np.random.default_rng(k))
+        image = draw_discs(FOREIGN_PX, truth, 3.8, level=(20, 120), blur_px=0.8, noise_sd=1.0, rng=np.random.default_rng(k))
+        cv2.circle(image, (187, 159), 128, 180, 9)
         frames.append(Frame(image, Form.RAW, f"foreign-{k}"))
         truths.append(truth)
     return frames, truths
@@ -81,9 +82,9 @@ def test_a_tuning_tells_what_it_left_out_and_frames_of_another_size(spec, tuned,
 
 
 def test_a_tuning_says_whether_its_pins_at_rest_were_made_from_contacts(spec, foreign):
-    uneven = foreign[1][0] + np.random.default_rng(0).normal(0, 1.5, foreign[1][0].shape)  # as no frame without contact is
+    uneven = foreign[1][0] + np.random.default_rng(0).normal(0, 0.9, foreign[1][0].shape)  # as no frame without contact is
     contact, given = (
-        Frame(draw_discs((640, 480), px, 6.0, level=(20, 120), blur_px=0.8), Form.RAW, name)
+        Frame(draw_discs(FOREIGN_PX, px, 3.8, level=(20, 120), blur_px=0.8), Form.RAW, name)
         for px, name in ((uneven, "f_0.png"), (foreign[1][1], "init_0.png"))
     )
     made, measured = tune([contact], spec), tune([contact], spec, given=given)

@@ -26,7 +26,7 @@ from twin.frames import open_recording, read_image
 from twin.frames.tables import order_by_table, read_metadata, read_table
 from twin.pins import nominal_reference
 from twin.pins.graph_files import read_pins
-from twin.records.session import SessionWriter, read_steps
+from twin.records.session import STEPS, Session, SessionWriter
 from twin.rig.labels import read_executed
 from twin.store import Item, find_arrays, find_json, keep_arrays, keep_json
 from twin.types import Form
@@ -335,9 +335,17 @@ def test_a_damaged_session_is_replayed_or_refused(tmp_path, session, data, name)
 
 @MANY
 @given(content=st.binary(max_size=300))
-def test_any_bytes_are_steps_up_to_the_first_that_is_none(tmp_path, content):
-    (tmp_path / "steps.jsonl").write_bytes(content)
-    assert isinstance(read_steps(tmp_path), list)
+def test_steps_before_any_bytes_that_are_none_are_read(tmp_path, session, content):
+    folder = tmp_path / "session"
+    shutil.copytree(session, folder, dirs_exist_ok=True)
+    whole = [json.loads(line) for line in (session / STEPS).read_text().splitlines()]
+    with (folder / STEPS).open("ab") as file:
+        file.write(content)
+    try:
+        found = Session(folder)
+        assert found.steps[: len(whole)] == whole and (not content or found.notes), "what is left out is told"
+    except OURS as error:
+        assert str(folder) in str(error) and len(str(error).splitlines()) == 1
 
 
 @pytest.fixture(scope="module")

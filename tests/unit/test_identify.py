@@ -25,14 +25,17 @@ LAYOUTS = [
 ]
 
 
-def rest_of(pins, *, size=(500, 420), radius=180.0, turn_deg=11.0, bulge=-0.15):
+SIZE, RADIUS = (300, 252), 108.0  # px: small frames, in which 331 pins still stand 11 px apart
+
+
+def rest_of(pins, *, size=SIZE, radius=RADIUS, turn_deg=11.0, bulge=-0.15):
     """Where a camera that looks at a dome, turned and a little off, has the pins: px (N, 2)."""
     place = pin_lattice(pins).places @ [1, 1j] * np.exp(1j * np.radians(turn_deg))
     place = place * (1 + bulge * np.abs(place) ** 2) / (1 + bulge)
-    return np.column_stack([place.real, place.imag]) * radius + np.array(size) / 2 + [9.0, -6.0]
+    return np.column_stack([place.real, place.imag]) * radius + np.array(size) / 2 + [5.4, -3.6]
 
 
-def frames_of(rest, count=3, *, size=(500, 420), contact_px=7.0, ring=True, level=(20, 120), seed=0):
+def frames_of(rest, count=3, *, size=SIZE, contact_px=4.2, ring=True, level=(20, 120), seed=0):
     """Gray frames of contacts: caps, and the bright ring of the housing."""
     spacing = np.median(np.sort(np.linalg.norm(rest[:, None] - rest, axis=2), axis=1)[:, 1])
     images = []
@@ -59,21 +62,21 @@ def test_the_layout_is_found_and_its_pins_named(pins):
     assert same(found.best.pins, pins), found.best.line()
     assert found.sure, found.doubts
     nearest = np.linalg.norm(found.best.rest_px[:, None] - rest, axis=2).min(axis=1)
-    assert np.median(nearest) < 4.0  # the contacts' median is not the rest
+    assert np.median(nearest) < 2.4  # the contacts' median is not the rest
 
 
-@pytest.mark.parametrize("scale", [0.27, 3.0])
+@pytest.mark.parametrize("scale", [0.45, 5.0])
 def test_the_frames_size_does_not_matter(scale):
     pins = PinsSpec(layout="hexagon", rings=6) if scale < 1 else PinsSpec(rings=4)
-    size = (int(500 * scale), int(420 * scale))
+    size = (int(SIZE[0] * scale), int(SIZE[1] * scale))
     rest = (rest_of(pins) + 0.5) * scale - 0.5
-    found = identify(frames_of(rest, 2, size=size, contact_px=6 * scale))
+    found = identify(frames_of(rest, 2, size=size, contact_px=3.6 * scale))
     assert same(found.best.pins, pins) and found.sure, found.best.line()
 
 
 def test_a_rim_that_the_frame_cuts_is_told_from_what_is_in_view():
     pins = PinsSpec(rings=6)
-    cut = [np.ascontiguousarray(image[55:365, 60:460]) for image in frames_of(rest_of(pins), ring=False)]
+    cut = [np.ascontiguousarray(image[33:219, 36:276]) for image in frames_of(rest_of(pins), ring=False)]
     found = identify(cut)
     assert same(found.best.pins, pins), found.best.line()
 
@@ -81,15 +84,15 @@ def test_a_rim_that_the_frame_cuts_is_told_from_what_is_in_view():
 @pytest.mark.parametrize(
     ("pins", "part"),
     [
-        (PinsSpec(rings=6), np.s_[110:310, 130:390]),
-        (PinsSpec(layout="hexagon", rings=6), np.s_[110:310, 130:390]),
-        (PinsSpec(layout="grid", columns=9, rows=9), np.s_[:, 150:350]),
+        (PinsSpec(rings=6), np.s_[66:186, 78:234]),
+        (PinsSpec(layout="hexagon", rings=6), np.s_[66:186, 78:234]),
+        (PinsSpec(layout="grid", columns=9, rows=9), np.s_[:, 90:210]),
     ],
     ids=lambda p: p.in_words() if isinstance(p, PinsSpec) else "",
 )
 def test_a_layout_whose_end_is_cut_off_is_never_sure(pins, part):
     turn_deg = 0.0 if pins.layout == "grid" else 11.0
-    cut = [np.ascontiguousarray(image[part]) for image in frames_of(rest_of(pins, turn_deg=turn_deg), ring=False, contact_px=3.0)]
+    cut = [np.ascontiguousarray(image[part]) for image in frames_of(rest_of(pins, turn_deg=turn_deg), ring=False, contact_px=1.8)]
     found = identify(cut)
     assert found.best.pins.count < pins.count and not found.sure, found.best.line()
     assert any("may be cut off" in doubt for doubt in found.doubts)
@@ -110,7 +113,7 @@ def masked(images, rest, share, *, level=0.0, soft_px=0.0, noise_sd=3.0):
     ("share", "look"),
     [
         (0.86, {}),
-        (0.9, {"level": 12.0, "soft_px": 8.0}),
+        (0.9, {"level": 12.0, "soft_px": 4.8}),
         (0.62, {"noise_sd": 8.0}),
     ],
     ids=["noise", "a soft gray edge", "much noise, two rings hidden"],
@@ -119,14 +122,14 @@ def test_a_layout_behind_a_round_mask_is_never_sure(share, look):
     """What the mask leaves looks like a smaller layout that explains everything: nothing is seen beyond it, not even a housing."""
     pins = PinsSpec(rings=6)
     rest = rest_of(pins)
-    found = identify(masked(frames_of(rest, contact_px=3.0), rest, share, **look))
+    found = identify(masked(frames_of(rest, contact_px=1.8), rest, share, **look))
     assert found.best.pins.count < pins.count and found.best.explained > 0.95, found.best.line()
     assert not found.sure and any("may be cut off" in doubt for doubt in found.doubts)
 
 
 def test_a_mask_that_shows_the_housing_leaves_the_layout_sure():
     rest = rest_of(PinsSpec(rings=6))
-    found = identify(masked(frames_of(rest, contact_px=3.0), rest, 1.3))
+    found = identify(masked(frames_of(rest, contact_px=1.8), rest, 1.3))
     assert found.sure and same(found.best.pins, PinsSpec(rings=6)), found.doubts
 
 
@@ -134,7 +137,7 @@ def test_a_layout_whose_pins_fall_together_explains_nothing():
     """Labels of a grid that are put on rings can bring two of its pins to one place."""
     pins = PinsSpec(rings=3)
     rest = rest_of(pins)
-    spots = find_bumps(frames_of(rest, 1)[0], 10.0)
+    spots = find_bumps(frames_of(rest, 1)[0], 6.0)
     assert _matched(pins, rest, spots).explained > 0.9
     rest[5] = rest[6]
     assert _matched(pins, rest, spots).explained == 0.0
@@ -142,17 +145,17 @@ def test_a_layout_whose_pins_fall_together_explains_nothing():
 
 def test_a_pin_that_the_rim_lacks_may_be_dark_and_is_not_sure():
     whole = PinsSpec(rings=4)
-    found = identify(frames_of(np.delete(rest_of(whole), 50, axis=0), contact_px=3.0, ring=False))
+    found = identify(frames_of(np.delete(rest_of(whole), 50, axis=0), contact_px=1.8, ring=False))
     assert found.best.pins.missing and not found.sure and any("too dark to be seen" in doubt for doubt in found.doubts)
 
 
 def test_frames_turned_and_filled_show_the_layout():
     """A turned frame's corners are filled, and its cut pins are not in view: they count neither for the layout nor against it."""
     pins = PinsSpec(rings=6)
-    images = frames_of(rest_of(pins, radius=205.0), ring=False)
-    turn = cv2.getRotationMatrix2D((249.5, 209.5), 37, 1.0)
-    turn[:, 2] += 50
-    turned = [cv2.warpAffine(image[22:398], turn, (600, 560)) for image in images]
+    images = frames_of(rest_of(pins, radius=123.0), ring=False)
+    turn = cv2.getRotationMatrix2D((149.5, 125.5), 37, 1.0)
+    turn[:, 2] += 30
+    turned = [cv2.warpAffine(image[13:239], turn, (360, 336)) for image in images]
     found = identify(turned)
     assert same(found.best.pins, pins) and found.best.explained > 0.97, found.best.line()
 
@@ -163,9 +166,9 @@ def test_stray_light_and_specks_do_not_change_the_layout():
     rng = np.random.default_rng(0)
     for image in images:
         glow = np.zeros(image.shape, np.float32)
-        cv2.circle(glow, (330, 160), 60, 90, -1)
-        np.copyto(image, np.clip(image + cv2.GaussianBlur(glow, (0, 0), 35), 0, 255).astype(np.uint8))
-        for x, y in rng.uniform((150, 120), (350, 300), (6, 2)).astype(int):
+        cv2.circle(glow, (198, 96), 36, 90, -1)
+        np.copyto(image, np.clip(image + cv2.GaussianBlur(glow, (0, 0), 21), 0, 255).astype(np.uint8))
+        for x, y in rng.uniform((90, 72), (210, 180), (6, 2)).astype(int):
             cv2.circle(image, (int(x), int(y)), 2, 255, -1)
     found = identify(images)
     assert same(found.best.pins, pins), found.best.line()
@@ -231,10 +234,10 @@ def test_frames_of_inverted_contrast_are_refused_as_such():
 def test_thresholded_frames_of_fading_light_are_not_sure():
     """A fixed threshold makes caps in dark corners black, and those before them small; a local one leaves them alike."""
     pins = PinsSpec(rings=6)
-    images = frames_of(rest_of(pins, radius=150.0), 3, contact_px=3.0)
+    images = frames_of(rest_of(pins, radius=90.0), 3, contact_px=1.8)
     y, x = np.mgrid[: images[0].shape[0], : images[0].shape[1]]
-    light = np.clip(1.0 - 0.8 * np.hypot(x - 259, y - 204) / 150, 0, 1)
+    light = np.clip(1.0 - 0.8 * np.hypot(x - 155, y - 122) / 90, 0, 1)
     even = identify([np.where(image > 70, 255, 0).astype(np.uint8) for image in images])
-    faded = identify([np.where(cv2.GaussianBlur(image, (0, 0), 3) * light > 32, 255, 0).astype(np.uint8) for image in images])
+    faded = identify([np.where(cv2.GaussianBlur(image, (0, 0), 1.8) * light > 32, 255, 0).astype(np.uint8) for image in images])
     assert even.sure and even.best.pins.rings == 6, even.doubts
     assert not faded.sure and any("light fades" in doubt for doubt in faded.doubts), faded.best.line()

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -20,6 +21,7 @@ from twin.records import FORMATS, RecordError, convert, open_records, open_write
 from twin.records.folder import SIDECAR
 
 KILLED = """
+import os
 import sys
 from pathlib import Path
 from made_records import ABOUT, made_episode
@@ -27,10 +29,14 @@ from twin.records import open_writer
 def forever():
     for seed in range(100000):
         if seed == 1:
-            print("ready", flush=True)
+            print(os.getpid(), flush=True)
         yield made_episode(seed)
-with open_writer(Path(sys.argv[2]), sys.argv[1], ABOUT, 10, at_once=True) as writer:
-    writer.write(forever())
+for folder in sys.argv[2:]:  # each is written to by a process of its own, until that is killed
+    if process := os.fork():
+        os.waitpid(process, 0)
+        continue
+    with open_writer(Path(folder), sys.argv[1], ABOUT, 10, at_once=True) as writer:
+        writer.write(forever())
 """
 TESTS = Path(__file__).parents[1]
 WITH_HELPERS = os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS / "helpers")])}
@@ -82,12 +88,19 @@ def test_it_is_gone_on_with_and_no_episode_is_written_twice(tmp_path, to):
 
 @pytest.mark.parametrize("to", FORMATS)
 def test_killed_at_any_moment_every_finished_episode_is_there(tmp_path, to):
-    for number, after_s in enumerate((0.0, 0.07)):
-        folder = tmp_path / str(number)
-        with subprocess.Popen([sys.executable, "-c", KILLED, to, str(folder)], stdout=subprocess.PIPE, env=WITH_HELPERS) as process:
-            assert process.stdout.readline() == b"ready\n"
-            time.sleep(after_s)
-            process.send_signal(signal.SIGKILL)
+    folders = [tmp_path / str(number) for number in range(2)]
+    run = [sys.executable, "-c", KILLED, to, *map(str, folders)]
+    with subprocess.Popen(run, stdout=subprocess.PIPE, env=WITH_HELPERS, start_new_session=True) as process:
+        try:
+            for after_s in (0.0, 0.07):
+                writes = int(process.stdout.readline())
+                time.sleep(after_s)
+                os.kill(writes, signal.SIGKILL)
+            assert not process.wait(60.0)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    for folder in folders:
         found = open_records(folder).episodes
         assert found
         for seed, its in enumerate(found):

@@ -14,7 +14,7 @@ from hardware.session import SessionSource
 from twin.errors import FrameError, StoreError
 from twin.frames.images import write_image
 from twin.records import open_records
-from twin.records.session import FRAMES, REST, STEPS, SessionWriter, is_session, read_steps
+from twin.records.session import FRAMES, REST, STEPS, Session, SessionWriter, is_session
 from twin.types import Form, Frame
 
 WRITER = """
@@ -56,7 +56,7 @@ def test_a_session_that_ended_before_its_first_step_is_begun_anew_and_no_other(t
         session.keep_rest(frame(9))
     with SessionWriter(tmp_path / "s", {"try": 2}) as session:
         session.append(frame(0), {"k": 0})
-    assert [step["k"] for step in read_steps(tmp_path / "s")] == [0]
+    assert [step["k"] for step in Session(tmp_path / "s").steps] == [0]
     assert not (tmp_path / "s" / REST).exists()
     with pytest.raises(StoreError, match="not empty"):
         SessionWriter(tmp_path / "s", {})
@@ -70,7 +70,7 @@ def test_a_torn_last_line_is_left_out(tmp_path):
     last = whole.rstrip(b"\n").rfind(b"\n") + 1
     for cut in range(last, len(whole)):
         (tmp_path / "s" / STEPS).write_bytes(whole[:cut])
-        assert [step["k"] for step in read_steps(tmp_path / "s")] == [0, 1]
+        assert [step["k"] for step in Session(tmp_path / "s").steps] == [0, 1]
 
 
 def test_a_frame_that_serves_several_steps_is_kept_once_and_comes_as_often(tmp_path):

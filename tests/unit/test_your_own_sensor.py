@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from drawn_frames import drawn_frame
 from scipy.spatial import cKDTree
-from test_identify import frames_of, rest_of
+from test_identify import RADIUS, SIZE, frames_of, rest_of
 
 from scenes import load_sensor
 from scenes.pins import PinsSpec
@@ -136,9 +136,9 @@ def test_without_a_no_contact_frame_a_rest_layout_is_made_and_said():
     contacts = []
     for depth in np.linspace(0.2, 1.0, 12):  # a contact spreads the inner pins, and shears them
         away = rest - rest.mean(axis=0)
-        fade = np.clip(1 - (np.linalg.norm(away, axis=1, keepdims=True) / 180) ** 2, 0, None)
-        contacts.append(rest + depth * fade * (0.25 * away + rng.normal(0, 3, 2)))
-    contacts = [px + rng.normal(0, 1.5, px.shape) for px in contacts]  # none looks like a frame without contact
+        fade = np.clip(1 - (np.linalg.norm(away, axis=1, keepdims=True) / RADIUS) ** 2, 0, None)
+        contacts.append(rest + depth * fade * (0.25 * away + rng.normal(0, 1.8, 2)))
+    contacts = [px + rng.normal(0, 0.9, px.shape) for px in contacts]  # none looks like a frame without contact
     nothing = np.zeros((0, 2))
     seen = tuple(Seen(px, px, 0, nothing) for px in contacts)
     layout = Candidate(PINS, 1.0, 1.0, 0, 0, 0.0, np.median(contacts, axis=0), np.ones(61), seen)
@@ -191,7 +191,7 @@ def test_frames_of_another_size_are_tuned_and_then_observed():
     with pytest.raises(FrameError, match="expected 640x480"):
         Pipeline(spec, Form.RAW)(frames[0])
     tuned = with_detector(spec, tune(frames, spec).detector)
-    assert (tuned.camera.width_px, tuned.camera.height_px) == (500, 420)
+    assert (tuned.camera.width_px, tuned.camera.height_px) == SIZE
     assert all(Pipeline(tuned, Form.RAW)(frame).found == 127 for frame in frames)
 
 
@@ -243,13 +243,13 @@ def _inverted(image):
 
 FUZZ = {
     "one pixel": lambda image: image[:1, :1],
-    "a line": lambda image: np.ascontiguousarray(np.repeat(image[200:201], 10, axis=0))[:, :300],
+    "a line": lambda image: np.ascontiguousarray(np.repeat(image[120:121], 10, axis=0))[:, :180],
     "long": lambda image: np.zeros((10, 8000), np.uint8),
     "black": lambda image: np.zeros_like(image),
     "white": lambda image: np.full_like(image, 255),
     "inverted": _inverted,
     "turned": lambda image: np.rot90(image).copy(),
-    "masked": lambda image: np.where(np.arange(image.shape[1]) < 250, image, 0).astype(np.uint8),
+    "masked": lambda image: np.where(np.arange(image.shape[1]) < 150, image, 0).astype(np.uint8),
     "colour": lambda image: np.repeat(image[..., None], 3, axis=2),
     "16 bits": lambda image: image.astype(np.uint16) * 257,
     "noise": lambda image: np.random.default_rng(0).integers(0, 255, image.shape).astype(np.uint8),

@@ -213,12 +213,3 @@ def _bring_down(field: ObjectField, T: FloatArray, points_mm: FloatArray, height
         if height_mm < -depth_mm:
             break
     raise ContactError("the object misses the skin; use a smaller offset or tilt")
-
-
-def _sphere_points(count: int) -> FloatArray:
-    """(count, 3) nearly even unit vectors (Fibonacci sphere)."""
-    k = np.arange(count) + 0.5
-    z = 1 - 2 * k / count
-    azimuth = np.pi * (1 + np.sqrt(5)) * k
-    across = np.sqrt(1 - z * z)
-    return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])

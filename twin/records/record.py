@@ -10,9 +10,8 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
-from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -268,19 +267,6 @@ class Records:
                 lasted_s = max(last.time_s, 1.0 / FASTEST_HZ)
                 return int(np.clip(round((episode.length - 1) / lasted_s), 1, FASTEST_HZ))
         return round(NOMINAL_HZ)
-
-
-class RecordWriter(Protocol):
-    """Destination of episodes. Each format has its own writer."""
-
-    folder: Path
-
-    @property
-    def keys(self) -> set[str]:
-        """Keys of the episodes that are already stored."""
-
-    def write(self, episodes: Iterator[Episode]) -> int:
-        """Write episodes, and return their number. Episodes that are unfinished when the process ends are not stored."""
 
 
 def digest(*parts: object) -> str:

@@ -127,19 +127,16 @@ class _StepLine(BaseModel):
     value: list[float | None] = []
 
 
-def read_steps(folder: str | Path) -> list[dict]:
-    """Every complete step of a session. An incomplete last line, and everything after it, is left out.
+def _steps_and_note(folder: Path) -> tuple[list[dict], str]:
+    """The complete steps of a session, and the fault in the line after them ("" if there is none).
+
+    An incomplete last line, and everything after it, is left out.
 
     Raises
     ------
     FrameError
         The file can't be read.
     """
-    return _steps_and_note(Path(folder))[0]
-
-
-def _steps_and_note(folder: Path) -> tuple[list[dict], str]:
-    """The complete steps of a session, and the fault in the line after them ("" if there is none)."""
     try:
         text = read_regular(folder / STEPS, LARGEST_BYTES).decode("utf-8", "replace")
     except OSError as error:

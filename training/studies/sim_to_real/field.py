@@ -2,8 +2,8 @@
 
 A displacement is written in waves (``training.models.steered.field``). Where one label is a direction c that goes round the whole circle,
 an edge's, the waves are turned back by c. They are then those that the object's own frame sees, and change little with c. One Gaussian
-process of the labels that vary, and of cos c and sin c, gives all waves: its lengths are those by which the leading components of the
-waves are likeliest.
+process of the labels that vary, of cos c and sin c, and of the moves limited by friction, gives all waves. Its lengths maximise the
+likelihood of the leading components of the waves.
 """
 
 import numpy as np
@@ -12,14 +12,20 @@ from training.audit import LabelColumns
 from training.gaussian_process import SMOOTH_AND_LINEAR, Kernel, Points, climbed
 from training.models.steered.field import waves_of
 
-MOST_STATES = 2500
-"""Simulated states that the process learns from; more are slower and change no error."""
+MOST_STATES = 5000
+"""Simulated states that the process learns from. The cost grows with the third power of their number; a sheared contact needs thousands."""
 FITTED = 400
 """States on which lengths, sizes and noise are fitted."""
 LEADING = 3
 """Components of the waves by which they are fitted; they hold most of the displacement."""
+NEGLIGIBLE = 1e-4
+"""Share of the fitted displacements' variance that is left out. It is below the noise of the pins."""
 LEAST_RANGE = 1e-9
 """mm or deg by which a label varies."""
+MOVES_FROM = 6
+"""First column of the moves among the labels."""
+SLIPS_AT = 0.4
+"""Size of a move, in half ranges, from which the skin slips and its pins hardly move any further."""
 
 
 class TwinField:
@@ -71,13 +77,19 @@ class TwinField:
         points = Points.of(self._inputs(self.known))
         self._kernel = _likeliest(points, left, rng)
         self._placed = self._kernel.placed(points)
-        self._weight = np.linalg.solve(self._kernel.noisy(points), left)
+        weight = np.linalg.solve(self._kernel.noisy(points), left)
+        # The fitted displacements need few components: what else the simulated ones have is the noise of their simulation.
+        _, sizes, components = np.linalg.svd(self._kernel.between(self._placed, self._placed) @ weight, full_matrices=False)
+        rest = np.cumsum(sizes[::-1] ** 2)[::-1]
+        self._components = components[: int((rest > NEGLIGIBLE * rest[0]).sum())]
+        self._weight = weight @ self._components.T
 
-    def __call__(self, known: np.ndarray) -> np.ndarray:
-        """Expected waves (B, C) of contacts (B, 12)."""
-        found = self._kernel.between(self._kernel.placed(Points.of(self._inputs(known))), self._placed) @ self._weight
+    def own(self, known: np.ndarray) -> np.ndarray:
+        """Expected waves (B, C) of contacts (B, 12) in the object's frame."""
+        near = self._kernel.between(self._kernel.placed(Points.of(self._inputs(known))), self._placed)
+        found = near @ self._weight @ self._components
         real, imaginary = np.split(found, 2, axis=1)
-        expected: np.ndarray = (self._mean + real + 1j * imaginary) * self.turned(known)
+        expected: np.ndarray = self._mean + real + 1j * imaginary
         return expected
 
     def waves(self, moved_px: np.ndarray) -> np.ndarray:
@@ -86,11 +98,17 @@ class TwinField:
         return found
 
     def noise(self, moved_px: np.ndarray) -> np.ndarray:
-        """(2C, 2C) covariance, as ``parts``, of the waves by the noise of pins: by what displacements (B, N, 2) have beside all waves."""
+        """(2C, 2C) covariance, as ``parts``, of the waves by the noise of pins, in the object's frame.
+
+        The noise is estimated from the part of displacements (B, N, 2) that no wave describes. Where a label is a direction, the covariance
+        is the mean over all directions: waves that turn differently are independent.
+        """
         count, pins = self._fit.shape
         beside = moved_px @ [1, 1j] - self.waves(moved_px) @ np.linalg.pinv(self._fit).T
         variance = float((np.abs(beside) ** 2).mean()) / 2 * pins / max(pins - count, 1)
         shared = variance * self._fit @ self._fit.conj().T
+        if self.direction is not None:
+            shared = np.where(self.order[:, None] == self.order, shared, 0)
         return np.block([[shared.real, -shared.imag], [shared.imag, shared.real]])
 
     def turned(self, known: np.ndarray, *, back: bool = False) -> np.ndarray:
@@ -106,11 +124,22 @@ class TwinField:
         found: np.ndarray = (known[:, self.varied] - self.middle[self.varied]) / self.half[self.varied]
         return found
 
+    def slipped(self, known: np.ndarray) -> np.ndarray:
+        """As ``scaled``, with moves m as m / sqrt(m0^2 + |m|^2), m0 = ``SLIPS_AT``.
+
+        A move beyond the limit of friction changes the pins by its direction alone.
+        """
+        found, moves = self.scaled(known), self.varied >= MOVES_FROM
+        found[:, moves] /= np.sqrt(SLIPS_AT**2 + (found[:, moves] ** 2).sum(axis=1, keepdims=True))
+        return found
+
     def _inputs(self, known: np.ndarray) -> np.ndarray:
-        if self.direction is None:
-            return self.scaled(known)
-        angle = np.radians(known[:, self.direction])
-        return np.column_stack([self.scaled(known), np.cos(angle), np.sin(angle)])
+        """Inputs of the process: labels, the moves also as they slip, and cosine and sine of a direction."""
+        found = [self.scaled(known), self.slipped(known)[:, self.varied >= MOVES_FROM]]
+        if self.direction is not None:
+            angle = np.radians(known[:, self.direction])[:, None]
+            found += [np.cos(angle), np.sin(angle)]
+        return np.hstack(found)
 
 
 def parts(waves: np.ndarray) -> np.ndarray:

@@ -1,44 +1,35 @@
 """The twin read backwards: the labels whose simulated pins are most like a frame's.
 
-With the waves d(l) of the twin's displacement at the labels l (``TwinField``), what the twin misses e(l), and S the covariance of what is
-left on the labelled frames, each predicted from the others, the estimate is
+A frame's waves t are turned to the object's frame of the labels l. They differ from the twin's waves d(l) and the discrepancy e(l) by
 
-    l = argmin (t - d(l) - e(l))' S^-1 (t - d(l) - e(l)) + |l - m|^2 / w^2
+    r(l) = t - d(l) - e(l)
 
-t are the waves of the frame, m and w the middle and the width of the ranges. It is found by Gauss-Newton steps from the nearest simulated
-state. Moves are unknown, too, and found with the pose.
+(``TwinField``, ``missed``). With S the covariance of what is left of such a frame, the labels have the negative logarithmic probability
 
-What the twin misses has two parts, both found at once by a ridge regression on the residuals of the labelled frames. A quadratic of the
-labels that vary stands in the object's frame: it is what the mechanics and the object's shape miss, and the same all around an edge. Where
-there is a direction, a second part stands in the sensor's frame: it is what the camera and the pins at rest miss.
+    J(l) / 2 = r' S^-1 r / 2 + |l - m|^2 / 2 w^2
+
+up to a constant. m and w are the middle and the width of the ranges. Moves are unknown, too, and estimated with the pose.
+
+The minimum of J is found by damped Gauss-Newton steps from the nearest simulated state. Where a label is a direction, J has several minima
+that are nearly as deep, because a far edge changes the pins little. The estimate is then the mean over directions around the whole circle:
+for each direction the other labels are optimised, and it is weighted by its probability. Residuals of neighbouring waves are not
+independent, so J is divided by ``TEMPERATURE`` first.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from scenes.experiment import ExperimentSpec
-from training.audit import polynomials
 from training.dataset import Dataset
 from training.label_code import label_error, wrapped_deg
 from training.studies.sim_to_real.field import TwinField, parts
+from training.studies.sim_to_real.missed import Left, Missed, chosen
 from twin.rig.labels import ArmLabel
 
 BACKWARDS = "twin backwards"
 """Name of the model in the study's table."""
-RIDGE = 1.0
-"""Penalty on the terms of the discrepancy, with labels scaled to -1..1."""
-CONSTANT_RIDGE = 1e-3
-"""Penalty on the constant term in the sensor's frame. It is nearly free."""
-OWN_CONSTANT = 0.3
-"""Penalty on the constant term in the object's frame, as a share of ``RIDGE``."""
-LEAST_SHARE = 0.1
-"""Smallest divisor of a leave-one-out residual, 1 minus the frame's own weight in the regression."""
-NOISE_FRAMES = 60.0
-"""Weight of the pins' noise in the covariance of the residuals, as a number of labelled frames."""
-NOISE_TIMES = 1.5
-"""Expected covariance of the residuals before any labelled frame, as a multiple of the pins' noise."""
 WIDTH = 1.5
 """Width w of the prior on the labels, in half ranges."""
 STARTS = 700
@@ -55,8 +46,30 @@ DIRECTION_DEG = 60.0
 """Half range of a direction, deg. It scales steps and difference quotients."""
 BEYOND = 1.15
 """Range in which labels are searched, as a multiple of the simulated range. The Gaussian process knows nothing beyond it."""
-Expected = Callable[[np.ndarray], np.ndarray]
-"""Function from contacts (B, 12) to their expected waves (B, 2C)."""
+DAMPING = 1e-3
+"""First damping of the steps, as a share of the diagonal of the normal matrix."""
+DAMPING_LESS, DAMPING_MORE = 0.25, 8.0
+"""Factors of the damping after a step that lowers J, and after one that does not and is taken back."""
+AROUND_STEPS = 3
+"""Number of Gauss-Newton steps at each of these directions that is likely after a first one."""
+UNLIKELY = 300.0
+"""Excess of J at the nearest simulated state beyond which a direction is left out of the mean; half of it after a first step."""
+TEMPERATURE = 8.0
+"""Divisor of J in the mean over directions. 4 to 16 give nearly the same errors."""
+SURE_DEG = 4.0
+"""Difference of the mean direction from that of the deepest minimum below which the latter is the estimate, because the mean is coarse."""
+AT_ONCE = 200
+"""Frames that are estimated at once; more would need more memory."""
+
+
+class _Frames(NamedTuple):
+    """Frames that are asked for: their waves (B, C), and the weights (B, 2C) of the components of a residual."""
+
+    waves: np.ndarray
+    weights: np.ndarray
+
+    def rows(self, index: np.ndarray) -> "_Frames":
+        return _Frames(self.waves[index], self.weights[index])
 
 
 class TwinBackwards:
@@ -85,111 +98,163 @@ class TwinBackwards:
 
         Without a labelled frame the twin is taken to miss nothing but the noise of pins.
         """
-        field, told = self._field, _both(labels)
-        missed = _Missed(field, told, field.waves(real_px) - field(told))
-        left = parts(missed.left)
-        noise = field.noise(real_px if len(real_px) else asked_px)
-        spread = (left.T @ left + NOISE_FRAMES * NOISE_TIMES * noise) / (len(left) + NOISE_FRAMES)
-        whitening = np.linalg.cholesky(np.linalg.inv(spread))
+        rows = chosen(len(real_px))
+        field, known, seen = self._field, _both(labels)[rows], self._field.waves(real_px)[rows]
+        missed = Missed(field, known, seen)
+        left = Left(missed.left, seen, field.noise(real_px if len(real_px) else asked_px))
+        reader = _Reader(field, missed, left, self._ranges)
+        groups = np.array_split(asked_px, -(-len(asked_px) // AT_ONCE)) if len(asked_px) else []
+        return np.concatenate([np.zeros((0, 12)), *(reader(field.waves(group)) for group in groups)])
 
-        def expected(those: np.ndarray) -> np.ndarray:
-            found: np.ndarray = parts(field(those) + missed(those)) @ whitening
-            return found
 
-        asked = parts(field.waves(asked_px)) @ whitening
-        fixed = np.flatnonzero(np.ptp(self._ranges, axis=1) == 0)
-        states = field.known[:STARTS].copy()
-        states[:, fixed] = self._ranges[fixed, 0]
-        unknown = np.setdiff1d(field.varied, fixed)
-        return self._found(asked, _nearest(asked, states, field.direction, expected), unknown, expected)
+class _Reader:
+    """Estimates labels of frames by a twin's field, its discrepancy, and the covariance of what is left."""
 
-    def _found(self, asked: np.ndarray, those: np.ndarray, unknown: np.ndarray, expected: Expected) -> np.ndarray:
-        """The labels (B, 12) after Gauss-Newton steps from a start."""
+    def __init__(self, field: TwinField, missed: Missed, left: Left, ranges: np.ndarray) -> None:
+        self._field, self._missed, self._left = field, missed, left
+        fixed = np.flatnonzero(np.ptp(ranges, axis=1) == 0)
+        self._states = field.known[:STARTS].copy()
+        self._states[:, fixed] = ranges[fixed, 0]
+        self._unknown = np.setdiff1d(field.varied, fixed).tolist()
+
+    def __call__(self, waves: np.ndarray) -> np.ndarray:
+        """Pose and move (B, 12) of frames with waves (B, C)."""
+        frames = _Frames(waves, self._left.weights(waves))
+        turn = self._field.direction
+        turns = [None] if turn is None else np.arange(-180.0, 180.0, TURN_DEG)
+        nearest, least = zip(*(self._nearest(frames, each) for each in turns), strict=True)
+        starts, far = np.stack(nearest, axis=1), np.stack(least, axis=1)
+        best = starts[np.arange(len(waves)), far.argmin(axis=1)]
+        if turn is None:
+            return self._improved(frames, best, self._unknown, STEPS).labels
+        best = self._improved(frames, best, [*self._unknown, turn], STEPS).labels
+        return self._mean(frames, best, starts, far - far.min(axis=1, keepdims=True))
+
+    def _mean(self, frames: _Frames, best: np.ndarray, starts: np.ndarray, excess: np.ndarray) -> np.ndarray:
+        """The mean labels (B, 12) over all directions.
+
+        Parameters
+        ----------
+        best : (B, 12) float
+            The labels of the deepest minimum found.
+        starts, excess : (B, T, 12) and (B, T) float
+            The nearest simulated state in each direction that was tried, and the excess of its misfit over the smallest.
+        """
+        turn = self._field.direction
+        frame, which = np.nonzero(excess < UNLIKELY)
+        several = frames.rows(frame)
+        tried = [starts[frame, which], best[frame]]
+        tried[1][:, turn] = tried[0][:, turn]
+        first, second = (self._objective(several, each) for each in tried)
+        found = self._improved(several, np.where((first < second)[:, None], *tried), self._unknown, 1)
+        lowest = np.full(len(best), np.inf)
+        np.minimum.at(lowest, frame, found.objective)
+        likely = found.objective < lowest[frame] + UNLIKELY / 2
+        frame, which, several = frame[likely], which[likely], several.rows(likely)
+        found = self._improved(several, found.labels[likely], self._unknown, AROUND_STEPS)
+        told = np.full(excess.shape, -np.inf)
+        told[frame, which] = -(found.objective + found.volume) / 2 / TEMPERATURE
+        weight = np.exp(told - told.max(axis=1, keepdims=True))[frame, which]
+        total = np.bincount(frame, weight)
+        mean = np.stack([np.bincount(frame, weight * column) for column in found.labels.T], axis=1) / total[:, None]
+        around = np.exp(1j * np.radians(found.labels[:, turn]))
+        mean[:, turn] = np.degrees(np.angle(np.bincount(frame, weight * around.real) + 1j * np.bincount(frame, weight * around.imag)))
+        sure = np.abs(wrapped_deg(mean[:, turn] - best[:, turn])) < SURE_DEG
+        mean[sure, turn] = best[sure, turn]
+        return mean
+
+    def _nearest(self, frames: _Frames, turn: float | None) -> tuple[np.ndarray, np.ndarray]:
+        """The state (B, 12) in one direction, deg, whose expected waves are nearest to each frame's, and its misfit (B,)."""
+        states = self._states.copy()
+        if turn is not None:
+            states[:, self._field.direction] = turn
+        there, here = self._expected(states), self._turned(frames, states[:1])
+        square = frames.weights**2
+        far = (square * here**2).sum(axis=1)[:, None] + square @ (there**2).T - 2 * (square * here) @ there.T
+        near = far.argmin(axis=1)
+        return states[near], far[np.arange(len(near)), near]
+
+    def _improved(self, frames: _Frames, labels: np.ndarray, columns: list[int], steps: int) -> "_Improved":
+        """Labels (B, 12) after damped Gauss-Newton steps in some columns."""
+        labels, field = labels.copy(), self._field
+        half, prior = self._scales(columns)
+        damping = np.full(len(labels), DAMPING)
+        residual = self._residual(frames, labels)
+        objective = self._objective(frames, labels, residual)
+        normal = np.zeros((len(labels), len(columns), len(columns)))
+        for _ in range(steps):
+            slope = self._slopes(frames, labels, columns, half)
+            force = np.einsum("bik,bk->bi", slope, residual) - prior * (labels[:, columns] - field.middle[columns]) / half
+            normal = slope @ slope.swapaxes(1, 2) + np.diag(prior)
+            damped = normal + damping[:, None, None] * normal * np.eye(len(columns))
+            step = np.linalg.solve(damped, force[..., None])[..., 0]
+            moved = labels.copy()
+            moved[:, columns] += np.clip(step, -LONGEST, LONGEST) * half
+            middle, reach = field.middle[self._unknown], BEYOND * field.half[self._unknown]
+            moved[:, self._unknown] = np.clip(moved[:, self._unknown], middle - reach, middle + reach)
+            there = self._residual(frames, moved)
+            lower = self._objective(frames, moved, there)
+            better = lower < objective
+            labels[better], residual[better], objective[better] = moved[better], there[better], lower[better]
+            damping *= np.where(better, DAMPING_LESS, DAMPING_MORE)
+        return _Improved(labels, objective, np.linalg.slogdet(normal)[1])
+
+    def _scales(self, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Half range (K,) of some labels and the precision (K,) of their prior in half ranges; a direction has none."""
         field = self._field
-        columns = [*unknown.tolist(), *([] if field.direction is None else [field.direction])]
         half = np.array([DIRECTION_DEG if k == field.direction else field.half[k] for k in columns])
-        prior = np.array([0.0 if k == field.direction else WIDTH**-2 for k in columns])
-        middle, reach = field.middle[unknown], BEYOND * field.half[unknown]
-        for _ in range(STEPS):
-            now = expected(those)
-            slopes = []
-            for k, width in zip(columns, half, strict=True):
-                nudged = those.copy()
-                nudged[:, k] += NUDGE * width
-                slopes.append((expected(nudged) - now) / NUDGE)
-            slope = np.stack(slopes, axis=1)
-            force = np.einsum("bik,bk->bi", slope, asked - now) - prior * (those[:, columns] - field.middle[columns]) / half
-            step = np.linalg.solve(slope @ slope.swapaxes(1, 2) + np.diag(prior), force[..., None])[..., 0]
-            those[:, columns] += np.clip(step, -LONGEST, LONGEST) * half
-            those[:, unknown] = np.clip(those[:, unknown], middle - reach, middle + reach)
-        return those
+        return half, np.array([0.0 if k == field.direction else WIDTH**-2 for k in columns])
+
+    def _objective(self, frames: _Frames, labels: np.ndarray, residual: np.ndarray | None = None) -> np.ndarray:
+        """(B,) J at labels (B, 12)."""
+        left = self._residual(frames, labels) if residual is None else residual
+        half, prior = self._scales(self._unknown)
+        away = (labels[:, self._unknown] - self._field.middle[self._unknown]) / half
+        return np.asarray((left**2).sum(axis=1) + (prior * away**2).sum(axis=1))
+
+    def _residual(self, frames: _Frames, labels: np.ndarray) -> np.ndarray:
+        """(B, 2C) components of r, each divided by its standard deviation."""
+        return np.asarray((self._turned(frames, labels) - self._expected(labels)) * frames.weights)
+
+    def _slopes(self, frames: _Frames, labels: np.ndarray, columns: list[int], half: np.ndarray) -> np.ndarray:
+        """(B, K, 2C) minus the derivatives of r, by labels in half ranges. The frame's noise is not turned with the direction."""
+        field = self._field
+        now, back, slopes = self._waves(labels), field.turned(labels, back=True), []
+        for k, width in zip(columns, half, strict=True):
+            nudged = labels.copy()
+            nudged[:, k] += NUDGE * width
+            by = (self._waves(nudged) * field.turned(nudged) * back - now) / NUDGE
+            slopes.append(parts(by) @ self._left.axes * frames.weights)
+        return np.stack(slopes, axis=1)
+
+    def _waves(self, labels: np.ndarray) -> np.ndarray:
+        """Expected waves (B, C) in the object's frame."""
+        return np.asarray(self._field.own(labels) + self._missed(labels))
+
+    def _expected(self, labels: np.ndarray) -> np.ndarray:
+        """(B, 2C) components of the expected waves."""
+        return parts(self._waves(labels)) @ self._left.axes
+
+    def _turned(self, frames: _Frames, labels: np.ndarray) -> np.ndarray:
+        """(B, 2C) components of the frames' waves in the object's frame."""
+        return parts(frames.waves * self._field.turned(labels, back=True)) @ self._left.axes
 
 
-class _Missed:
-    """What the twin misses, by n labelled frames: called with contacts (B, 12), it gives waves (B, C).
+class _Improved(NamedTuple):
+    """Result of Gauss-Newton steps.
 
     Attributes
     ----------
-    left : (n, C) complex
-        What is left of each frame's residual, predicted from the others.
+    labels : (B, 12) float
+    objective : (B,) float
+        J.
+    volume : (B,) float
+        Logarithm of the determinant of the normal matrix.
     """
 
-    def __init__(self, field: TwinField, known: np.ndarray, residual: np.ndarray) -> None:
-        self._field, self._weight = field, {}
-        self.left = np.empty_like(residual)
-        penalty = RIDGE * np.r_[1.0 if field.direction is None else OWN_CONSTANT, np.ones(self._own(known).shape[1] - 1)]
-        if field.direction is None:
-            penalty[0] = CONSTANT_RIDGE
-        else:
-            penalty = np.r_[penalty, CONSTANT_RIDGE, np.full(self._seen(known).shape[1] - 1, RIDGE)]
-        for order, waves in self._alike():
-            terms = self._terms(known, waves)
-            smooth = np.linalg.solve(terms.conj().T @ terms + np.diag(penalty), terms.conj().T)
-            self._weight[order] = smooth @ residual[:, waves]
-            own = np.einsum("ij,ji->i", terms, smooth).real
-            self.left[:, waves] = (residual[:, waves] - terms @ self._weight[order]) / np.maximum(1 - own, LEAST_SHARE)[:, None]
-
-    def __call__(self, known: np.ndarray) -> np.ndarray:
-        found = np.empty((len(known), len(self._field.order)), complex)
-        for order, waves in self._alike():
-            found[:, waves] = self._terms(known, waves) @ self._weight[order]
-        return found
-
-    def _alike(self) -> list[tuple[int, np.ndarray]]:
-        """Waves that turn alike, and so have the same terms; all of them where nothing turns."""
-        order = self._field.order if self._field.direction is not None else np.zeros_like(self._field.order)
-        return [(int(each), np.flatnonzero(order == each)) for each in np.unique(order)]
-
-    def _terms(self, known: np.ndarray, waves: np.ndarray) -> np.ndarray:
-        if self._field.direction is None:
-            return self._own(known)
-        return np.hstack([self._own(known) * self._field.turned(known)[:, waves[:1]], self._seen(known)])
-
-    def _own(self, known: np.ndarray) -> np.ndarray:
-        """Terms (B, P) in the object's frame."""
-        return polynomials(self._field.scaled(known), 2)
-
-    def _seen(self, known: np.ndarray) -> np.ndarray:
-        """Terms (B, Q) in the sensor's frame: the labels, their products with cosine and sine of the direction, and those of twice it."""
-        once = np.radians(known[:, self._field.direction]).reshape(-1, 1)
-        straight, twice = polynomials(self._field.scaled(known), 1), 2 * once
-        return np.hstack([straight, straight * np.cos(once), straight * np.sin(once), np.cos(twice), np.sin(twice)])
-
-
-def _nearest(asked: np.ndarray, states: np.ndarray, direction: int | None, expected: Expected) -> np.ndarray:
-    """The states (B, 12), in any direction, whose expected waves are nearest to those asked for (B, 2C)."""
-    found, least = np.empty((len(asked), states.shape[1])), np.full(len(asked), np.inf)
-    for turn in [None] if direction is None else np.arange(-180.0, 180.0, TURN_DEG):
-        tried = states.copy()
-        if direction is not None:
-            tried[:, direction] = turn
-        there = expected(tried)
-        far = (there**2).sum(axis=1) - 2 * asked @ there.T
-        near = far.argmin(axis=1)
-        nearer = far[np.arange(len(asked)), near] < least
-        least[nearer] = far[nearer, near[nearer]]
-        found[nearer] = tried[near[nearer]]
-    return found
+    labels: np.ndarray
+    objective: np.ndarray
+    volume: np.ndarray
 
 
 def read_backwards(simulated: Dataset, labels: Sequence[ArmLabel], experiment: ExperimentSpec, *, seed: int) -> TwinBackwards:

@@ -16,6 +16,7 @@ from training.packed import pack, shipped_names
 from training.recipes import TrainingError
 from training.run import train_run, write_tensors
 from training.studies.sim_to_real.inverted import TwinBackwards
+from training.studies.sim_to_real.missed import Left
 from training.studies.sim_to_real.steps import choose_frames, put_beside, quadratic_row, states_like, widen_intervals
 from twin.pins import make_reference
 from twin.rig.labels import ArmLabel
@@ -229,3 +230,40 @@ def test_the_twin_read_backwards_finds_labels_and_learns_what_the_twin_misses(se
 
     assert (errors(30) < [0.15, 0.25, 1.5]).all()
     assert (errors(30) < 0.85 * errors(0)).all(), "labelled frames tell what the twin misses"
+
+
+def test_the_covariance_of_what_is_left_is_that_of_the_frames_and_grows_with_their_amplitude():
+    rng = np.random.default_rng(0)
+    noise = np.diag(np.linspace(0.5, 2.0, 12))
+    axes, _ = np.linalg.qr(rng.normal(size=(12, 12)))
+    grown = (axes * np.array([40.0, 15.0, *[0.0] * 10])) @ axes.T
+    size = rng.uniform(1, 10, 4000)
+    seen = np.zeros((4000, 6), complex)
+    seen[:, 0] = size
+    drawn = rng.multivariate_normal(np.zeros(12), noise, 4000) + np.sqrt(size / np.median(size))[:, None] * rng.multivariate_normal(
+        np.zeros(12), grown, 4000
+    )
+    left = Left(drawn[:, :6] + 1j * drawn[:, 6:], seen, noise)
+    for least, most in ((1, 2), (9, 10)):
+        rows = (size > least) & (size < most)
+        white = drawn[rows] @ left.axes * left.weights(seen[rows])
+        assert np.abs(np.cov(white.T) - np.eye(12)).max() < 0.35
+    assert (left.weights(seen[:1] * 0 + 10) < left.weights(seen[:1] * 0 + 1)).all()
+
+
+def test_frames_without_labels_teach_what_the_twin_misses_where_few_have_labels():
+    rng = np.random.default_rng(1)
+    rest = rng.uniform(-60, 60, (60, 2))
+    ranges = np.zeros((12, 2))
+    ranges[[1, 2, 5]] = [[-6, 6], [3, 5], [-180, 180]]
+    simulated, few, more, asked = ([ArmLabel(each[:6], each[6:]) for each in rng.uniform(*ranges.T, (n, 12))] for n in (300, 4, 150, 60))
+    shifted = rng.normal(0, 0.4, (60, 2))
+    seen = [1.1 * edge_pins(each, rest) + shifted + rng.normal(0, 0.02, (len(each), 60, 2)) for each in (few, more, asked)]
+    twin = TwinBackwards(edge_pins(simulated, rest), simulated, rest, ranges)
+    truth = np.array([label.pose[5] for label in asked])
+
+    def error(*unlabelled):
+        found = twin.estimate(seen[0], few, seen[2], *unlabelled)
+        return np.abs((found[:, 5] - truth + 180) % 360 - 180).mean()
+
+    assert error(seen[1]) < 0.95 * error()

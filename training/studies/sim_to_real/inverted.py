@@ -56,8 +56,12 @@ UNLIKELY = 300.0
 """Excess of J at the nearest simulated state beyond which a direction is left out of the mean; half of it after a first step."""
 TEMPERATURE = 8.0
 """Divisor of J in the mean over directions. 4 to 16 give nearly the same errors."""
-SURE_DEG = 4.0
+NEAR_DEG = 4.0
 """Difference of the mean direction from that of the deepest minimum below which the latter is the estimate, because the mean is coarse."""
+SURE = 0.9
+"""Length of the mean direction, as a vector, above which a direction is sure; 0.9 is a standard deviation of 26 deg."""
+NOISIER = 10.0
+"""Variance of the residual of a frame without a label, as a multiple of that of a labelled frame, because its estimated label errs."""
 AT_ONCE = 200
 """Frames that are estimated at once; more would need more memory."""
 
@@ -93,18 +97,49 @@ class TwinBackwards:
         self._field = TwinField(moved_px, _both(labels), rest_px, seed=seed)
         self._ranges = ranges
 
-    def estimate(self, real_px: np.ndarray, labels: Sequence[ArmLabel], asked_px: np.ndarray) -> np.ndarray:
+    def estimate(
+        self, real_px: np.ndarray, labels: Sequence[ArmLabel], asked_px: np.ndarray, unlabelled_px: np.ndarray | None = None
+    ) -> np.ndarray:
         """Pose and move (B, 12) of frames with displacements (B, N, 2), after n labelled ones with displacements (n, N, 2), px.
 
-        Without a labelled frame the twin is taken to miss nothing but the noise of pins.
+        Without a labelled frame the twin is taken to miss nothing but the noise of pins. Frames without labels (U, N, 2) help where a label
+        is a direction: they are estimated first, and those whose direction is sure teach the discrepancy, as frames with more noise. The
+        covariance of what is left comes from the labelled frames alone, because the labels of the others are fitted to their pins.
         """
         rows = chosen(len(real_px))
         field, known, seen = self._field, _both(labels)[rows], self._field.waves(real_px)[rows]
-        missed = Missed(field, known, seen)
-        left = Left(missed.left, seen, field.noise(real_px if len(real_px) else asked_px))
-        reader = _Reader(field, missed, left, self._ranges)
-        groups = np.array_split(asked_px, -(-len(asked_px) // AT_ONCE)) if len(asked_px) else []
-        return np.concatenate([np.zeros((0, 12)), *(reader(field.waves(group)) for group in groups)])
+        noise = field.noise(real_px if len(real_px) else asked_px)
+
+        def reader(more: np.ndarray, told: np.ndarray) -> _Reader:
+            """Of the labelled frames, and of frames with waves (U, C) and estimated labels (U, 12)."""
+            noisier = np.concatenate([np.ones(len(known)), np.full(len(more), NOISIER)])
+            missed = Missed(field, np.concatenate([known, told]), np.concatenate([seen, more]), noisier)
+            return _Reader(field, missed, Left(missed.left[: len(known)], seen, noise), self._ranges)
+
+        found = reader(seen[:0], known[:0])
+        if unlabelled_px is not None:
+            more = field.waves(unlabelled_px)
+            told = _in_groups(found, more)
+            sure = np.flatnonzero(told.sure)
+            sure = sure[chosen(len(sure))]
+            found = reader(more[sure], told.labels[sure])
+        return _in_groups(found, field.waves(asked_px)).labels
+
+
+def _in_groups(reader: "_Reader", waves: np.ndarray) -> "_Found":
+    """Estimates of ``AT_ONCE`` frames at a time."""
+    found = [reader(waves[first : first + AT_ONCE]) for first in range(0, len(waves), AT_ONCE)]
+    return _Found(
+        np.concatenate([np.zeros((0, 12)), *(each.labels for each in found)]),
+        np.concatenate([np.zeros(0, bool), *(each.sure for each in found)]),
+    )
+
+
+class _Found(NamedTuple):
+    """Estimated labels (B, 12), and whether each frame's direction is sure (B,), which it is where there is none."""
+
+    labels: np.ndarray
+    sure: np.ndarray
 
 
 class _Reader:
@@ -117,8 +152,8 @@ class _Reader:
         self._states[:, fixed] = ranges[fixed, 0]
         self._unknown = np.setdiff1d(field.varied, fixed).tolist()
 
-    def __call__(self, waves: np.ndarray) -> np.ndarray:
-        """Pose and move (B, 12) of frames with waves (B, C)."""
+    def __call__(self, waves: np.ndarray) -> _Found:
+        """Pose and move of frames with waves (B, C)."""
         frames = _Frames(waves, self._left.weights(waves))
         turn = self._field.direction
         turns = [None] if turn is None else np.arange(-180.0, 180.0, TURN_DEG)
@@ -126,12 +161,12 @@ class _Reader:
         starts, far = np.stack(nearest, axis=1), np.stack(least, axis=1)
         best = starts[np.arange(len(waves)), far.argmin(axis=1)]
         if turn is None:
-            return self._improved(frames, best, self._unknown, STEPS).labels
+            return _Found(self._improved(frames, best, self._unknown, STEPS).labels, np.ones(len(waves), bool))
         best = self._improved(frames, best, [*self._unknown, turn], STEPS).labels
         return self._mean(frames, best, starts, far - far.min(axis=1, keepdims=True))
 
-    def _mean(self, frames: _Frames, best: np.ndarray, starts: np.ndarray, excess: np.ndarray) -> np.ndarray:
-        """The mean labels (B, 12) over all directions.
+    def _mean(self, frames: _Frames, best: np.ndarray, starts: np.ndarray, excess: np.ndarray) -> _Found:
+        """The mean labels over all directions.
 
         Parameters
         ----------
@@ -158,10 +193,11 @@ class _Reader:
         total = np.bincount(frame, weight)
         mean = np.stack([np.bincount(frame, weight * column) for column in found.labels.T], axis=1) / total[:, None]
         around = np.exp(1j * np.radians(found.labels[:, turn]))
-        mean[:, turn] = np.degrees(np.angle(np.bincount(frame, weight * around.real) + 1j * np.bincount(frame, weight * around.imag)))
-        sure = np.abs(wrapped_deg(mean[:, turn] - best[:, turn])) < SURE_DEG
-        mean[sure, turn] = best[sure, turn]
-        return mean
+        middle = (np.bincount(frame, weight * around.real) + 1j * np.bincount(frame, weight * around.imag)) / total
+        mean[:, turn] = np.degrees(np.angle(middle))
+        near = np.abs(wrapped_deg(mean[:, turn] - best[:, turn])) < NEAR_DEG
+        mean[near, turn] = best[near, turn]
+        return _Found(mean, np.abs(middle) > SURE)
 
     def _nearest(self, frames: _Frames, turn: float | None) -> tuple[np.ndarray, np.ndarray]:
         """The state (B, 12) in one direction, deg, whose expected waves are nearest to each frame's, and its misfit (B,)."""
@@ -265,14 +301,21 @@ def read_backwards(simulated: Dataset, labels: Sequence[ArmLabel], experiment: E
 
 
 def inverted_row(
-    name: str, twin: TwinBackwards, real: Dataset, labels: Sequence[ArmLabel], rows: np.ndarray, test: np.ndarray
+    name: str,
+    twin: TwinBackwards,
+    real: Dataset,
+    labels: Sequence[ArmLabel],
+    rows: np.ndarray,
+    test: np.ndarray,
+    *,
+    unlabelled: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """A row of the study's table: the twin read backwards with labelled frames ``rows`` (n,), judged on ``test`` (t,).
 
-    ``labels`` are those of all frames.
+    ``labels`` are those of all frames; those of the frames ``unlabelled`` (u,) are not used.
     """
     moved = real.pins.nodes_px - real.pins.reference.pins_px
-    found = twin.estimate(moved[rows], [labels[row] for row in rows], moved[test])
+    found = twin.estimate(moved[rows], [labels[row] for row in rows], moved[test], None if unlabelled is None else moved[unlabelled])
     columns = dict(zip([f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7)], found.T, strict=True))
     targets = real.targets.rows(test)
     named = zip(targets.names, targets.units, strict=True)

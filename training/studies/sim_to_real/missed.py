@@ -36,7 +36,7 @@ SEEN_SIZE = 1.0
 SEEN_LENGTH = 0.5
 """Length r_3, in half ranges of the labels."""
 MOST_FRAMES = 1000
-"""Labelled frames that the discrepancy is learnt from. The cost grows with the third power of their number."""
+"""Most frames that the discrepancy is learnt from. The cost grows with the third power of their number."""
 NOISE_FRAMES = 150.0
 """Weight of the expected covariance, as a number of labelled frames."""
 EXPECTED = 0.5
@@ -152,7 +152,7 @@ class Left:
 
 
 def chosen(count: int) -> np.ndarray:
-    """Indices of the labelled frames that are learnt from, evenly through their order: all, or ``MOST_FRAMES`` of them."""
+    """Indices of the frames that are learnt from, evenly through their order: all of ``count``, or ``MOST_FRAMES`` of them."""
     return np.unique(np.linspace(0, count - 1, min(count, MOST_FRAMES)).round().astype(int)) if count else np.zeros(0, int)
 
 

@@ -126,6 +126,15 @@ class TwinBackwards:
         return _in_groups(found, field.waves(asked_px)).labels
 
 
+def _in_all_directions(states: np.ndarray, direction: int | None) -> list[np.ndarray]:
+    """States (S, 12), once for each direction that is tried, or once if there is none."""
+    if direction is None:
+        return [states]
+    turned = np.repeat(states[None], round(360 / TURN_DEG), axis=0)
+    turned[:, :, direction] = np.arange(-180.0, 180.0, TURN_DEG)[:, None]
+    return list(turned)
+
+
 def _in_groups(reader: "_Reader", waves: np.ndarray) -> "_Found":
     """Estimates of ``AT_ONCE`` frames at a time."""
     found = [reader(waves[first : first + AT_ONCE]) for first in range(0, len(waves), AT_ONCE)]
@@ -148,16 +157,16 @@ class _Reader:
     def __init__(self, field: TwinField, missed: Missed, left: Left, ranges: np.ndarray) -> None:
         self._field, self._missed, self._left = field, missed, left
         fixed = np.flatnonzero(np.ptp(ranges, axis=1) == 0)
-        self._states = field.known[:STARTS].copy()
-        self._states[:, fixed] = ranges[fixed, 0]
+        states = field.known[:STARTS].copy()
+        states[:, fixed] = ranges[fixed, 0]
         self._unknown = np.setdiff1d(field.varied, fixed).tolist()
+        self._starts = [(states, self._expected(states)) for states in _in_all_directions(states, field.direction)]
 
     def __call__(self, waves: np.ndarray) -> _Found:
         """Pose and move of frames with waves (B, C)."""
         frames = _Frames(waves, self._left.weights(waves))
         turn = self._field.direction
-        turns = [None] if turn is None else np.arange(-180.0, 180.0, TURN_DEG)
-        nearest, least = zip(*(self._nearest(frames, each) for each in turns), strict=True)
+        nearest, least = zip(*(self._nearest(frames, *each) for each in self._starts), strict=True)
         starts, far = np.stack(nearest, axis=1), np.stack(least, axis=1)
         best = starts[np.arange(len(waves)), far.argmin(axis=1)]
         if turn is None:
@@ -199,12 +208,9 @@ class _Reader:
         mean[near, turn] = best[near, turn]
         return _Found(mean, np.abs(middle) > SURE)
 
-    def _nearest(self, frames: _Frames, turn: float | None) -> tuple[np.ndarray, np.ndarray]:
-        """The state (B, 12) in one direction, deg, whose expected waves are nearest to each frame's, and its misfit (B,)."""
-        states = self._states.copy()
-        if turn is not None:
-            states[:, self._field.direction] = turn
-        there, here = self._expected(states), self._turned(frames, states[:1])
+    def _nearest(self, frames: _Frames, states: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The state (B, 12) of one direction whose expected waves ``there`` (S, 2C) are nearest to each frame's, and its misfit (B,)."""
+        here = self._turned(frames, states[:1])
         square = frames.weights**2
         far = (square * here**2).sum(axis=1)[:, None] + square @ (there**2).T - 2 * (square * here) @ there.T
         near = far.argmin(axis=1)

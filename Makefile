@@ -43,8 +43,8 @@ validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, Calculi
 	@$(BIN)/python -m pytest -m hypothesis --hypothesis-profile=anew tests  # other draws than those of make test
 	@$(BIN)/python -m pytest -m slow -n 0 -s tests
 
-figures: setup   ## every figure that a document states, into figures.json; goes on where it was; ONLY=pins,render for some of them
-	@$(SCRIPT) -m figures $(if $(ONLY),--only $(ONLY))
+figures: setup   ## every figure that a document states, into figures.json; goes on where it was; ONLY=pins,render for some, LIST=1 to list
+	@$(SCRIPT) -m figures $(if $(ONLY),--only $(ONLY)) $(if $(LIST),--list)
 
 film: setup      ## the studio's film and three pictures, in out/film; needs Debian's chromium
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,browser]'

@@ -174,13 +174,14 @@ def layout_from(text: str) -> PinsSpec:
 
 
 def _places_in(path: Path) -> tuple[tuple[float, float], ...]:
-    """x and y in each line of a CSV file; lines that begin with # or hold no numbers (a header) are passed over."""
+    """x and y in each line of a CSV file. Lines that begin with # are passed over, and so is a header before the first pin."""
     try:
         lines = read_regular(path, LARGEST_PLACES).decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         how = error.strerror if isinstance(error, OSError) else "no UTF-8 text"
         raise SpecError(f"{path}: can't be read ({how}); give a CSV file with x,y of one pin in each line") from error
     places: list[tuple[float, float]] = []
+    header = False
     for number, line in enumerate(lines, 1):
         cells = [cell.strip() for cell in line.replace(";", ",").split(",")]
         if not line.strip() or line.startswith("#"):
@@ -188,8 +189,9 @@ def _places_in(path: Path) -> tuple[tuple[float, float], ...]:
         try:
             x, y = map(float, cells)
         except ValueError:
-            if places or number > 1:
+            if places or header:
                 raise SpecError(f"{path}, line {number}: expected two numbers, x,y, got {line[:40]!r}") from None
+            header = True
             continue
         places.append((x, y))
     return tuple(places)

@@ -100,6 +100,11 @@ def test_positions_come_from_a_file_with_or_without_a_header(tmp_path):
     file = tmp_path / "pins.csv"
     file.write_text("\ufeffx;y\n0;0\n1;0\n0;2\n", encoding="utf-8")
     assert layout_from(f"positions:{file}").positions == ((0.0, 0.0), (1.0, 0.0), (0.0, 2.0))
+    file.write_text("# pins of the dome\nx,y\n0,0\n1,0\n0,2\n")
+    assert layout_from(f"positions:{file}").positions == ((0.0, 0.0), (1.0, 0.0), (0.0, 2.0)), "a comment before the header"
+    file.write_text("x,y\nmm,mm\n0,0\n1,0\n0,2\n")
+    with pytest.raises(SpecError, match="line 2"):
+        layout_from(f"positions:{file}")
     file.write_text("0,0\n1,1\n2,2\n")
     with pytest.raises(SpecError, match="on one line"):
         layout_from(f"positions:{file}")

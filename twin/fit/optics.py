@@ -164,8 +164,8 @@ def calibrate_optics(
         The specification at the start of the fit.
     out : Path
         The ``.toml`` file to write.
-        limit, no_contact
-            As in ``fit_optics``.
+    limit, no_contact
+        As in ``fit_optics``.
 
     Raises
     ------

@@ -26,7 +26,7 @@ WIDEST_FISHEYE = 57.0
 
 
 def valid_radius(camera: CameraSpec) -> float:
-    """Tangent up to which the distorted radius increases (inf: it never folds back)."""
+    """Tangent up to which the distorted radius increases by more than a twentieth of the undistorted one (inf: everywhere)."""
     fisheye = camera.projection == "fisheye"
     radius = np.linspace(0, np.pi / 2 if fisheye else WIDEST_FIELD, 6001)
     slope = 1 + 3 * camera.k1 * radius**2 + 5 * camera.k2 * radius**4

@@ -57,7 +57,7 @@ class Plan:
         Batch sizes of the efficiency figure; if empty, there is no figure.
     contacts : bool
         Simulate and render the contacts of the area figure.
-        device : {"auto", "cpu", "cuda"}
+    device : {"auto", "cpu", "cuda"}
     threads : int or None
         Number of CPU threads.
     form : Form or None

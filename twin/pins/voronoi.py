@@ -19,7 +19,8 @@ from twin.compiled import compiled
 
 # Factor by which the outline is enlarged about its centroid: half way to the release's additional sites, which lie at 1.1.
 BOUNDARY_SCALE = 1.05
-# The strip that replaces the hull of nodes on a line reaches beyond them by half this share of their length, and by half this many px at least.
+# The strip that replaces the hull of nodes on a line reaches beyond them by half this share of their length, and at least by half this
+# many px.
 STRIP_SHARE, LEAST_STRIP_PX = 0.05, 1.0
 
 

@@ -5,13 +5,13 @@ captured render, divided by the slope of the response curve, are spread over the
 fine structure converge last, so that few rounds also keep noise out.
 
 A pixel shows the background and tiles. Where the same pixel lacks the same light in most frames, it is background; what moves with the
-caps is relief.
+caps is relief. The edges of caps that hardly move look like a background at first. Therefore the tiles are fitted to all pixels, also to
+those that have a background.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy import sparse
 
@@ -35,8 +35,6 @@ EDGE = (0.6, 1.5)
 """Distances from a cap's middle, cap radii, between which a pixel tells nothing of the background before tiles are fitted."""
 SURE_SDS, SURE_LEVELS = 3.0, 3.0
 """Where caps pass, a background is believed from so many standard errors, plus so many gray levels, on."""
-GLINT_LIGHT, GLINT_PX = 0.004, 5
-"""Added light from which on a pixel where caps pass tells nothing of tiles; width of the surroundings that are left out, too."""
 DARKEST = 2e-4
 """Least light at which the slope of the response curve is taken, because the slope of a dark pixel has no bound."""
 BRIGHTEST = 2.0
@@ -151,16 +149,13 @@ class _Fit:
 
     def tiles(self) -> FloatArray:
         """The tiles (N cells^2, channels) that explain what is left."""
-        height, width, channels = self._views[0].image.shape
-        bright = (self.background.max(axis=1) > GLINT_LIGHT) & self._passed
-        glint = cv2.dilate(bright.reshape(height, width).astype(np.uint8), np.ones((GLINT_PX, GLINT_PX))).ravel() > 0
-        tiles = np.zeros((self._views[0].weights.shape[1], channels), np.float32)
+        tiles = np.zeros((self._views[0].weights.shape[1], self.background.shape[1]), np.float32)
         prior = (PRIOR_LEVELS / PRIOR_SHARE) ** 2
         for _ in range(TILE_ROUNDS):
             found, weight = np.zeros_like(tiles), np.full_like(tiles, prior)
             for view in self._views:
                 light = self._lit(view, tiles)
-                slope = self._slope(light[view.pixels]) * view.lamp * ~glint[view.pixels, None]
+                slope = self._slope(light[view.pixels]) * view.lamp
                 found += view.weights.T @ (slope * self._missing(view, light)[view.pixels])
                 weight += view.weights.T @ slope**2
             tiles += TILE_GAIN * found / weight

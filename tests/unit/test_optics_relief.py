@@ -34,7 +34,7 @@ def spec() -> SensorSpec:
 
 @pytest.fixture(scope="module")
 def tiles(spec) -> np.ndarray:
-    """Smooth random tiles (N, 19, 19, 3)."""
+    """Smooth random tiles (N, CELLS, CELLS, 3)."""
     rng = np.random.default_rng(3)
     rough = rng.standard_normal((spec.pins.count, CELLS, CELLS, 3)).astype(np.float32)
     return 0.15 * np.stack([cv2.GaussianBlur(tile, (0, 0), 3) * 6 for tile in rough])
@@ -139,7 +139,7 @@ def test_a_background_is_added_where_it_was_measured_and_scaled_to_the_frame(spe
 
 def test_too_few_tiles_are_an_error(spec, tiles):
     few = with_tiles(spec, tiles[:5]).appearance.relief.model_copy(update={"count": 19})
-    with pytest.raises(FrameError, match="the picture holds 6 tiles of 19 cells, the specification says 19"):
+    with pytest.raises(FrameError, match=f"the picture holds 6 tiles of {CELLS} cells, the specification says 19"):
         tiles_of(few, 19)
 
 

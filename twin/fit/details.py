@@ -23,8 +23,8 @@ from twin.optics.relief import POWER, CapLamp, cap_places, tiles_picture
 from twin.optics.static_layer import BACKGROUND_POWER
 from twin.types import BoolArray, FloatArray, IntArray
 
-CELLS, REACH = 19, 1.8
-"""Cells along a tile's side, and the tile's reach, cap radii: cells are about a pixel apart, and neighbours' tiles meet."""
+CELLS, REACH = 23, 1.8
+"""Cells along a tile's side, and the tile's reach, cap radii: cells are a little closer than pixels, and neighbours' tiles meet."""
 PRIOR_LEVELS, PRIOR_SHARE = 9.0, 0.2
 """Prior of a tile: the gray levels of a pixel that tiles do not explain, and the standard deviation of a tile's values."""
 BACKGROUND_ROUNDS, TILE_ROUNDS = 4, 8

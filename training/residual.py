@@ -19,7 +19,7 @@ from torch import nn
 from torch.nn import functional
 
 from scenes.sensor import ResidualSpec, SensorSpec
-from training.two_sample import JUDGES, LEVEL_SCALE, PATCH_PX, TwoSample, patch_corners, patch_network, real_halves, two_sample
+from training.two_sample import LEVEL_SCALE, PATCH_PX, TwoSample, judged, judged_halves, patch_corners, patch_network
 from twin.camera.capture import CHROMA_RANGE, LUMA_RANGE, before_stream, expose, luma_weights
 from twin.camera.projection import Disc, lens_disc
 from twin.camera.residual import LEAK, LEVELS, MIDDLE, MOST_LEVELS, STEEPNESS, differences, with_residual
@@ -151,21 +151,18 @@ def calibrate_residual(
     plain = _shots(sensor, light)
     found = list(plain)
     halves = [np.arange(len(real))[k::2] for k in (0, 1)]
-    for taught, judged in (halves, halves[::-1]):
+    for taught, unseen in (halves, halves[::-1]):
         with stage(progress, "teach a network on half of the frames") as step:
             residual = teach([real[k] for k in taught], [light[k] for k in taught], sensor, disc, steps=steps, progress=step)
         own = with_residual(revised(sensor, response={"residual": residual.model_dump()}))
-        for k in judged:
+        for k in unseen:
             found[k] = expose(light[k], own.capture, np.random.default_rng(k))
     with stage(progress, "teach the network on all frames") as step:
         residual = teach(real, light, sensor, disc, steps=steps, progress=step)
     with stage(progress, "train the two-sample test") as step:
-        before, after = (
-            {name: two_sample(real, shown, disc.inside, judge=judge, progress=step) for name, judge in JUDGES.items()}
-            for shown in (plain, found)
-        )
+        before, after = (judged(real, shown, disc.inside, progress=step) for shown in (plain, found))
     with stage(progress, "the same for halves of the real frames") as step:
-        real_told = {name: real_halves(real, disc.inside, judge=judge, progress=step) for name, judge in JUDGES.items()}
+        real_told = judged_halves(real, disc.inside, progress=step)
     psnr = [
         float(np.mean([compare_images(a, b, disc.inside).psnr_db for a, b in zip(real, shown, strict=True)])) for shown in (plain, found)
     ]

@@ -9,6 +9,7 @@ What one network does not see, a stronger one may see. There are two (`JUDGES`),
 real frames (`real_halves`), which shows what a test says where there is nothing to distinguish.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -87,7 +88,7 @@ class TwoSample:
 
     def text(self) -> str:
         """The accuracy and its interval in words."""
-        return f"{100 * self.accuracy:.1f} % ({100 * self.low:.1f} to {100 * self.high:.1f} %)"
+        return accuracy_text(self.accuracy, self.low, self.high)
 
 
 def two_sample(
@@ -135,6 +136,28 @@ def two_sample(
         if progress:
             progress(fold + 1, folds)
     return _outcome(correct, rng)
+
+
+def judged(
+    real: list[np.ndarray],
+    rendered: list[np.ndarray],
+    inside: np.ndarray,
+    *,
+    judges: Mapping[str, Judge] = JUDGES,
+    progress: Step | None = None,
+) -> dict[str, TwoSample]:
+    """What each of several judges tells of real and rendered frames, by the judges' names. Parameters are those of `two_sample`."""
+    return {name: two_sample(real, rendered, inside, judge=judge, progress=progress) for name, judge in judges.items()}
+
+
+def judged_halves(images: list[np.ndarray], inside: np.ndarray, *, progress: Step | None = None) -> dict[str, TwoSample]:
+    """What each of the judges tells of halves of the real frames, by the judges' names. Parameters are those of `real_halves`."""
+    return {name: real_halves(images, inside, judge=judge, progress=progress) for name, judge in JUDGES.items()}
+
+
+def accuracy_text(accuracy: float, low: float, high: float) -> str:
+    """The accuracy of a two-sample test, and its interval, in words."""
+    return f"{100 * accuracy:.1f} % ({100 * low:.1f} to {100 * high:.1f} %)"
 
 
 def real_halves(

@@ -28,15 +28,17 @@ FITTED = 6
     sensors=("ur5-331",),
     code=("training.studies.realism",),
     recordings=("ur5-331-raw",),
-    minutes=10,
+    minutes=23,
 )
 def realism(work: Path) -> Measured:
-    """Unfitted frames, caps where they stand in the real ones: likeness, and the worst bin of radius of what caps look like."""
+    """Unfitted frames, caps where they stand in the real ones: likeness, what is fixed to each cap, the worst radius."""
     metrics = judged(work, work / "realism", "--thorough")
     images, seen = metrics["pin_aligned"], metrics["statistics"]
     found = {name: Value(part["mean"], RENDERED.get(name, "px")) for name, part in images.items() if isinstance(part, dict)}
     found |= {"frames": Value(metrics["frames"]), "exact": Value(images["exact_fraction"])}
     found |= {f"worst_{name}": Value(value) for name, value in seen["worst_relative_difference"].items()}
+    fixed = metrics["fixed_residual"]
+    found |= {"fixed_share": Value(fixed["share"]), "caps_missed": Value(fixed["levels"], "gray levels")}
     noise = seen["scalars"]["noise_sd"]
     found |= {"noise_real": Value(noise["real"], "gray levels"), "noise_rendered": Value(noise["rendered"], "gray levels")}
     names = {
@@ -60,7 +62,7 @@ def judged(work: Path, out: Path, *options: str) -> dict:
     sensors=("ur5-331",),
     code=("training.residual",),
     recordings=("ur5-331-raw",),
-    minutes=15,
+    minutes=35,
 )
 def residual(work: Path) -> Measured:
     """The residual network, taught on half of the unfitted frames and judged on the other half: what the two-sample test tells of them."""

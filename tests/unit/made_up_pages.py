@@ -197,7 +197,7 @@ def drawn(name: str, seed: int = 0) -> Frame:
 def realism_page(out: Path) -> Path:
     figures = ImageFigures(psnr_db=31.2, psnr_gray_db=30.1, ssim=0.912, ssim_gray=0.921, flip=0.062, psnr_whole_db=30.5)
     frames = [drawn("a.png"), drawn("b #2?.png", 1)]
-    pairs = [Pair(SimpleNamespace(frame=f, gray=f.image), f.image, figures, 0.21, k == 0) for k, f in enumerate(frames)]
+    pairs = [Pair(SimpleNamespace(frame=f, gray=f.image), SimpleNamespace(), f.image, figures, 0.21, k == 0) for k, f in enumerate(frames)]
     radial = [RadialRow(m, 40.0 * b, 40.0 * b + 40, 100.0, 103.0 + 4 * b) for m in RADIAL_MEASURES for b in range(3)]
     spots = SimpleNamespace(px=np.zeros((2, 2)), peak=np.ones(2))
     found = SimpleNamespace(
@@ -219,6 +219,7 @@ def realism_page(out: Path) -> Path:
         "disc": {"center_px": [32.1, 24.2], "radius_px": 20.3},
         "refused": [{"image_name": HOSTILE, "reason": "black"}],
         "pin_aligned": images,
+        "fixed_residual": {"levels": 6.7, "share": 0.24},
         "statistics": realism.statistics_summary(found),
         "two_sample": {"small": {"accuracy": 0.61, "low": 0.57, "high": 0.65}},
         "pose_aligned": {"pin_error_px": {"fitted": 0.9, "test": 1.01, "test_max": 2.2}, "test_images": images},

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from scenes import load_sensor
 from training import two_sample as module
-from training.two_sample import JUDGES, Judge, patch_corners, patch_network, real_halves, two_sample
-from twin.errors import FrameError
+from training.studies.realism import compare_with_renders
+from training.two_sample import JUDGES, Judge, accuracy_text, judged, patch_corners, patch_network, real_halves, two_sample
+from twin.errors import FrameError, OptionError
 
 INSIDE = np.ones((72, 72), bool)
 PAIRS = 10
@@ -78,3 +80,16 @@ def test_patches_lie_in_the_disc():
 def test_sets_of_different_length_are_refused():
     with pytest.raises(FrameError, match="3 and 2"):
         two_sample(pictures(3, 0), pictures(2, 1), INSIDE)
+
+
+def test_each_judge_tells_what_it_tells_alone():
+    sets = pictures(6, 0), pictures(6, 1)
+    told = judged(*sets, INSIDE, judges={"quick": QUICKER})
+    assert (told["quick"].by_pair == two_sample(*sets, INSIDE, judge=QUICKER).by_pair).all()
+    assert told["quick"].text() == accuracy_text(told["quick"].accuracy, told["quick"].low, told["quick"].high)
+    assert accuracy_text(0.5, 0.4, 0.625) == "50.0 % (40.0 to 62.5 %)"
+
+
+def test_a_thorough_test_that_is_left_out_is_an_error(tmp_path):
+    with pytest.raises(OptionError, match="--thorough adds to the two-sample test, but --no-two-sample leaves it out"):
+        compare_with_renders(tmp_path, load_sensor("ur5-331"), tmp_path / "out", test=False, thorough=True)

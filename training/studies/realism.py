@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from scenes import SensorSpec
-from training.two_sample import JUDGES, SMALL, TwoSample, real_halves, two_sample
+from training.two_sample import SMALL, TwoSample, accuracy_text, judged, judged_halves
+from twin.errors import OptionError
 from twin.judge.pictures.realism import run_realism
 from twin.optics.render import Quality
 from twin.progress import Progress, Step, silent
@@ -29,6 +30,9 @@ class Realism:
         metrics, found = self.metrics, self.metrics["statistics"]
         lines = [f"refused {refused['image_name']}: {refused['reason']}" for refused in metrics["refused"]]
         lines.append(_image_line("pin-aligned", metrics["frames"], metrics["pin_aligned"]))
+        if fixed := metrics["fixed_residual"]:
+            share = f"{100 * fixed['share']:.1f} % of its power is fixed to each cap"
+            lines.append(f"on the caps the renders miss {fixed['levels']:.2f} gray levels (rms); {share}")
         worst = ", ".join(f"{name} {100 * value:.1f} %" for name, value in found["worst_relative_difference"].items())
         lines.append(f"largest difference in a radial bin: {worst}")
         lines += [f"{name}: real {pair['real']:.2f}, rendered {pair['rendered']:.2f}" for name, pair in found["scalars"].items()]
@@ -38,8 +42,7 @@ class Realism:
         )
         lines.append(f"all pins found in {100 * metrics['pin_aligned']['exact_fraction']:.1f} % of the renders")
         for name, told in metrics["two_sample"].items():
-            interval = f"{100 * told['low']:.1f} to {100 * told['high']:.1f} %"
-            lines.append(f"two-sample accuracy, {name}: {100 * told['accuracy']:.1f} % ({interval})")
+            lines.append(f"two-sample accuracy, {name}: {accuracy_text(**told)}")
         if poses := metrics["pose_aligned"]:
             error = poses["pin_error_px"]
             lines.append(
@@ -84,9 +87,13 @@ def compare_with_renders(
     ------
     FrameError
         No frame can be used, or the labels are missing.
+    OptionError
+        ``thorough`` without ``test``.
     RenderError
         Nothing can be rendered here.
     """
+    if thorough and not test:
+        raise OptionError("--thorough adds to the two-sample test, but --no-two-sample leaves it out; give one of them")
     asked = (_thorough if thorough else _quick) if test else None
     found = run_realism(
         frames,
@@ -104,12 +111,12 @@ def compare_with_renders(
 
 
 def _quick(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> dict[str, TwoSample]:
-    return {"small": two_sample(real, rendered, inside, judge=SMALL, progress=step)}
+    return judged(real, rendered, inside, judges={"small": SMALL}, progress=step)
 
 
 def _thorough(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> dict[str, TwoSample]:
-    told = {name: two_sample(real, rendered, inside, judge=judge, progress=step) for name, judge in JUDGES.items()}
-    return told | {f"{name}, real halves": real_halves(real, inside, judge=judge, progress=step) for name, judge in JUDGES.items()}
+    halves = judged_halves(real, inside, progress=step)
+    return judged(real, rendered, inside, progress=step) | {f"{name}, real halves": told for name, told in halves.items()}
 
 
 def _image_line(title: str, count: int, images: dict[str, Any]) -> str:

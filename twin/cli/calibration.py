@@ -326,7 +326,8 @@ saturated, of another size or without all their pins are refused by name. The ex
 \b
 Writes:
   index.html      pictures side by side, all figures, plots
-  metrics.json    every figure: PSNR, SSIM, FLIP over the lens disc;
+  metrics.json    every figure: PSNR, SSIM, FLIP over the lens disc; what is
+                  missed on the caps, and how much of it is fixed to each cap;
                   differences by radius; spots; spectra; two-sample accuracy;
                   pin errors
   frames.csv      figures of each frame
@@ -340,10 +341,11 @@ How to read it: no render can do better than PSNR and SSIM of two real frames
 with the same contact. Two-sample accuracy is the share of patches of unseen
 frames that a small network puts into the right set: at 100 % it always tells
 real from rendered, at 50 % never. --thorough trains a stronger network, too,
-and both on two halves of the real frames, which should give 50 %. --without
-shows what a measured detail is worth: the caps' relief, the skin's grain, the
-background. --residual adds the sensor's residual network; judge it on frames
-that it was not taught on.
+and both on two halves of the real frames, which should give 50 %. What is
+missed on the caps and fixed to each of them is what a better relief could
+hold. --without shows what a measured detail is worth: the caps' relief, the
+skin's grain, the background. --residual adds the sensor's residual network;
+judge it on frames that it was not taught on.
 
 \b
 Example:

@@ -5,13 +5,13 @@ captured render, divided by the slope of the response curve, are spread over the
 fine structure converge last, so that few rounds also keep noise out.
 
 A pixel shows the background and tiles. If the same pixel lacks the same light in most frames, that light belongs to the background. Light
-that moves with the caps belongs to the tiles (the relief).
+that moves with the caps belongs to the tiles (the relief). The edges of caps that hardly move look like a background at first. Therefore
+the tiles are fitted to all pixels, also to those that have a background.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy import sparse
 
@@ -23,8 +23,8 @@ from twin.optics.relief import POWER, CapLamp, cap_places, tiles_picture
 from twin.optics.static_layer import BACKGROUND_POWER
 from twin.types import BoolArray, FloatArray, IntArray
 
-CELLS, REACH = 19, 1.8
-"""Cells along a tile's side, and half of that side, cap radii. A cell is about one pixel wide, and the tiles of neighbours meet."""
+CELLS, REACH = 23, 1.8
+"""Cells along a tile's side, and half of that side, cap radii. A cell is a little narrower than a pixel, and tiles of neighbours meet."""
 PRIOR_LEVELS, PRIOR_SHARE = 9.0, 0.2
 """Prior of a tile: standard deviation of the gray levels that tiles do not explain, and standard deviation of a tile's values."""
 BACKGROUND_ROUNDS, TILE_ROUNDS = 4, 8
@@ -35,8 +35,6 @@ EDGE = (0.6, 1.5)
 """Range of distances from a cap's middle, cap radii, whose pixels do not count for the background until tiles are fitted."""
 SURE_SDS, SURE_LEVELS = 3.0, 3.0
 """Where caps pass, only the part of a background beyond so many standard errors plus so many gray levels is used."""
-GLINT_LIGHT, GLINT_PX = 0.004, 5
-"""Background light above which a pixel where caps pass is not used to fit tiles; width, px, of the square that is left out with it."""
 DARKEST = 2e-4
 """Least light at which the slope of the response curve is computed, because the slope has no bound at light 0."""
 BRIGHTEST = 2.0
@@ -151,16 +149,13 @@ class _Fit:
 
     def tiles(self) -> FloatArray:
         """The tiles (N cells^2, channels) that explain the remaining differences."""
-        height, width, channels = self._views[0].image.shape
-        bright = (self.background.max(axis=1) > GLINT_LIGHT) & self._passed
-        glint = cv2.dilate(bright.reshape(height, width).astype(np.uint8), np.ones((GLINT_PX, GLINT_PX))).ravel() > 0
-        tiles = np.zeros((self._views[0].weights.shape[1], channels), np.float32)
+        tiles = np.zeros((self._views[0].weights.shape[1], self.background.shape[1]), np.float32)
         prior = (PRIOR_LEVELS / PRIOR_SHARE) ** 2
         for _ in range(TILE_ROUNDS):
             found, weight = np.zeros_like(tiles), np.full_like(tiles, prior)
             for view in self._views:
                 light = self._lit(view, tiles)
-                slope = self._slope(light[view.pixels]) * view.lamp * ~glint[view.pixels, None]
+                slope = self._slope(light[view.pixels]) * view.lamp
                 found += view.weights.T @ (slope * self._missing(view, light)[view.pixels])
                 weight += view.weights.T @ slope**2
             tiles += TILE_GAIN * found / weight

@@ -12,6 +12,7 @@ from twin.camera.capture import expose
 from twin.camera.projection import Disc, project
 from twin.frames.forms import gray_levels
 from twin.geometry.mesh import SensorMesh
+from twin.judge.pictures.fixed import cap_patches, fixed_share
 from twin.judge.pictures.frames import RealFrame
 from twin.judge.pictures.images import ImageFigures, compare_images
 from twin.judge.pictures.poses import (
@@ -44,6 +45,8 @@ class Pair:
     Attributes
     ----------
     real : RealFrame
+    state : FittedPins or ContactState
+        What was rendered.
     image : (H, W) or (H, W, 3) uint8
         The rendered frame.
     figures : ImageFigures
@@ -54,10 +57,16 @@ class Pair:
     """
 
     real: RealFrame
+    state: FittedPins | ContactState
     image: np.ndarray
     figures: ImageFigures
     remainder_px: float
     exact: bool
+
+    @property
+    def recorded(self) -> np.ndarray:
+        """The real frame (H, W) or (H, W, 3) uint8 with as many channels as the rendered one."""
+        return self.real.frame.image if self.image.ndim == self.real.frame.image.ndim else self.real.gray
 
 
 @dataclass(frozen=True)
@@ -130,6 +139,16 @@ def statistics(pairs: list[Pair], disc: Disc, *, progress: Step) -> Statistics:
     return compare_statistics(*sets)
 
 
+def fixed_residual(spec: SensorSpec, pairs: list[Pair]) -> dict[str, float] | None:
+    """What pin-aligned renders miss on the caps: ``levels``, its rms in gray levels, and ``share``, as ``fixed_share`` tells it.
+
+    None if there is one pair only, or nothing is missed.
+    """
+    patches = np.stack([cap_patches(spec.view, spec.pins, pair.state, pair.recorded, pair.image) for pair in pairs])
+    share = fixed_share(patches)
+    return {"levels": float(np.sqrt(np.mean(patches**2))), "share": share} if np.isfinite(share) else None
+
+
 class _Shooter:
     """Renders states and compares the renders with real frames."""
 
@@ -143,4 +162,4 @@ class _Shooter:
         seen = self._pipeline(replace(real.frame, image=image))
         exact = seen.valid and seen.found == seen.expected
         recorded = real.frame.image if image.ndim == real.frame.image.ndim else real.gray
-        return Pair(real, image, compare_images(recorded, image, self._disc.inside), remainder_px, exact)
+        return Pair(real, state, image, compare_images(recorded, image, self._disc.inside), remainder_px, exact)

@@ -9,7 +9,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.camera.projection import lens_disc
-from twin.judge.pictures.compare import Quality, pin_aligned, pose_aligned, statistics
+from twin.judge.pictures.compare import Quality, fixed_residual, pin_aligned, pose_aligned, statistics
 from twin.judge.pictures.frames import FEW_LOST, read_real
 from twin.judge.pictures.report import (
     image_summary,
@@ -115,6 +115,7 @@ def run_realism(
         "refused": real.refused,
         "disc": {"center_px": disc.center_px.tolist(), "radius_px": disc.radius_px},
         "pin_aligned": image_summary(pairs),
+        "fixed_residual": fixed_residual(spec, pairs),
         "statistics": statistics_summary(found),
         "two_sample": {name: {"accuracy": told.accuracy, "low": told.low, "high": told.high} for name, told in outcome.items()},
         "pose_aligned": poses and pose_summary(poses),

@@ -36,9 +36,8 @@ def write_pictures(folder: Path, pairs: list[Pair], kind: str) -> list[dict]:
     folder.mkdir(exist_ok=True)
     rows = []
     for pair, stem in zip(pairs, distinct_stems([pair.real.frame.name for pair in pairs]), strict=True):
-        real = pair.real.frame.image if pair.image.ndim == pair.real.frame.image.ndim else pair.real.gray
         row = _frame_row(pair, kind)
-        images = {"real": real, kind: pair.image, f"{kind}-difference": difference_picture(real, pair.image)}
+        images = {"real": pair.recorded, kind: pair.image, f"{kind}-difference": difference_picture(pair.recorded, pair.image)}
         for key, image in images.items():
             path = folder / f"{stem}-{key}.png"
             write_image(path, image)
@@ -196,6 +195,11 @@ def write_page(
     )
     _image_table(page, metrics["pin_aligned"])
     page.text(_detector_text(spec.pins.count, metrics))
+    if fixed := metrics["fixed_residual"]:
+        page.text(
+            f"On the caps and their edges the renders miss {number(fixed['levels'], decimals=1)} gray levels (rms), of whose power "
+            f"{number(100 * fixed['share'], decimals=1)} % is a picture fixed to each cap, which a better relief could hold."
+        )
     _statistics_section(page, metrics["statistics"], plots, found)
     if metrics["pose_aligned"]:
         error = metrics["pose_aligned"]["pin_error_px"]

@@ -8,7 +8,7 @@ import bench_environments
 import bench_surrogate
 import numpy as np
 
-from figures.jobs import Measured, Value, job, real_folder, run_twin
+from figures.jobs import NO_PICTURES, Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
 from training.surrogate.model import surrogate_of
 
@@ -48,11 +48,18 @@ for name, recording in SENSORS.items():
         shipped=("training/surrogates",),
         recordings=(recording,),
         minutes=1,
+        beside=NO_PICTURES,
     )(partial(on_real_contacts, sensor=name))
     command = f"twin surrogate --sensor {name} --out mine.safetensors"
-    job(f"surrogate.{name}", command, sensors=(name,), code=("training.surrogate.model",), shipped=("training/surrogates",), minutes=0.1)(
-        partial(stated_errors, sensor=name)
-    )
+    job(
+        f"surrogate.{name}",
+        command,
+        sensors=(name,),
+        code=("training.surrogate.model",),
+        shipped=("training/surrogates",),
+        minutes=0.1,
+        beside=NO_PICTURES,
+    )(partial(stated_errors, sensor=name))
 
 
 @job(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from figures.jobs import Measured, Value, job, real_folder, run_twin
+from figures.jobs import NO_PICTURES, Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
 from twin.fit.sensor_file import write_sensor
 
@@ -116,6 +116,7 @@ for name in EXPERIMENTS:
         f"twin train --model touch --sensor {name} --data SIMULATED ... --target contact --members 2 --no-kernel --out RUN",
         sensors=(name,),
         code=CODE,
+        beside=NO_PICTURES,
         minutes=25,
     )(partial(forces, sensor=name))
 job(
@@ -123,6 +124,7 @@ job(
     "twin train --model touch --sensor mg400-331 --data DRAGS ... --target contact --members 2 --no-kernel --out RUN",
     sensors=("mg400-331",),
     code=CODE,
+    beside=NO_PICTURES,
     minutes=20,
 )(partial(slip, sensor="mg400-331"))
 for number in TACPAD_SPLITS:
@@ -132,6 +134,7 @@ for number in TACPAD_SPLITS:
         f"--split {number} --out RUN",
         sensors=(TACPAD,),
         code=CODE,
+        beside=NO_PICTURES,
         recordings=(TACPAD_SET,),
         minutes=12,
     )(partial(real_forces, split=number))

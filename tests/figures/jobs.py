@@ -19,8 +19,9 @@ from functools import partial
 from pathlib import Path
 from time import perf_counter
 
-from scenes import load_sensor
+from scenes import SensorSpec, load_sensor
 from twin import store
+from twin.optics.relief import DETAILS, without
 from twin.store.fingerprint import Code
 
 ROOT = Path(__file__).parents[2]
@@ -58,6 +59,8 @@ class Job:
         What a reader would type to get the same.
     sensors : tuple of str
         Whose specifications it depends on.
+    beside : tuple of str
+        Parts of these specifications that it does not depend on (``NO_PICTURES``, ``NO_RESIDUAL``).
     code : tuple of str
         Modules that compute the figures (a package: all of its modules). All that they import counts, too. Benches are named as well.
     shipped : tuple of str
@@ -76,6 +79,7 @@ class Job:
     recordings: tuple[str, ...]
     minutes: float
     shipped: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
 
     @property
     def family(self) -> str:
@@ -95,13 +99,14 @@ def job(
     shipped: tuple[str, ...] = (),
     recordings: tuple[str, ...] = (),
     minutes: float = 1.0,
+    beside: tuple[str, ...] = (),
 ) -> Callable:
     """Register a function as the job of that name."""
 
     def register(measure: Callable[[Path], Measured]) -> Callable[[Path], Measured]:
         if name in JOBS:
             raise FiguresError(f"two jobs are called {name!r}")
-        JOBS[name] = Job(name, measure, command, sensors, code, recordings, minutes, shipped)
+        JOBS[name] = Job(name, measure, command, sensors, code, recordings, minutes, shipped, beside)
         return measure
 
     return register
@@ -130,10 +135,23 @@ def run_twin(work: Path, *arguments: object) -> str:
     return done.stdout
 
 
-def specification_digest(sensors: tuple[str, ...]) -> str:
-    """Of the resolved specifications, however their files are laid out."""
-    text = "\n".join(load_sensor(name).model_dump_json() for name in sensors)
+NO_RESIDUAL = ("residual",)
+"""``Job.beside`` of a job that uses no residual network, or teaches one."""
+NO_PICTURES = (*DETAILS, *NO_RESIDUAL)
+"""``Job.beside`` of a job that renders nothing: neither measured details of pictures nor a residual network change its figures."""
+
+
+def specification_digest(sensors: tuple[str, ...], beside: tuple[str, ...] = ()) -> str:
+    """Digest of the resolved specifications, however their files are laid out, without the parts ``beside``."""
+    text = "\n".join(_shortened(load_sensor(name), beside).model_dump_json() for name in sensors)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _shortened(spec: SensorSpec, beside: tuple[str, ...]) -> SensorSpec:
+    """A specification without some of its parts."""
+    if "residual" in beside:
+        spec = spec.model_copy(update={"response": spec.response.model_copy(update={"residual": None})})
+    return without(spec, [name for name in beside if name in DETAILS])
 
 
 UNMEASURED = ("twin.cli", "twin.report")
@@ -182,7 +200,7 @@ def fingerprint(made: Job) -> str:
 
 def key_of(made: Job) -> dict[str, str]:
     """What must not have changed for a job's figures to count."""
-    return {"specification": specification_digest(made.sensors), "fingerprint": fingerprint(made)}
+    return {"specification": specification_digest(made.sensors, made.beside), "fingerprint": fingerprint(made)}
 
 
 def read(path: Path = FIGURES) -> dict[str, dict]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from figures.jobs import ROOT, Measured, Value, job, real_folder
+from figures.jobs import NO_PICTURES, ROOT, Measured, Value, job, real_folder
 from scenes import load_experiment, load_sensor
 from training.dataset import load_dataset
 from training.estimator import PoseEstimator
@@ -23,8 +23,8 @@ RECORDINGS = {  # by recording: sensor, experiment, contacts, elements across, m
     "tac-vgnn-127": ("mg400-127", "surface-2d", 300, 20, 12.0),
     "ur5-331-surface-3d-tap": ("ur5-331", "surface-3d", 300, 12, 5.0),
     "ur5-331-surface-3d-shear": ("ur5-331", "surface-3d-sheared", 300, 12, 9.0),
-    "ur5-331-edge-2d-tap": ("ur5-331", "edge-circle", 800, 12, 8.0),
-    "ur5-331-edge-2d-shear": ("ur5-331", "edge-circle-sheared", 500, 12, 14.0),
+    "ur5-331-edge-2d-tap": ("ur5-331", "edge-circle", 800, 12, 25.0),
+    "ur5-331-edge-2d-shear": ("ur5-331", "edge-circle-sheared", 500, 12, 35.0),
 }
 SEEDS = (0, 1, 2)
 CHARTS = ROOT / "docs" / "pictures"
@@ -75,6 +75,7 @@ def register() -> None:
             code=("training.studies.sim_to_real.worth",),
             recordings=(recording,),
             minutes=minutes,
+            beside=NO_PICTURES,
         )(partial(by_labels, recording=recording))
         job(
             f"intervals.{recording}",
@@ -84,6 +85,7 @@ def register() -> None:
             shipped=(f"training/weights/{sensor}",),
             recordings=(recording,),
             minutes=2.0,
+            beside=NO_PICTURES,
         )(partial(inside, recording=recording))
 
 

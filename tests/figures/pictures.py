@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from bench_render import CHOSEN, DRAWN, Bench
 
-from figures.jobs import Measured, Value, job, real_folder, run_twin
+from figures.jobs import NO_RESIDUAL, Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
 from training.residual import calibrate_residual
 from twin.frames import open_recording
@@ -29,6 +29,7 @@ FITTED = 6
     code=("training.studies.realism",),
     recordings=("ur5-331-raw",),
     minutes=23,
+    beside=NO_RESIDUAL,
 )
 def realism(work: Path) -> Measured:
     """Unfitted frames, caps where they stand in the real ones: likeness, what is fixed to each cap, the worst radius."""
@@ -63,6 +64,7 @@ def judged(work: Path, out: Path, *options: str) -> dict:
     code=("training.residual",),
     recordings=("ur5-331-raw",),
     minutes=35,
+    beside=NO_RESIDUAL,
 )
 def residual(work: Path) -> Measured:
     """The residual network, taught on half of the unfitted frames and judged on the other half: what the two-sample test tells of them."""
@@ -82,6 +84,7 @@ def residual(work: Path) -> Measured:
     code=("training.studies.realism",),
     recordings=("ur5-331-raw",),
     minutes=20,
+    beside=NO_RESIDUAL,
 )
 def details(work: Path) -> Measured:
     """What each measured detail is worth: likeness of drawn pictures with all, and without each."""

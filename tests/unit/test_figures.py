@@ -7,8 +7,10 @@ import pytest
 from figures import __main__ as driver
 from figures import jobs as module
 from figures import tables
-from figures.jobs import FIGURES, JOBS, FiguresError, Job, Value, is_kept, read, run, values
+from figures.jobs import FIGURES, JOBS, NO_PICTURES, NO_RESIDUAL, FiguresError, Job, Value, is_kept, read, run, values
 
+from scenes import load_sensor
+from twin.optics.relief import DETAILS, without
 from twin.store.fingerprint import Code
 
 
@@ -72,6 +74,20 @@ def test_another_version_of_a_library_makes_a_figure_old(counted, monkeypatch):
     first = module.fingerprint(job)
     monkeypatch.setattr(module, "code_behind", lambda *names: Code({}, {"numpy": "2.0"}))
     assert len({before, first, module.fingerprint(job)}) == 3
+
+
+def test_details_of_pictures_make_no_figure_old_that_renders_nothing(monkeypatch):
+    spec = load_sensor("ur5-331")
+    plain, other = without(spec, DETAILS), spec.model_copy(update={"camera": spec.camera.model_copy(update={"k1": spec.camera.k1 + 0.01})})
+
+    def digest(seen, *beside):
+        monkeypatch.setattr(module, "load_sensor", lambda name: seen)
+        return module.specification_digest(("ur5-331",), beside)
+
+    assert digest(spec) != digest(plain) and digest(spec, *NO_PICTURES) == digest(plain, *NO_PICTURES)
+    assert digest(spec, *NO_PICTURES) != digest(other, *NO_PICTURES)
+    taught = spec.model_copy(update={"response": spec.response.model_copy(update={"residual": None})})
+    assert digest(spec) != digest(taught) and digest(spec, *NO_RESIDUAL) == digest(taught, *NO_RESIDUAL)
 
 
 def test_another_shipped_file_makes_a_figure_old(tmp_path, monkeypatch):

@@ -122,9 +122,11 @@ class Magician(BaseArm):
         self._require_connected()
         begun_s = time.monotonic()
         try:
-            moving = self._last_index is not None and self._index_of(self._request(Id.QUEUE_INDEX)) < self._last_index
-            values = np.array(struct.unpack("<8f", self._request(Id.GET_POSE)))
-            alarms = self._alarms()
+            until_s = begun_s + max_age_s
+            last = self._last_index
+            moving = last is not None and self._index_of(self._request(Id.QUEUE_INDEX, until_s=until_s)) < last
+            values = np.array(struct.unpack("<8f", self._request(Id.GET_POSE, until_s=until_s)))
+            alarms = self._alarms(until_s)
         except DeviceNotConnectedError:
             raise
         except DeviceError as error:
@@ -186,8 +188,8 @@ class Magician(BaseArm):
         self._request(Id.QUEUE_CLEAR, ctrl=WRITE)
         self._last_index = None
 
-    def _alarms(self) -> list[int]:
-        bits = int.from_bytes(self._request(Id.ALARMS), "little")
+    def _alarms(self, until_s: float = np.inf) -> list[int]:
+        bits = int.from_bytes(self._request(Id.ALARMS, until_s=until_s), "little")
         return [n for n in range(bits.bit_length()) if bits >> n & 1]
 
     def _index_of(self, payload: bytes) -> int:
@@ -200,11 +202,16 @@ class Magician(BaseArm):
         if not self._enabled:
             raise DeviceError(f"{self.name}: not enabled; call enable() first")
 
-    def _request(self, id: Id, params: bytes = b"", *, ctrl: int = 0) -> bytes:
-        """Send a command and wait for the reply with the same id and ctrl. The command is sent again if the reply is missing or damaged."""
+    def _request(self, id: Id, params: bytes = b"", *, ctrl: int = 0, until_s: float = np.inf) -> bytes:
+        """Send a command and wait for the reply with the same id and ctrl.
+
+        The command is sent again if the reply is missing or damaged, but not after ``until_s`` of ``time.monotonic``.
+        """
         sent = Message(id, ctrl, params).to_bytes()
         with self._lock:
-            for _ in range(TRIES):
+            tries = 0
+            while tries == 0 or (tries < TRIES and time.monotonic() < until_s):
+                tries += 1
                 port = self._port()
                 try:
                     port.reset_input_buffer()
@@ -219,7 +226,7 @@ class Magician(BaseArm):
                         "Plug the cable in, then connect() again"
                     ) from error
         raise DeviceError(
-            f"{self.name}: no valid reply to command {int(id)} in {TRIES} tries of {REPLY_TIMEOUT_S:g} s; switch the arm on, "
+            f"{self.name}: no valid reply to command {int(id)} in {tries} tries of {REPLY_TIMEOUT_S:g} s; switch the arm on, "
             "check that the port is a Magician's and the cable is sound"
         )
 

@@ -1,5 +1,6 @@
 """Whatever a Magician's line does wrong, the driver recovers, or stops it and says what to do."""
 
+import itertools
 import os
 import pty
 import select
@@ -85,6 +86,18 @@ def test_an_arm_that_falls_silent_is_stale():
         with pytest.raises(StaleDataError, match="Don't trust the last pose"):
             arm.state()
         emulator.faults.clear()
+
+
+def test_an_arm_whose_replies_are_mostly_lost_is_stale_within_a_second(monkeypatch):
+    count = itertools.count()
+    with MagicianEmulator() as emulator, Magician(emulator.device) as arm:
+        arm.enable()
+        monkeypatch.setattr(emulator, "_every", lambda fault: fault == "lost-reply" and next(count) % 4 != 3)
+        begun_s = time.monotonic()
+        with pytest.raises(StaleDataError):
+            arm.state()
+        assert time.monotonic() - begun_s < 1.0
+        monkeypatch.undo()
 
 
 def test_plugged_in_again_it_connects_again(tmp_path):

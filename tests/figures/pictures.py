@@ -24,7 +24,7 @@ FITTED = 6
 
 @job(
     "render.realism.ur5-331",
-    "twin realism DIR --sensor ur5-331 --fitted 6 --out OUT",
+    "twin realism DIR --sensor ur5-331 --fitted 6 --thorough --out OUT",
     sensors=("ur5-331",),
     code=("training.studies.realism",),
     recordings=("ur5-331-raw",),

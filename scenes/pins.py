@@ -173,6 +173,14 @@ def layout_from(text: str) -> PinsSpec:
     raise SpecError(f"layout {text}: not known; give rings:10, hexagon:6, grid:9x7 or positions:FILE.csv")
 
 
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def _places_in(path: Path) -> tuple[tuple[float, float], ...]:
     """x and y in each line of a CSV file. Lines that begin with # are passed over, and so is a header before the first pin."""
     try:
@@ -189,7 +197,7 @@ def _places_in(path: Path) -> tuple[tuple[float, float], ...]:
         try:
             x, y = map(float, cells)
         except ValueError:
-            if places or header:
+            if places or header or any(_is_number(cell) for cell in cells):
                 raise SpecError(f"{path}, line {number}: expected two numbers, x,y, got {line[:40]!r}") from None
             header = True
             continue

@@ -210,7 +210,7 @@ class Magician(BaseArm):
         sent = Message(id, ctrl, params).to_bytes()
         with self._lock:
             tries = 0
-            while tries == 0 or (tries < TRIES and time.monotonic() < until_s):
+            while tries < TRIES and time.monotonic() < until_s:
                 tries += 1
                 port = self._port()
                 try:

@@ -141,6 +141,7 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
     assert [weights.stat().st_mtime_ns for weights in trained] == written, "trained once"
     plan = Plan(load_sensor(SENSOR), tmp_path / "frames", load_experiment(str(tmp_path / "gentle.toml")), labels=8, simulated=(sims,))
     curves = worth(plan, tmp_path / "worth", (0, 1))
+    assert not any("without labels" in row["trained_on"] for row in curves), "a plate's frames without labels would tell nothing"
     assert {row["labelled_frames"] for row in curves if row["model"] == BACKWARDS and row["trained_on"] == BOTH} >= {0, 5, 8}
     assert {row["trained_on"] for row in curves} == {REAL, BOTH, REAL + EVENLY, BOTH + EVENLY}
     assert all(np.isfinite(row["pose_2_corrected"]) for row in curves)

@@ -105,6 +105,9 @@ def test_positions_come_from_a_file_with_or_without_a_header(tmp_path):
     file.write_text("x,y\nmm,mm\n0,0\n1,0\n0,2\n")
     with pytest.raises(SpecError, match="line 2"):
         layout_from(f"positions:{file}")
+    file.write_text("1.0,2.O\n0,0\n1,0\n0,2\n")
+    with pytest.raises(SpecError, match="line 1"):
+        layout_from(f"positions:{file}")
     file.write_text("0,0\n1,1\n2,2\n")
     with pytest.raises(SpecError, match="on one line"):
         layout_from(f"positions:{file}")

@@ -232,6 +232,27 @@ def test_the_twin_read_backwards_finds_labels_and_learns_what_the_twin_misses(se
     assert (errors(30) < 0.85 * errors(0)).all(), "labelled frames tell what the twin misses"
 
 
+def test_a_twin_without_unknown_labels_or_without_noise_is_read_as_well():
+    rng = np.random.default_rng(2)
+    rest = rng.uniform(-60, 60, (60, 2))
+    ranges = np.zeros((12, 2))
+    ranges[[1, 2, 5]] = [[1, 1], [4, 4], [-180, 180]]
+    only = [ArmLabel(each[:6], each[6:]) for each in rng.uniform(*ranges.T, (200, 12))]
+    truth = np.array([label.pose[5] for label in only])
+    found = TwinBackwards(edge_pins(only, rest), only, rest, ranges).estimate(np.zeros((0, 60, 2)), [], edge_pins(only[:20], rest))
+    assert np.abs((found[:, 5] - truth[:20] + 180) % 360 - 180).max() < 1.0, "the direction alone is unknown, the pins have no noise"
+    known = ranges.copy()
+    known[1:3], known[5] = [[-6, 6], [3, 5]], 30.0
+    ranges[1:3] = known[1:3]
+    around = [ArmLabel(each[:6], each[6:]) for each in rng.uniform(*ranges.T, (300, 12))]
+    asked = [ArmLabel(each[:6], each[6:]) for each in rng.uniform(*known.T, (20, 12))]
+    twin = TwinBackwards(edge_pins(around, rest), around, rest, known)
+    found = twin.estimate(np.zeros((0, 60, 2)), [], edge_pins(asked, rest) + rng.normal(0, 0.01, (20, 60, 2)))
+    assert (found[:, 5] == 30.0).all(), "the direction is known"
+    assert np.median(np.abs(found[:, 1] - [label.pose[1] for label in asked])) < 0.2
+    assert twin.estimate(np.zeros((0, 60, 2)), [], np.zeros((0, 60, 2))).shape == (0, 12)
+
+
 def test_the_covariance_of_what_is_left_is_that_of_the_frames_and_grows_with_their_amplitude():
     rng = np.random.default_rng(0)
     noise = np.diag(np.linspace(0.5, 2.0, 12))

@@ -20,6 +20,10 @@ LEADING = 3
 """Components of the waves by which they are fitted; they hold most of the displacement."""
 NEGLIGIBLE = 1e-4
 """Share of the fitted displacements' variance that is left out. It is below the noise of the pins."""
+LEAST_NOISE_PX = 1e-3
+"""Smallest standard deviation of the pins' noise, px, so that pins without any noise can be used."""
+AT_ONCE = 1000
+"""Contacts whose waves are computed at once, so that the covariance of many contacts with all states does not fill the memory."""
 LEAST_RANGE = 1e-9
 """mm or deg by which a label varies."""
 MOVES_FROM = 6
@@ -86,6 +90,8 @@ class TwinField:
 
     def own(self, known: np.ndarray) -> np.ndarray:
         """Expected waves (B, C) of contacts (B, 12) in the object's frame."""
+        if len(known) > AT_ONCE:
+            return np.concatenate([self.own(known[first : first + AT_ONCE]) for first in range(0, len(known), AT_ONCE)])
         near = self._kernel.between(self._kernel.placed(Points.of(self._inputs(known))), self._placed)
         found = near @ self._weight @ self._components
         real, imaginary = np.split(found, 2, axis=1)
@@ -105,7 +111,7 @@ class TwinField:
         """
         count, pins = self._fit.shape
         beside = moved_px @ [1, 1j] - self.waves(moved_px) @ np.linalg.pinv(self._fit).T
-        variance = float((np.abs(beside) ** 2).mean()) / 2 * pins / max(pins - count, 1)
+        variance = max(float((np.abs(beside) ** 2).mean()) / 2 * pins / max(pins - count, 1), LEAST_NOISE_PX**2)
         shared = variance * self._fit @ self._fit.conj().T
         if self.direction is not None:
             shared = np.where(self.order[:, None] == self.order, shared, 0)

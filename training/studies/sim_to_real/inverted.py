@@ -13,7 +13,7 @@ up to a constant. m and w are the middle and the width of the ranges. Moves are 
 The minimum of J is found by damped Gauss-Newton steps from the nearest simulated state. Where a label is a direction, J has several minima
 that are nearly as deep, because a far edge changes the pins little. The estimate is then the mean over directions around the whole circle:
 for each direction the other labels are optimised, and it is weighted by its probability. Residuals of neighbouring waves are not
-independent, so J is divided by ``TEMPERATURE`` first.
+independent, so the logarithm of that probability is divided by ``TEMPERATURE``.
 """
 
 from collections.abc import Sequence
@@ -21,11 +21,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scenes.experiment import ExperimentSpec
+from scenes import ExperimentSpec, ObjectSpec
 from training.dataset import Dataset
 from training.label_code import label_error, wrapped_deg
+from training.recipes import TrainingError
 from training.studies.sim_to_real.field import TwinField, parts
-from training.studies.sim_to_real.missed import Left, Missed, chosen
+from training.studies.sim_to_real.missed import MOST_FRAMES, Left, Missed, chosen
+from training.studies.sim_to_real.steps import RANGE_MARGIN, arm_labels, states_touching
 from twin.rig.labels import ArmLabel
 
 BACKWARDS = "twin backwards"
@@ -55,13 +57,15 @@ AROUND_STEPS = 3
 UNLIKELY = 300.0
 """Excess of J at the nearest simulated state beyond which a direction is left out of the mean; half of it after a first step."""
 TEMPERATURE = 8.0
-"""Divisor of J in the mean over directions. 4 to 16 give nearly the same errors."""
+"""Divisor of the logarithm of a direction's probability in the mean over directions. 4 to 16 give nearly the same errors."""
 NEAR_DEG = 4.0
 """Difference of the mean direction from that of the deepest minimum below which the latter is the estimate, because the mean is coarse."""
 SURE = 0.9
 """Length of the mean direction, as a vector, above which a direction is sure; 0.9 is a standard deviation of 26 deg."""
 NOISIER = 10.0
 """Variance of the residual of a frame without a label, as a multiple of that of a labelled frame, because its estimated label errs."""
+LEAST_STATES = 10
+"""Least number of simulated states that a twin learns from."""
 AT_ONCE = 200
 """Frames that are estimated at once; more would need more memory."""
 
@@ -102,11 +106,15 @@ class TwinBackwards:
     ) -> np.ndarray:
         """Pose and move (B, 12) of frames with displacements (B, N, 2), after n labelled ones with displacements (n, N, 2), px.
 
-        Without a labelled frame the twin is taken to miss nothing but the noise of pins. Frames without labels (U, N, 2) help where a label
-        is a direction: they are estimated first, and those whose direction is sure teach the discrepancy, as frames with more noise. The
-        covariance of what is left comes from the labelled frames alone, because the labels of the others are fitted to their pins.
+        Without a labelled frame there is no discrepancy, and what is left is half as large again as the noise of pins.
+
+        Frames without labels (U, N, 2) are used where a label is a direction. They are estimated first. Those whose direction is sure teach
+        the discrepancy, as frames with more noise. The covariance of what is left comes from the labelled frames alone, because the labels
+        of the others are fitted to their pins.
         """
-        rows = chosen(len(real_px))
+        if not len(asked_px):
+            return np.zeros((0, 12))
+        rows = chosen(len(real_px), MOST_FRAMES)
         field, known, seen = self._field, _both(labels)[rows], self._field.waves(real_px)[rows]
         noise = field.noise(real_px if len(real_px) else asked_px)
 
@@ -117,11 +125,11 @@ class TwinBackwards:
             return _Reader(field, missed, Left(missed.left[: len(known)], seen, noise), self._ranges)
 
         found = reader(seen[:0], known[:0])
-        if unlabelled_px is not None:
+        if unlabelled_px is not None and field.direction is not None:
             more = field.waves(unlabelled_px)
             told = _in_groups(found, more)
             sure = np.flatnonzero(told.sure)
-            sure = sure[chosen(len(sure))]
+            sure = sure[chosen(len(sure), MOST_FRAMES)]
             found = reader(more[sure], told.labels[sure])
         return _in_groups(found, field.waves(asked_px)).labels
 
@@ -157,15 +165,16 @@ class _Reader:
     def __init__(self, field: TwinField, missed: Missed, left: Left, ranges: np.ndarray) -> None:
         self._field, self._missed, self._left = field, missed, left
         fixed = np.flatnonzero(np.ptp(ranges, axis=1) == 0)
-        states = field.known[:STARTS].copy()
+        states = field.known[chosen(len(field.known), STARTS)].copy()
         states[:, fixed] = ranges[fixed, 0]
         self._unknown = np.setdiff1d(field.varied, fixed).tolist()
-        self._starts = [(states, self._expected(states)) for states in _in_all_directions(states, field.direction)]
+        self._turn = None if field.direction in fixed else field.direction
+        self._starts = [(states, self._expected(states)) for states in _in_all_directions(states, self._turn)]
 
     def __call__(self, waves: np.ndarray) -> _Found:
         """Pose and move of frames with waves (B, C)."""
         frames = _Frames(waves, self._left.weights(waves))
-        turn = self._field.direction
+        turn = self._turn
         nearest, least = zip(*(self._nearest(frames, *each) for each in self._starts), strict=True)
         starts, far = np.stack(nearest, axis=1), np.stack(least, axis=1)
         best = starts[np.arange(len(waves)), far.argmin(axis=1)]
@@ -184,7 +193,7 @@ class _Reader:
         starts, excess : (B, T, 12) and (B, T) float
             The nearest simulated state in each direction that was tried, and the excess of its misfit over the smallest.
         """
-        turn = self._field.direction
+        turn = self._turn
         frame, which = np.nonzero(excess < UNLIKELY)
         several = frames.rows(frame)
         tried = [starts[frame, which], best[frame]]
@@ -224,7 +233,7 @@ class _Reader:
         residual = self._residual(frames, labels)
         objective = self._objective(frames, labels, residual)
         normal = np.zeros((len(labels), len(columns), len(columns)))
-        for _ in range(steps):
+        for _ in range(steps if columns else 0):
             slope = self._slopes(frames, labels, columns, half)
             force = np.einsum("bik,bk->bi", slope, residual) - prior * (labels[:, columns] - field.middle[columns]) / half
             normal = slope @ slope.swapaxes(1, 2) + np.diag(prior)
@@ -299,11 +308,30 @@ class _Improved(NamedTuple):
     volume: np.ndarray
 
 
-def read_backwards(simulated: Dataset, labels: Sequence[ArmLabel], experiment: ExperimentSpec, *, seed: int) -> TwinBackwards:
-    """The twin of some simulated states with their labels, to be read backwards for frames of an experiment."""
-    rest_px = simulated.pins.reference.pins_px
-    ranges = np.array(list(experiment.ranges().values()))
-    return TwinBackwards(simulated.pins.nodes_px - rest_px, labels, rest_px, ranges, seed=seed)
+def read_backwards(sets: list[Dataset], touched: ObjectSpec, experiment: ExperimentSpec, *, seed: int) -> TwinBackwards:
+    """The twin of simulated data sets, to be read backwards for frames of an experiment that touches an object.
+
+    It learns from the states of this object whose labels lie within the experiment's ranges, extended by ``RANGE_MARGIN``.
+
+    Raises
+    ------
+    TrainingError
+        There are fewer than ``LEAST_STATES`` such states.
+    """
+    simulated = states_touching(sets, touched)
+    by_folder = {each.folder: each for each in sets}
+    labels = [label for folder in simulated.folders for label in arm_labels(by_folder[folder])]
+    limits = experiment.ranges()
+    low, high = np.array([limits[name] for name in simulated.targets.names]).T
+    margin, told = RANGE_MARGIN * (high - low), simulated.targets.corrected
+    rows = np.flatnonzero(((told >= low - margin) & (told <= high + margin)).all(axis=1))
+    if len(rows) < LEAST_STATES:
+        raise TrainingError(
+            f"{len(rows)} simulated states have labels within the ranges of {experiment.name}, there must be {LEAST_STATES}; simulate the "
+            "experiment that the frames come from (--contacts, or another --sim), or more of it (--count)"
+        )
+    part, rest_px = simulated.rows(rows), simulated.pins.reference.pins_px
+    return TwinBackwards(part.pins.nodes_px - rest_px, [labels[row] for row in rows], rest_px, np.array(list(limits.values())), seed=seed)
 
 
 def inverted_row(

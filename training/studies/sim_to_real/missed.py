@@ -36,7 +36,7 @@ SEEN_SIZE = 1.0
 SEEN_LENGTH = 0.5
 """Length r_3, in half ranges of the labels."""
 MOST_FRAMES = 1000
-"""Most frames that the discrepancy is learnt from. The cost grows with the third power of their number."""
+"""Most frames with labels, and most without, that the discrepancy is learnt from. The cost grows with the third power of their number."""
 NOISE_FRAMES = 150.0
 """Weight of the expected covariance, as a number of labelled frames."""
 EXPECTED = 0.5
@@ -151,9 +151,9 @@ class Left:
         return np.ones(len(seen)) if not self._size else SHALLOW + (1 - SHALLOW) * _amplitude(seen) / self._size
 
 
-def chosen(count: int) -> np.ndarray:
-    """Indices of the frames that are learnt from, evenly through their order: all of ``count``, or ``MOST_FRAMES`` of them."""
-    return np.unique(np.linspace(0, count - 1, min(count, MOST_FRAMES)).round().astype(int)) if count else np.zeros(0, int)
+def chosen(count: int, most: int) -> np.ndarray:
+    """At most ``most`` of ``count`` indices, evenly through their order."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(int)
 
 
 def _near(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:

@@ -315,11 +315,7 @@ def _beside(ground: _Ground, folder: Path, sets: list[Dataset]) -> Beside:
 
 def _backwards(ground: _Ground, sets: list[Dataset]) -> list[dict[str, Any]]:
     """Rows of the table for the twin read backwards, with growing numbers of labelled frames."""
-    bare = states_touching(sets, ground.plan.touched)
-    by_folder = {each.folder: each for each in sets}
-    told = [label for folder in bare.folders for label in arm_labels(by_folder[folder])]
-    like = states_like(bare, ground.few)
-    twin = read_backwards(bare.rows(like), [told[row] for row in like], ground.plan.experiment, seed=ground.plan.seed)
+    twin = read_backwards(sets, ground.plan.touched, ground.plan.experiment, seed=ground.plan.seed)
     labels, test = arm_labels(ground.real), ground.chosen.test
     rows = [inverted_row(BOTH, twin, ground.real, labels, rows, test) for rows in (np.zeros(0, int), *ground.chosen.nested)]
     designed = designed_frames(ground.real, ground.chosen, ground.plan.seed)

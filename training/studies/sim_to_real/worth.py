@@ -12,17 +12,18 @@ from typing import Any
 import numpy as np
 
 from scenes import load_randomisation
-from training.dataset import joined, load_dataset
+from training.dataset import load_dataset
 from training.generation import generate
+from training.label_code import goes_round
 from training.studies.sim_to_real.inverted import inverted_row, read_backwards
 from training.studies.sim_to_real.page import BOTH, EVENLY, REAL
-from training.studies.sim_to_real.steps import arm_labels, choose_frames, designed_frames, quadratic_row, states_like
+from training.studies.sim_to_real.steps import arm_labels, choose_frames, designed_frames, quadratic_row
 from training.studies.sim_to_real.study import FULL, Plan
 from training.studies.sim_to_real.twins import Twin
 from twin.progress import Progress, silent, stage
 
 UNLABELLED = (300, 3000)
-"""Numbers of frames without labels that the twin is given beside the ``Plan.labels`` labelled ones."""
+"""Numbers of frames without labels that the twin is given beside the ``Plan.labels`` labelled ones, where a label is a direction."""
 
 
 def worth(plan: Plan, out: Path, seeds: Sequence[int], *, progress: Progress = silent) -> list[dict[str, Any]]:
@@ -52,10 +53,8 @@ def worth(plan: Plan, out: Path, seeds: Sequence[int], *, progress: Progress = s
         with stage(progress, plan.wider.name) as step:
             generate(folders[0], twin.config(plan.touched, plan.seed), plan.count, workers=plan.workers, progress=step)
     sets = [load_dataset(folder, plan.sensor, plan.experiment.targets, form=real.pins.form) for folder in folders]
-    told = [label for each in sets for label in arm_labels(each)]
-    simulated = joined(sets)
-    like = states_like(simulated, real.rows(choose_frames(len(real), plan.labels, plan.seed).few))
-    backwards = read_backwards(simulated.rows(like), [told[row] for row in like], plan.experiment, seed=plan.seed)
+    backwards = read_backwards(sets, plan.touched, plan.experiment, seed=plan.seed)
+    turns = goes_round(real.targets.units, real.targets.corrected)
     found: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for seed in seeds:
         chosen = choose_frames(len(real), plan.labels, seed)
@@ -65,7 +64,7 @@ def worth(plan: Plan, out: Path, seeds: Sequence[int], *, progress: Progress = s
                 made = [inverted_row(f"{BOTH}{designed}", backwards, real, labels, rows, chosen.test)]
                 if len(rows):
                     made.append(quadratic_row(f"{REAL}{designed}", real, rows, chosen.test))
-                if not designed and len(rows) == plan.labels:
+                if any(turns) and not designed and len(rows) == plan.labels:
                     pool = np.random.default_rng(seed).permutation(np.setdiff1d(chosen.trained["all"], rows))
                     for count in (count for count in UNLABELLED if count <= len(pool)):
                         more, name = np.sort(pool[:count]), f"{BOTH}, {count} without labels"

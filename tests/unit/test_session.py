@@ -38,7 +38,8 @@ def frame(k: int, image=None) -> Frame:
 def test_killed_at_any_moment_it_is_whole_up_to_the_last_line(tmp_path, after_s):
     process = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path / "s")], stdout=subprocess.PIPE, env=os.environ)
     process.stdout.readline()
-    while (tmp_path / "s" / STEPS).read_bytes().count(b"\n") < 4:  # on a busy machine a step takes as long as all waits
+    steps = tmp_path / "s" / STEPS
+    while not steps.exists() or steps.read_bytes().count(b"\n") < 4:  # on a busy machine a step takes as long as all waits
         time.sleep(0.01)
     time.sleep(after_s)
     process.send_signal(signal.SIGKILL)

@@ -139,13 +139,14 @@ class TwinField:
         found[:, moves] /= np.sqrt(SLIPS_AT**2 + (found[:, moves] ** 2).sum(axis=1, keepdims=True))
         return found
 
+    def around(self, known: np.ndarray) -> np.ndarray:
+        """Cosine and sine of the direction (B, 2), or (B, 0) if there is none."""
+        angle = np.radians(known[:, [] if self.direction is None else [self.direction]])
+        return np.hstack([np.cos(angle), np.sin(angle)])
+
     def _inputs(self, known: np.ndarray) -> np.ndarray:
         """Inputs of the process: labels, the moves also as they slip, and cosine and sine of a direction."""
-        found = [self.scaled(known), self.slipped(known)[:, self.varied >= MOVES_FROM]]
-        if self.direction is not None:
-            angle = np.radians(known[:, self.direction])[:, None]
-            found += [np.cos(angle), np.sin(angle)]
-        return np.hstack(found)
+        return np.hstack([self.scaled(known), self.slipped(known)[:, self.varied >= MOVES_FROM], self.around(known)])
 
 
 def parts(waves: np.ndarray) -> np.ndarray:

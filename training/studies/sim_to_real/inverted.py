@@ -24,10 +24,9 @@ import numpy as np
 from scenes import ExperimentSpec, ObjectSpec
 from training.dataset import Dataset
 from training.label_code import label_error, wrapped_deg
-from training.recipes import TrainingError
 from training.studies.sim_to_real.field import TwinField, parts
 from training.studies.sim_to_real.missed import MOST_FRAMES, Left, Missed, chosen
-from training.studies.sim_to_real.steps import RANGE_MARGIN, arm_labels, states_touching
+from training.studies.sim_to_real.steps import arm_labels, states_touching, states_within
 from twin.rig.labels import ArmLabel
 
 BACKWARDS = "twin backwards"
@@ -323,13 +322,7 @@ def read_backwards(sets: list[Dataset], touched: ObjectSpec, experiment: Experim
     labels = [label for folder in simulated.folders for label in arm_labels(by_folder[folder])]
     limits = experiment.ranges()
     low, high = np.array([limits[name] for name in simulated.targets.names]).T
-    margin, told = RANGE_MARGIN * (high - low), simulated.targets.corrected
-    rows = np.flatnonzero(((told >= low - margin) & (told <= high + margin)).all(axis=1))
-    if len(rows) < LEAST_STATES:
-        raise TrainingError(
-            f"{len(rows)} simulated states have labels within the ranges of {experiment.name}, there must be {LEAST_STATES}; simulate the "
-            "experiment that the frames come from (--contacts, or another --sim), or more of it (--count)"
-        )
+    rows = states_within(simulated, low, high, LEAST_STATES, f"within the ranges of {experiment.name}, there must be {LEAST_STATES}")
     part, rest_px = simulated.rows(rows), simulated.pins.reference.pins_px
     return TwinBackwards(part.pins.nodes_px - rest_px, [labels[row] for row in rows], rest_px, np.array(list(limits.values())), seed=seed)
 

@@ -10,8 +10,8 @@ covariances of the two parts are
     object's frame    s_0 + q(a).q(b) + s_1 exp(-|a - b|^2 / 2 r_1^2)      q: the labels and their products of degree 2
     sensor's frame    s_2 + s_3 exp(-|a - b|^2 / 2 r_3^2) exp(cos c - 1)
 
-in units of the variance of one frame's residual. The number of labelled frames is small, therefore these sizes are fixed. Errors change
-little when they are halved or doubled.
+in units of the variance of one frame's residual. exp(cos c - 1) is a squared exponential, of length 1, in cosine and sine of the
+direction. The number of labelled frames is small, therefore these sizes are fixed. Errors change little when they are halved or doubled.
 
 What is left has the covariance N + g D of a frame whose pins move by the amplitude A. N is the noise of the pins. g = 0.1 + 0.9 A / A_m
 grows with the amplitude, because the discrepancy of a deep contact is larger than that of a shallow one; A_m is the median of the labelled
@@ -21,6 +21,7 @@ frames. D is estimated from the residuals of the labelled frames, each predicted
 import numpy as np
 
 from training.audit import polynomials
+from training.gaussian_process import CONSTANT_AND_SMOOTH, Kernel, Points
 from training.studies.sim_to_real.field import TwinField, parts
 
 CONSTANT = 10 / 3
@@ -59,8 +60,8 @@ class Missed:
         Labels of the frames.
     seen : (n, C) complex
         Their waves.
-    noisier : (n,) float, optional
-        Variance of each frame's residual, as a multiple of that of a labelled frame; default 1.
+    noisier : (n,) float
+        Variance of each frame's residual, as a multiple of that of a labelled frame.
 
     Attributes
     ----------
@@ -68,19 +69,18 @@ class Missed:
         Residual of each frame in the object's frame, predicted from the other frames.
     """
 
-    def __init__(self, field: TwinField, known: np.ndarray, seen: np.ndarray, noisier: np.ndarray | None = None) -> None:
-        self._field, self._known = field, known
+    def __init__(self, field: TwinField, known: np.ndarray, seen: np.ndarray, noisier: np.ndarray) -> None:
+        self._field, self._known, self._turns = field, known, field.direction is not None
         turn = field.turned(known, back=True) * np.ones(seen.shape)
         residual = seen * turn - field.own(known)
-        noise = np.diag(np.ones(len(known)) if noisier is None else noisier)
-        own, there = self._own(known), self._seen(known)
+        own, there = self._own(known) + np.diag(noisier), self._seen(known) if self._turns else 0.0
         self._weight, self.left = np.empty_like(residual), np.empty_like(residual)
-        for order in np.unique(field.order) if there is not None else [0]:
-            alike = field.order == order if there is not None else np.full(len(field.order), True)
-            covariance = own + noise
-            if there is not None and alike.any():
+        order = field.order if self._turns else np.zeros_like(field.order)  # waves of one order turn alike
+        for alike in (order == each for each in np.unique(order)):
+            covariance = own
+            if self._turns:
                 phase = turn[:, np.flatnonzero(alike)[0]]
-                covariance = covariance + there * np.outer(phase, phase.conj())
+                covariance = own + there * np.outer(phase, phase.conj())
             inverse = np.linalg.inv(covariance)
             self._weight[:, alike] = inverse @ residual[:, alike]
             self.left[:, alike] = self._weight[:, alike] / np.diag(inverse).real[:, None]
@@ -88,28 +88,23 @@ class Missed:
 
     def __call__(self, known: np.ndarray) -> np.ndarray:
         """The discrepancy (B, C) of contacts (B, 12), in the object's frame."""
-        if not len(self._known):
-            return np.zeros((len(known), len(self._field.order)), complex)
         found = self._own(known) @ self._weight
-        there = self._seen(known)
-        if there is not None:
-            found = found + self._field.turned(known, back=True) * (there @ self._turned_weight)
+        if self._turns:
+            found = found + self._field.turned(known, back=True) * (self._seen(known) @ self._turned_weight)
         return np.asarray(found)
 
     def _own(self, known: np.ndarray) -> np.ndarray:
         """Covariance (B, n) in the object's frame."""
         here, there = self._field.slipped(known), self._field.slipped(self._known)
-        constant = FREE if self._field.direction is None else CONSTANT
         bent: np.ndarray = polynomials(here, 2)[:, 1:] @ polynomials(there, 2)[:, 1:].T
-        return constant + bent + OWN_SIZE * _near(here, there, OWN_LENGTH)
+        lengths = np.full(here.shape[1], OWN_LENGTH)
+        return bent + _covariance(CONSTANT if self._turns else FREE, OWN_SIZE, lengths, here, there)
 
-    def _seen(self, known: np.ndarray) -> np.ndarray | None:
-        """Covariance (B, n) in the sensor's frame; None where no label is a direction."""
-        if self._field.direction is None:
-            return None
-        apart = np.radians(known[:, self._field.direction])[:, None] - np.radians(self._known[:, self._field.direction])
-        near = _near(self._field.slipped(known), self._field.slipped(self._known), SEEN_LENGTH)
-        return FREE + SEEN_SIZE * near * np.exp(np.cos(apart) - 1)
+    def _seen(self, known: np.ndarray) -> np.ndarray:
+        """Covariance (B, n) in the sensor's frame, where a label is a direction."""
+        here, there = (np.hstack([self._field.slipped(each), self._field.around(each)]) for each in (known, self._known))
+        lengths = np.r_[np.full(here.shape[1] - 2, SEEN_LENGTH), 1.0, 1.0]
+        return _covariance(FREE, SEEN_SIZE, lengths, here, there)
 
 
 class Left:
@@ -156,10 +151,10 @@ def chosen(count: int, most: int) -> np.ndarray:
     return np.linspace(0, count - 1, min(count, most)).round().astype(int)
 
 
-def _near(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:
-    """Squared exponential covariance (A, B) of rows (A, V) and (B, V) with one length."""
-    squared = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T
-    return np.asarray(np.exp(-0.5 * np.maximum(squared, 0) / length**2))
+def _covariance(constant: float, size: float, lengths: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Covariance (A, B) of rows (A, V) and (B, V), for a constant and a smooth function with these variances."""
+    kernel = Kernel(CONSTANT_AND_SMOOTH, lengths, np.sqrt([constant, size]), np.zeros(1))
+    return kernel(Points.of(here), Points.of(there))
 
 
 def _amplitude(seen: np.ndarray) -> np.ndarray:

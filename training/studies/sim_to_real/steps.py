@@ -174,13 +174,27 @@ def states_like(simulated: Dataset, labelled: Dataset) -> np.ndarray:
     TrainingError
         There are fewer such states than labelled frames.
     """
-    told, truth = simulated.targets.corrected, labelled.targets.corrected
-    margin = RANGE_MARGIN * np.ptp(truth, axis=0)
-    found = np.flatnonzero(((told >= truth.min(axis=0) - margin) & (told <= truth.max(axis=0) + margin)).all(axis=1))
-    if len(found) < len(labelled):
+    truth, count = labelled.targets.corrected, len(labelled)
+    meant = f"like those of the {count} labelled frames, there must be as many"
+    return states_within(simulated, truth.min(axis=0), truth.max(axis=0), count, meant)
+
+
+def states_within(simulated: Dataset, low: np.ndarray, high: np.ndarray, least: int, meant: str) -> np.ndarray:
+    """Rows of simulated states whose labels lie between ``low`` (K,) and ``high`` (K,), extended by ``RANGE_MARGIN``.
+
+    ``meant`` says in the error what the labels are and how many there must be.
+
+    Raises
+    ------
+    TrainingError
+        There are fewer than ``least`` such states.
+    """
+    told, margin = simulated.targets.corrected, RANGE_MARGIN * (high - low)
+    found = np.flatnonzero(((told >= low - margin) & (told <= high + margin)).all(axis=1))
+    if len(found) < least:
         raise TrainingError(
-            f"{len(found)} simulated states have labels like those of the {len(labelled)} labelled frames, there must be as many; "
-            "simulate the experiment that the frames come from (--contacts, or another --sim), or more of it (--count)"
+            f"{len(found)} simulated states have labels {meant}; simulate the experiment that the frames come from (--contacts, or another "
+            "--sim), or more of it (--count)"
         )
     return found
 

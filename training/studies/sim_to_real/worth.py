@@ -54,23 +54,24 @@ def worth(plan: Plan, out: Path, seeds: Sequence[int], *, progress: Progress = s
             generate(folders[0], twin.config(plan.touched, plan.seed), plan.count, workers=plan.workers, progress=step)
     sets = [load_dataset(folder, plan.sensor, plan.experiment.targets, form=real.pins.form) for folder in folders]
     backwards = read_backwards(sets, plan.touched, plan.experiment, seed=plan.seed)
-    turns = goes_round(real.targets.units, real.targets.corrected)
+    unlabelled = UNLABELLED if any(goes_round(real.targets.units, real.targets.corrected)) else ()
     found: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for seed in seeds:
         chosen = choose_frames(len(real), plan.labels, seed)
         every = [np.zeros(0, int), *chosen.nested, chosen.trained["all"]]
+        made = []
         for designed, among in (("", every), (EVENLY, designed_frames(real, chosen, seed))):
             for rows in among:
-                made = [inverted_row(f"{BOTH}{designed}", backwards, real, labels, rows, chosen.test)]
+                made.append(inverted_row(f"{BOTH}{designed}", backwards, real, labels, rows, chosen.test))
                 if len(rows):
                     made.append(quadratic_row(f"{REAL}{designed}", real, rows, chosen.test))
-                if any(turns) and not designed and len(rows) == plan.labels:
-                    pool = np.random.default_rng(seed).permutation(np.setdiff1d(chosen.trained["all"], rows))
-                    for count in (count for count in UNLABELLED if count <= len(pool)):
-                        more, name = np.sort(pool[:count]), f"{BOTH}, {count} without labels"
-                        made.append(inverted_row(name, backwards, real, labels, rows, chosen.test, unlabelled=more))
-                for row in made:
-                    found.setdefault((row["trained_on"], row["model"], row["labelled_frames"]), []).append(row)
+        pool = np.random.default_rng(seed).permutation(np.setdiff1d(chosen.trained["all"], chosen.few))
+        for count in unlabelled:
+            if count <= len(pool):
+                name, more = f"{BOTH}, {count} without labels", np.sort(pool[:count])
+                made.append(inverted_row(name, backwards, real, labels, chosen.few, chosen.test, unlabelled=more))
+        for row in made:
+            found.setdefault((row["trained_on"], row["model"], row["labelled_frames"]), []).append(row)
     return [_mean(rows) for rows in found.values()]
 
 

@@ -21,6 +21,7 @@ from time import perf_counter
 
 from scenes import SensorSpec, load_sensor
 from twin import store
+from twin.judge.pictures.aligned import revised
 from twin.optics.relief import DETAILS, without
 from twin.store.fingerprint import Code
 
@@ -150,7 +151,7 @@ def specification_digest(sensors: tuple[str, ...], beside: tuple[str, ...] = ())
 def _shortened(spec: SensorSpec, beside: tuple[str, ...]) -> SensorSpec:
     """A specification without some of its parts."""
     if "residual" in beside:
-        spec = spec.model_copy(update={"response": spec.response.model_copy(update={"residual": None})})
+        spec = revised(spec, response={"residual": None})
     return without(spec, [name for name in beside if name in DETAILS])
 
 

@@ -96,26 +96,31 @@ def test_a_layout_that_cannot_be_is_refused_in_words(text, said):
         layout_from(text)
 
 
-def test_positions_come_from_a_file_with_or_without_a_header(tmp_path):
+@pytest.mark.parametrize(
+    "text",
+    ["\ufeffx;y\n0;0\n1;0\n0;2\n", "# pins of the dome\nx,y\n0,0\n1,0\n0,2\n"],
+    ids=["semicolons", "a comment before the header"],
+)
+def test_positions_come_from_a_file_with_or_without_a_header(tmp_path, text):
     file = tmp_path / "pins.csv"
-    file.write_text("\ufeffx;y\n0;0\n1;0\n0;2\n", encoding="utf-8")
+    file.write_text(text, encoding="utf-8")
     assert layout_from(f"positions:{file}").positions == ((0.0, 0.0), (1.0, 0.0), (0.0, 2.0))
-    file.write_text("# pins of the dome\nx,y\n0,0\n1,0\n0,2\n")
-    assert layout_from(f"positions:{file}").positions == ((0.0, 0.0), (1.0, 0.0), (0.0, 2.0)), "a comment before the header"
-    file.write_text("x,y\nmm,mm\n0,0\n1,0\n0,2\n")
-    with pytest.raises(SpecError, match="line 2"):
-        layout_from(f"positions:{file}")
-    file.write_text("1.0,2.O\n0,0\n1,0\n0,2\n")
-    with pytest.raises(SpecError, match="line 1"):
-        layout_from(f"positions:{file}")
-    file.write_text("0,0\n1,1\n2,2\n")
-    with pytest.raises(SpecError, match="on one line"):
-        layout_from(f"positions:{file}")
-    file.write_text("1e308,1e308\n-1e308,1e308\n1,1\n0,0\n")
-    with pytest.raises(SpecError, match="less than or equal to 1000000000"):
-        layout_from(f"positions:{file}")
-    file.write_text("0,0\n1,one\n")
-    with pytest.raises(SpecError, match="line 2"):
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("x,y\nmm,mm\n0,0\n1,0\n0,2\n", "line 2"),
+        ("1.0,2.O\n0,0\n1,0\n0,2\n", "line 1"),
+        ("0,0\n1,1\n2,2\n", "on one line"),
+        ("1e308,1e308\n-1e308,1e308\n1,1\n0,0\n", "less than or equal to 1000000000"),
+        ("0,0\n1,one\n", "line 2"),
+    ],
+)
+def test_a_file_that_holds_no_positions_is_refused_by_its_line(tmp_path, text, said):
+    file = tmp_path / "pins.csv"
+    file.write_text(text)
+    with pytest.raises(SpecError, match=said):
         layout_from(f"positions:{file}")
 
 

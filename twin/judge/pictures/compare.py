@@ -63,11 +63,6 @@ class Pair:
     remainder_px: float
     exact: bool
 
-    @property
-    def recorded(self) -> np.ndarray:
-        """The real frame (H, W) or (H, W, 3) uint8 with as many channels as the rendered one."""
-        return self.real.frame.image if self.image.ndim == self.real.frame.image.ndim else self.real.gray
-
 
 @dataclass(frozen=True)
 class PoseAligned:
@@ -144,7 +139,7 @@ def fixed_residual(spec: SensorSpec, pairs: list[Pair]) -> dict[str, float] | No
 
     None if there is one pair only, or nothing is missed.
     """
-    patches = np.stack([cap_patches(spec.view, spec.pins, pair.state, pair.recorded, pair.image) for pair in pairs])
+    patches = np.stack([cap_patches(spec.view, spec.pins, pair.state, pair.real.like(pair.image), pair.image) for pair in pairs])
     share = fixed_share(patches)
     return {"levels": float(np.sqrt(np.mean(patches**2))), "share": share} if np.isfinite(share) else None
 
@@ -161,5 +156,4 @@ class _Shooter:
         image = expose(self._renderer.render(state, seed=seed), self._spec.capture, np.random.default_rng(seed))
         seen = self._pipeline(replace(real.frame, image=image))
         exact = seen.valid and seen.found == seen.expected
-        recorded = real.frame.image if image.ndim == real.frame.image.ndim else real.gray
-        return Pair(real, state, image, compare_images(recorded, image, self._disc.inside), remainder_px, exact)
+        return Pair(real, state, image, compare_images(real.like(image), image, self._disc.inside), remainder_px, exact)

@@ -46,6 +46,10 @@ class RealFrame:
         """(H, W) uint8."""
         return gray_levels(self.frame.image)
 
+    def like(self, rendered: np.ndarray) -> np.ndarray:
+        """The frame (H, W) or (H, W, 3) uint8 with as many channels as a rendered one."""
+        return self.frame.image if rendered.ndim == self.frame.image.ndim else self.gray
+
 
 @dataclass(frozen=True)
 class RealFrames:

@@ -36,8 +36,8 @@ def write_pictures(folder: Path, pairs: list[Pair], kind: str) -> list[dict]:
     folder.mkdir(exist_ok=True)
     rows = []
     for pair, stem in zip(pairs, distinct_stems([pair.real.frame.name for pair in pairs]), strict=True):
-        row = _frame_row(pair, kind)
-        images = {"real": pair.recorded, kind: pair.image, f"{kind}-difference": difference_picture(pair.recorded, pair.image)}
+        row, real = _frame_row(pair, kind), pair.real.like(pair.image)
+        images = {"real": real, kind: pair.image, f"{kind}-difference": difference_picture(real, pair.image)}
         for key, image in images.items():
             path = folder / f"{stem}-{key}.png"
             write_image(path, image)

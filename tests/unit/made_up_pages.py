@@ -25,6 +25,7 @@ from twin.fit.optics import write_page as write_calibration_page
 from twin.judge.labelled.model import MeasuredFrames
 from twin.judge.pictures import report as realism
 from twin.judge.pictures.compare import Pair
+from twin.judge.pictures.frames import RealFrame
 from twin.judge.pictures.images import ImageFigures
 from twin.judge.pictures.spectra import RadialRow
 from twin.judge.pictures.statistics import RADIAL_MEASURES
@@ -197,7 +198,7 @@ def drawn(name: str, seed: int = 0) -> Frame:
 def realism_page(out: Path) -> Path:
     figures = ImageFigures(psnr_db=31.2, psnr_gray_db=30.1, ssim=0.912, ssim_gray=0.921, flip=0.062, psnr_whole_db=30.5)
     frames = [drawn("a.png"), drawn("b #2?.png", 1)]
-    pairs = [Pair(SimpleNamespace(frame=f, gray=f.image), SimpleNamespace(), f.image, figures, 0.21, k == 0) for k, f in enumerate(frames)]
+    pairs = [Pair(RealFrame(f, np.zeros((0, 2)), {}), SimpleNamespace(), f.image, figures, 0.21, k == 0) for k, f in enumerate(frames)]
     radial = [RadialRow(m, 40.0 * b, 40.0 * b + 40, 100.0, 103.0 + 4 * b) for m in RADIAL_MEASURES for b in range(3)]
     spots = SimpleNamespace(px=np.zeros((2, 2)), peak=np.ones(2))
     found = SimpleNamespace(

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from scenes import load_experiment, load_sensor
 from training.recipes import TrainingError
 from training.studies.sim_to_real import Plan
-from training.studies.sim_to_real.inverted import BACKWARDS
 from training.studies.sim_to_real.page import BOTH, EVENLY, REAL
+from training.studies.sim_to_real.read import READ
 from training.studies.sim_to_real.worth import worth
 from twin.cli import command_line
 from twin.errors import FrameError, TwinError
@@ -142,7 +142,7 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
     plan = Plan(load_sensor(SENSOR), tmp_path / "frames", load_experiment(str(tmp_path / "gentle.toml")), labels=8, simulated=(sims,))
     curves = worth(plan, tmp_path / "worth", (0, 1))
     assert not any("without labels" in row["trained_on"] for row in curves), "a plate's frames without labels would tell nothing"
-    assert {row["labelled_frames"] for row in curves if row["model"] == BACKWARDS and row["trained_on"] == BOTH} >= {0, 5, 8}
+    assert {row["labelled_frames"] for row in curves if row["model"] == READ and row["trained_on"] == BOTH} >= {0, 5, 8}
     assert {row["trained_on"] for row in curves} == {REAL, BOTH, REAL + EVENLY, BOTH + EVENLY}
     assert all(np.isfinite(row["pose_2_corrected"]) for row in curves)
     for run in ("sim_only", "sim_plus_real"):

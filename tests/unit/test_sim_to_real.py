@@ -17,6 +17,7 @@ from training.recipes import TrainingError
 from training.run import train_run, write_tensors
 from training.studies.sim_to_real.inverted import TwinBackwards
 from training.studies.sim_to_real.missed import Left
+from training.studies.sim_to_real.read import TwinForwards, TwinRead, _share
 from training.studies.sim_to_real.steps import choose_frames, put_beside, quadratic_row, states_like, widen_intervals
 from twin.pins import make_reference
 from twin.rig.labels import ArmLabel
@@ -288,3 +289,45 @@ def test_frames_without_labels_teach_what_the_twin_misses_where_few_have_labels(
         return np.abs((found[:, 5] - truth + 180) % 360 - 180).mean()
 
     assert error(seen[1]) < 0.95 * error()
+
+
+def plate_pins(labels, rest):
+    """Displacements (B, N, 2) by a plate's depth and tilt: a stretch that grows with the depth, and a shift with the tilt."""
+    depth, tilt = (np.array([label.pose[k] for label in labels])[:, None, None] for k in (2, 3))
+    far = np.exp(-np.sum(rest**2, axis=1) / 50**2)[:, None]
+    return 0.05 * depth * rest * far + 0.02 * (tilt + 0.02 * tilt**2) * far * [1.0, 0.4] + 0.004 * depth * tilt * rest[:, ::-1] * far
+
+
+def test_a_twin_read_both_ways_is_as_good_as_the_better_reading_and_better_than_the_other():
+    """The real pins move by a tenth more than the twin's, are displaced, and bend with the tilt in a way that the twin does not know."""
+    rng = np.random.default_rng(3)
+    rest = rng.uniform(-60, 60, (60, 2))
+    ranges = np.zeros((12, 2))
+    ranges[[2, 3]] = [[1, 5], [-20, 20]]
+    simulated, few, asked = ([ArmLabel(each[:6], each[6:]) for each in rng.uniform(*ranges.T, (n, 12))] for n in (300, 20, 200))
+    odd = rng.normal(0, 0.02, (60, 2))
+
+    def seen(labels):
+        tilt = np.array([label.pose[3] for label in labels])[:, None, None]
+        return 1.1 * plate_pins(labels, rest) + odd * np.abs(tilt) + rng.normal(0, 0.1, (len(labels), 60, 2))
+
+    real, judged = seen(few), seen(asked)
+    truth, told = (np.array([label.pose[[2, 3]] for label in labels]) for labels in (asked, few))
+    twin = TwinRead(plate_pins(simulated, rest), simulated, rest, ranges)
+    back = TwinBackwards(plate_pins(simulated, rest), simulated, rest, ranges).estimate(real, few, judged)[:, [2, 3]]
+    states = np.array([label.pose[[2, 3]] for label in simulated])
+    forwards = TwinForwards(plate_pins(simulated, rest), states)
+    forth = forwards.estimate(real, told, judged)
+    both, alone, without = (np.abs(made - truth).mean(axis=0) for made in (twin.estimate(real, few, judged)[:, [2, 3]], back, forth))
+    assert (both < 1.1 * np.minimum(alone, without)).all() and (both < 0.97 * np.maximum(alone, without)).all()
+    assert (without < 0.7 * np.abs(forwards.estimate(real[:0], told[:0], judged) - truth).mean(axis=0)).all(), "labelled frames teach it"
+
+
+def test_two_readings_are_weighted_by_their_errors_and_equally_without_any():
+    rng = np.random.default_rng(0)
+    first, second = rng.normal(size=(2, 400))
+    assert _share(np.stack([first, second])) == pytest.approx(0.5, abs=0.05)
+    assert _share(np.stack([first, 5 * second])) > 0.9 and _share(np.stack([5 * first, second])) < 0.1
+    assert _share(np.stack([first, 3 * first])) == 1.0, "a reading with the same errors, but larger, has no weight"
+    assert _share(np.zeros((2, 0))) == _share(np.zeros((2, 5))) == 0.5
+    assert 0.5 < _share(np.stack([first, 5 * second])[:, :5]) < 0.95, "a few frames tell less"

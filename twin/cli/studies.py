@@ -171,7 +171,7 @@ these frames first ('twin calibrate contact'; about an hour). All models are jud
                        intervals are calibrated on the labelled frames
   simulated and real   the same, averaged with a Gaussian process of the pins
                        of both simulated contacts and labelled frames;
-                       also the twin read backwards, with 0 to 500 frames
+                       also the twin that is read, with 0 to 500 frames
   real                 vgnn or steered, and a quadratic regression, trained on
                        as many real frames, on 500 and on all
   ..., even            the same with frames that are nearest to an even

@@ -17,20 +17,16 @@ independent, so the logarithm of that probability is divided by ``TEMPERATURE``.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from scenes import ExperimentSpec, ObjectSpec
-from training.dataset import Dataset
-from training.label_code import label_error, wrapped_deg
+from training.label_code import wrapped_deg
 from training.studies.sim_to_real.field import TwinField, parts
 from training.studies.sim_to_real.missed import MOST_FRAMES, Left, Missed, chosen
-from training.studies.sim_to_real.steps import arm_labels, states_touching, states_within
+from training.studies.sim_to_real.steps import stands_and_moves
 from twin.rig.labels import ArmLabel
 
-BACKWARDS = "twin backwards"
-"""Name of the model in the study's table."""
 WIDTH = 1.5
 """Width w of the prior on the labels, in half ranges."""
 STARTS = 700
@@ -63,8 +59,6 @@ SURE = 0.9
 """Length of the mean direction, as a vector, above which a direction is sure; 0.9 is a standard deviation of 26 deg."""
 NOISIER = 10.0
 """Variance of the residual of a frame without a label, as a multiple of that of a labelled frame, because its estimated label errs."""
-LEAST_STATES = 10
-"""Least number of simulated states that a twin learns from."""
 AT_ONCE = 200
 """Frames that are estimated at once; more would need more memory."""
 
@@ -94,11 +88,20 @@ class TwinBackwards:
         Least and largest pose and move of the frames that are asked for; labels that do not vary are known.
     seed : int
         Chooses the simulated states that are learnt from.
+
+    Attributes
+    ----------
+    turns : bool
+        Whether a label of the simulated states is a direction that goes round the whole circle.
+    unknown : list of int
+        Columns of the labels that are estimated; the direction is not among them.
     """
 
     def __init__(self, moved_px: np.ndarray, labels: Sequence[ArmLabel], rest_px: np.ndarray, ranges: np.ndarray, *, seed: int = 0) -> None:
-        self._field = TwinField(moved_px, _both(labels), rest_px, seed=seed)
+        self._field = TwinField(moved_px, stands_and_moves(labels), rest_px, seed=seed)
         self._ranges = ranges
+        self.turns = self._field.direction is not None
+        self.unknown: list[int] = np.setdiff1d(self._field.varied, _known(ranges)).tolist()
 
     def estimate(
         self, real_px: np.ndarray, labels: Sequence[ArmLabel], asked_px: np.ndarray, unlabelled_px: np.ndarray | None = None
@@ -114,7 +117,7 @@ class TwinBackwards:
         if not len(asked_px):
             return np.zeros((0, 12))
         rows = chosen(len(real_px), MOST_FRAMES)
-        field, known, seen = self._field, _both(labels)[rows], self._field.waves(real_px)[rows]
+        field, known, seen = self._field, stands_and_moves(labels)[rows], self._field.waves(real_px)[rows]
         noise = field.noise(real_px if len(real_px) else asked_px)
 
         def reader(more: np.ndarray, told: np.ndarray) -> _Reader:
@@ -131,6 +134,11 @@ class TwinBackwards:
             sure = sure[chosen(len(sure), MOST_FRAMES)]
             found = reader(more[sure], told.labels[sure])
         return _in_groups(found, field.waves(asked_px)).labels
+
+
+def _known(ranges: np.ndarray) -> np.ndarray:
+    """The columns of labels with ranges (12, 2) that do not vary."""
+    return np.flatnonzero(np.ptp(ranges, axis=1) == 0)
 
 
 def _in_all_directions(states: np.ndarray, direction: int | None) -> list[np.ndarray]:
@@ -163,7 +171,7 @@ class _Reader:
 
     def __init__(self, field: TwinField, missed: Missed, left: Left, ranges: np.ndarray) -> None:
         self._field, self._missed, self._left = field, missed, left
-        fixed = np.flatnonzero(np.ptp(ranges, axis=1) == 0)
+        fixed = _known(ranges)
         states = field.known[chosen(len(field.known), STARTS)].copy()
         states[:, fixed] = ranges[fixed, 0]
         self._unknown = np.setdiff1d(field.varied, fixed).tolist()
@@ -305,59 +313,3 @@ class _Improved(NamedTuple):
     labels: np.ndarray
     objective: np.ndarray
     volume: np.ndarray
-
-
-def read_backwards(sets: list[Dataset], touched: ObjectSpec, experiment: ExperimentSpec, *, seed: int) -> TwinBackwards:
-    """The twin of simulated data sets, to be read backwards for frames of an experiment that touches an object.
-
-    It learns from the states of this object whose labels lie within the experiment's ranges, extended by ``RANGE_MARGIN``.
-
-    Raises
-    ------
-    TrainingError
-        There are fewer than ``LEAST_STATES`` such states.
-    """
-    simulated = states_touching(sets, touched)
-    by_folder = {each.folder: each for each in sets}
-    labels = [label for folder in simulated.folders for label in arm_labels(by_folder[folder])]
-    limits = experiment.ranges()
-    low, high = np.array([limits[name] for name in simulated.targets.names]).T
-    rows = states_within(simulated, low, high, LEAST_STATES, f"within the ranges of {experiment.name}, there must be {LEAST_STATES}")
-    part, rest_px = simulated.rows(rows), simulated.pins.reference.pins_px
-    return TwinBackwards(part.pins.nodes_px - rest_px, [labels[row] for row in rows], rest_px, np.array(list(limits.values())), seed=seed)
-
-
-def inverted_row(
-    name: str,
-    twin: TwinBackwards,
-    real: Dataset,
-    labels: Sequence[ArmLabel],
-    rows: np.ndarray,
-    test: np.ndarray,
-    *,
-    unlabelled: np.ndarray | None = None,
-) -> dict[str, Any]:
-    """A row of the study's table: the twin read backwards with labelled frames ``rows`` (n,), judged on ``test`` (t,).
-
-    ``labels`` are those of all frames; those of the frames ``unlabelled`` (u,) are not used.
-    """
-    moved = real.pins.nodes_px - real.pins.reference.pins_px
-    found = twin.estimate(moved[rows], [labels[row] for row in rows], moved[test], None if unlabelled is None else moved[unlabelled])
-    columns = dict(zip([f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7)], found.T, strict=True))
-    targets = real.targets.rows(test)
-    named = zip(targets.names, targets.units, strict=True)
-    made = np.column_stack([wrapped_deg(columns[key]) if unit == "deg" else columns[key] for key, unit in named])
-    row = {"trained_on": name, "labelled_frames": len(rows), "model": BACKWARDS}
-    for kind in ("corrected", "raw"):
-        errors = np.abs(label_error(made, getattr(targets, kind), targets.units)).mean(axis=0)
-        row |= {f"{label}_{kind}": float(error) for label, error in zip(targets.names, errors, strict=True)}
-    return row
-
-
-def _both(labels: Sequence[ArmLabel]) -> np.ndarray:
-    """(K, 12) where the arm stands, and the move that it made, mm and deg."""
-    undone = np.array([0.0 if label.executed else 1.0 for label in labels])[:, None]
-    if not len(labels):
-        return np.zeros((0, 12))
-    pose, move = np.stack([label.pose for label in labels]), np.stack([label.move for label in labels])
-    return np.hstack([pose - undone * move, (1 - undone) * move])

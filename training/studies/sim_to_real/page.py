@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from scenes.randomisation import FrictionSpread
-from training.studies.sim_to_real.inverted import BACKWARDS
+from training.studies.sim_to_real.read import READ
 from training.targets import unit_of
 from twin.report.charts import muted, plain_log, sized_figure, write_chart
 from twin.report.numbers import number
@@ -176,12 +176,12 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
         for row in _of(rows, SIMULATED):
             ax.axhline(row[key], color=BLUE, ls=(0, (5, 2)), label="twin alone")
         for row in _of(rows, BOTH):
-            if row["model"] != BACKWARDS:
+            if row["model"] != READ:
                 ax.plot(row["labelled_frames"], row[key], "*", color=PURPLE, ms=13, label="twin and labelled frames")
             elif not row["labelled_frames"]:
-                ax.axhline(row[key], color=PURPLE, ls=(0, (1, 2)), label="twin read backwards, no label")
-        _curve(ax, _model(rows, BOTH, BACKWARDS), key, "^-", PURPLE, "twin read backwards")
-        _curve(ax, _model(rows, f"{BOTH}{EVENLY}", BACKWARDS), key, "^:", PURPLE, "twin read backwards, evenly chosen frames")
+                ax.axhline(row[key], color=PURPLE, ls=(0, (1, 2)), label="twin read, no label")
+        _curve(ax, _model(rows, BOTH, READ), key, "^-", PURPLE, "twin read")
+        _curve(ax, _model(rows, f"{BOTH}{EVENLY}", READ), key, "^:", PURPLE, "twin read, evenly chosen frames")
         ax.set(
             title=f"{name} error", xlabel="labelled real frames", ylabel=f"mean absolute error, {unit_of(name)}", xscale="log", yscale="log"
         )

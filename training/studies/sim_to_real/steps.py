@@ -1,6 +1,7 @@
 """The steps of the sim-to-real study. Each can be called alone."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,15 @@ def arm_labels(data: Dataset) -> list[ArmLabel]:
     recording = open_simulated(folder, pins.sensor)[0] if is_pins_only(folder) else open_recording(folder, pins.sensor, pins.form)
     labels = dict(zip(recording.names, read_arm_labels(recording), strict=True))
     return [labels[name] for name in pins.image_name.tolist()]
+
+
+def stands_and_moves(labels: Sequence[ArmLabel]) -> np.ndarray:
+    """(K, 12) where the arm stands, and the move that it made, mm and deg."""
+    undone = np.array([0.0 if label.executed else 1.0 for label in labels])[:, None]
+    if not len(labels):
+        return np.zeros((0, 12))
+    pose, move = np.stack([label.pose for label in labels]), np.stack([label.move for label in labels])
+    return np.hstack([pose - undone * move, (1 - undone) * move])
 
 
 def with_missing(

@@ -12,8 +12,8 @@ from training.generation import generate, require_count
 from training.recipes import TrainingError
 from training.simulated import is_simulated
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
-from training.studies.sim_to_real.inverted import inverted_row, read_backwards
 from training.studies.sim_to_real.page import BOTH, EVENLY, REAL, write_page
+from training.studies.sim_to_real.read import read_row, read_twin
 from training.studies.sim_to_real.steps import (
     Beside,
     Frames,
@@ -213,7 +213,7 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
         if twin is ground.full:
             rows.append(judged(BOTH, plan.labels, out / BESIDE, ground.real, ground.chosen.test))
     rows += _without_the_twin(ground)
-    rows += _backwards(ground, sets[ground.full.contacts])
+    rows += _read(ground, sets[ground.full.contacts])
     page = _write_page(ground, rows, beside, known[_tried(ground.full)], full_learnt)
     return Result(rows, beside.left_out, ground.residuals.error_px, [write_table(out / "study.csv", rows), page])
 
@@ -313,13 +313,13 @@ def _beside(ground: _Ground, folder: Path, sets: list[Dataset]) -> Beside:
     return made
 
 
-def _backwards(ground: _Ground, sets: list[Dataset]) -> list[dict[str, Any]]:
-    """Rows of the table for the twin read backwards, with growing numbers of labelled frames."""
-    twin = read_backwards(sets, ground.plan.touched, ground.plan.experiment, seed=ground.plan.seed)
+def _read(ground: _Ground, sets: list[Dataset]) -> list[dict[str, Any]]:
+    """Rows of the table for the twin that is read, with growing numbers of labelled frames."""
+    twin = read_twin(sets, ground.plan.touched, ground.plan.experiment, seed=ground.plan.seed)
     labels, test = arm_labels(ground.real), ground.chosen.test
-    rows = [inverted_row(BOTH, twin, ground.real, labels, rows, test) for rows in (np.zeros(0, int), *ground.chosen.nested)]
+    rows = [read_row(BOTH, twin, ground.real, labels, rows, test) for rows in (np.zeros(0, int), *ground.chosen.nested)]
     designed = designed_frames(ground.real, ground.chosen, ground.plan.seed)
-    return rows + [inverted_row(f"{BOTH}{EVENLY}", twin, ground.real, labels, rows, test) for rows in designed]
+    return rows + [read_row(f"{BOTH}{EVENLY}", twin, ground.real, labels, rows, test) for rows in designed]
 
 
 def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:

@@ -1,8 +1,8 @@
 """The value of the twin: errors by the number of labelled frames, with and without the twin, of models that need no training.
 
-With the twin: read backwards (``inverted``). Without: quadratic regression. Both with frames drawn at random and with frames nearest to an
-even sequence. With the twin also: frames without labels beside labelled ones. All models together take a minute for a plate, and half an
-hour for an edge with five thousand frames.
+With the twin: it is read (``read``). Without: quadratic regression. Both with frames drawn at random and with frames nearest to an even
+sequence. With the twin also: frames without labels beside labelled ones. All models together take minutes for a plate, and half an hour
+for an edge with five thousand frames.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,8 +15,8 @@ from scenes import load_randomisation
 from training.dataset import load_dataset
 from training.generation import generate
 from training.label_code import goes_round
-from training.studies.sim_to_real.inverted import inverted_row, read_backwards
 from training.studies.sim_to_real.page import BOTH, EVENLY, REAL
+from training.studies.sim_to_real.read import read_row, read_twin
 from training.studies.sim_to_real.steps import arm_labels, choose_frames, designed_frames, quadratic_row
 from training.studies.sim_to_real.study import FULL, Plan
 from training.studies.sim_to_real.twins import Twin
@@ -27,7 +27,8 @@ UNLABELLED = (300, 3000)
 
 
 def worth(plan: Plan, out: Path, seeds: Sequence[int], *, progress: Progress = silent) -> list[dict[str, Any]]:
-    """Rows as those of the study's table: the mean over the draws of frames by these seeds. Contacts have the rig's one friction.
+    """Rows as those of the study's table: the mean over the draws of frames by these seeds, and the largest. Contacts have the rig's one
+    friction.
 
     Parameters
     ----------
@@ -48,12 +49,12 @@ def worth(plan: Plan, out: Path, seeds: Sequence[int], *, progress: Progress = s
     if not folders:
         executed = 1.0 if all(label.executed for label in labels) else load_randomisation("moves").executed_share
         drawn = load_randomisation("moves").model_copy(update={"friction": None, "executed_share": executed})
-        twin = Twin(FULL, "simulated", "sim", plan.sensor, plan.wider, drawn, plan.across)
-        folders = [out / twin.contacts]
+        full = Twin(FULL, "simulated", "sim", plan.sensor, plan.wider, drawn, plan.across)
+        folders = [out / full.contacts]
         with stage(progress, plan.wider.name) as step:
-            generate(folders[0], twin.config(plan.touched, plan.seed), plan.count, workers=plan.workers, progress=step)
+            generate(folders[0], full.config(plan.touched, plan.seed), plan.count, workers=plan.workers, progress=step)
     sets = [load_dataset(folder, plan.sensor, plan.experiment.targets, form=real.pins.form) for folder in folders]
-    backwards = read_backwards(sets, plan.touched, plan.experiment, seed=plan.seed)
+    twin = read_twin(sets, plan.touched, plan.experiment, seed=plan.seed)
     unlabelled = UNLABELLED if any(goes_round(real.targets.units, real.targets.corrected)) else ()
     found: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for seed in seeds:
@@ -62,21 +63,22 @@ def worth(plan: Plan, out: Path, seeds: Sequence[int], *, progress: Progress = s
         made = []
         for designed, among in (("", every), (EVENLY, designed_frames(real, chosen, seed))):
             for rows in among:
-                made.append(inverted_row(f"{BOTH}{designed}", backwards, real, labels, rows, chosen.test))
+                made.append(read_row(f"{BOTH}{designed}", twin, real, labels, rows, chosen.test))
                 if len(rows):
                     made.append(quadratic_row(f"{REAL}{designed}", real, rows, chosen.test))
         pool = np.random.default_rng(seed).permutation(np.setdiff1d(chosen.trained["all"], chosen.few))
         for count in unlabelled:
             if count <= len(pool):
                 name, more = f"{BOTH}, {count} without labels", np.sort(pool[:count])
-                made.append(inverted_row(name, backwards, real, labels, chosen.few, chosen.test, unlabelled=more))
+                made.append(read_row(name, twin, real, labels, chosen.few, chosen.test, unlabelled=more))
         for row in made:
             found.setdefault((row["trained_on"], row["model"], row["labelled_frames"]), []).append(row)
-    return [_mean(rows) for rows in found.values()]
+    return [_summary(rows) for rows in found.values()]
 
 
-def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """One row with the mean of all errors."""
-    errors = [key for key in rows[0] if key.endswith(("_corrected", "_raw"))]
+def _summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """One row with the mean of each error, and its largest value as ``KEY_most``."""
+    errors = {key: [row[key] for row in rows] for key in rows[0] if key.endswith(("_corrected", "_raw"))}
     named = {key: rows[0][key] for key in ("trained_on", "labelled_frames", "model")}
-    return named | {key: float(np.mean([row[key] for row in rows])) for key in errors}
+    most = {f"{key}_most": float(max(each)) for key, each in errors.items()}
+    return named | {key: float(np.mean(each)) for key, each in errors.items()} | most

@@ -12,6 +12,7 @@ from figures import (  # noqa: F401  (each registers its jobs)
     pictures,
     pins,
     poses,
+    recordings,
     robustness,
     servo,
     studio,

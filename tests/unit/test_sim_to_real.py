@@ -15,8 +15,9 @@ from training.models.vgnn import network as vgnn
 from training.packed import pack, shipped_names
 from training.recipes import TrainingError
 from training.run import train_run, write_tensors
+from training.studies.sim_to_real import inverted
 from training.studies.sim_to_real.inverted import TwinBackwards
-from training.studies.sim_to_real.missed import Left
+from training.studies.sim_to_real.missed import Left, Missed
 from training.studies.sim_to_real.read import TwinForwards, TwinRead, _share
 from training.studies.sim_to_real.steps import choose_frames, put_beside, quadratic_row, states_like, widen_intervals
 from twin.pins import make_reference
@@ -273,7 +274,7 @@ def test_the_covariance_of_what_is_left_is_that_of_the_frames_and_grows_with_the
     assert (left.weights(seen[:1] * 0 + 10) < left.weights(seen[:1] * 0 + 1)).all()
 
 
-def test_frames_without_labels_teach_what_the_twin_misses_where_few_have_labels():
+def test_frames_without_labels_teach_what_the_twin_misses_where_few_have_labels(monkeypatch):
     rng = np.random.default_rng(1)
     rest = rng.uniform(-60, 60, (60, 2))
     ranges = np.zeros((12, 2))
@@ -289,6 +290,17 @@ def test_frames_without_labels_teach_what_the_twin_misses_where_few_have_labels(
         return np.abs((found[:, 5] - truth + 180) % 360 - 180).mean()
 
     assert error(seen[1]) < 0.95 * error()
+    empty = rng.normal(0, 0.02, (60, 60, 2)) + shifted
+    taught = []
+
+    class Counted(Missed):
+        def __init__(self, field, known, seen, noisier):
+            taught.append(len(known) - len(few))
+            super().__init__(field, known, seen, noisier)
+
+    monkeypatch.setattr(inverted, "Missed", Counted)
+    error(np.concatenate([seen[1][:60], empty]))
+    assert 40 < taught[-1] < 66, "frames that show no direction teach nothing"
 
 
 def plate_pins(labels, rest):

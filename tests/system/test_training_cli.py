@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from scenes import load_experiment, load_sensor
 from training.recipes import TrainingError
 from training.studies.sim_to_real import Plan
-from training.studies.sim_to_real.page import BOTH, EVENLY, REAL
+from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
 from training.studies.sim_to_real.read import READ
 from training.studies.sim_to_real.worth import worth
 from twin.cli import command_line
@@ -145,7 +145,7 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
     assert {row["labelled_frames"] for row in curves if row["model"] == READ and row["trained_on"] == BOTH} >= {0, 5, 8}
     assert {row["trained_on"] for row in curves} == {REAL, BOTH, REAL + EVENLY, BOTH + EVENLY}
     assert all(np.isfinite(row["pose_2_corrected"]) for row in curves)
-    for run in ("sim_only", "sim_plus_real"):
+    for run in ("sim_only", "sim_plus_real", "sim_taught"):
         told = twin("evaluate", tmp_path / "study" / run, "--data", tmp_path / "frames", "--rows", "all", "--out", tmp_path / run)
         assert "pose_6: mean error" in told
 

@@ -172,6 +172,9 @@ these frames first ('twin calibrate contact'; about an hour). All models are jud
   simulated and real   the same, averaged with a Gaussian process of the pins
                        of both simulated contacts and labelled frames;
                        also the twin that is read, with 0 to 500 frames
+  ..., N without labels
+                       vgnn or steered, trained on the labelled frames and on
+                       N others, whose labels the twin that is read tells
   real                 vgnn or steered, and a quadratic regression, trained on
                        as many real frames, on 500 and on all
   ..., even            the same with frames that are nearest to an even
@@ -188,8 +191,8 @@ are used instead (give it once for each). If a data set has pictures, the pins a
 command continues an interrupted study.
 
 \b
-Writes to --out: sim_only/, sim_plus_real/ and real_N/, each a RUN; study.csv,
-index.html.
+Writes to --out: sim_only/, sim_plus_real/, sim_taught/ and real_N/, each a RUN;
+study.csv, index.html.
 """
 
 

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from scenes.randomisation import FrictionSpread
+from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
 from training.studies.sim_to_real.read import READ
 from training.targets import unit_of
 from twin.report.charts import muted, plain_log, sized_figure, write_chart
@@ -19,10 +20,6 @@ from twin.report.themes import BLUE, OLIVE, PURPLE, RED
 
 # Name of the row of the model trained in the twin alone. Names of rows without one ingredient begin with this word and a comma.
 SIMULATED = "simulated"
-# Names of rows of models that learnt from real frames alone, and from simulated contacts and real frames.
-REAL, BOTH = "real", "simulated and real"
-# What is added to these where the frames are not drawn at random, but nearest to an even sequence.
-EVENLY = ", even"
 # Name of the row of the model trained on simulated pins without a drawn discrepancy.
 BARE = "simulated, bare"
 # Colours and lines of the models trained on real frames, in the order of the rows.

@@ -17,6 +17,7 @@ from training.label_code import label_error, wrapped_deg
 from training.studies.sim_to_real.inverted import TwinBackwards
 from training.studies.sim_to_real.missed import MOST_FRAMES, chosen
 from training.studies.sim_to_real.steps import MODES, arm_labels, stands_and_moves, states_touching, states_within
+from training.targets import unit_of
 from twin.rig.labels import ArmLabel
 
 READ = "twin read"
@@ -130,34 +131,43 @@ class TwinRead:
         rows = chosen(len(labels), MOST_FRAMES)
         known_px, known = real_px[rows], [labels[row] for row in rows]
         back, forth = self._both(known_px, known, asked_px)
-        share = self._shares(known_px, known)
-        back[:, self._columns] = share * back[:, self._columns] + (1 - share) * forth
+        back[:, self._columns] = self._averaged(self._shares(*self._folded(known_px, known), known), back, forth)
         return back
 
+    def left_out(self, real_px: np.ndarray, labels: Sequence[ArmLabel]) -> tuple[np.ndarray, np.ndarray]:
+        """The labelled frames (m,) that are chosen to be judged, and pose and move (m, 12) of each, estimated from frames of other folds.
+
+        Where both readings are averaged, the weights are those of all labelled frames.
+        """
+        rows, back, forth = self._folded(real_px, labels)
+        if self._forwards is not None:
+            back[:, self._columns] = self._averaged(self._shares(rows, back, forth, labels), back, forth)
+        return rows, back
+
+    def _averaged(self, share: np.ndarray, back: np.ndarray, forth: np.ndarray) -> np.ndarray:
+        """Poses (B, K) by the weights (K,) of those read backwards, as pose and move (B, 12), and of those read forwards (B, K)."""
+        return np.asarray(share * back[:, self._columns] + (1 - share) * forth)
+
     def _both(self, real_px: np.ndarray, labels: Sequence[ArmLabel], asked_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pose and move (B, 12) read backwards, and poses (B, K) read forwards."""
-        if self._forwards is None:
-            raise ValueError("a direction is read backwards alone")
+        """Pose and move (B, 12) read backwards, and poses (B, K) read forwards, NaN where a label is a direction."""
         back = self._backwards.estimate(real_px, labels, asked_px)
+        if self._forwards is None:
+            return back, np.full((len(asked_px), len(self._columns)), np.nan)
         return back, self._forwards.estimate(real_px, stands_and_moves(labels)[:, self._columns], asked_px)
 
-    def _shares(self, real_px: np.ndarray, labels: Sequence[ArmLabel]) -> np.ndarray:
-        """(K,) weight of each label read backwards, from 0 to 1, by the covariance of both readings' errors.
+    def _folded(self, real_px: np.ndarray, labels: Sequence[ArmLabel]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows (m,) of labelled frames, and both readings of each, as ``_both``, from frames of other folds."""
+        fold, rows = np.arange(len(labels)) % FOLDS, chosen(len(labels), WEIGHED) if len(labels) > 1 else np.zeros(0, int)
+        back, forth = np.zeros((len(rows), 12)), np.zeros((len(rows), len(self._columns)))
+        for each in np.unique(fold[rows]):
+            asked, others = fold[rows] == each, np.flatnonzero(fold != each)
+            back[asked], forth[asked] = self._both(real_px[others], [labels[row] for row in others.tolist()], real_px[rows[asked]])
+        return rows, back, forth
 
-        The errors are those of labelled frames, each estimated from frames of other folds.
-        """
-        truth = stands_and_moves(labels)[:, self._columns]
-        fold = np.arange(len(labels)) % FOLDS
-        judged = np.isin(np.arange(len(labels)), chosen(len(labels), WEIGHED))
-        errors: list[np.ndarray] = []
-        for each in range(min(FOLDS, len(labels)) if len(labels) > 1 else 0):
-            asked = (fold == each) & judged
-            if not asked.any():
-                continue
-            others = np.flatnonzero(fold != each)
-            back, forth = self._both(real_px[others], [labels[row] for row in others.tolist()], real_px[asked])
-            errors.append(np.stack([back[:, self._columns] - truth[asked], forth - truth[asked]]))
-        missed = np.concatenate([np.zeros((2, 0, truth.shape[1])), *errors], axis=1)
+    def _shares(self, rows: np.ndarray, back: np.ndarray, forth: np.ndarray, labels: Sequence[ArmLabel]) -> np.ndarray:
+        """(K,) weight of each label read backwards, from 0 to 1, by the covariance of both readings' errors on labelled frames."""
+        truth = stands_and_moves(labels)[rows][:, self._columns]
+        missed = np.stack([back[:, self._columns], forth]) - truth
         return np.array([_share(label) for label in np.moveaxis(missed, 2, 0)])
 
 
@@ -213,12 +223,16 @@ def read_row(
     """
     moved = real.pins.nodes_px - real.pins.reference.pins_px
     found = twin.estimate(moved[rows], [labels[row] for row in rows], moved[test], None if unlabelled is None else moved[unlabelled])
-    columns = dict(zip([f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7)], found.T, strict=True))
     targets = real.targets.rows(test)
-    named = zip(targets.names, targets.units, strict=True)
-    made = np.column_stack([wrapped_deg(columns[key]) if unit == "deg" else columns[key] for key, unit in named])
+    made = named_labels(found, targets.names)
     row = {"trained_on": name, "labelled_frames": len(rows), "model": READ}
     for kind in ("corrected", "raw"):
         errors = np.abs(label_error(made, getattr(targets, kind), targets.units)).mean(axis=0)
         row |= {f"{label}_{kind}": float(error) for label, error in zip(targets.names, errors, strict=True)}
     return row
+
+
+def named_labels(found: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """The labels (B, K) with these names of poses and moves (B, 12); angles from -180 to 180 deg."""
+    columns = dict(zip([f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7)], found.T, strict=True))
+    return np.column_stack([wrapped_deg(columns[name]) if unit_of(name) == "deg" else columns[name] for name in names])

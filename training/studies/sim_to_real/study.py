@@ -6,14 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_experiment, load_object, load_randomisation
+from scenes import SensorSpec, load_randomisation
 from training.dataset import Dataset, joined, load_dataset
-from training.generation import generate, require_count
-from training.recipes import TrainingError
-from training.simulated import is_simulated
+from training.generation import generate
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
-from training.studies.sim_to_real.page import BOTH, EVENLY, REAL, write_page
-from training.studies.sim_to_real.read import read_row, read_twin
+from training.studies.sim_to_real.page import write_page
+from training.studies.sim_to_real.plan import BOTH, EVENLY, FULL, REAL, WITHOUT, Plan
+from training.studies.sim_to_real.read import TwinRead, read_row, read_twin
 from training.studies.sim_to_real.steps import (
     Beside,
     Frames,
@@ -31,96 +30,18 @@ from training.studies.sim_to_real.steps import (
     widen_intervals,
     with_missing,
 )
+from training.studies.sim_to_real.taught import teach
 from training.studies.sim_to_real.twins import Twin, as_mounted, contact_of, without_one_ingredient
-from twin.errors import DatasetError
 from twin.fit.contact import fit_contact
 from twin.fit.contact.simulate import Setup
 from twin.judge.labelled.model import MeasuredFrames
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
-from twin.types import FINE
 
 SEEDS_APART = 1000  # between the draws of one study, so that those of seeds 0, 1, 2... differ
-FULL, BESIDE = "sim_only", "sim_plus_real"  # folders of the twin's own run, and of the run with labelled frames beside it
-MOST_DRAWS = 1000  # of what the twin misses, for each contact; more would not fit into memory
+BESIDE, TAUGHT = "sim_plus_real", "sim_taught"  # folders of the run with labelled frames beside it, and of the one that the twin taught
 SHOWN_MODES = 4  # of what the twin misses, that the page names
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Settings of a study.
-
-    Attributes
-    ----------
-    sensor : SensorSpec
-    frames : Path
-        A labelled real recording.
-    experiment : ExperimentSpec
-        The experiment that the recording was made with. It also names the labels that are learnt.
-    contacts : ExperimentSpec or None
-        The experiment that is simulated; None: the one that ``experiment`` names as wider, else ``experiment``.
-    labels : int
-        Number of labelled frames that are used with the simulated contacts.
-    seed : int
-        Seed of the choice of frames, the contacts and the weights.
-    draws : int
-        Number of discrepancies that are drawn for each contact.
-    count : int
-        Number of contacts to simulate.
-    simulated : tuple of Path
-        Finished data sets to use instead of simulating contacts for the twin with all ingredients; several are joined.
-    calibrate : bool
-        Fit the specification to the labelled frames first.
-    ablate : bool
-        Also train without one ingredient at a time.
-    epochs : int or None
-        Epochs of every training; None: the default of that training.
-    workers : int
-        Processes that simulate.
-    across : int
-        Elements along each side of the skin's grid.
-
-    Raises
-    ------
-    TrainingError
-        A folder of ``simulated`` holds no simulated data set.
-    """
-
-    sensor: SensorSpec
-    frames: Path
-    experiment: ExperimentSpec
-    contacts: ExperimentSpec | None = None
-    labels: int = 40
-    seed: int = 0
-    draws: int = 2
-    count: int = 500
-    simulated: tuple[Path, ...] = ()
-    calibrate: bool = False
-    ablate: bool = False
-    epochs: int | None = None
-    workers: int = 1
-    across: int = FINE
-
-    def __post_init__(self) -> None:
-        require_count(self.count)
-        if not 1 <= self.draws <= MOST_DRAWS:
-            raise DatasetError(f"--draws {self.draws}: expected 1 to {MOST_DRAWS} for each contact")
-        for folder in self.simulated:
-            if not is_simulated(folder):
-                raise TrainingError(f"--sim {folder}: no simulated data set; give the folder of one that 'twin dataset' has finished")
-
-    @property
-    def touched(self) -> ObjectSpec:
-        """The object of the recording's experiment."""
-        return load_object(self.experiment.object)
-
-    @property
-    def wider(self) -> ExperimentSpec:
-        """The experiment that is simulated."""
-        if self.contacts is not None:
-            return self.contacts
-        return load_experiment(self.experiment.wider) if self.experiment.wider else self.experiment
 
 
 @dataclass(frozen=True)
@@ -213,7 +134,9 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
         if twin is ground.full:
             rows.append(judged(BOTH, plan.labels, out / BESIDE, ground.real, ground.chosen.test))
     rows += _without_the_twin(ground)
-    rows += _read(ground, sets[ground.full.contacts])
+    read = read_twin(sets[ground.full.contacts], plan.touched, plan.experiment, seed=plan.seed)
+    rows += _read(ground, read)
+    rows.append(_taught(ground, read))
     page = _write_page(ground, rows, beside, known[_tried(ground.full)], full_learnt)
     return Result(rows, beside.left_out, ground.residuals.error_px, [write_table(out / "study.csv", rows), page])
 
@@ -313,13 +236,21 @@ def _beside(ground: _Ground, folder: Path, sets: list[Dataset]) -> Beside:
     return made
 
 
-def _read(ground: _Ground, sets: list[Dataset]) -> list[dict[str, Any]]:
+def _read(ground: _Ground, twin: TwinRead) -> list[dict[str, Any]]:
     """Rows of the table for the twin that is read, with growing numbers of labelled frames."""
-    twin = read_twin(sets, ground.plan.touched, ground.plan.experiment, seed=ground.plan.seed)
     labels, test = arm_labels(ground.real), ground.chosen.test
     rows = [read_row(BOTH, twin, ground.real, labels, rows, test) for rows in (np.zeros(0, int), *ground.chosen.nested)]
     designed = designed_frames(ground.real, ground.chosen, ground.plan.seed)
     return rows + [read_row(f"{BOTH}{EVENLY}", twin, ground.real, labels, rows, test) for rows in designed]
+
+
+def _taught(ground: _Ground, twin: TwinRead) -> dict[str, Any]:
+    """Train a run on the labelled frames and on all others that are not judged, with the labels that the twin tells of them."""
+    plan, real, few = ground.plan, ground.real, ground.chosen.few
+    others = np.setdiff1d(ground.chosen.trained["all"], few)
+    with stage(ground.progress, TAUGHT) as step:
+        teach(twin, real, arm_labels(real), few, others, ground.out / TAUGHT, seed=plan.seed, epochs=plan.epochs, progress=step)
+    return judged(BOTH + WITHOUT.format(count=len(others)), len(few), ground.out / TAUGHT, real, ground.chosen.test)
 
 
 def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:

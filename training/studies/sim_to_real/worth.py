@@ -15,10 +15,9 @@ from scenes import load_randomisation
 from training.dataset import load_dataset
 from training.generation import generate
 from training.label_code import goes_round
-from training.studies.sim_to_real.page import BOTH, EVENLY, REAL
+from training.studies.sim_to_real.plan import BOTH, EVENLY, FULL, REAL, WITHOUT, Plan
 from training.studies.sim_to_real.read import read_row, read_twin
 from training.studies.sim_to_real.steps import arm_labels, choose_frames, designed_frames, quadratic_row
-from training.studies.sim_to_real.study import FULL, Plan
 from training.studies.sim_to_real.twins import Twin
 from twin.progress import Progress, silent, stage
 
@@ -69,7 +68,7 @@ def worth(plan: Plan, out: Path, seeds: Sequence[int], *, progress: Progress = s
         pool = np.random.default_rng(seed).permutation(np.setdiff1d(chosen.trained["all"], chosen.few))
         for count in unlabelled:
             if count <= len(pool):
-                name, more = f"{BOTH}, {count} without labels", np.sort(pool[:count])
+                name, more = BOTH + WITHOUT.format(count=count), np.sort(pool[:count])
                 made.append(read_row(name, twin, real, labels, chosen.few, chosen.test, unlabelled=more))
         for row in made:
             found.setdefault((row["trained_on"], row["model"], row["labelled_frames"]), []).append(row)

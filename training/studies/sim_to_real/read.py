@@ -97,21 +97,7 @@ def _difference(known: Points, missed: np.ndarray) -> Posterior:
 
 
 class TwinRead:
-    """A twin, to be read both ways.
-
-    Parameters
-    ----------
-    moved_px : (S, N, 2) float
-        Simulated displacements.
-    labels : sequence of ArmLabel
-        Their labels.
-    rest_px : (N, 2) float
-        The pins at rest.
-    ranges : (12, 2) float
-        Least and largest pose and move of the frames that are asked for; labels that do not vary are known.
-    seed : int
-        Chooses the simulated states that are learnt from.
-    """
+    """A twin, to be read both ways. Its parameters are those of ``TwinBackwards``."""
 
     def __init__(self, moved_px: np.ndarray, labels: Sequence[ArmLabel], rest_px: np.ndarray, ranges: np.ndarray, *, seed: int = 0) -> None:
         self._backwards = TwinBackwards(moved_px, labels, rest_px, ranges, seed=seed)

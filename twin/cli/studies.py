@@ -190,9 +190,7 @@ The contacts are simulated in --out/sim, without pictures. With --sim finished d
 are used instead (give it once for each). If a data set has pictures, the pins are those that the pipeline finds in them. The same
 command continues an interrupted study.
 
-\b
-Writes to --out: sim_only/, sim_plus_real/, sim_taught/ and real_N/, each a RUN;
-study.csv, index.html.
+Writes to --out: sim_only/, sim_plus_real/, sim_taught/ and real_N/, each a RUN; study.csv and index.html.
 """
 
 

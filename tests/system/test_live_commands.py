@@ -253,7 +253,8 @@ def test_a_camera_that_was_never_shown_a_rest_is_counted_from_where_its_contacts
 
     seeker = model.seeking_rest()
     with CameraEmulator(ShownPictures(images)) as camera:
-        watched = watch(WatchPlan(camera=camera.url, shown=False, count=20 * len(images)), seeker, on_estimate=keep)
+        count = 200 * len(images)  # ends a test that fails; a machine with other work needs more than twenty rounds
+        watched = watch(WatchPlan(camera=camera.url, shown=False, count=count), seeker, on_estimate=keep)
     assert watched.interrupted, "the contacts told other rest places"
     frame, estimate = newest
     recorded, other = model.at_rest_of([Frame(image, model.form) for image in images])

@@ -59,7 +59,8 @@ Writes:
 --layout rings:10         331 pins in 10 rings
          hexagon:6        127 pins in a hexagon
          grid:9x7         9 columns, 7 rows
-         positions:F.csv  x,y of each pin, a line each, in any unit
+         positions:F.csv  x,y of each pin from the sensor's axis, a line each,
+                          in any unit; y down as in the picture
 
 \b
 Example:

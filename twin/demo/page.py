@@ -156,7 +156,11 @@ def _contact_section(page: Page, contact: ContactContent) -> None:
         shown.append(Picture(at["recorded"], f"{title}: frame in the form of a recording", said, "frame"))
     page.figures(*shown, layout="row")
     page.figures(
-        Picture(at["pins"], f"{title}: pins and Voronoi graph", "Pins found (green), graph edges (blue) and Voronoi cells (white)."),
+        Picture(
+            at["pins"],
+            f"{title}: pins and Voronoi graph",
+            "Pins found (green), graph edges (blue) and Voronoi cells (white); yellow crosses are spots that are not pins.",
+        ),
         Picture(at["areas"], f"{title}: Voronoi area change", "Voronoi cell areas against no contact: cells grow where the dome flattens."),
         layout="row",
     )

@@ -176,6 +176,18 @@ def test_a_layout_that_was_given_and_is_wrong_is_told_which_one_is_right():
     assert _given(PINS, images).sure
 
 
+def test_places_that_do_not_count_from_the_axis_are_refused():
+    """As typed from a picture in px: the camera would lie beside the sensor, and every later command would believe it."""
+    rest_px = rest_of(PinsSpec(rings=4))
+    for off, works in ((rest_px.mean(axis=0), True), (np.zeros(2), False)):
+        pins = PinsSpec(layout="positions", positions=tuple(map(tuple, (rest_px - off).tolist())))
+        if works:
+            assert _given(pins, frames_of(rest_px)).sure
+        else:
+            with pytest.raises(FrameError, match="subtract the place of the middle pin"):
+                _given(pins, frames_of(rest_px))
+
+
 def test_stretched_and_few_frames_are_told():
     rest = Rest(rest_of(PINS), "given")
     spacing = float(np.median(cKDTree(rest.pins_px).query(rest.pins_px, k=2)[0][:, 1]))

@@ -8,7 +8,7 @@ import typer
 from twin.cli import app
 from twin.cli.options import AlsoFormat, Force, Out, if_given, tell
 
-HELP_CONVERT = """Translate records into the formats of other tools, and back.
+HELP_CONVERT = """Translate records to other tools' formats, and back.
 
 A SOURCE is a recording, a simulated data set, a collection, the session of 'twin live --record' or 'twin servo --record', or what this
 command wrote. One contact path, or one round of a servo, is one episode.

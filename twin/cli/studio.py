@@ -12,7 +12,7 @@ from twin.cli.options import say
 if TYPE_CHECKING:
     from training.estimator import PoseEstimator
 
-HELP_STUDIO = """Serve a page on which you move an object against the sensor and see what follows.
+HELP_STUDIO = """Move an object over the skin, on a page in the browser.
 
 Drag the object with the arrows and rings of the gizmo, or use sliders, typed numbers or keys (shift and arrows, page up and page down;
 with ctrl they turn it; 'ctrl + K' lists all). At once the page shows the skin with its pins, the camera's picture, the pins found and

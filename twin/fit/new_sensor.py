@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import Delaunay
 
 from scenes.pins import PinsSpec
 from scenes.sensor import BlobSpec, CameraSpec, PipelineSpec, RecordingSpec, SensorSpec
@@ -222,8 +223,18 @@ def new_sensor(
         return NewSensor(sensor, found, rest, camera, tuned, health, known, assumed, steps, tuple(odd), [out, page])
 
 
+def _holds_its_axis(places: np.ndarray) -> bool:
+    """Whether the axis of the sensor, at 0,0, lies among places (N, 2), which do not lie on one line."""
+    return bool(Delaunay(places).find_simplex(np.zeros(2)) >= 0)
+
+
 def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
     """The user's layout, compared with the frames."""
+    if layout.layout == "positions" and not _holds_its_axis(np.array(layout.positions)):
+        raise FrameError(
+            f"the sensor's axis, 0,0, lies outside of the {layout.in_words()} that were given; x,y count from the axis: "
+            "subtract the place of the middle pin, or of the middle of all pins"
+        )
     shown = judge_layout(layout, images)
     if shown is not None and shown.explained >= GIVEN_SHOWN:
         return Identified((shown,), True, (), 0.0)
@@ -233,7 +244,10 @@ def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
         other = None
     if shown is None or shown.explained < LEAST_SHOWN:
         instead = f"; they show {other.pins.in_words()}" if other is not None else ""
-        raise FrameError(f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave --layout out to have it identified")
+        raise FrameError(
+            f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave --layout out to have it identified, "
+            "or give each pin's place, --layout positions:FILE.csv"
+        )
     doubt = f"{layout.in_words()} were given, and explain only {100 * shown.explained:.1f} % of what is there"
     if other is None or other.explained <= shown.explained:
         return Identified((shown,), False, (f"{doubt}; look at the overlay: are these all pins?",), 0.0)

@@ -90,6 +90,10 @@ def test_a_folder_of_frames_becomes_a_sensor(made):
     assert "4 frames are few" in few, few
 
 
+def test_the_size_of_the_tip_is_said_to_be_assumed(made):
+    assert any(line.startswith("assumed: Dome: radius 20 mm") for line in made[0].lines())
+
+
 def test_a_layout_of_too_few_pins_for_a_camera_is_told(tmp_path):
     folder = folder_of(tmp_path, frames_of(rest_of(PinsSpec(rings=2)), 2))
     with pytest.raises(FrameError, match="19 pins are seen in most frames, as 19 pins in 2 rings: too few.*light fades"):

@@ -146,7 +146,7 @@ class NewSensor:
         lines += [f"doubt: {doubt}" for doubt in self.identified.doubts]
         if not self.identified.sure:
             lines += [f"or: {other.line()}" for other in self.identified.candidates[1:2]]
-        lines += [self.rest.line(), *self.known[2:], *self.health.lines()]
+        lines += [self.rest.line(), *self.known[2:], *self.health.lines(), f"assumed: {self.assumed[0]}"]
         return lines + [f"next: {step}" for step in self.next_steps] + [f"note: {note}" for note in self.odd]
 
 
@@ -456,7 +456,7 @@ def _told(
     )
     assumed = [
         f"Dome: radius {sensor.skin.outer_radius_mm:g} mm, skin {sensor.skin.thickness_mm:g} mm, of a printed TacTip. Frames do not tell "
-        "lengths in mm.",
+        "lengths in mm. If your tip differs, lengths, forces and poses are wrong until the specification says its own.",
         f"Outermost pins at {sensor.pins.max_polar_deg:g} deg from the axis, and the camera's distance {sensor.camera.distance_mm:.1f} mm: "
         "pins at rest fit many pairs of them.",
         "Stiffness of skin and gel: Shore A 26 to 30 rubber and a soft gel.",

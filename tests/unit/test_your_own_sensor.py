@@ -183,13 +183,12 @@ def test_a_layout_that_was_given_and_is_wrong_is_told_which_one_is_right():
 def test_places_that_do_not_count_from_the_axis_are_refused():
     """As typed from a picture in px: the camera would lie beside the sensor, and every later command would believe it."""
     rest_px = rest_of(PinsSpec(rings=4))
-    for off, works in ((rest_px.mean(axis=0), True), (np.zeros(2), False)):
-        pins = PinsSpec(layout="positions", positions=tuple(map(tuple, (rest_px - off).tolist())))
-        if works:
-            assert _given(pins, frames_of(rest_px)).sure
-        else:
-            with pytest.raises(FrameError, match="subtract the place of the middle pin"):
-                _given(pins, frames_of(rest_px))
+    from_axis, from_corner = (
+        PinsSpec(layout="positions", positions=tuple(map(tuple, (rest_px - axis).tolist()))) for axis in (rest_px.mean(axis=0), np.zeros(2))
+    )
+    assert _given(from_axis, frames_of(rest_px)).sure
+    with pytest.raises(FrameError, match="subtract the place of the middle pin"):
+        _given(from_corner, frames_of(rest_px))
 
 
 def test_stretched_and_few_frames_are_told():

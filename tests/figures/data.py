@@ -8,7 +8,7 @@ from time import process_time
 import numpy as np
 from fresh_contacts import simulate_contacts
 
-from figures.jobs import Measured, Value, job
+from figures.jobs import NO_PICTURES, Measured, Value, job
 from scenes import load_sensor
 from training.simulated import open_simulated
 
@@ -22,6 +22,7 @@ ACROSS = (20, 16, 12)
     sensors=(SENSOR,),
     code=("training.generation", "training.simulated"),
     minutes=3,
+    beside=NO_PICTURES,
 )
 def rates(work: Path) -> Measured:
     """Contacts and labelled states a CPU second of one core, and pins off those of the finest of these meshes."""

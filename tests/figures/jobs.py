@@ -12,7 +12,8 @@ import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -61,7 +62,7 @@ class Job:
     sensors : tuple of str
         Whose specifications it depends on.
     beside : tuple of str
-        Parts of these specifications that it does not depend on (``NO_PICTURES``, ``NO_RESIDUAL``).
+        What it does not depend on: parts of these specifications, and packages of code (``NO_PICTURES``, ``NO_RESIDUAL``).
     code : tuple of str
         Modules that compute the figures (a package: all of its modules). All that they import counts, too. Benches are named as well.
     shipped : tuple of str
@@ -138,8 +139,10 @@ def run_twin(work: Path, *arguments: object) -> str:
 
 NO_RESIDUAL = ("residual",)
 """``Job.beside`` of a job that uses no residual network, or teaches one."""
-NO_PICTURES = (*DETAILS, *NO_RESIDUAL)
-"""``Job.beside`` of a job that renders nothing: neither measured details of pictures nor a residual network change its figures."""
+RENDERING = "twin.optics"
+NO_PICTURES = (*DETAILS, *NO_RESIDUAL, RENDERING)
+"""``Job.beside`` of a job that renders nothing: neither measured details of pictures, a residual network nor the renderer's code change its
+figures. While such a job runs, rendering is an error (`without_rendering`)."""
 
 
 def specification_digest(sensors: tuple[str, ...], beside: tuple[str, ...] = ()) -> str:
@@ -159,8 +162,15 @@ UNMEASURED = ("twin.cli", "twin.report")
 """Packages whose code changes no figure: the command line's words and the pages' looks."""
 
 
-def code_behind(*names: str) -> Code:
+def code_behind(*names: str, beside: tuple[str, ...] = ()) -> Code:
     """The code that may change a figure of a job which names these modules and packages: modules, and versions of libraries.
+
+    Parameters
+    ----------
+    names
+        As in ``Job.code``.
+    beside
+        As ``Job.beside``: code of these packages does not count.
 
     Raises
     ------
@@ -176,7 +186,8 @@ def code_behind(*names: str) -> Code:
         found = [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in files]
         modules += found or [name]  # a bench, which lies outside of the packages
     found = store.code_of(*modules)
-    return replace(found, modules={name: digest for name, digest in found.modules.items() if not name.startswith(UNMEASURED)})
+    unneeded = tuple(f"{package}." for package in (*UNMEASURED, *beside))
+    return replace(found, modules={name: digest for name, digest in found.modules.items() if not f"{name}.".startswith(unneeded)})
 
 
 def shipped_digest(names: tuple[str, ...]) -> str:
@@ -195,7 +206,7 @@ def fingerprint(made: Job) -> str:
     measure, bound = made.measure, ""
     if isinstance(measure, partial):
         measure, bound = measure.func, repr(sorted(measure.keywords.items()))
-    code, shipped = code_behind(*made.code).fingerprint, shipped_digest(made.shipped)
+    code, shipped = code_behind(*made.code, beside=made.beside).fingerprint, shipped_digest(made.shipped)
     return hashlib.sha256(f"{code}\n{inspect.getsource(measure)}\n{bound}\n{shipped}".encode()).hexdigest()[:16]
 
 
@@ -231,7 +242,8 @@ def run(made: Job, path: Path = FIGURES, work: Path = WORK) -> Measured:
     key, started = key_of(made), perf_counter()
     folder = work / made.name / key["fingerprint"]
     folder.mkdir(parents=True, exist_ok=True)
-    found = made.measure(folder)
+    with without_rendering() if RENDERING in made.beside else nullcontext():
+        found = made.measure(folder)
     entry = {
         "command": made.command,
         **key,
@@ -243,6 +255,19 @@ def run(made: Job, path: Path = FIGURES, work: Path = WORK) -> Measured:
     }
     _write(path, read(path) | {made.name: entry})
     return found
+
+
+@contextmanager
+def without_rendering() -> Iterator[None]:
+    """Context in which the renderer refuses to trace a path, in this process and in all that it starts."""
+    before = os.environ.get("TACTIP_VARIANT")
+    os.environ["TACTIP_VARIANT"] = "none, because this figure is said to need no picture"
+    try:
+        yield
+    finally:
+        del os.environ["TACTIP_VARIANT"]
+        if before is not None:
+            os.environ["TACTIP_VARIANT"] = before
 
 
 def machine() -> str:

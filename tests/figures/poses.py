@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from bench_training import drawn_table, inputs_of
 
-from figures.jobs import FiguresError, Measured, Value, job, read, real_folder, run_twin
+from figures.jobs import NO_PICTURES, FiguresError, Measured, Value, job, read, real_folder, run_twin
 from training.dataset import load_dataset
 from training.estimator import PoseEstimator
 from training.evaluate import judge
@@ -168,7 +168,7 @@ def register() -> None:
     """All jobs of this file."""
     for (model, minutes), sensor in product(MODELS.items(), SETS):
         splits = SPLITS if model == "vgnn" else SPLITS[:1]
-        common = {"sensors": (sensor,), "code": TRAINED, "recordings": (SETS[sensor],)}
+        common = {"sensors": (sensor,), "code": TRAINED, "recordings": (SETS[sensor],), "beside": NO_PICTURES}
         for split in splits:
             command = f"twin train --model {model} --sensor {sensor} --data DIR --target surface-2d-shear --split {split} --out RUN"
             job(f"training.{model}.{sensor}.split{split}", command, minutes=minutes, **common)(
@@ -178,10 +178,10 @@ def register() -> None:
             job(f"training.{model}.{sensor}.splits", f"mean of the runs of {model}", minutes=minutes + 0.1, **common)(
                 partial(over_splits, model=model, sensor=sensor)
             )
-    real = {"code": ("training.studies.tac_vgnn",), "recordings": (SETS["mg400-331"],), "sensors": ("mg400-331",)}
+    real = {"code": ("training.studies.tac_vgnn",), "recordings": (SETS["mg400-331"],), "sensors": ("mg400-331",), "beside": NO_PICTURES}
     job("training.parts.mg400-331", f"twin study tac-vgnn --labels corrected --models {','.join(PARTS)}", minutes=20, **real)(parts_of_vgnn)
     for sensor in SETS:
-        common = {"sensors": (sensor,), "code": ("training.studies.sim_to_real",), "recordings": (SETS[sensor],)}
+        common = {"sensors": (sensor,), "code": ("training.studies.sim_to_real",), "recordings": (SETS[sensor],), "beside": NO_PICTURES}
         command = f"twin study sim-to-real --sensor {sensor} --frames DIR --labels {LABELS} --count 300 --seed"
         for seed in SIMULATED_SEEDS:
             job(f"sim_to_real.{sensor}.seed{seed}", f"{command} {seed}", minutes=8, **common)(
@@ -191,11 +191,18 @@ def register() -> None:
             partial(taught_by_the_twin, sensor=sensor, seed=0, extra=("--calibrate",))
         )
     command = "twin study objects --sensor mg400-331 --count 60 --tests 25 --across 12 --seed 1"
-    job("objects.mg400-331", command, sensors=("mg400-331",), code=("training.studies.objects",), minutes=30)(never_touched)
-    command = "tests/bench/bench_training.py --models tac-vgnn vgnn --batches 128 --threads 2"
-    job("training.epoch", command, sensors=tuple(SETS), code=("bench_training", "training.studies.tac_vgnn.models"), minutes=2)(
-        seconds_an_epoch
+    job("objects.mg400-331", command, sensors=("mg400-331",), code=("training.studies.objects",), minutes=30, beside=NO_PICTURES)(
+        never_touched
     )
+    command = "tests/bench/bench_training.py --models tac-vgnn vgnn --batches 128 --threads 2"
+    job(
+        "training.epoch",
+        command,
+        sensors=tuple(SETS),
+        code=("bench_training", "training.studies.tac_vgnn.models"),
+        minutes=2,
+        beside=NO_PICTURES,
+    )(seconds_an_epoch)
     job(
         "training.shipped.ur5-331",
         "twin evaluate ur5-331 --data DIR --rows all",
@@ -204,6 +211,7 @@ def register() -> None:
         shipped=(f"{SHIPPED}/ur5-331",),
         recordings=("ur5-331-raw",),
         minutes=1,
+        beside=NO_PICTURES,
     )(shipped_on_frames)
     for sensor in SETS:
         command = f"twin evaluate {sensor} --data DIR --rows all, DIR with init_0.png and without it"
@@ -215,6 +223,7 @@ def register() -> None:
             shipped=(f"{SHIPPED}/{sensor}",),
             recordings=(SETS[sensor],),
             minutes=2,
+            beside=NO_PICTURES,
         )(partial(without_no_contact, sensor=sensor))
 
 

@@ -84,13 +84,12 @@ for _recording, (_sensor, _, _) in SETS.items():
     )(partial(against_recorded, recording=_recording))
 for _recording in KINDS:
     _command = f"twin audit {_recording} --sensor {SENSOR} --out OUT"
-    _common = {"sensors": (SENSOR,), "recordings": (_recording,), "minutes": 2}
+    _common = {"sensors": (SENSOR,), "recordings": (_recording,), "minutes": 2, "beside": NO_PICTURES}
     job(f"audit.{_recording}", _command, code=("training.studies.label_audit",), **_common)(partial(audited, recording=_recording))
     job(
         f"kinds.{_recording}",
         f"ContactEstimator.taken_for: shipped weights of {SENSOR} on frames of {_recording} that they did not learn from",
         code=("training.studies.evaluation",),
         shipped=(f"training/weights/{SENSOR}",),
-        beside=NO_PICTURES,
         **_common,
     )(partial(kinds_told, recording=_recording))

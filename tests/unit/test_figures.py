@@ -10,7 +10,9 @@ from figures import tables
 from figures.jobs import FIGURES, JOBS, NO_PICTURES, NO_RESIDUAL, FiguresError, Job, Value, is_kept, read, run, values
 
 from scenes import load_sensor
+from twin.errors import RenderError
 from twin.optics.relief import DETAILS, without
+from twin.optics.render import Renderer
 from twin.store.fingerprint import Code
 
 
@@ -43,7 +45,7 @@ def test_what_it_was_made_from_decides_whether_it_counts(counted, tmp_path, monk
     run(job, path, tmp_path)
     other = Job(job.name, job.measure, job.command, ("mg400-331",), job.code, (), 0.0)
     assert not is_kept(other, path), "another specification"
-    monkeypatch.setattr(module, "code_behind", lambda *names: Code({"scenes": "changed"}, {}))
+    monkeypatch.setattr(module, "code_behind", lambda *names, beside=(): Code({"scenes": "changed"}, {}))
     assert not is_kept(job, path), "other code"
     run(job, path, tmp_path)
     assert is_kept(job, path) and values(path)["probe.force.force"].value == 1.0
@@ -66,13 +68,31 @@ def test_only_code_that_a_figure_comes_from_makes_it_old():
     assert not [name for name in pins | poses if name.startswith(module.UNMEASURED)]
 
 
+def test_the_renderers_code_makes_no_figure_old_that_renders_nothing():
+    poses = "training.studies.sim_to_real"
+    assert "twin.optics.sampling" in module.code_behind(poses).modules
+    left = module.code_behind(poses, beside=NO_PICTURES).modules
+    assert not [name for name in left if name.startswith("twin.optics")] and "twin.mechanics.solver" in left
+    assert "twin.simulator" in left, "other code of the same packages counts"
+
+
+def test_a_figure_said_to_need_no_picture_is_not_measured_with_one(tmp_path):
+    def rendered(work):
+        return {"light": Value(float(Renderer(load_sensor("mg400-127"), spp=1).render().mean()))}
+
+    made = Job("one.pins", rendered, "", (), ("twin.pins.batch",), (), 1.0, beside=NO_PICTURES)
+    with pytest.raises(RenderError, match="said to need no picture"):
+        run(made, tmp_path / "figures.json", tmp_path)
+    assert not (tmp_path / "figures.json").exists()
+
+
 def test_another_version_of_a_library_makes_a_figure_old(counted, monkeypatch):
     job, _ = counted
     now, before = module.code_behind("twin.pins.batch"), module.fingerprint(job)
     assert "numpy" in now.libraries
-    monkeypatch.setattr(module, "code_behind", lambda *names: Code({}, {"numpy": "1.0"}))
+    monkeypatch.setattr(module, "code_behind", lambda *names, beside=(): Code({}, {"numpy": "1.0"}))
     first = module.fingerprint(job)
-    monkeypatch.setattr(module, "code_behind", lambda *names: Code({}, {"numpy": "2.0"}))
+    monkeypatch.setattr(module, "code_behind", lambda *names, beside=(): Code({}, {"numpy": "2.0"}))
     assert len({before, first, module.fingerprint(job)}) == 3
 
 

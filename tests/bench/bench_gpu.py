@@ -43,7 +43,7 @@ def rendering(side: str, work: Path, cores: int, sensor: str) -> dict[str, float
         renderer = bench.renderer(spp)
         bench.frame(renderer, 0)
         dr.set_thread_count(cores)
-        found[f"{spp} samples"] = timed_ms(partial(bench.frame, renderer), bench.repeats)[0]
+        found[f"{spp}_samples"] = timed_ms(partial(bench.frame, renderer), bench.repeats)[0]
     renderer = bench.renderer(CONVERGED)
     np.save(work / f"{sensor}.{side}.npy", [renderer.render(bench.states[1], seed=seed) for seed in (1, 2)])
     return found
@@ -83,6 +83,13 @@ def dataset(side: str, work: Path, cores: int, contacts: int) -> dict[str, float
 PARTS = {"rendering": rendering, "training": training, "dataset": dataset}
 
 
+def gpu_name() -> str:
+    """What PyTorch calls the GPU; "" without one."""
+    import torch
+
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else ""
+
+
 def measured(part: str, side: str, work: Path, cores: int, **options: object) -> dict[str, float]:
     """The result of one measurement, in a process of its own."""
     command = [sys.executable, __file__, "--part", part, "--side", side, "--work", work, "--cores", cores, "--options", json.dumps(options)]
@@ -93,41 +100,43 @@ def measured(part: str, side: str, work: Path, cores: int, **options: object) ->
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def measure(cores: int = 2, contacts: int = 8) -> dict[str, float]:
-    """Print a table, and return its numbers by name: what each side needs, and how far the pictures are apart."""
-    import numpy as np
-    from bench_render import Bench
-
+def measure(part: str, cores: int = 2, contacts: int = 8) -> dict[str, float]:
+    """Print the rows of a part, and return their numbers by name: what each side needs, and for pictures how far they are apart."""
     found: dict[str, float] = {}
-    print(f"{platform.machine()}, {gpu_name()}; {cores} cores\n{'':44s}{'without GPU':>12s}{'with':>10s}{'ratio':>8s}", flush=True)
 
-    def row(name: str, part: str, unit: str, **options: object) -> None:
-        sides = {side: measured(part, side, Path(work), cores, **options) for side in BACKENDS}
-        for key in sides["cpu"]:
-            without, using = sides["cpu"][key], sides["gpu"][key]
-            ratio = using / without if unit == "1/s" else without / using
-            print(f"{name} {key:{44 - len(name) - len(unit) - 2}s} {unit}{without:12.4g}{using:10.4g}{ratio:8.2f}", flush=True)
-            found.update({f"{part}.{name}.{key}.{side}": value[key] for side, value in sides.items()})
+    def rows(unit: str, of: str = "", **options: object) -> None:
+        """Measure on both sides; print and keep a row for each number."""
+        without, using = (measured(part, side, Path(work), cores, **options) for side in BACKENDS)
+        for key, before in without.items():
+            name = ".".join(filter(None, (of, key)))
+            faster = using[key] / before if unit == "1/s" else before / using[key]
+            print(f"{part} {name:{37 - len(part)}s}{unit:>6s}{before:12.4g}{using[key]:10.4g}{faster:8.2f}", flush=True)
+            found.update({f"{name}.cpu": before, f"{name}.gpu": using[key], f"{name}.faster": faster})
 
     with TemporaryDirectory() as work:
-        for sensor in SENSORS:
-            row(sensor, "rendering", "ms", sensor=sensor)
-            pictures = {side: np.load(Path(work) / f"{sensor}.{side}.npy") for side in BACKENDS}
-            truth = Bench(sensor, 1).truth(pictures["cpu"][0])
-            for name, other in (("other samples", pictures["cpu"][1]), ("GPU", pictures["gpu"][1])):
-                gray, rms, _ = truth.errors(other)
-                print(f"{sensor} {name} against the processor's picture: gray {gray:.3f} rms, centroids {rms:.4f} px", flush=True)
-                found[f"difference.{sensor}.{name}.gray"], found[f"difference.{sensor}.{name}.px"] = gray, rms
-        row("an epoch of", "training", "s")
-        row("data set,", "dataset", "1/s", contacts=contacts)
+        if part == "training":
+            rows("s")
+        elif part == "dataset":
+            rows("1/s", contacts=contacts)
+        else:
+            for sensor in SENSORS:
+                rows("ms", sensor, sensor=sensor)
+                found.update(differences(Path(work), sensor))
     return found
 
 
-def gpu_name() -> str:
-    """What PyTorch calls the GPU; "" without one."""
-    import torch
+def differences(work: Path, sensor: str) -> dict[str, float]:
+    """Gray levels and centroids (px), rms, of pictures of other samples off the processor's picture: its own, and the GPU's."""
+    import numpy as np
+    from bench_render import Bench
 
-    return torch.cuda.get_device_name() if torch.cuda.is_available() else ""
+    pictures = {side: np.load(work / f"{sensor}.{side}.npy") for side in BACKENDS}
+    truth, found = Bench(sensor, 1).truth(pictures["cpu"][0]), {}
+    for side in BACKENDS:
+        gray, rms, _ = truth.errors(pictures[side][1])
+        print(f"{sensor}: other samples of the {side} off the cpu's picture: gray {gray:.3f} rms, centroids {rms:.4f} px", flush=True)
+        found[f"{sensor}.off_gray.{side}"], found[f"{sensor}.off_px.{side}"] = gray, rms
+    return found
 
 
 def main() -> None:
@@ -145,7 +154,11 @@ def main() -> None:
     elif not gpu_name():
         sys.exit("bench_gpu: PyTorch finds no GPU here")
     else:
-        measure(given.cores, given.contacts)
+        print(
+            f"{platform.machine()}, {gpu_name()}; {given.cores} cores\n{'':44s}{'without GPU':>12s}{'with':>10s}{'faster':>8s}", flush=True
+        )
+        for part in PARTS:
+            measure(part, given.cores, given.contacts)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from figures import (  # noqa: F401  (each registers its jobs)
     data,
     environments,
     forces,
+    gpu,
     labels,
     mechanics,
     pictures,
@@ -17,7 +18,7 @@ from figures import (  # noqa: F401  (each registers its jobs)
     servo,
     studio,
 )
-from figures.jobs import FIGURES, JOBS, FiguresError, Job, is_kept, missing_recordings, run, values
+from figures.jobs import FIGURES, JOBS, FiguresError, Job, is_kept, lacking, run, values
 from figures.tables import documents, fill_documents, named_in_templates, used_in
 
 
@@ -36,8 +37,8 @@ def show(jobs: list[Job]) -> None:
     """A line for each job, then what documents and tables name that is not there."""
     for job in jobs:
         state = "kept" if is_kept(job) else "to be measured"
-        if lacking := missing_recordings(job):
-            state += f", needs recordings {', '.join(lacking)} (TACTIP_REAL)"
+        if needed := lacking(job):
+            state += f", needs {needed}"
         print(f"{job.name:34s} about {job.minutes:5g} min  {state}")
     named = named_in_templates() | {name for path in documents() for name in used_in(path.read_text())}
     absent = named - set(values())
@@ -64,8 +65,8 @@ def main() -> None:
         if is_kept(job) and not options.again:
             print(f"{job.name}: kept")
             continue
-        if lacking := missing_recordings(job):
-            print(f"{job.name}: left out, there is no recording {', '.join(lacking)} (set TACTIP_REAL)")
+        if needed := lacking(job):
+            print(f"{job.name}: left out, it needs {needed}")
             continue
         print(f"{job.name}: about {job.minutes:g} min", flush=True)
         try:

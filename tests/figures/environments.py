@@ -8,7 +8,7 @@ import bench_environments
 import bench_surrogate
 import numpy as np
 
-from figures.jobs import NO_PICTURES, Measured, Value, job, real_folder, run_twin
+from figures.jobs import DRAWN, NO_PICTURES, Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
 from training.surrogate.model import surrogate_of
 
@@ -69,6 +69,7 @@ for name, recording in SENSORS.items():
     code=("bench_environments", "training.environments"),
     shipped=("training/surrogates",),
     minutes=2,
+    beside=DRAWN,
 )
 def speed(work: Path) -> Measured:
     """Steps in a second of one core's time, of the slower task, and on the clock; against a rigid sensor's depth image in the same run."""
@@ -126,4 +127,5 @@ for name, (options, minutes) in LEARNT.items():
         code=("training.environments.learn",),
         shipped=("training/surrogates/mg400-331.safetensors",),
         minutes=minutes,
+        beside=DRAWN,
     )(partial(learnt, name=name))

@@ -17,8 +17,11 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from time import perf_counter
+
+from bench_gpu import gpu_name
 
 from scenes import SensorSpec, load_sensor
 from twin import store
@@ -71,6 +74,8 @@ class Job:
         Folders of ``TACTIP_REAL`` that it needs.
     minutes : float
         About how long it takes on two cores.
+    gpu : bool
+        Whether it needs a GPU.
     """
 
     name: str
@@ -82,6 +87,7 @@ class Job:
     minutes: float
     shipped: tuple[str, ...] = ()
     beside: tuple[str, ...] = ()
+    gpu: bool = False
 
     @property
     def family(self) -> str:
@@ -102,13 +108,14 @@ def job(
     recordings: tuple[str, ...] = (),
     minutes: float = 1.0,
     beside: tuple[str, ...] = (),
+    gpu: bool = False,
 ) -> Callable:
     """Register a function as the job of that name."""
 
     def register(measure: Callable[[Path], Measured]) -> Callable[[Path], Measured]:
         if name in JOBS:
             raise FiguresError(f"two jobs are called {name!r}")
-        JOBS[name] = Job(name, measure, command, sensors, code, recordings, minutes, shipped, beside)
+        JOBS[name] = Job(name, measure, command, sensors, code, recordings, minutes, shipped, beside, gpu)
         return measure
 
     return register
@@ -158,6 +165,8 @@ def _shortened(spec: SensorSpec, beside: tuple[str, ...]) -> SensorSpec:
     return without(spec, [name for name in beside if name in DETAILS])
 
 
+DRAWN = ("twin.optics.sampling",)
+"""``Job.beside`` of a job whose pictures are drawn: the random numbers of the picture that shading is fitted to change no figure."""
 UNMEASURED = ("twin.cli", "twin.report")
 """Packages whose code changes no figure: the command line's words and the pages' looks."""
 
@@ -206,7 +215,10 @@ def fingerprint(made: Job) -> str:
     measure, bound = made.measure, ""
     if isinstance(measure, partial):
         measure, bound = measure.func, repr(sorted(measure.keywords.items()))
-    code, shipped = code_behind(*made.code, beside=made.beside).fingerprint, shipped_digest(made.shipped)
+    behind = code_behind(*made.code, beside=made.beside)
+    if made.gpu:  # PyTorch is another build there; ``machine`` says which
+        behind = replace(behind, libraries={})
+    code, shipped = behind.fingerprint, shipped_digest(made.shipped)
     return hashlib.sha256(f"{code}\n{inspect.getsource(measure)}\n{bound}\n{shipped}".encode()).hexdigest()[:16]
 
 
@@ -232,9 +244,12 @@ def is_kept(made: Job, path: Path = FIGURES) -> bool:
     return entry is not None and {key: entry[key] for key in ("specification", "fingerprint")} == key_of(made)
 
 
-def missing_recordings(made: Job) -> list[str]:
-    """Folders that a job needs and this machine does not have."""
-    return [name for name in made.recordings if not real_folder(name).is_dir()]
+def lacking(made: Job) -> str:
+    """What a job needs and this machine does not have; "" if nothing."""
+    absent = [name for name in made.recordings if not real_folder(name).is_dir()]
+    if absent:
+        return f"recordings {', '.join(absent)} (set TACTIP_REAL)"
+    return "a GPU" if made.gpu and not gpu_name() else ""
 
 
 def run(made: Job, path: Path = FIGURES, work: Path = WORK) -> Measured:
@@ -249,7 +264,7 @@ def run(made: Job, path: Path = FIGURES, work: Path = WORK) -> Measured:
         **key,
         "commit": _commit(),
         "date": datetime.now(UTC).date().isoformat(),
-        "machine": machine(),
+        "machine": machine(made.gpu),
         "minutes": round((perf_counter() - started) / 60, 2),
         "figures": {name: asdict(value) for name, value in found.items()},
     }
@@ -270,12 +285,13 @@ def without_rendering() -> Iterator[None]:
             os.environ["TACTIP_VARIANT"] = before
 
 
-def machine() -> str:
-    """Processor and number of cores."""
+def machine(gpu: bool = False) -> str:
+    """Processor and number of cores, and on request the GPU and PyTorch's version."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
+    more = f", {gpu_name()}, PyTorch {metadata.version('torch')}" if gpu else ""
+    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores{more}"
 
 
 def _commit() -> str:

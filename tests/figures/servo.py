@@ -3,7 +3,7 @@
 import csv
 from pathlib import Path
 
-from figures.jobs import Measured, Value, job, run_twin
+from figures.jobs import DRAWN, Measured, Value, job, run_twin
 
 COLUMNS = {
     "path_error_mm": "mm",
@@ -24,6 +24,7 @@ COLUMNS = {
     code=("hardware.servo_study", "training.estimator"),
     shipped=("training/weights/mg400-331",),
     minutes=15,
+    beside=DRAWN,
 )
 def servo(work: Path) -> Measured:
     """One round of each object."""

@@ -11,7 +11,8 @@ from twin.camera.projection import project
 from twin.errors import RenderError
 from twin.geometry.pins import PinRest, rest_pins
 from twin.optics.render import Renderer
-from twin.optics.sampling import near_pins
+from twin.optics.sampling import PixelSamples, near_pins
+from twin.optics.variant import choose_variant, use_variant
 
 
 @pytest.fixture(scope="module")
@@ -235,3 +236,19 @@ def test_passes_are_refined_to_the_mean_of_all(small):
     calm = Renderer(small, spp=64).render(seed=9)
     noise = [np.sqrt(np.mean((each - calm) ** 2)) for each in passes]
     assert noise[2] < 0.8 * noise[0]
+
+
+@pytest.mark.parametrize("wide", [0, 1, 3, 6])
+def test_samples_of_a_pixel_have_one_in_each_box_of_a_grid(wide):
+    """64 samples are a (0, 6)-net: in 2^wide columns and 2^(6 - wide) rows there is one in each box, in every pixel and dimension."""
+    mi = use_variant(choose_variant("mono"))
+    import drjit as dr
+
+    count, pixels = 64, 5
+    number = dr.arange(mi.UInt32, count * pixels)
+    random = PixelSamples(mi, dr, number // count, number % count, count, 7)
+    for _ in range(3):
+        x, y = np.array(random.next_2d()).reshape(2, pixels, count)
+        assert (x >= 0).all() and (x < 1).all() and (y >= 0).all() and (y < 1).all()
+        boxes = np.floor(x * 2**wide) * count + np.floor(y * 2 ** (6 - wide))
+        assert all(len(np.unique(row)) == count for row in boxes), wide

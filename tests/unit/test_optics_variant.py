@@ -24,6 +24,16 @@ print(choice.variant, "|", choice.reason)
 """
 
 
+RENDER_WITH_TWO = """
+import numpy as np
+from scenes import load_sensor
+from twin.optics.render import Renderer
+first, then = ({variants})
+light = [Renderer(load_sensor("mg400-127"), name, spp=16, window_px=(290, 250, 322, 282)).render().mean() for name in (first, then)]
+print(abs(light[0] / light[1] - 1))
+"""
+
+
 def in_child(code: str, **env: str) -> str:
     """Output of ``code`` in a fresh interpreter without a display; a variable set to "" is removed."""
     environment = {k: v for k, v in (os.environ | env).items() if v != "" and k != "DISPLAY"}
@@ -45,8 +55,15 @@ def test_nothing_heavy_at_import():
 
 
 def test_without_any_llvm_the_scalar_variant_renders_and_says_what_to_install():
-    out = in_child(RENDER_TINY.format(search="()"), DRJIT_LIBLLVM_PATH="", TACTIP_VARIANT="")
+    out = in_child(RENDER_TINY.format(search="()"), DRJIT_LIBLLVM_PATH="", TACTIP_VARIANT="", CUDA_VISIBLE_DEVICES="-1")
     assert out.startswith("scalar_rgb") and "libllvm19" in out
+
+
+def test_one_process_renders_with_one_backend_after_the_other():
+    """Some functions of Mitsuba stay those of the first backend; what is rendered must not use them."""
+    vectorised = variant.choose_variant("mono").backend
+    out = in_child(RENDER_WITH_TWO.format(variants=("scalar", vectorised)), TACTIP_VARIANT="")
+    assert float(out) < 0.25  # the scalar variant approximates the window
 
 
 def test_an_llvm_that_aborts_is_refused_and_another_way_is_found(tmp_path):

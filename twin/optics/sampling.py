@@ -49,8 +49,24 @@ def _largest_outline(appearance: AppearanceSpec) -> float:
     return float(1 + np.abs(shapes).sum(axis=1).max())
 
 
+PASCAL_STEPS = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
+
+
+def times_pascal(bits: DrJit) -> DrJit:
+    """Bits of a UInt32 times Pascal's triangle modulo 2: read in reverse, the second coordinate of Sobol's sequence.
+
+    Bit j of the result is the sum of the bits k for which the binomial coefficient (k over j) is odd. By Lucas' theorem these are the k
+    that have all ones of j. Therefore five steps, one for each digit of k, do the work of a 32 x 32 matrix. (Mitsuba's own ``sobol_2`` and
+    ``radical_inverse_2`` belong to the backend that a process uses first, and fail with another one.)
+    """
+    for shift, where in PASCAL_STEPS:
+        bits = bits ^ ((bits >> shift) & where)
+    return bits
+
+
 class PixelSamples:
-    """Random numbers for ``spp`` samples in each of many pixels. In each dimension a pixel's samples form a scrambled (0, 2)-net.
+    """Random numbers for ``spp`` samples in each of many pixels. In each dimension a pixel's samples form a scrambled (0, 2)-net:
+    the first 2^m points have one in each box of the sizes 2^-k x 2^(k-m) (Sobol 1967).
 
     Each dimension has its own scramble and its own order of samples, so that dimensions are not correlated (padding; Kollig and Keller
     2002).
@@ -81,12 +97,17 @@ class PixelSamples:
     def next_1d(self) -> DrJit:
         """Uniform numbers in [0, 1)."""
         order, scramble, _ = self._scrambles()
-        return self._mi.radical_inverse_2(order, scramble)
+        return self._uniform(self._dr.brev(order) ^ scramble)
 
     def next_2d(self) -> DrJit:
         """Uniform points in the unit square."""
         order, first, second = self._scrambles()
-        return self._mi.Point2f(self._mi.radical_inverse_2(order, first), self._mi.sobol_2(order, second))
+        brev = self._dr.brev
+        return self._mi.Point2f(self._uniform(brev(order) ^ first), self._uniform(brev(times_pascal(order)) ^ second))
+
+    def _uniform(self, bits: DrJit) -> DrJit:
+        """The number 0.b31 b30 ... b9 of a UInt32: its highest 23 bits behind the point."""
+        return self._dr.reinterpret_array(self._mi.Float, (bits >> 9) | 0x3F800000) - 1
 
     def _scrambles(self) -> tuple[DrJit, DrJit, DrJit]:
         mi = self._mi

@@ -1,6 +1,7 @@
 """From frames to a specification that the program reads: any size, tables and no-contact frames from anywhere, and no nonsense."""
 
 import re
+from operator import attrgetter
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,8 @@ from scenes import load_sensor
 from scenes.pins import PinsSpec
 from training.estimator import PoseEstimator
 from training.studies.evaluation import predict_frames
-from twin.errors import FrameError, TwinError
+from twin.camera.projection import project
+from twin.errors import FrameError, OptionError, TwinError
 from twin.fit.camera_pose import CameraReport
 from twin.fit.new_sensor import _camera, _doubtful, _given, _health, new_sensor
 from twin.frames import frames_at, open_recording
@@ -91,7 +93,36 @@ def test_a_folder_of_frames_becomes_a_sensor(made):
 
 
 def test_the_size_of_the_tip_is_said_to_be_assumed(made):
-    assert any(line.startswith("assumed: Dome: radius 20 mm") for line in made[0].lines())
+    assert any(line.startswith("assumed: tip of radius 20 mm") and "--radius-mm" in line for line in made[0].lines())
+
+
+def test_a_tip_of_another_size_is_the_same_picture_with_other_lengths(made, tmp_path):
+    usual, _, folder = made
+    small = new_sensor(folder, tmp_path / "small.toml", radius_mm=8.0)
+    spec = load_sensor(small.written[0])
+    assert any(line.startswith("tip of radius 8 mm") for line in small.lines()) and spec.skin.outer_radius_mm == 8.0
+    for key in ("skin.thickness_mm", "pins.cap_diameter_mm", "camera.distance_mm", "leds.radius_mm", "lens.z_mm"):
+        before, now = (attrgetter(key)(sensor) for sensor in (usual.sensor, spec))
+        assert now == pytest.approx(0.4 * before, rel=2e-3), key
+    seen = [project(sensor.view, rest_pins(sensor.geometry).caps_mm) for sensor in (usual.sensor, spec)]
+    assert np.abs(seen[0] - seen[1]).max() < 0.05
+    assert next(f for f in examine(list(open_recording(folder, spec)), spec) if f.name == "twin").verdict is Grade.GOOD
+
+
+@pytest.mark.parametrize("radius_mm", [0.0, -3.0, 1e4, float("nan")])
+def test_a_tip_of_no_such_size_is_refused(made, tmp_path, radius_mm):
+    with pytest.raises(OptionError, match="radius .* mm: give the radius"):
+        new_sensor(made[2], tmp_path / "none.toml", radius_mm=radius_mm)
+    assert not (tmp_path / "none.toml").exists()
+
+
+def test_lengths_that_do_not_belong_to_the_camera_are_found_by_a_check(made):
+    """A tip made smaller by hand: pins are still found in frames, and the twin draws another sensor."""
+    spec, frames = made[0].sensor, list(open_recording(made[2], made[0].sensor))
+    shrunk = spec.model_copy(update={"skin": spec.skin.model_copy(update={"outer_radius_mm": 10.0})})
+    findings = {f.name: f for f in examine(frames, shrunk)}
+    assert findings["pins"].verdict is Grade.GOOD
+    assert findings["twin"].verdict is Grade.BAD and "--radius-mm" in findings["twin"].remedy
 
 
 def test_a_layout_of_too_few_pins_for_a_camera_is_told(tmp_path):

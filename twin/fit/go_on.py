@@ -73,6 +73,7 @@ def whole_sensor(
     workers: int = 1,
     across: int = FINE,
     layout: PinsSpec | None = None,
+    radius_mm: float | None = None,
     no_contact: Path | None = None,
     table: Path | None = None,
     form: Form | None = None,
@@ -104,7 +105,17 @@ def whole_sensor(
         raise OptionError(f"{frames}: thresholded frames tell nothing of light and colours; leave out --optics, or give raw camera frames")
     if labels is not None and experiment is None:
         experiment = experiment_like(open_recording(at, form=form).labels)
-    made = new_sensor(frames, out, layout=layout, no_contact=no_contact, table=labels or table, form=form, limit=limit, progress=progress)
+    made = new_sensor(
+        frames,
+        out,
+        layout=layout,
+        radius_mm=radius_mm,
+        no_contact=no_contact,
+        table=labels or table,
+        form=form,
+        limit=limit,
+        progress=progress,
+    )
     sensor = made.sensor
     light = calibrate_optics(frames, sensor, out, no_contact=no_contact, progress=progress) if optics else None
     sensor = light.found.spec if light else sensor

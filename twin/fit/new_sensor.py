@@ -11,6 +11,7 @@ from scenes.sensor import BlobSpec, CameraSpec, PipelineSpec, RecordingSpec, Sen
 from twin.errors import FrameError
 from twin.fit.camera_pose import LEAST_PINS, MODEL_PX, CameraReport, fit_camera
 from twin.fit.sensor_file import folder_beside, write_sensor
+from twin.fit.size import of_radius, require_radius
 from twin.frames import evenly_read, frames_at, open_recording, spread
 from twin.frames.forms import gray_levels
 from twin.frames.images import write_image
@@ -37,8 +38,8 @@ JUDGED = 40
 SHOWN_FRAMES = 4
 """Most frames whose overlay pictures are shown."""
 PINHOLE_MM, FISHEYE_MM = 45.0, 7.5
-"""Distance of the pupil from the dome's centre, mm, at the start of a fit. The values are those of two TacTip cameras, without and with a
-wide-angle lens."""
+"""Distance of the pupil from the centre of a dome of 20 mm, mm, at the start of a fit. The values are those of two TacTip cameras, without
+and with a wide-angle lens."""
 FITTED_PINHOLE = ("fx_px", "cx_px", "cy_px", "k1", "tilt_x_deg", "tilt_y_deg", "phase_deg")
 """Parameters of a pinhole camera that pins at rest may determine (see ``twin.fit.camera_pose``)."""
 FITTED_FISHEYE = (*FITTED_PINHOLE, "k2")
@@ -121,6 +122,8 @@ class NewSensor:
     camera : CameraReport
     tuned : Tuned
     health : Health
+    size : str
+        Where the size of the tip comes from, which frames do not tell.
     known, assumed, next_steps : tuple of str
         What the frames determine, what is assumed instead, and how to learn more.
     odd : tuple of str
@@ -134,6 +137,7 @@ class NewSensor:
     camera: CameraReport
     tuned: Tuned
     health: Health
+    size: str
     known: tuple[str, ...]
     assumed: tuple[str, ...]
     next_steps: tuple[str, ...]
@@ -146,7 +150,7 @@ class NewSensor:
         lines += [f"doubt: {doubt}" for doubt in self.identified.doubts]
         if not self.identified.sure:
             lines += [f"or: {other.line()}" for other in self.identified.candidates[1:2]]
-        lines += [self.rest.line(), *self.known[2:], *self.health.lines(), f"assumed: {self.assumed[0]}"]
+        lines += [self.rest.line(), *self.known[2:], *self.health.lines(), self.size]
         return lines + [f"next: {step}" for step in self.next_steps] + [f"note: {note}" for note in self.odd]
 
 
@@ -156,6 +160,7 @@ def new_sensor(
     out: Path,
     *,
     layout: PinsSpec | None = None,
+    radius_mm: float | None = None,
     no_contact: Path | None = None,
     table: Path | None = None,
     form: Form | None = None,
@@ -174,6 +179,8 @@ def new_sensor(
         The ``.toml`` file to write.
     layout : PinsSpec, optional
         The layout, if it is known. Otherwise it is identified.
+    radius_mm : float, optional
+        Radius of the tip's dome. By default that of a printed TacTip, 20 mm. All other lengths are in proportion to it (`of_radius`).
     no_contact : Path, optional
         A frame without contact. By default a file ``init_*`` beside the frames, else a frame that shows no contact, else an estimate from
         the contacts.
@@ -188,7 +195,11 @@ def new_sensor(
     ------
     FrameError
         There are no frames, they show no layout, or ``out`` is not the name of a ``.toml`` file.
+    OptionError
+        No dome has this radius.
     """
+    if radius_mm is not None:
+        require_radius(radius_mm)
     folder = folder_beside(out, "new")
     with output(folder, "index.html", "overlay-*.png"):
         recording = open_recording(frames_at(frames, table, no_contact), None, form)
@@ -208,6 +219,7 @@ def new_sensor(
             best, [frame.name for frame in looked], None if given is None else gray_levels(given.image), given.name if given else ""
         )
         start = _started(out.stem, looked[0], best.pins, rest, frames.name)
+        start = start if radius_mm is None else of_radius(start, radius_mm)
         with stage(progress, "camera"):
             sizes_px = _sizes(best, images) if looked[0].form == Form.RAW else None
             fitted, camera = _camera(start, np.where((best.there >= STEADY)[:, None], rest.pins_px, np.nan), rest.source, sizes_px)
@@ -217,10 +229,12 @@ def new_sensor(
         judged = looked if limit >= min(JUDGED, len(recording)) else evenly_read(recording, JUDGED)
         odd = list(dict.fromkeys([*odd, *recording.notes(), *_doubtful(camera, rest, len(looked))]))
         health, pictures = _health(sensor, looked[0].form, judged, folder)
+        size = _size(sensor, given=radius_mm is not None)
         known, assumed, steps = _told(sensor, found, rest, camera, tuned, health, recording.labels)
+        known, assumed = ((*known, size), assumed) if radius_mm is not None else (known, (size, *assumed))
         write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
         page = _page(folder, sensor, found, health, pictures, known, assumed, steps, odd)
-        return NewSensor(sensor, found, rest, camera, tuned, health, known, assumed, steps, tuple(odd), [out, page])
+        return NewSensor(sensor, found, rest, camera, tuned, health, size, known, assumed, steps, tuple(odd), [out, page])
 
 
 def _holds_its_axis(places: np.ndarray) -> bool:
@@ -329,7 +343,14 @@ def _camera(start: SensorSpec, pins_px: np.ndarray, source: str, sizes_px: np.nd
         camera = start.camera
         if projection == "fisheye":
             focal = camera.fx_px * FISHEYE_MM / PINHOLE_MM
-            camera = camera.model_copy(update={"projection": projection, "fx_px": focal, "fy_px": focal, "distance_mm": FISHEYE_MM})
+            camera = camera.model_copy(
+                update={
+                    "projection": projection,
+                    "fx_px": focal,
+                    "fy_px": focal,
+                    "distance_mm": camera.distance_mm * FISHEYE_MM / PINHOLE_MM,
+                }
+            )
         trial = _scaled(start.model_copy(update={"pins": pins, "camera": camera}), pins_px)
         fitted, report = fit_camera(trial, pins_px, free=FITTED_FISHEYE if projection == "fisheye" else FITTED_PINHOLE, named=True)
         fitted, uneven = _with_sizes(fitted, sizes_px)
@@ -455,8 +476,6 @@ def _told(
         ),
     )
     assumed = [
-        f"Dome: radius {sensor.skin.outer_radius_mm:g} mm, skin {sensor.skin.thickness_mm:g} mm, of a printed TacTip. Frames do not tell "
-        "lengths in mm. If your tip differs, lengths, forces and poses are wrong until the specification says its own.",
         f"Outermost pins at {sensor.pins.max_polar_deg:g} deg from the axis, and the camera's distance {sensor.camera.distance_mm:.1f} mm: "
         "pins at rest fit many pairs of them.",
         "Stiffness of skin and gel: Shore A 26 to 30 rubber and a soft gel.",
@@ -481,6 +500,17 @@ def _told(
     if sensor.camera.channels == "color":
         steps.append(f"fit light and colours: twin calibrate optics --sensor {sensor.name}.toml --frames FRAMES --out {sensor.name}-2.toml")
     return known, tuple(assumed), tuple(steps)
+
+
+def _size(sensor: SensorSpec, *, given: bool) -> str:
+    """Where the tip's size comes from."""
+    size = f"tip of radius {sensor.skin.outer_radius_mm:g} mm, skin {sensor.skin.thickness_mm:g} mm"
+    if given:
+        return f"{size}: the radius as given, all other lengths in proportion to a printed TacTip's"
+    return (
+        f"assumed: {size}, as a printed TacTip. Frames do not tell lengths in mm. If your tip differs, give its radius (--radius-mm): "
+        "otherwise lengths, forces and poses are wrong"
+    )
 
 
 def sensor_blob(sensor: SensorSpec, tuned: Tuned) -> BlobSpec:

@@ -14,8 +14,10 @@ from scipy.spatial import cKDTree
 
 from scenes.sensor import SensorSpec, UsualCapsSpec
 from twin.camera.capture import expose
+from twin.camera.projection import project
 from twin.frames import spread
-from twin.frames.forms import gray_levels
+from twin.frames.forms import from_raw, gray_levels
+from twin.geometry.pins import rest_pins
 from twin.optics.preview import Preview
 from twin.pins.blobs import Mask
 from twin.pins.caps import Caps, measure_caps
@@ -113,7 +115,13 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
         seen.append(pipeline(frame))
         if progress:
             progress(k + 1, len(frames))
-    findings = [_layout(frames, spec), _pins(seen, pipeline), _spots(seen, pipeline), *_place(seen, nominal_reference(spec, form))]
+    findings = [
+        _layout(frames, spec),
+        _pins(seen, pipeline),
+        _spots(seen, pipeline),
+        *_place(seen, nominal_reference(spec, form)),
+        _twin(spec, form),
+    ]
     return (
         findings
         if form == Form.RECORDING
@@ -249,6 +257,25 @@ def _place(seen: list[Observation], nominal: Reference) -> list[Finding]:
         _finding("turn", abs(turn), (1.5, 6.0), f"turned by {turn:.2f} deg", again),
         _finding("scale", abs(scale - 1), (0.02, 0.1), f"{scale:.3f} times its calibrated size{bulge}", again),
     ]
+
+
+def _twin(spec: SensorSpec, form: Form) -> list[Finding]:
+    """Finding about the specification alone: whether its camera sees the pins at rest where they were measured. None if they were not.
+
+    Pins are found from where they were measured; the twin draws them where lengths and camera put them. Therefore both can be wrong
+    apart from each other.
+    """
+    blob = spec.pipeline.raw if form == Form.RAW else spec.pipeline.recording
+    if blob is None or not blob.rest_px:
+        return []
+    found, drawn_px = nominal_reference(spec, form), from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm))
+    rms, pitch = float(np.sqrt(np.mean(np.sum((found.pins_px - drawn_px) ** 2, axis=1)))), float(np.mean(found.spacing_px))
+    text = f"the specification's camera sees its pins at rest {rms:.1f} px (rms), {rms / pitch:.2f} pitches, from where they were measured"
+    remedy = (
+        "lengths in mm, camera and rest_px do not belong together: the twin's pictures are not of this sensor; make the specification anew "
+        "('twin new', with --radius-mm for a tip of another size)"
+    )
+    return [_finding("twin", rms / pitch, (0.2, 0.5), text, remedy)]
 
 
 def _light(frames: list[Frame], seen: list[Observation], expected: UsualCapsSpec | None, mask: Mask) -> list[Finding]:

@@ -120,7 +120,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
         _pins(seen, pipeline),
         _spots(seen, pipeline),
         *_place(seen, nominal_reference(spec, form)),
-        _twin(spec, form),
+        *_twin(spec, form),
     ]
     return (
         findings

@@ -20,7 +20,7 @@ from twin.errors import FrameError, OptionError, TwinError
 from twin.fit.camera_pose import CameraReport
 from twin.fit.new_sensor import _camera, _doubtful, _given, _health, new_sensor
 from twin.frames import frames_at, open_recording
-from twin.geometry.pins import rest_pins
+from twin.geometry.pins import rest_pins, usual_spacing
 from twin.optics.relief import cap_planes
 from twin.pins import Grade, Pipeline, examine, nominal_reference, tune, with_detector
 from twin.pins.batch import recording_reference
@@ -225,9 +225,25 @@ def test_places_that_do_not_count_from_the_axis_are_refused():
 def test_stretched_and_few_frames_are_told():
     rest = Rest(rest_of(PINS), "given")
     spacing = float(np.median(cKDTree(rest.pins_px).query(rest.pins_px, k=2)[0][:, 1]))
-    assert not _doubtful(CameraReport(0.1 * spacing, 61, {}, {}), rest, 40)
+    assert not _doubtful(CameraReport(0.05 * spacing, 61, {}, {}), rest, 40)
+    (much,) = _doubtful(CameraReport(0.15 * spacing, 61, {}, {}), rest, 40)
+    assert "which is much for a frame without contact" in much
+    assert not _doubtful(CameraReport(0.15 * spacing, 61, {}, {}), Rest(rest.pins_px, "made"), 40), "contacts tell rest places no better"
     assert "stretched" in _doubtful(CameraReport(0.3 * spacing, 61, {}, {}), rest, 40)[0]
-    assert "3 frames are few" in _doubtful(CameraReport(0.1 * spacing, 61, {}, {}), rest, 3)[0]
+    assert "3 frames are few" in _doubtful(CameraReport(0.05 * spacing, 61, {}, {}), rest, 3)[0]
+
+
+def test_a_place_that_was_forgotten_is_asked_for():
+    """A list of all pins but one explains nearly all there is, and is not sure."""
+    rest_px, left_out = rest_of(PINS), 45
+    places = rest_px - rest_px.mean(axis=0)
+    short = np.delete(places, left_out, axis=0)
+    images = frames_of(rest_px)
+    whole, found = (_given(PinsSpec(layout="positions", positions=tuple(map(tuple, of.tolist()))), images) for of in (places, short))
+    assert whole.sure and not whole.doubts
+    assert not found.sure and len(found.doubts) == 1 and "does the file lack its place?" in found.doubts[0]
+    x, y = map(float, re.findall(r"-?\d+", found.doubts[0])[:2])
+    assert np.hypot(*(rest_px[left_out] - (x, y))) < usual_spacing(rest_px) / 2
 
 
 def test_frames_of_another_size_are_tuned_and_then_observed():

@@ -65,6 +65,8 @@ FEW_FRAMES = 20
 MOST_AWAY = 0.2
 """Rms distance, in spacings, between projected and found pins at rest above which the camera does not fit. Frames stretched in one
 direction cause such a distance, because no lens model describes them."""
+USUALLY_AWAY = 0.1
+"""Rms distance, in spacings, above which a camera is doubted that was fitted to a frame without contact. Usual: 0.02 to 0.05."""
 
 
 @dataclass(frozen=True)
@@ -242,6 +244,19 @@ def _holds_its_axis(places: np.ndarray) -> bool:
     return bool(Delaunay(places).find_simplex(np.zeros(2)) >= 0)
 
 
+def _unnamed(layout: Candidate) -> list[np.ndarray]:
+    """Places (2,) px of spots near the pins of a layout, and as bright, that are none of them, in most frames."""
+    within, frames = usual_spacing(layout.rest_px) / 2, [one.left_over_px for one in layout.seen]
+    places: list[np.ndarray] = []
+    for spot in np.concatenate([np.zeros((0, 2)), *frames]):
+        if any(np.linalg.norm(spot - place) < within for place in places):
+            continue
+        seen_in = sum(bool((np.linalg.norm(spots - spot, axis=1) < within).any()) for spots in frames)
+        if seen_in >= STEADY * len(layout.seen):
+            places.append(spot)
+    return places
+
+
 def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
     """The user's layout, compared with the frames."""
     if layout.layout == "positions" and not _holds_its_axis(np.array(layout.positions)):
@@ -251,16 +266,25 @@ def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
         )
     shown = judge_layout(layout, images)
     if shown is not None and shown.explained >= GIVEN_SHOWN:
-        return Identified((shown,), True, (), 0.0)
+        forgotten = _unnamed(shown) if layout.layout == "positions" else []
+        doubts = tuple(
+            f"a pin-like spot at ({x:.0f}, {y:.0f}) px is none of the {layout.in_words()}: does the file lack its place?"
+            for x, y in forgotten
+        )
+        return Identified((shown,), not doubts, doubts, 0.0)
     try:
         other = identify(images).best
     except FrameError:
         other = None
     if shown is None or shown.explained < LEAST_SHOWN:
         instead = f"; they show {other.pins.in_words()}" if other is not None else ""
+        places = (
+            "compare the places with the picture: one that is missing or wrong hides the others"
+            if layout.layout == "positions"
+            else "give each pin's place, --layout positions:FILE.csv"
+        )
         raise FrameError(
-            f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave --layout out to have it identified, "
-            "or give each pin's place, --layout positions:FILE.csv"
+            f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave --layout out to have it identified, or {places}"
         )
     doubt = f"{layout.in_words()} were given, and explain only {100 * shown.explained:.1f} % of what is there"
     if other is None or other.explained <= shown.explained:
@@ -450,6 +474,11 @@ def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
         notes.append(
             f"no camera sees this layout as the frames show it: the best one misses the pins at rest by {camera.rms_px:.1f} px (rms), "
             f"{away:.2f} of their spacing; were the frames stretched? Give them as the camera wrote them"
+        )
+    elif away > USUALLY_AWAY and rest.source == "given":
+        notes.append(
+            f"the camera misses the pins at rest by {camera.rms_px:.1f} px (rms), {away:.2f} of their spacing, which is much for a frame "
+            "without contact: look whether the layout's places are right, and whether that frame shows a contact"
         )
     if frames < FEW_FRAMES:
         notes.append(f"{frames} frames are few: kind and focal length of the camera are unsure; give about {LIMIT}, of different contacts")

@@ -97,6 +97,7 @@ def test_the_comparison_sees_what_is_wrong(compared, wrong, monkeypatch):
     assert min(chances(ours, theirs)) < CHANCE
 
 
+@pytest.mark.slow
 def test_the_mirror_images_alone_are_those_of_plain_path_tracing():
     """Nothing but black in the gel: what is seen are the LEDs in both faces of the window.
 

@@ -82,6 +82,7 @@ def undisturbed(tmp_path_factory):
     return get
 
 
+@pytest.mark.slow
 def test_killed_twice_it_goes_on_to_the_same_bytes(tmp_path, undisturbed):
     job = Job(tmp_path, COUNT)
     for moment, workers in ((2, 1), (5, 2)):

@@ -235,6 +235,7 @@ class ShownPictures(LiveSource):
         return Picture(self._images[self._next % len(self._images)], time.monotonic())
 
 
+@pytest.mark.slow
 def test_a_camera_that_was_never_shown_a_rest_is_counted_from_where_its_contacts_tell():
     """As a recording of the same contacts is: here of another unit than the weights', over the emulated camera."""
     model = PoseEstimator.load("mg400-127")

@@ -13,6 +13,7 @@ from twin.mechanics import ContactPose
 from twin.simulator import Simulator
 
 SENSOR = "ur5-331"
+DARK = np.zeros((480, 640, 3), np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -21,10 +22,11 @@ def folder(tmp_path_factory):
     simulator = Simulator(load_sensor(SENSOR))
     state = simulator.press(load_object("plane"), ContactPose(indent_mm=2.5, tilt_deg=(6.0, -4.0)))
     cv2.imwrite(str(path / "press.png"), simulator.shoot(state, seed=5).frame.image[..., ::-1])
-    cv2.imwrite(str(path / "dark.png"), np.zeros((480, 640, 3), np.uint8))
+    cv2.imwrite(str(path / "dark.png"), DARK)
     return path
 
 
+@pytest.mark.slow
 def test_a_render_looks_like_itself(folder, tmp_path):
     """The skin fitted to the detected pins gives the same picture again, but for noise and a few hundredths of a pixel."""
     metrics, written = run_realism(folder, load_sensor(SENSOR), tmp_path)
@@ -42,9 +44,10 @@ def test_a_render_looks_like_itself(folder, tmp_path):
     assert json.loads((tmp_path / "metrics.json").read_text())["frames"] == 1
 
 
-def test_the_command_refuses_in_one_line(folder, tmp_path):
+def test_the_command_refuses_in_one_line(tmp_path):
     (tmp_path / "none").mkdir()
-    for path, word in ((tmp_path / "none", "empty"), (tmp_path / "missing", "no such"), (folder / "dark.png", "black")):
-        done = run_twin("realism", path, "--sensor", SENSOR, "--out", tmp_path)
+    cv2.imwrite(str(tmp_path / "dark.png"), DARK)
+    for path, word in ((tmp_path / "none", "empty"), (tmp_path / "missing", "no such"), (tmp_path / "dark.png", "black")):
+        done = run_twin("realism", path, "--sensor", SENSOR, "--out", tmp_path / "out")
         assert done.returncode == 1 and "Traceback" not in done.stderr
         assert any(line.startswith("twin: error:") and word in line for line in done.stderr.splitlines()), done.stderr

@@ -28,6 +28,7 @@ def evenly(recording, count):
     return [recording.read(int(k)) for k in np.linspace(0, len(recording) - 1, count)]
 
 
+@pytest.mark.slow
 def test_tune_check_and_robustness_from_the_command_line(tmp_path):
     spec = load_sensor("mg400-127")
     source = RenderedSource(spec, CONTACTS[:1])

@@ -84,6 +84,7 @@ def test_the_papers_models_take_the_same_way(model, recording, tmp_path):
     assert "pose_6" in twin("predict", tmp_path / "run", recording / "frames_bw" / "f_3.png")
 
 
+@pytest.mark.slow
 def test_the_papers_comparison_is_one_command_and_goes_on_where_it_was(recording, tmp_path):
     command = ("study", "tac-vgnn", "--data", recording, "--sensor", "mg400-127", "--out", tmp_path, "--epochs", 1, "--no-contacts")
     said = twin(*command, "--models", "gnn,vgnn-without-graph", "--batches", "16")
@@ -101,6 +102,7 @@ def test_the_papers_comparison_is_one_command_and_goes_on_where_it_was(recording
     }
 
 
+@pytest.mark.slow
 def test_objects_never_seen_are_one_command_and_go_on_where_they_were(tmp_path):
     (tmp_path / "gentle.toml").write_text(EXPERIMENT)
     command = ("study", "objects", "--sensor", SENSOR, "--train", "plane,sphere", "--unseen", "cylinder", "--count", 3, "--tests", 2)
@@ -143,7 +145,8 @@ def assert_labels_of_frames_without_are_not_used(plan, out):
     assert (told["told"].mean == told["odd"].mean).all() and (told["told"].half_width == told["odd"].half_width).all()
 
 
-@pytest.mark.parametrize("left_out", [(), pytest.param(WITHOUT_ONE, marks=pytest.mark.slow)], ids=["full", "ablation"])
+@pytest.mark.slow
+@pytest.mark.parametrize("left_out", [(), WITHOUT_ONE], ids=["full", "ablation"])
 def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_was(tmp_path, left_out):
     (tmp_path / "gentle.toml").write_text(EXPERIMENT)
     gentle = ("--sensor", SENSOR, "--experiment", tmp_path / "gentle.toml", "--across", ACROSS, "--workers", 1)

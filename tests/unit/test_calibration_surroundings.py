@@ -106,6 +106,7 @@ def test_leds_are_found_by_their_reflections(known, found):
     assert 1 - ours.core_share == pytest.approx(1 - real.core_share, rel=0.3)
 
 
+@pytest.mark.slow
 def test_reflections_that_the_housing_dims_are_met(known):
     """Spots of the whole LEDs' light, over which a camera sharpens, would be white with black rings around them."""
     _, spec, images, _ = known

@@ -52,15 +52,21 @@ def frames(config, sensor, seeds, *, bad=()):
 
 
 @pytest.fixture(scope="module")
-def calibrated(tmp_path_factory):
+def prepared(tmp_path_factory):
+    """What a calibration starts from, which moves were made, and frames that it does not see."""
     home = tmp_path_factory.mktemp("calibration")
     config = small_config(home, experiment=load_experiment(telling(home)))
     true = config.sensor.model_copy(update={"rig": config.sensor.rig.model_copy(update=TRUTH)})
     measured, done = frames(config, true, range(FRAMES), bad=(4,))
     setup = Setup(config.sensor, config.experiment, config.object, Form.RECORDING, ACROSS, home / "contacts", parameters=FITTED)
-    fit = fit_contact(setup, measured)
     held, _ = frames(config, true, range(100, 103))
-    return setup, measured, done, fit, held
+    return setup, measured, done, held
+
+
+@pytest.fixture(scope="module")
+def calibrated(prepared):
+    setup, measured, done, held = prepared
+    return setup, measured, done, fit_contact(setup, measured), held
 
 
 @pytest.mark.slow
@@ -72,6 +78,7 @@ def test_numbers_and_sign_are_found_again_within_their_uncertainty(calibrated):
     assert fit.sensor.rig.contact_offset_mm == fit.value[0] and (fit.told > 0.9).all()
 
 
+@pytest.mark.slow
 def test_moves_that_were_not_executed_and_odd_frames_are_found(calibrated):
     _, _, done, fit, _ = calibrated
     good = np.arange(FRAMES) != 4
@@ -80,12 +87,14 @@ def test_moves_that_were_not_executed_and_odd_frames_are_found(calibrated):
     assert np.nanmean(fit.after_px[good]) < 0.2 < np.nanmean(fit.before_px[good])
 
 
+@pytest.mark.slow
 def test_frames_that_were_not_fitted_are_met_as_well(calibrated):
     setup, _, _, fit, held = calibrated
     before, after = held_out_px(setup, fit, held)
     assert after < 0.25 * before
 
 
+@pytest.mark.slow
 def test_a_continued_calibration_computes_nothing_twice(calibrated, monkeypatch):
     setup, measured, _, fit, _ = calibrated
     monkeypatch.setattr("twin.fit.contact.simulate._contact", None)  # not callable: a new contact would fail
@@ -110,8 +119,8 @@ def test_values_go_into_the_specification_and_come_back(tmp_path):
     assert there.rig.turn_offset_deg[:2] == (0, 0) and there.rig.turn_offset_deg[2] == pytest.approx(moved[3])
 
 
-def test_too_few_frames_are_refused(calibrated):
-    setup, measured, _, _, _ = calibrated
+def test_too_few_frames_are_refused(prepared):
+    setup, measured, _, _ = prepared
     few = MeasuredFrames(measured.form, measured.names[:2], measured.labels[:2], measured.pins_px[:2], measured.no_contact_px, [])
     with pytest.raises(FrameError, match="2 frames with pins are too few"):
         fit_contact(setup, few)

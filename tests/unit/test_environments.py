@@ -284,6 +284,7 @@ def test_the_same_seed_gives_the_same_episode_on_finite_elements():
     assert np.abs(first).max() > 0.1  # the sensor feels something
 
 
+@pytest.mark.slow
 def test_gymnasium_accepts_an_environment_on_finite_elements():
     check_env(gymnasium.make("tactip/SurfaceFollow-v0", steps=2, **FAST).unwrapped, skip_render_check=True)
 

@@ -119,6 +119,7 @@ def test_warmed_up_it_is_as_new(solver):
     np.testing.assert_array_equal(one.caps_mm, other.caps_mm)
 
 
+@pytest.mark.slow
 def test_skin_is_not_carried_past_wires():
     """Load steps stay below a wire's radius: farther, skin ends up beneath a wire and hooks; the mesh drags far less than it is pressed."""
     can = load_object("mesh-can")

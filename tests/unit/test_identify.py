@@ -177,7 +177,7 @@ def test_stray_light_and_specks_do_not_change_the_layout():
 @pytest.mark.parametrize(
     ("shown", "offered"),
     [
-        (PinsSpec(rings=10), PinsSpec(rings=9)),
+        pytest.param(PinsSpec(rings=10), PinsSpec(rings=9), marks=pytest.mark.slow),
         (PinsSpec(rings=6), PinsSpec(rings=4)),
         (PinsSpec(rings=5), PinsSpec(rings=6)),
         (PinsSpec(rings=6), PinsSpec(layout="hexagon", rings=4)),

@@ -310,6 +310,7 @@ def plate_pins(labels, rest):
     return 0.05 * depth * rest * far + 0.02 * (tilt + 0.02 * tilt**2) * far * [1.0, 0.4] + 0.004 * depth * tilt * rest[:, ::-1] * far
 
 
+@pytest.mark.slow
 def test_a_twin_read_both_ways_is_as_good_as_the_better_reading_and_better_than_the_other():
     """The real pins move by a tenth more than the twin's, are displaced, and bend with the tilt in a way that the twin does not know."""
     rng = np.random.default_rng(3)

@@ -79,7 +79,8 @@ class Collection:
     Parameters
     ----------
     folder : Path
-        A new or empty folder, or the folder of a collection with the same ``about``, which is continued.
+        A new or empty folder, or the folder of a collection with the same ``about``, which is continued. A folder in which a start failed
+        before the first frame counts as empty.
     about : dict
         Everything that the frames depend on, in types that JSON can hold.
     form : Form
@@ -108,7 +109,10 @@ class Collection:
                     raise ValueError("expected keys and values")
             except (ValueError, RecursionError) as error:
                 raise DeviceError(f"{meta}: is damaged ({shown(error)}); remove it if the folder holds no contacts yet") from error
-            if other := [key for key in about if before.get(key) != about[key]]:
+            other = [key for key in about if before.get(key) != about[key]]
+            if other and not (self.has_rest or self._has_contacts()):  # a start that failed; nothing is lost
+                write_json(meta, about | {"made_by": made_by(collect, inputs=about)})
+            elif other:
                 raise DeviceError(
                     f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another --out"
                 )
@@ -123,6 +127,11 @@ class Collection:
                 self._drop_torn_line(lines)
         if not table.is_file() or not table.read_text(encoding="utf-8"):
             write_text(table, ",".join(COLUMNS) + "\n")
+
+    def _has_contacts(self) -> bool:
+        """Whether the table holds more than its header, whatever that is."""
+        table = self.folder / TABLE
+        return table.is_file() and table.read_bytes().count(b"\n") > 1
 
     @property
     def count(self) -> int:

@@ -9,14 +9,14 @@ import pytest
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.reader import LiveSource, Picture
-from hardware.collect import COLUMNS, Collection, CollectPlan, WorkFrame, _Asked, collect, draw_contact
+from hardware.collect import COLUMNS, META, Collection, CollectPlan, WorkFrame, _Asked, collect, draw_contact
 from hardware.errors import DeviceError
 from hardware.rig_geometry import PlacedObject, matrix_of
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from training.design import least_sure, nearest_to_even
 from twin.frames import open_recording, read_image
 from twin.rig.mounting import Mounting
-from twin.types import Form
+from twin.types import Form, Frame
 
 LATE_S = 0.15  # of the late camera: a frame arrives so long after its exposure
 SCALE = 1e-2  # mm a gray level in the pictures of ``PoseCamera``
@@ -124,6 +124,16 @@ def test_another_collection_is_not_mixed_in(rig, tmp_path):
     run(rig, tmp_path, 1)
     with pytest.raises(DeviceError, match="seed"):
         Collection(tmp_path, {"seed": 2}, Form.RAW)
+
+
+def test_a_start_that_failed_before_the_first_frame_keeps_no_folder_for_itself(tmp_path):
+    """For example a wrong camera: the same command with the right one must not need another folder."""
+    Collection(tmp_path, {"seed": 1, "camera": "none"}, Form.RAW)
+    assert Collection(tmp_path, {"seed": 1, "camera": "another"}, Form.RAW).count == 0
+    assert json.loads((tmp_path / META).read_text())["camera"] == "another"
+    Collection(tmp_path, {"seed": 1, "camera": "another"}, Form.RAW).keep_rest(Frame(np.zeros((4, 4), np.uint8), Form.RAW))
+    with pytest.raises(DeviceError, match="made otherwise \\(camera\\)"):
+        Collection(tmp_path, {"seed": 1, "camera": "none"}, Form.RAW)
 
 
 def test_the_folder_is_a_recording(rig, tmp_path):

@@ -294,6 +294,12 @@ with locked(Path(sys.argv[1])):
 """
 
 
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder in which even root makes no file")
+def test_a_folder_that_takes_no_file_is_not_said_to_be_another_runs():
+    with pytest.raises(StoreError, match="no file can be made there"), locked(Path("/proc/self")):
+        pass
+
+
 def test_a_folder_is_held_by_one_run_and_let_go_of_when_that_is_killed(tmp_path):
     run = [sys.executable, "-c", HOLDER, str(tmp_path)]
     with subprocess.Popen(run, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True) as holder:

@@ -91,7 +91,16 @@ class Machine:
             lines += [f"  {kind}: {device.node} ({device.description})" for device in found]
             if not found:
                 lines.append(f"  {kind}: none found; {DEVICES[kind]}")
-        return lines
+        return [*lines, "", self._verdict()]
+
+    def _verdict(self) -> str:
+        """What can be done here, in a sentence."""
+        missing = [name for name, version in self.packages.items() if not version]
+        if missing or not self.can_render:
+            lacking = [*(["a way to render (see above)"] if not self.can_render else []), *missing]
+            return f"Not ready: this machine lacks {', '.join(lacking)}."
+        plain = " Pictures of the deformed skin are plain ones." if self.plain_pictures else ""
+        return f"Ready: frames can be rendered, read and learnt from.{plain} Next: twin demo --out out/demo"
 
     def _own_lines(self) -> list[str]:
         """The place of the program's own packages, or a line for each package if they lie in different places."""

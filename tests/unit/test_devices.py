@@ -28,5 +28,15 @@ def test_a_package_of_another_project_is_noticed():
     assert "scenes, twin, training in /a" in one.lines() and "kept results /kept" in one.lines()
 
 
+def test_a_diagnosis_ends_with_what_can_be_done():
+    def verdict(packages: dict[str, str], can_render: bool, plain: str = "") -> str:
+        return Machine(packages, [], can_render, plain, {}, {"twin": Path("/a")}, None).lines()[-1]
+
+    assert verdict({"torch": "2.13"}, True).startswith("Ready:") and "plain" not in verdict({"torch": "2.13"}, True)
+    assert "plain ones" in verdict({"torch": "2.13"}, True, "no EGL")
+    assert verdict({"torch": ""}, False).startswith("Not ready:") and "way to render" in verdict({"torch": ""}, False)
+    assert "torch" in verdict({"torch": ""}, True)
+
+
 def test_the_packages_of_this_program_are_found():
     assert _places() == dict.fromkeys(OWN, Path(__file__).parents[2])

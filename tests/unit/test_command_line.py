@@ -152,7 +152,12 @@ def test_what_could_not_be_let_go_of_is_printed_after_ctrl_c(monkeypatch, tmp_pa
     command = ["collect", "--camera", "twin", "--arm", "simulated", "--sensor", "mg400-331", "--out", str(tmp_path)]
     ended = CliRunner().invoke(command_line(), command)
     assert ended.exit_code == 130
-    assert ended.stderr.splitlines()[-2:] == ["twin: interrupted", "twin: note: stop failed: press its emergency stop"]
+    told = [
+        "twin: interrupted",
+        "twin: note: stop failed: press its emergency stop",
+        "twin: note: what is finished is kept; the same command goes on from there",
+    ]
+    assert ended.stderr.splitlines()[-3:] == told
 
 
 TRAIN = ["train", "--model", "gnn", "--sensor", "mg400-127", "--data", "nowhere", "--out", "nowhere/run"]

@@ -235,7 +235,7 @@ def contact(
     from twin.frames import frames_at
     from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
+    with overwriting(force), shown(goes_on=True) as progress:
         found = calibrate_to_file(
             frames_at(frames, table, no_contact),
             sensor_with(sensor, pipeline),
@@ -489,7 +489,7 @@ def robustness(
         rendered=rendered,
         jobs=jobs,
     )
-    with overwriting(force), shown() as progress:
+    with overwriting(force), shown(goes_on=True) as progress:
         found = degradation.run(plan, out, progress=progress)
     tell(found)
 

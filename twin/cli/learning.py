@@ -150,7 +150,7 @@ def dataset(
         quality=quality,
         across=across,
     )
-    with overwriting(force), shown() as progress:
+    with overwriting(force), shown(goes_on=True) as progress:
         made = simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, also=tuple(also or ()), progress=progress)
     tell(made)
 
@@ -233,7 +233,7 @@ def train(
     from twin.cli.progress import shown
     from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
+    with overwriting(force), shown(goes_on=True) as progress:
         made = train_model(
             model,
             sensor_with(sensor, pipeline),

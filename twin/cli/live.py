@@ -176,7 +176,7 @@ def collect_command(
         plain_light=plain_light,
         also=tuple(also or ()),
     )
-    with overwriting(force), signals_as_ctrl_c(), shown() as progress:
+    with overwriting(force), signals_as_ctrl_c(), shown(goes_on=True) as progress:
         collected = collect_frames(plan, out, progress=progress)
     say(collected.lines())
 

@@ -127,16 +127,28 @@ class Lines:
         self._watcher.join()
 
 
+GOES_ON = "what is finished is kept; the same command goes on from there"
+"""Note of an interrupted command that does."""
+
+
 @contextmanager
-def shown() -> Iterator[Told]:
-    """The ``Progress`` of a command: bars where stderr is a terminal, else lines."""
+def shown(*, goes_on: bool = False) -> Iterator[Told]:
+    """The ``Progress`` of a command: bars where stderr is a terminal, else lines.
+
+    ``goes_on``: the same command continues interrupted work, and Ctrl-C says so.
+    """
     console = Console(stderr=True)
-    if not console.is_terminal:
-        with Lines(sys.stderr) as lines:
-            yield lines
-        return
-    bars = Bars(console)
     try:
-        yield bars
-    finally:
-        bars.close()
+        if not console.is_terminal:
+            with Lines(sys.stderr) as lines:
+                yield lines
+            return
+        bars = Bars(console)
+        try:
+            yield bars
+        finally:
+            bars.close()
+    except KeyboardInterrupt as interrupt:
+        if goes_on:
+            interrupt.add_note(GOES_ON)
+        raise

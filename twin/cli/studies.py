@@ -146,7 +146,7 @@ def study_objects(
         epochs=epochs,
         workers=workers,
     )
-    with overwriting(force), shown() as progress:
+    with overwriting(force), shown(goes_on=True) as progress:
         found = objects.run(plan, out, progress=progress)
     tell(found)
 
@@ -240,7 +240,7 @@ def study_sim_to_real(
         workers=workers,
         across=across,
     )
-    with overwriting(force), shown() as progress:
+    with overwriting(force), shown(goes_on=True) as progress:
         found = sim_to_real.run(plan, out, progress=progress)
     tell(found)
 
@@ -313,6 +313,6 @@ def study_tac_vgnn(
         threads=threads,
         form=form,
     )
-    with overwriting(force), shown() as progress:
+    with overwriting(force), shown(goes_on=True) as progress:
         found = tac_vgnn.run(plan, out, progress=progress)
     tell(found)

@@ -166,6 +166,7 @@ def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path
     assert json.loads(cells[1].read_text())
 
 
+@pytest.mark.slow
 def test_two_processes_find_what_one_does(spec, frames, tmp_path):
     plan = replace(real_plan(spec, frames), severities=(0.0, 1.0))
     rows = [run_sweep(plan, tmp_path / str(jobs), jobs=jobs, progress=lambda done, total: None) for jobs in (1, 2)]

@@ -56,7 +56,7 @@ def test_no_contact_is_found_as_no_contact(straight, fit):
     assert np.linalg.norm(found.force_n) < rounding
 
 
-@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "sheared")) for name in POSES])
 def test_a_pressed_skin_is_recovered_from_its_pins(straight, fit, states, name):
     """The fit reproduces the given pins. Depth and axes follow from skin and gel alone, because nothing is known about the object."""
     pressed, (depth_mm, axis_deg, remainder_px) = states[name], MEDIANS[name]

@@ -6,7 +6,7 @@ import torch
 
 from scenes import load_sensor
 from training import two_sample as module
-from training.studies.realism import compare_with_renders
+from training.studies.realism import _verdict, compare_with_renders
 from training.two_sample import JUDGES, Judge, accuracy_text, judged, patch_corners, patch_network, real_halves, two_sample
 from twin.errors import FrameError, OptionError
 
@@ -93,3 +93,9 @@ def test_each_judge_tells_what_it_tells_alone():
 def test_a_thorough_test_that_is_left_out_is_an_error(tmp_path):
     with pytest.raises(OptionError, match="--thorough adds to the two-sample test, but --no-two-sample leaves it out"):
         compare_with_renders(tmp_path, load_sensor("ur5-331"), tmp_path / "out", test=False, thorough=True)
+
+
+def test_the_verdict_names_what_differs_and_what_fits_it():
+    assert _verdict(0.05, {"level": True, "edge_px": True}).endswith("within 5 % of the real ones at every radius")
+    one, two = _verdict(0.05, {"level": True, "edge_px": False}), _verdict(0.05, {"level": False, "edge_px": False})
+    assert "the caps' edge differs" in one and "the caps' level, edge differ " in two and "twin calibrate optics" in one

@@ -49,7 +49,18 @@ class Realism:
                 f"pin error from the labels: {error['test']:.2f} px on unseen frames ({error['fitted']:.2f} px on those fitted to)"
             )
             lines.append(_image_line("pose-aligned, unseen", metrics["frames"] // 2, poses["test_images"]))
-        return lines
+        return [*lines, _verdict(**found["target"])]
+
+
+def _verdict(relative: float, met: dict[str, bool]) -> str:
+    """Whether the caps look as the real ones do at every radius, and else what to do."""
+    missed = [name.removesuffix("_px") for name, reached in met.items() if not reached]
+    if not missed:
+        return f"verdict: level, diameter and edges of the caps are within {100 * relative:.0f} % of the real ones at every radius"
+    return (
+        f"verdict: the caps' {', '.join(missed)} {'differ' if len(missed) > 1 else 'differs'} from the real ones by more than {100 * relative:.0f} % "
+        "at some radius; 'twin calibrate optics' fits them"
+    )
 
 
 @writes("index.html", "metrics.json", "frames.csv", "radial.csv", "spectrum.csv", "spots.csv", "pictures")

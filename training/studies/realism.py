@@ -57,9 +57,10 @@ def _verdict(relative: float, met: dict[str, bool]) -> str:
     missed = [name.removesuffix("_px") for name, reached in met.items() if not reached]
     if not missed:
         return f"verdict: level, diameter and edges of the caps are within {100 * relative:.0f} % of the real ones at every radius"
+    verb = "differ" if len(missed) > 1 else "differs"
     return (
-        f"verdict: the caps' {', '.join(missed)} {'differ' if len(missed) > 1 else 'differs'} from the real ones by more than {100 * relative:.0f} % "
-        "at some radius; 'twin calibrate optics' fits them"
+        f"verdict: the caps' {', '.join(missed)} {verb} from the real ones by more than {100 * relative:.0f} % at some radius; "
+        "'twin calibrate optics' fits them"
     )
 
 

@@ -12,14 +12,15 @@ import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from importlib import metadata
 from pathlib import Path
 from time import perf_counter
+from unittest.mock import patch
 
 from bench_gpu import gpu_name
 
@@ -272,17 +273,9 @@ def run(made: Job, path: Path = FIGURES, work: Path = WORK) -> Measured:
     return found
 
 
-@contextmanager
-def without_rendering() -> Iterator[None]:
+def without_rendering() -> AbstractContextManager[object]:
     """Context in which the renderer refuses to trace a path, in this process and in all that it starts."""
-    before = os.environ.get("TACTIP_VARIANT")
-    os.environ["TACTIP_VARIANT"] = "none, because this figure is said to need no picture"
-    try:
-        yield
-    finally:
-        del os.environ["TACTIP_VARIANT"]
-        if before is not None:
-            os.environ["TACTIP_VARIANT"] = before
+    return patch.dict(os.environ, TACTIP_VARIANT="none, because this figure is said to need no picture")
 
 
 def machine(gpu: bool = False) -> str:

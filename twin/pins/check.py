@@ -115,12 +115,13 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
         seen.append(pipeline(frame))
         if progress:
             progress(k + 1, len(frames))
+    nominal = nominal_reference(spec, form)
     findings = [
         _layout(frames, spec),
         _pins(seen, pipeline),
         _spots(seen, pipeline),
-        *_place(seen, nominal_reference(spec, form)),
-        *_twin(spec, form),
+        *_place(seen, nominal),
+        *_twin(spec, form, nominal),
     ]
     return (
         findings
@@ -259,7 +260,7 @@ def _place(seen: list[Observation], nominal: Reference) -> list[Finding]:
     ]
 
 
-def _twin(spec: SensorSpec, form: Form) -> list[Finding]:
+def _twin(spec: SensorSpec, form: Form, nominal: Reference) -> list[Finding]:
     """Finding about the specification alone: whether its camera sees the pins at rest where they were measured. None if they were not.
 
     Pins are found from where they were measured; the twin draws them where lengths and camera put them. Therefore both can be wrong
@@ -268,8 +269,8 @@ def _twin(spec: SensorSpec, form: Form) -> list[Finding]:
     blob = spec.pipeline.raw if form == Form.RAW else spec.pipeline.recording
     if blob is None or not blob.rest_px:
         return []
-    found, drawn_px = nominal_reference(spec, form), from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm))
-    rms, pitch = float(np.sqrt(np.mean(np.sum((found.pins_px - drawn_px) ** 2, axis=1)))), float(np.mean(found.spacing_px))
+    drawn_px = from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm))
+    rms, pitch = float(np.sqrt(np.mean(np.sum((nominal.pins_px - drawn_px) ** 2, axis=1)))), float(np.mean(nominal.spacing_px))
     text = f"the specification's camera sees its pins at rest {rms:.1f} px (rms), {rms / pitch:.2f} pitches, from where they were measured"
     remedy = (
         "lengths in mm, camera and rest_px do not belong together: the twin's pictures are not of this sensor; make the specification anew "

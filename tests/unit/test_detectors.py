@@ -1,15 +1,19 @@
 """Every detector finds the pins of an easy frame; tuning needs no knowledge but the layout, and its file says it all."""
 
+import pickle
+import re
+
 import cv2
 import numpy as np
 import pytest
 from drawn_frames import draw_discs, drawn_frame, smooth_warp
 
 from scenes import load_sensor
-from twin.errors import FrameError
+from twin.errors import FrameError, OptionError
 from twin.frames.forms import known_frames
 from twin.geometry.pins import pin_lattice
 from twin.pins import METHODS, load_detector, make_detector, shipped_detector, tune, write_detector
+from twin.pins.own_finder import own_detector, own_name, own_places
 from twin.pins.reference import nominal_reference
 from twin.pins.tune_files import tune_on_frames
 from twin.types import Form, Frame
@@ -152,3 +156,79 @@ def test_wrong_files_are_refused_by_name(spec, tmp_path):
     tuned = shipped_detector(spec, Form.RAW).model_copy(update={"pins_px": ((0.0, 0.0),)})
     with pytest.raises(FrameError, match="tuned for 1 pins"):
         make_detector(spec, tuned)
+
+
+OWN = """
+import cv2
+
+def my_pins(image):
+    gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    count, _, stats, middle = cv2.connectedComponentsWithStats((gray > 80).astype("uint8"))
+    return middle[1:][stats[1:, cv2.CC_STAT_AREA] < 200]
+
+def by_rows(image):
+    return [(1.0, 2.0, 3.0)]
+
+def careless(image):
+    return 1 / int(image.max() < 10)
+
+def blind(image):
+    return []
+"""
+
+
+@pytest.fixture
+def own_file(tmp_path):
+    """A user's functions in a file."""
+    path = tmp_path / "mine.py"
+    path.write_text(OWN)
+    return path
+
+
+def test_a_function_of_the_user_is_a_detector_like_the_others(spec, own_file):
+    detector = own_detector(f"{own_file}:my_pins", spec, Form.RAW)
+    rest = nominal_reference(spec, Form.RAW).pins_px
+    frame = Frame(draw_discs(known_frames(spec).size_px[Form.RAW], rest, 4.0, level=(20, 140), blur_px=0.8), Form.RAW, "drawn")
+    found = make_detector(spec, detector)(frame)
+    assert detector.name == "my_pins" and found.valid
+    np.testing.assert_allclose(found.pins_px, rest, atol=0.5)
+    assert pickle.loads(pickle.dumps(detector)) == detector  # it goes to other processes
+    assert detector.stricter(20.0) == detector
+
+
+def test_a_failing_function_is_a_result_and_says_why(spec, own_file):
+    frame = Frame(np.full(known_frames(spec).size_px[Form.RAW][::-1], 128, np.uint8), Form.RAW, "gray")
+    for name, why in (
+        ("by_rows", r"by_rows returned an array \(1, 3\)"),
+        ("careless", "careless failed: ZeroDivisionError"),
+        ("blind", "too few pins: 0"),
+    ):
+        found = make_detector(spec, own_detector(f"{own_file}:{name}", spec, Form.RAW))(frame)
+        assert not found.valid and re.search(why, found.reason)
+
+
+def test_a_changed_file_is_another_detector(spec, own_file):
+    before = own_detector(f"{own_file}:blind", spec, Form.RAW)
+    own_file.write_text(OWN.replace("return []", "return [(5.0, 6.0)]"))
+    after = own_detector(f"{own_file}:blind", spec, Form.RAW)
+    assert before != after
+    frame = Frame(np.zeros((9, 9), np.uint8), Form.RAW, "dark")
+    assert len(own_places(before, frame)) == 0 and own_places(after, frame).tolist() == [[5.0, 6.0]]
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "said"),
+    [
+        (None, "my_pins", "can't be read"),
+        ("def other(image): ...", "my_pins", "has no function 'my_pins'; it has: other"),
+        ("import no_such_package", "my_pins", "No module named 'no_such_package'"),
+        ("raise SystemExit(3)", "my_pins", "SystemExit"),
+        ("def my_pins(", "my_pins", "SyntaxError"),
+    ],
+)
+def test_a_function_that_is_not_there_is_named(tmp_path, content, name, said):
+    path = tmp_path / "mine.py"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(OptionError, match=re.escape(said)):
+        own_name(f"{path}:{name}")

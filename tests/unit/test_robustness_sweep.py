@@ -1,8 +1,10 @@
 """Measures against planted errors, envelopes against known crossings, and a sweep end to end that goes on where it was."""
 
+import csv
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from drawn_frames import drawn_frame, smooth_warp
@@ -10,12 +12,13 @@ from plain_sensor import changed
 from sound_page import read_sound_page
 
 from scenes import load_sensor
+from training.studies import degradation
 from twin.errors import TwinError
 from twin.judge.degradation.condition import Case
 from twin.judge.degradation.conditions import CONDITIONS
 from twin.judge.degradation.envelope import Envelope, crossing, curves_of, envelopes_of, shares_of
 from twin.judge.degradation.measures import MEASURES, judge_shot
-from twin.judge.degradation.plan import SweepPlan, load_plan
+from twin.judge.degradation.plan import ConditionPlan, SweepPlan, load_plan
 from twin.judge.degradation.report import _share_row, compare
 from twin.judge.degradation.shots import DegradedShot, RealSource
 from twin.judge.degradation.study import check_pipelines, consensus, study
@@ -270,6 +273,7 @@ def test_pipelines_are_checked_before_the_work(tmp_path):
         (["magic"], "magic: give one of twin"),
         ([str(tmp_path / "none.toml")], "No such file"),
         (["twin", "twin"], "a name of its own"),
+        ([f"{tmp_path}/none.py:pins"], "none.py can't be read"),
     ):
         with pytest.raises(TwinError, match=says):
             check_pipelines(names)
@@ -277,3 +281,40 @@ def test_pipelines_are_checked_before_the_work(tmp_path):
         with pytest.raises(TwinError, match="--model: each needs a name of its own"):
             check_pipelines(["twin"], models)
     check_pipelines(["twin"], ("run", "other"))
+
+
+MINE = """
+import cv2
+
+def my_pins(image):
+    gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    count, _, stats, middle = cv2.connectedComponentsWithStats((gray > LEVEL).astype("uint8"))
+    return middle[1:][stats[1:, cv2.CC_STAT_AREA] < 400]
+
+def careless(image):
+    raise ValueError("not today")
+"""
+
+
+def test_code_of_the_user_is_judged_like_the_others(spec, frames, tmp_path):
+    mine, recording = tmp_path / "mine.py", tmp_path / "frames"
+    recording.mkdir()
+    for frame in frames:
+        cv2.imwrite(str(recording / f"{frame.name}.png"), frame.image)
+    sweep = SweepPlan(steps=(1.0,), condition=(ConditionPlan(name="hot-pixels"),))
+    level = int(np.mean([np.percentile(frame.image, 50) + frame.image.max() for frame in frames]) / 2)
+    mine.write_text(f"LEVEL = {level}\n{MINE}")
+    out = tmp_path / "out"
+    out.mkdir()
+
+    def recall(name):
+        plan = degradation.Plan(spec, pipelines=(f"{mine}:{name}",), sweep=sweep, frames=recording, rendered=False)
+        degradation.run(plan, out)
+        rows = list(csv.DictReader((out / "frames.csv").read_text().splitlines()))
+        return {float(row["severity"]): float(row["recall"]) for row in rows if row["pipeline"] == name}
+
+    assert recall("my_pins")[0.0] == 1.0
+    mine.write_text(f"LEVEL = 256\n{MINE}")  # the same function finds nothing now
+    assert recall("my_pins")[0.0] == 0.0
+    with pytest.raises(TwinError, match=r"undegraded frame .*: careless failed: ValueError: not today"):
+        recall("careless")

@@ -273,3 +273,28 @@ def test_a_file_that_a_run_goes_on_from_is_left_to_that_run(tmp_path: Path) -> N
     (tmp_path / "state").write_text("damaged")
     with output(tmp_path, gone_on=("state",)):
         assert (tmp_path / "state").read_text() == "damaged"
+
+
+@pytest.mark.parametrize("wrote", [False, True])
+def test_a_failed_run_leaves_no_empty_folder(tmp_path: Path, wrote: bool) -> None:
+    folder = tmp_path / "new" / "out"
+
+    @writes(*NAMES)
+    def fails(out: Path) -> None:
+        if wrote:
+            write_text(out / "table.csv", "half")
+        raise ValueError("no such sensor")
+
+    with pytest.raises(ValueError, match="no such sensor"):
+        fails(folder)
+    assert folder.exists() == wrote and (tmp_path / "new").exists() == wrote
+    (tmp_path / "there").mkdir()
+    with pytest.raises(ValueError, match="no such sensor"):
+        fails(tmp_path / "there")
+    assert (tmp_path / "there").exists()  # it was not made by the run
+
+
+def test_a_failed_run_leaves_no_empty_folder_around_a_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no fit"), output_file(tmp_path / "new" / "mine.toml"):
+        raise ValueError("no fit")
+    assert not (tmp_path / "new").exists()

@@ -35,7 +35,7 @@ class Plan:
     ----------
     sensor : SensorSpec
     pipelines : tuple of str
-        Methods, or files of 'twin tune'.
+        Methods, files of 'twin tune', or functions of yours as ``FILE.py:FUNCTION`` (``twin.pins.own_finder``).
     models : tuple of Path
         Folders of runs.
     sweep : SweepPlan

@@ -430,6 +430,12 @@ ones, which tells how much of a sound sensor's margin this sensor has left.
 Rendered frames are swept for that, too; --no-rendered leaves this out.
 
 \b
+Code of your own that finds pins is judged, too: --pipeline mine.py:my_pins
+takes the function my_pins of the file. It is given the picture of a frame
+(uint8, gray or RGB) and returns the places (n, 2) of the pins it finds, x and
+y in px, in any order.
+
+\b
 A file for --conditions:
   steps = [0.1, 0.3, 1.0]               # severities
   pairs = [["leds-dim", "noise"]]       # conditions that grow together
@@ -442,7 +448,7 @@ Examples:
   twin robustness --sensor ur5-331 --pipeline twin --pipeline legacy \\
       --out out/robustness
   twin robustness --sensor ur5-331 --frames recordings/mine \\
-      --pipeline mine.toml --out out/mine
+      --pipeline mine.toml --pipeline mine.py:my_pins --out out/mine
 """
 
 
@@ -460,7 +466,11 @@ def robustness(
     out: Out,
     pipeline: Annotated[
         list[str] | None,
-        typer.Option("--pipeline", metavar="P", help="twin, legacy, adaptive, fixed, simple, log, dog, doh, or a file of 'twin tune'"),
+        typer.Option(
+            "--pipeline",
+            metavar="P",
+            help="twin, legacy, adaptive, fixed, simple, log, dog, doh, a file of 'twin tune', or your own as FILE.py:FUNCTION",
+        ),
     ] = None,
     model: Annotated[list[Path] | None, typer.Option("--model", metavar="RUN", help="folder of a trained model")] = None,
     conditions: Annotated[

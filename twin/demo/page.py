@@ -193,7 +193,8 @@ def _tables_section(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> Non
         "Against real recordings: displacement by depth",
         "Mean displacement of all pins on a flat plate, in pixels of the uncropped camera frame. Measured: the Tac-VGNN release's "
         "recordings, pure presses in 1 mm bins. Simulated: true cap positions at the middle of each bin, with nominal stiffness; the "
-        "hexagonal sensor's camera distance and pin spacing were chosen with these figures in view.",
+        "hexagonal sensor's camera distance and pin spacing were chosen with these figures in view. The differences are those of a skin "
+        "that is not calibrated: 'twin calibrate contact' fits skin and arm to a recording, and docs/results says how small they are then.",
     )
     columns = [
         Column("indent_mm", "indentation", "mm", decimals=1),

@@ -1,9 +1,12 @@
 """Detectors: objects that find pins in a frame. All have the same interface, which gives places, labelled pins and a graph.
 
-The detectors are this program's pipeline, the published method, and plain blob detectors of OpenCV and scikit-image.
+The detectors are this program's pipeline, the published method, plain blob detectors of OpenCV and scikit-image, and functions of the
+user.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import cv2
@@ -17,10 +20,11 @@ from twin.camera.capture import record
 from twin.errors import FrameError
 from twin.frames.forms import frame_size, from_raw, gray_levels, recording_to_raw
 from twin.pins.blobs import Mask, circular_mask, threshold
-from twin.pins.detector_spec import DetectorSpec, with_detector
+from twin.pins.detector_spec import OWN, DetectorSpec, with_detector
 from twin.pins.graph import make_graph
 from twin.pins.legacy import LegacyPipeline, legacy_graph
 from twin.pins.matching import match
+from twin.pins.own_finder import own_places
 from twin.pins.pipeline import MIN_FOUND, Pipeline
 from twin.pins.reference import Reference, nominal_reference
 from twin.types import Form, Frame, PinGraph
@@ -73,6 +77,9 @@ class Found:
     reason: str = ""
 
 
+Places = Callable[[Frame], tuple[np.ndarray, np.ndarray]]
+
+
 class Detector(Protocol):
     """Finds pins in frames of one form."""
 
@@ -105,7 +112,10 @@ def make_detector(sensor: SensorSpec, detector: DetectorSpec, *, second_look: bo
     reference = nominal_reference(sensor, detector.form)
     if detector.method == "twin":
         return TwinDetector(sensor, detector, second_look=second_look)
-    return PlainDetector(frame_size(sensor, detector.form), detector, reference)
+    blob = detector.blob
+    mask = circular_mask(frame_size(sensor, detector.form), blob.mask_center_px, blob.mask_radius_px)
+    places = partial(_own, detector) if detector.method == OWN else partial(_masked, detector, mask)
+    return MatchedDetector(detector, places, reference)
 
 
 class TwinDetector:
@@ -123,19 +133,29 @@ class TwinDetector:
         return make_graph("voronoi", nodes_px, outmost=self._pipeline.reference.outmost)
 
 
-class PlainDetector:
-    """A plain blob detector. Its blobs are matched to the pins as in the pipeline, so that only the method of finding blobs differs."""
+class MatchedDetector:
+    """A detector that gives places. They are matched to the pins as in the pipeline, so that only the method of finding them differs.
 
-    def __init__(self, size_px: tuple[int, int], spec: DetectorSpec, reference: Reference) -> None:
-        self.spec, self._reference = spec, reference
-        self._mask = circular_mask(size_px, spec.blob.mask_center_px, spec.blob.mask_radius_px)
+    Parameters
+    ----------
+    spec : DetectorSpec
+    places : callable
+        From a frame to the places (K, 2), px, and areas (K,), px^2, of its blobs. Raises ``FrameError`` if it can't find any.
+    reference : Reference
+    """
+
+    def __init__(self, spec: DetectorSpec, places: Places, reference: Reference) -> None:
+        self.spec, self._places, self._reference = spec, places, reference
 
     def __call__(self, frame: Frame) -> Found:
-        window = np.ascontiguousarray(gray_levels(np.ascontiguousarray(frame.image[self._mask.window])))
-        px, area = find(window, self._mask, self.spec)
         count = len(self._reference.pins_px)
+        lost = np.full((count, 2), np.nan)
+        try:
+            px, area = self._places(frame)
+        except FrameError as error:
+            return Found(np.zeros((0, 2)), lost, None, count, False, str(error))
         if len(px) > MOST_BLOBS * count:
-            return Found(px, np.full((count, 2), np.nan), None, count, False, f"too many blobs: {len(px)}")
+            return Found(px, lost, None, count, False, f"too many blobs: {len(px)}")
         found = match(self._reference, px, area)
         paired = found.blob >= 0
         pins_px = np.full((count, 2), np.nan)
@@ -178,6 +198,17 @@ class LegacyDetector:
             return legacy_graph(nodes - np.median(nodes), self._pipeline.parameters)
         except QhullError:
             return None
+
+
+def _masked(detector: DetectorSpec, mask: Mask, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Places and areas of the blobs in a frame's mask."""
+    return find(np.ascontiguousarray(gray_levels(np.ascontiguousarray(frame.image[mask.window]))), mask, detector)
+
+
+def _own(detector: DetectorSpec, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Places of the user's function. All have the area of a usual cap, because the function tells none."""
+    px = own_places(detector, frame)
+    return px, np.full(len(px), np.pi * detector.radius_px[0] * detector.radius_px[1])
 
 
 def find(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:

@@ -29,6 +29,8 @@ METHODS: dict[Method, str] = {
     "doh": "scikit-image's determinant of Hessian",
 }
 assert set(METHODS) == set(get_args(Method))
+OWN: Literal["own"] = "own"
+"""Method of a detector that uses a function of the user; it has no parameters and can't be tuned."""
 # Assumed block, px, and offset, gray levels, of a recorder's threshold, because frames do not show how they were thresholded. The values
 # are those of the published TacTip recordings' recorder.
 UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET = 61, -5.0
@@ -70,7 +72,7 @@ class DetectorSpec(Section):
     name : str
         The file's stem; not a key of the file.
     method : str
-        A key of ``METHODS``, which describes each method.
+        A key of ``METHODS``, which describes each method; or ``OWN``.
     form : {"raw", "recording"}
         Form of the frames.
     size_px : (width, height), optional
@@ -86,10 +88,12 @@ class DetectorSpec(Section):
         Pins at rest that the tuning found, in the specification's order; if empty, the specification's own layout is used.
     evidence : Evidence, optional
         Evidence for the reliability of the tuning.
+    finder, finder_digest : str
+        With ``OWN``: the function as ``FILE.py:FUNCTION``, and a digest of the file.
     """
 
     name: Name
-    method: Method
+    method: Method | Literal["own"]
     form: Annotated[Form, Field(strict=False)] = Form.RAW  # not strict, because files hold the form as text
     size_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = None
     blob: BlobSpec
@@ -97,10 +101,12 @@ class DetectorSpec(Section):
     recording: RecordingSpec | None = None
     pins_px: tuple[tuple[float, float], ...] = ()
     evidence: Evidence | None = None
+    finder: str = ""
+    finder_digest: str = ""
 
     def stricter(self, levels: float) -> "DetectorSpec":
-        """The same parameters with a threshold that is stricter by this number of gray levels."""
-        if not levels:
+        """The same parameters with a threshold that is stricter by this number of gray levels. A function of the user has none."""
+        if not levels or self.method == OWN:
             return self
         if self.method == "legacy" and self.recording is not None:
             moved = self.recording.model_copy(update={"threshold_offset": self.recording.threshold_offset - levels})

@@ -49,7 +49,8 @@ def overwriting(wanted: bool = True) -> Iterator[None]:
 def output(folder: Path, *names: str, gone_on: tuple[str, ...] = ()) -> Iterator[None]:
     """Context that reserves a folder for this run, which writes files or folders with the given names into it.
 
-    The folder is created if missing. A run may open a folder again that it has already reserved.
+    The folder is created if missing, and removed if the run fails before it has written anything. A run may open a folder again that it
+    has already reserved.
 
     Parameters
     ----------
@@ -66,7 +67,7 @@ def output(folder: Path, *names: str, gone_on: tuple[str, ...] = ()) -> Iterator
         If the folder can't be written to, if another run uses it, if it contains a file with one of these names that this program did not
         write or that has changed since, or if the disk becomes full during the work.
     """
-    with _held_once(folder), _told(folder):
+    with _unmade_if_empty(folder), _held_once(folder), _told(folder):
         every = (*names, *gone_on)
         written = _require_ours(folder, every)
         _write_list(folder, written | dict.fromkeys(every, _ANY))
@@ -81,7 +82,8 @@ def output(folder: Path, *names: str, gone_on: tuple[str, ...] = ()) -> Iterator
 def output_file(path: Path, *beside: str) -> Iterator[None]:
     """Context that checks first that a file can be written, and enters it into the list of its folder at the end.
 
-    The folder is created if missing. It is not reserved in between, because it may be the user's working folder.
+    The folder is created if missing, and removed if it is still empty after an error. It is not reserved in between, because it may be the
+    user's working folder.
 
     Parameters
     ----------
@@ -95,7 +97,7 @@ def output_file(path: Path, *beside: str) -> Iterator[None]:
         As ``output``.
     """
     folder, names = path.parent, [glob.escape(path.name), *(glob.escape(path.stem) + ending for ending in beside)]
-    with _told(path):
+    with _unmade_if_empty(folder), _told(path):
         with _held_once(folder, wait_s=_WAIT_S):
             _write_list(folder, _require_ours(folder, names))
         try:
@@ -230,6 +232,22 @@ def _write_list(folder: Path, content: dict[str, str]) -> None:
     path = write_json(folder / WRITTEN, dict(sorted(content.items())))
     if not content:  # the list was still written, because this tests whether the folder can be written
         path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _unmade_if_empty(folder: Path) -> Iterator[None]:
+    """Context that removes the folders again which were made in it, if it ends with an error and nothing was written there."""
+    made = [each for each in (folder, *folder.parents) if not os.path.exists(each)]
+    try:
+        yield
+    except BaseException:
+        with suppress(StoreError, OSError):  # another run is at work there, or a parent holds something
+            if made and not contents(folder):
+                with locked(folder):
+                    (folder / LOCK).unlink()
+                    for each in made:
+                        each.rmdir()
+        raise
 
 
 @contextmanager

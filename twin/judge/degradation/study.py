@@ -19,6 +19,8 @@ from twin.judge.degradation.report import write_report
 from twin.judge.degradation.shots import CONTACTS, RealSource, RenderedSource
 from twin.judge.degradation.sweep import Models, Plan
 from twin.pins import METHODS, DetectorSpec, load_detector, make_detector, shipped_detector, tune, write_detector
+from twin.pins.detector_spec import OWN
+from twin.pins.own_finder import is_own, own_detector, own_name, own_places
 from twin.progress import Progress, Step, silent, stage
 from twin.store import Item, inputs_digest
 from twin.types import Form, Frame
@@ -78,7 +80,8 @@ def real_study(
     with bar("tuning") as step:
         detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
         judges = choose_pipelines(["twin", "adaptive"], spec, frames, out / "pipelines", step)
-    source, notes = consensus(spec, frames, list(dict.fromkeys((*detectors, *judges))))
+    built_in = [each for each in detectors if each.method != OWN]  # what is judged must not say what is true
+    source, notes = consensus(spec, frames, list(dict.fromkeys((*built_in, *judges))))
     notes += recording.notes()
     usable = tuple(c for c in cases if c.image_level and (recording.form == Form.RAW or _on_frames(c)))
     if not usable:
@@ -131,39 +134,52 @@ def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
     Parameters
     ----------
     names : list of str
-        Methods, or files of detectors.
+        Methods, files of detectors, or functions of the user (``FILE.py:FUNCTION``).
     models : tuple of str
         Names of the models, whose rows are in the same tables as those of the pipelines.
 
     Raises
     ------
     TwinError
-        A name is neither a method nor a readable file, or two names are the same.
+        A name is neither a method nor a readable file or function, or two names are the same.
     """
     for name in names:
-        if name not in METHODS and Path(name).suffix != ".toml":
-            raise OptionError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a .toml file written by 'twin tune'")
-    called = [name if name in METHODS else load_detector(Path(name)).name for name in names]
+        if name not in METHODS and Path(name).suffix != ".toml" and not is_own(name):
+            raise OptionError(
+                f"--pipeline {name}: give one of {', '.join(METHODS)}, a .toml file written by 'twin tune', or a function of yours as "
+                "FILE.py:FUNCTION"
+            )
+    called = [_name_of(name) for name in names]
     if len(set(called)) < len(called):
-        raise OptionError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files")
+        raise OptionError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files or functions")
     if len({*called, *models}) < len(called) + len(models):
         raise OptionError(f"--model: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
 
 
+def _name_of(name: str) -> str:
+    """How a pipeline is called in the tables."""
+    if is_own(name):
+        return own_name(name)
+    return name if name in METHODS else load_detector(Path(name)).name
+
+
 def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], folder: Path, progress: Step) -> tuple[DetectorSpec, ...]:
-    """Detectors by file or by method. Ours is that of the specification; others are tuned on undegraded frames and stored in ``folder``.
+    """Detectors by file, by method or by function. Ours is that of the specification; others are tuned on undegraded frames and stored in
+    ``folder``.
 
     Raises
     ------
     TwinError
-        A file cannot be read. `check_pipelines` finds this before any work is done.
+        A file cannot be read (`check_pipelines` finds this before any work is done), or a function fails on the first undegraded frame.
     """
     folder.mkdir(parents=True, exist_ok=True)
     chosen, inputs = [], inputs_digest(spec, [frame.image for frame in frames])
     for k, name in enumerate(names):
         progress(k, len(names))
         method = next((known for known in METHODS if known == name), None)
-        if method is None:
+        if is_own(name):
+            chosen.append(_tried(own_detector(name, spec, frames[0].form), frames[0]))
+        elif method is None:
             chosen.append(load_detector(Path(name)))
         elif method == "twin":
             chosen.append(shipped_detector(spec, frames[0].form))
@@ -176,6 +192,15 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
             chosen.append(load_detector(kept).model_copy(update={"name": method}))
         progress(k + 1, len(names))
     return tuple(chosen)
+
+
+def _tried(detector: DetectorSpec, frame: Frame) -> DetectorSpec:
+    """A detector whose function works on an undegraded frame. On degraded frames its failure is a result."""
+    try:
+        own_places(detector, frame)
+    except FrameError as error:
+        raise OptionError(f"--pipeline {detector.finder}, on the undegraded frame {frame.name}: {error}") from error
+    return detector
 
 
 def consensus(spec: SensorSpec, frames: list[Frame], detectors: list[DetectorSpec]) -> tuple[RealSource, list[str]]:

@@ -160,9 +160,20 @@ def test_the_sizes_of_caps_decide_how_rings_are_spaced_where_contacts_blur_their
     swing = 2.5 * np.sin(np.pi * np.linalg.norm(away, axis=1, keepdims=True))  # px, as other spacings and lenses move pins
     seen = middle + (swing if spacing == "polar" else -swing) * away
     sizes = 2 * np.sqrt(np.abs(np.linalg.det(plane))) * np.random.default_rng(0).normal(1, 0.04, len(plane))
-    found, _ = _camera(start, seen, "made", sizes)
+    found, _, _ = _camera(start, seen, "made", sizes)
     assert found.pins.spacing == spacing
     assert found.pins.cap_diameter_mm == pytest.approx(cap_mm, rel=0.06)
+
+
+def test_other_cameras_that_fit_as_well_are_named():
+    """Pins at rest alone are seen alike by a pinhole and a fisheye, unless their spacing is one that only one of them explains."""
+    start = load_sensor("ur5-331")
+    seen = project(start.view, rest_pins(start.geometry).caps_mm)
+    _, _, others = _camera(start, seen + np.random.default_rng(0).normal(0, 0.5, seen.shape), "given", None)
+    assert any(words.startswith("fisheye") for words in others)
+    away = (seen - seen[0]) / np.linalg.norm(seen - seen[0], axis=1).max()
+    _, _, others = _camera(start, seen + 2.5 * np.sin(np.pi * np.linalg.norm(away, axis=1, keepdims=True)) * away, "given", None)
+    assert not others
 
 
 def test_without_a_no_contact_frame_a_rest_layout_is_made_and_said():

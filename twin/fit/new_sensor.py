@@ -224,7 +224,7 @@ def new_sensor(
         start = start if radius_mm is None else of_radius(start, radius_mm)
         with stage(progress, "camera"):
             sizes_px = _sizes(best, images) if looked[0].form == Form.RAW else None
-            fitted, camera = _camera(start, np.where((best.there >= STEADY)[:, None], rest.pins_px, np.nan), rest.source, sizes_px)
+            fitted, camera, others = _camera(start, np.where((best.there >= STEADY)[:, None], rest.pins_px, np.nan), rest.source, sizes_px)
         with stage(progress, "pins") as step:
             tuned = tune(looked, fitted, known=best, rest=rest, progress=step)
         sensor = _with_usual_caps(_with_pipeline(fitted, tuned.detector), looked)
@@ -232,7 +232,7 @@ def new_sensor(
         odd = list(dict.fromkeys([*odd, *recording.notes(), *_doubtful(camera, rest, len(looked))]))
         health, pictures = _health(sensor, looked[0].form, judged, folder)
         size = _size(sensor, given=radius_mm is not None)
-        known, assumed, steps = _told(sensor, found, rest, camera, tuned, health, recording.labels)
+        known, assumed, steps = _told(sensor, found, rest, camera, others, tuned, health, recording.labels)
         known, assumed = ((*known, size), assumed) if radius_mm is not None else (known, (size, *assumed))
         write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
         page = _page(folder, sensor, found, health, pictures, known, assumed, steps, odd)
@@ -344,7 +344,9 @@ def _sizes(layout: Candidate, images: list[np.ndarray]) -> np.ndarray:
     return np.where(some, np.nanmedian(np.where(some, found, 0.0), axis=0), np.nan)
 
 
-def _camera(start: SensorSpec, pins_px: np.ndarray, source: str, sizes_px: np.ndarray | None) -> tuple[SensorSpec, CameraReport]:
+def _camera(
+    start: SensorSpec, pins_px: np.ndarray, source: str, sizes_px: np.ndarray | None
+) -> tuple[SensorSpec, CameraReport, tuple[str, ...]]:
     """The camera model and the pin spacing that explain the pins at rest and the caps' sizes best.
 
     Pinhole and fisheye lenses and both spacings are tried, and a simpler model is preferred (see ``BETTER``). Pins at rest alone hardly
@@ -359,9 +361,17 @@ def _camera(start: SensorSpec, pins_px: np.ndarray, source: str, sizes_px: np.nd
         Origin of these pins: ``Rest.source``.
     sizes_px : (N,) float, optional
         Diameters of the caps, NaN where unknown.
+
+    Returns
+    -------
+    fitted : SensorSpec
+    report : CameraReport
+    others : tuple of str
+        Other cameras that explain the pins about as well, in words.
     """
     sd_px = MODEL_PX if source != "made" else max(MODEL_PX, MADE_SD * usual_spacing(pins_px))
-    best: tuple[float, SensorSpec, CameraReport] | None = None
+    tried: list[tuple[float, SensorSpec, CameraReport]] = []
+    best = 0
     for projection, spacing in (("perspective", "polar"), ("perspective", "plan"), ("fisheye", "polar"), ("fisheye", "plan")):
         pins = start.pins.model_copy(update={"spacing": spacing})
         camera = start.camera
@@ -379,10 +389,18 @@ def _camera(start: SensorSpec, pins_px: np.ndarray, source: str, sizes_px: np.nd
         fitted, report = fit_camera(trial, pins_px, free=FITTED_FISHEYE if projection == "fisheye" else FITTED_PINHOLE, named=True)
         fitted, uneven = _with_sizes(fitted, sizes_px)
         misfit = float(np.hypot(report.rms_px / sd_px, uneven / SIZE_SD))
-        if best is None or misfit < BETTER * best[0]:
-            best = misfit, fitted, report
-    assert best is not None
-    return best[1:]
+        tried.append((misfit, fitted, report))
+        if misfit < BETTER * tried[best][0]:
+            best = len(tried) - 1
+    least = min(misfit for misfit, _, _ in tried)
+    others = [each for k, (misfit, each, _) in enumerate(tried) if k != best and misfit * BETTER <= least]
+    return tried[best][1], tried[best][2], tuple(_camera_words(each) for each in others)
+
+
+def _camera_words(sensor: SensorSpec) -> str:
+    """Kind of lens and focal length of a sensor's camera."""
+    lens = "fisheye" if sensor.camera.projection == "fisheye" else "pinhole"
+    return f"{lens}, focal length {sensor.camera.fx_px:.0f} px"
 
 
 def _with_sizes(sensor: SensorSpec, sizes_px: np.ndarray | None) -> tuple[SensorSpec, float]:
@@ -486,16 +504,23 @@ def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
 
 
 def _told(
-    sensor: SensorSpec, found: Identified, rest: Rest, camera: CameraReport, tuned: Tuned, health: Health, labels: dict[str, np.ndarray]
+    sensor: SensorSpec,
+    found: Identified,
+    rest: Rest,
+    camera: CameraReport,
+    other_cameras: tuple[str, ...],
+    tuned: Tuned,
+    health: Health,
+    labels: dict[str, np.ndarray],
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """What the frames determine, what is assumed, and how to learn more."""
-    lens = "fisheye" if sensor.camera.projection == "fisheye" else "pinhole"
     evidence = tuned.detector.evidence
     known = (
         f"Layout: {found.best.line()}",
         rest.line(),
-        f"camera: {lens}, focal length {sensor.camera.fx_px:.0f} px, middle ({sensor.camera.cx_px:.0f}, {sensor.camera.cy_px:.0f}) px; "
-        f"it sees the {camera.pins} pins at rest within {camera.rms_px:.2f} px (rms)",
+        f"camera: {_camera_words(sensor)}, middle ({sensor.camera.cx_px:.0f}, {sensor.camera.cy_px:.0f}) px; "
+        f"it sees the {camera.pins} pins at rest within {camera.rms_px:.2f} px (rms)"
+        + (f"; about as well: {', or '.join(dict.fromkeys(other_cameras))}" if other_cameras else ""),
         f"pin detection: {evidence.sure if evidence else 'unsure'}; "
         + (
             f"spots of {sensor_blob(sensor, tuned).spot_sigma_px:g} px"

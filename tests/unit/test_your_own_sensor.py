@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from drawn_frames import drawn_frame
+from drawn_frames import drawn_frame, smooth_warp
 from scipy.spatial import cKDTree
 from test_identify import RADIUS, SIZE, frames_of, rest_of
 
@@ -220,6 +220,18 @@ def test_a_layout_that_was_given_and_is_wrong_is_told_which_one_is_right():
     with pytest.raises(FrameError, match="they show 61 pins in 4 rings; leave --layout out"):
         _given(PinsSpec(rings=2), images)
     assert _given(PINS, images).sure
+
+
+def test_a_layout_of_no_known_kind_is_asked_for(tmp_path):
+    """Rings of 8, 16 and 24 pins: the frame without contact is not what is wrong."""
+    places = [(0.0, 0.0)] + [(5.2 * r * np.cos(a), 5.2 * r * np.sin(a)) for r in (1, 2, 3) for a in np.arange(8 * r) * np.pi / (4 * r)]
+    spec = load_sensor("mg400-331")
+    spec = spec.model_copy(update={"pins": PinsSpec(layout="positions", positions=tuple(places))})
+    rest = project(spec.view, rest_pins(spec.geometry).caps_mm)
+    warped = (rest if k == 0 else smooth_warp(rest, 3.0, np.random.default_rng(k)) for k in range(4))
+    folder = folder_of(tmp_path, [drawn_frame(spec, Form.RAW, px).image for px in warped], ["init_0.png", "a.png", "b.png", "c.png"])
+    with pytest.raises(FrameError, match=r"layout is not recognised.*--layout positions:FILE.csv"):
+        new_sensor(folder, tmp_path / "mine.toml")
 
 
 def test_places_that_do_not_count_from_the_axis_are_refused():

@@ -216,10 +216,17 @@ def new_sensor(
                 f"{enough} pins are seen in most frames, as {best.pins.in_words()}: too few, a camera is fitted to {LEAST_PINS} or more; "
                 "give frames in which more pins are bright, not thresholded if the light fades towards the rim"
             )
-        given = recording.reference
-        rest = rest_of(
-            best, [frame.name for frame in looked], None if given is None else gray_levels(given.image), given.name if given else ""
-        )
+        given, names = recording.reference, [frame.name for frame in looked]
+        known_name, known_gray = (given.name, gray_levels(given.image)) if given is not None else ("", None)
+        try:
+            rest = rest_of(best, names, known_gray, known_name)
+        except FrameError as error:
+            if found.sure:
+                raise
+            raise FrameError(
+                f"the layout is not recognised: the likeliest, {best.line()}, and {known_name} does not show it. If {known_name} shows no "
+                "contact, give the layout with --layout; one of no known kind as --layout positions:FILE.csv"
+            ) from error
         start = _started(out.stem, looked[0], best.pins, rest, frames.name)
         start = start if radius_mm is None else of_radius(start, radius_mm)
         with stage(progress, "camera"):

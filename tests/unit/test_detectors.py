@@ -57,7 +57,7 @@ def tuned(spec, foreign):
     return tune(foreign[0], spec)
 
 
-@pytest.mark.parametrize("method", [pytest.param(name, marks=pytest.mark.slow if name == "doh" else ()) for name in METHODS])
+@pytest.mark.parametrize("method", [pytest.param(name, marks=pytest.mark.slow if name in ("doh", "log") else ()) for name in METHODS])
 def test_every_method_tunes_itself_and_finds_the_pins(spec, foreign, method):
     frames, truths = foreign
     detector = tune(frames, spec, method).detector

@@ -43,14 +43,14 @@ def test_an_undamaged_sensor_has_no_bad_finding():
     ("name", "severity", "finding"),
     [
         ("exposure-low", 0.35, "brightness"),
-        ("exposure-high", 0.4, "saturation"),
+        pytest.param("exposure-high", 0.4, "saturation", marks=pytest.mark.slow),
         ("defocus", 0.15, "focus"),
         ("glare", 0.4, "glare"),
-        ("room-light", 0.5, "stray light"),
+        pytest.param("room-light", 0.5, "stray light", marks=pytest.mark.slow),
         ("caps-missing", 0.1, "pins"),
         ("camera-shifted", 0.1, "shift"),
-        ("camera-rolled", 0.08, "turn"),
-        ("camera-zoomed", 0.2, "scale"),
+        pytest.param("camera-rolled", 0.08, "turn", marks=pytest.mark.slow),
+        pytest.param("camera-zoomed", 0.2, "scale", marks=pytest.mark.slow),
     ],
 )
 def test_a_planted_fault_is_named(name, severity, finding):

@@ -179,9 +179,9 @@ def test_stray_light_and_specks_do_not_change_the_layout():
     [
         pytest.param(PinsSpec(rings=10), PinsSpec(rings=9), marks=pytest.mark.slow),
         (PinsSpec(rings=6), PinsSpec(rings=4)),
-        (PinsSpec(rings=5), PinsSpec(rings=6)),
+        pytest.param(PinsSpec(rings=5), PinsSpec(rings=6), marks=pytest.mark.slow),
         (PinsSpec(rings=6), PinsSpec(layout="hexagon", rings=4)),
-        (PinsSpec(layout="hexagon", rings=6), PinsSpec(rings=6)),
+        pytest.param(PinsSpec(layout="hexagon", rings=6), PinsSpec(rings=6), marks=pytest.mark.slow),
     ],
     ids=lambda p: p.in_words(),
 )

@@ -59,6 +59,7 @@ def test_without_any_llvm_the_scalar_variant_renders_and_says_what_to_install():
     assert out.startswith("scalar_rgb") and "libllvm19" in out
 
 
+@pytest.mark.slow
 def test_one_process_renders_with_one_backend_after_the_other():
     """Some functions of Mitsuba stay those of the first backend; what is rendered must not use them."""
     vectorised = variant.choose_variant("mono").backend

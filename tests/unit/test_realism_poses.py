@@ -77,6 +77,7 @@ def test_a_known_rig_is_recovered_from_its_pins(start):
     )
 
 
+@pytest.mark.slow
 def test_the_second_round_corrects_the_polynomials_errors():
     """Pins that differ from the polynomial by a constant: only the second round corrects this."""
     labels, off_px = spread(12), np.array([1.5, -0.7])

@@ -341,6 +341,9 @@ FUZZ = {
 }
 
 
+SLOW_FUZZ = ("turned", "16 bits", "masked", "colour")
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -95,6 +95,10 @@ def prints(root: Path, names=KEEPERS) -> dict[str, str]:
 def test_a_changed_line_of_the_solver_is_other_code_for_all_that_was_solved(tree):
     before, after = prints(ROOT), prints(tree((SOLVER, "\nclass SkinSolver", "\nNEW = 1\n\n\nclass SkinSolver")))
     assert all(before[name] != after[name] for name in SOLVED)
+    carried = prints(
+        tree(("twin/mechanics/newton.py", "raise NoConvergence(balance.relative)", "raise NoConvergence(2 * balance.relative)"))
+    )
+    assert all(before[name] != carried[name] for name in SOLVED), "the solver decides by the number that the error carries"
     untouched = ("twin.geometry.solid", "twin.mechanics.skin_fit", "twin.optics.render", "twin.objects.mesh_field", "twin.pins.tune")
     assert all(before[name] == after[name] for name in untouched), "these compute nothing with the solver"
 
@@ -103,6 +107,7 @@ HARMLESS = {
     "a help text": ("twin/cli/learning.py", 'help="', 'help="Now: '),
     "a docstring": (SOLVER, '"""', '"""Otherwise said. '),
     "the explanation of a constant": ("twin/mechanics/newton.py", '"""Convergence threshold', '"""Otherwise said: convergence threshold'),
+    "what an error says": (SOLVER, 'raise ContactError(f"', 'raise ContactError(f"Otherwise said: '),
     "a comment": (SOLVER, "\nclass SkinSolver", "\n# A remark.\nclass SkinSolver"),
     "formatting": (SOLVER, "import Callable, Iterator", "import (\n    Callable,\n    Iterator,\n)"),
     "how results are kept": ("twin/store/atomic.py", "import errno", "import errno\n\nNEW = 1"),

@@ -2,9 +2,9 @@
 
 Modules are found by the import statements in their files, including those in functions. A name that a package re-exports is followed to
 the module that defines it, so the package's other modules don't count. The fingerprint of a module is that of its syntax tree without
-strings that stand alone, which are docstrings and explanations of constants; comments and formatting are not in the tree. Therefore a
-changed formula changes the fingerprint, and a changed explanation does not. The texts of the command line are in ``twin.cli``, which no
-computing module imports.
+strings that stand alone, which are docstrings and explanations of constants, and without what a raised error says, because a computation
+that raises has no result. Comments and formatting are not in the tree. Therefore a changed formula changes the fingerprint, and a changed
+explanation or error does not. The texts of the command line are in ``twin.cli``, which no computing module imports.
 """
 
 import ast
@@ -233,7 +233,10 @@ def _imports(tree: ast.Module, module: str, is_package: bool) -> tuple[tuple[_Fr
 
 
 def _flatten(node: ast.AST, lines: list[str]) -> None:
-    """Append a syntax tree as text, without strings that stand alone, line numbers and empty fields."""
+    """Append a syntax tree as text, without strings that stand alone, what raised errors say, line numbers and empty fields."""
+    if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+        given = [part for part in node.exc.args if not _is_words(part)]
+        node = ast.Raise(ast.Call(node.exc.func, given, node.exc.keywords), node.cause)
     lines.append(f"({type(node).__name__}")
     for name in node._fields:
         value = getattr(node, name, None)
@@ -252,6 +255,13 @@ def _flatten(node: ast.AST, lines: list[str]) -> None:
         elif value is not None:
             lines.append(f" {name}={value!r}")
     lines.append(")")
+
+
+def _is_words(part: ast.expr) -> bool:
+    """Whether an expression is a literal text, or several that are joined. A number that an error carries is not."""
+    if isinstance(part, ast.BinOp):
+        return isinstance(part.op, ast.Add) and (_is_words(part.left) or _is_words(part.right))
+    return isinstance(part, ast.JoinedStr) or (isinstance(part, ast.Constant) and isinstance(part.value, str))
 
 
 def _is_text(part: object) -> bool:

@@ -4,6 +4,8 @@ BIN := $(VENV)/bin
 DEMO := out/demo
 OUT ?= $(DEMO)
 export TACTIP_REAL ?= ../shared/real
+# one more than cores, because tests of devices often wait
+WORKERS ?= $(shell expr $$(nproc) + 1)
 SCRIPT := PYTHONPATH=$(CURDIR):$(CURDIR)/tests:$(CURDIR)/tests/helpers:$(CURDIR)/tests/bench $(BIN)/python
 
 .PHONY: help setup demo test golden bench figures film tables docs validate lint types wheel clean
@@ -25,7 +27,7 @@ demo: setup      ## the main job: press, render, detect, graph; pictures and a p
 	@$(BIN)/twin demo --out $(OUT) $(if $(filter $(DEMO),$(OUT)),--force)
 
 test: setup      ## run the tests; at the end which took longest
-	@$(BIN)/python -m pytest -n auto --dist loadfile --durations=15 --durations-min=1
+	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --durations=15 --durations-min=1
 
 golden: setup    ## make the golden renders anew (after a wanted change of the pictures; look at them in out/golden)
 	@$(SCRIPT) tests/golden/make.py --pictures out/golden

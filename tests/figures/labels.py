@@ -1,7 +1,10 @@
 """On six recordings: what the twin is worth by the number of labelled frames, and whether shipped intervals hold what they say."""
 
+import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +20,7 @@ from training.studies.sim_to_real.worth import worth
 from training.targets import unit_of
 from twin.frames import open_recording
 from twin.report.charts import write_chart
+from twin.store import write_json
 
 RECORDINGS = {  # by recording: sensor, experiment, contacts, elements across, minutes on two idle cores
     "tac-vgnn-331": ("mg400-331", "surface-2d", 300, 20, 20.0),
@@ -32,11 +36,32 @@ CHARTS = ROOT / "docs" / "pictures"
 CHART_DPI = 90
 
 
+def draw(work: Path, plan: Plan, seed: int) -> list[dict[str, Any]]:
+    """Rows of one draw of frames. A draw that was measured before the work was interrupted is read."""
+    kept = work / f"draw-{seed}.json"
+    if not kept.is_file():
+        write_json(kept, worth(plan, work / "worth", (seed,)))
+    rows: list[dict[str, Any]] = json.loads(kept.read_text())
+    return rows
+
+
+def over_draws(draws: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """One row for each model and number of labels: the mean of its errors, and of ``KEY_most`` the largest."""
+    by_row: dict[tuple[object, ...], list[dict[str, Any]]] = {}
+    for row in (row for rows in draws for row in rows):
+        by_row.setdefault((row["trained_on"], row["model"], row["labelled_frames"]), []).append(row)
+    found = []
+    for rows in by_row.values():
+        errors = {key: [row[key] for row in rows] for key, value in rows[0].items() if isinstance(value, float)}
+        found.append(rows[0] | {key: max(each) if key.endswith("_most") else float(np.mean(each)) for key, each in errors.items()})
+    return found
+
+
 def by_labels(work: Path, *, recording: str) -> Measured:
     """Mean errors over the draws of frames, the largest for ``Plan.labels`` labels, and their chart."""
     sensor, experiment, count, across, _ = RECORDINGS[recording]
     plan = Plan(load_sensor(sensor), real_folder(recording), load_experiment(experiment), count=count, across=across, workers=2)
-    rows = worth(plan, work / "worth", SEEDS)
+    rows = over_draws([draw(work, plan, seed) for seed in SEEDS])
     CHARTS.mkdir(parents=True, exist_ok=True)
     write_chart(CHARTS / f"labels-{recording}.png", lambda: errors_figure(rows, plan.experiment.targets), dpi=CHART_DPI)
     found = {}

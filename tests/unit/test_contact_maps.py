@@ -12,7 +12,7 @@ from training.models.part import OneFrame
 from training.models.touch.model import TOUCH
 from training.packed import pack
 from training.recipes import TrainingError
-from training.studies.evaluation import Predictions, write_frame_maps
+from training.studies.prediction import Predictions, write_frame_maps
 from twin.errors import StoreError
 from twin.geometry.mesh import build_mesh
 from twin.mechanics.skin_map import SIDE, ContactMaps, between_nodes, skin_grid

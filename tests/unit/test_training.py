@@ -22,7 +22,7 @@ from training.pins import PinTable
 from training.recipes import TrainingError
 from training.run import fold_rows, is_finished, train_run, training_rows
 from training.run_files import read_tensors
-from training.studies.evaluation import Predictions
+from training.studies.prediction import Predictions
 from twin.errors import FrameError, warn_once
 from twin.pins import Pipeline, nominal_reference
 from twin.store import contents

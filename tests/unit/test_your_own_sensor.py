@@ -14,7 +14,7 @@ from test_identify import RADIUS, SIZE, frames_of, rest_of
 from scenes import load_sensor
 from scenes.pins import PinsSpec
 from training.estimator import PoseEstimator
-from training.studies.evaluation import predict_frames
+from training.studies.prediction import predict_frames
 from twin.camera.projection import project
 from twin.errors import FrameError, OptionError, TwinError
 from twin.fit.camera_pose import CameraReport
@@ -373,3 +373,17 @@ def test_without_a_no_contact_frame_shipped_weights_count_from_their_units_pins(
     cv2.imwrite(str(tmp_path / "init_0.png"), image)
     again = predict_frames(name, tmp_path)
     assert not any("no-contact" in problem for problem in again.recording.problems)
+
+
+@pytest.mark.parametrize("inside", [False, True], ids=["beside the picture", "where a recording has it"])
+def test_a_single_picture_is_counted_from_the_frame_without_contact_of_its_folder(tmp_path, inside):
+    model = PoseEstimator.load("mg400-127")
+    rest = np.array(model.recorded_sensor.pipeline.recording.rest_px) + [1.0, -2.0]  # this unit's camera looks a little elsewhere
+    folder = tmp_path / "frames_bw" if inside else tmp_path
+    folder.mkdir(exist_ok=True)
+    cv2.imwrite(str(tmp_path / "init_0.png"), drawn_frame(model.sensor, Form.RECORDING, rest).image)
+    cv2.imwrite(str(folder / "f_0.png"), drawn_frame(model.sensor, Form.RECORDING, smooth_warp(rest, 3.0, np.random.default_rng(0))).image)
+    alone, of_folder = predict_frames("mg400-127", folder / "f_0.png"), predict_frames("mg400-127", tmp_path)
+    assert "pins are counted from init_0.png, which lies beside the picture" in alone.recording.problems
+    ((_, one),), ((_, other),) = list(alone), list(of_folder)
+    np.testing.assert_array_equal(one.value, other.value)

@@ -1,8 +1,7 @@
-"""Use of trained models on recordings: estimates of the pose in every frame, and a model's errors on labelled frames."""
+"""A trained model's errors on labelled frames."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,87 +10,22 @@ import numpy as np
 from training.contact_estimator import ContactEstimator, contacts_folder
 from training.contact_maps import judge_maps
 from training.dataset import Dataset, joined, load_dataset, told_apart
-from training.displacements import MOST_CONTACTS, OTHER_UNIT
-from training.estimator import PoseEstimate, PoseEstimator, folder_of
+from training.displacements import OTHER_UNIT
+from training.estimator import PoseEstimator, folder_of
 from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
 from training.identity import changed_since, learnt_before
 from training.recipes import TrainingError
 from training.simulated import is_simulated
 from training.slip import Eyes, drags_of, gone_through, judge_slip, random_places
-from twin.camera.projection import project
-from twin.errors import FrameError
-from twin.frames import Recording, evenly_read, open_recording
-from twin.frames.forms import from_raw
-from twin.mechanics.skin_map import ContactMaps
-from twin.pins.batch import recording_reference
+from twin.frames import open_recording
 from twin.progress import Progress, silent, stage
-from twin.report.contact_maps import SkinPicture, draw_contact_maps
 from twin.report.table import write_table
-from twin.store import output, write_npz, writes
-from twin.types import Frame
+from twin.store import writes
 
 # Choices of the rows to judge.
 ROWS = ("validation", "all")
 # Choices of the labels that count as truth.
 LABELS = ("corrected", "raw")
-# Length, mm, of the vector by which the direction of a shear traction is projected into the frame.
-ARROW_MM = 1e-3
-
-
-@dataclass(frozen=True)
-class Predictions:
-    """Estimates of a recording's frames, as an iterable. Each estimate is made when the iteration reaches its frame.
-
-    Attributes
-    ----------
-    estimator : PoseEstimator or ContactEstimator
-    recording : Recording
-    maps : Path or None
-        Folder into which the contact maps of each frame are written (see ``write_frame_maps``), if they are wanted.
-    """
-
-    estimator: PoseEstimator | ContactEstimator = field(repr=False)
-    recording: Recording = field(repr=False)
-    maps: Path | None = None
-
-    def __iter__(self) -> Iterator[tuple[str, PoseEstimate]]:
-        """The name of each frame and its estimate."""
-        with nullcontext() if self.maps is None else output(self.maps, "*.npz", "*.png"):
-            warm = False
-            for frame in self.recording:
-                if not warm:
-                    # loads or compiles code, which must not count in a frame's time; a copy is used, so that no memory changes
-                    self.estimator.remembering()(frame)
-                    warm = True
-                if self.maps is None or not isinstance(self.estimator, PoseEstimator):
-                    yield frame.name, self.estimator(frame)
-                    continue
-                made, maps = self.estimator.contact_maps(frame)
-                if maps is not None:
-                    write_frame_maps(self.maps, self.estimator, frame, maps)
-                yield frame.name, made
-
-    def lines(self) -> Iterator[str]:
-        """Lines of text: irregularities of the recording, each frame's pose as soon as it is estimated, and the frames that can't be read.
-
-        Raises
-        ------
-        FrameError
-            At the end, if no frame gave a pose.
-        """
-        told, poses, reasons = len(self.recording.problems), 0, []
-        yield from (f"note: {problem}" for problem in [*self.recording.problems, *self.estimator.caveats])
-        for name, made in self:
-            yield f"{name}: {_said(made)}"
-            poses += made.valid
-            if not made.valid:
-                reasons.append(f"{name}: {made.reason}")
-        yield from (f"note: {problem}" for problem in self.recording.problems[told:])
-        for bad in self.recording.failed:
-            yield f"skipped {bad['image_name']}: {bad['reason']}"
-            reasons.append(f"{bad['image_name']}: {bad['reason']}")
-        if not poses:
-            raise FrameError(f"{self.recording.path}: none of {len(self.recording)} frames gave a pose ({reasons[0]}); give other frames")
 
 
 def models_of_kinds(run: str | Path, frames: str | Path) -> ContactEstimator | None:
@@ -126,74 +60,6 @@ def _slip_errors(estimator: PoseEstimator, parts: Sequence[Dataset], chosen: set
     return asdict(judge_slip(estimator.slip, ways)) if ways else None
 
 
-def write_frame_maps(folder: Path, estimator: PoseEstimator, frame: Frame, maps: ContactMaps) -> list[Path]:
-    """Write the contact maps of one frame: arrays as ``NAME.npz``, a picture as ``NAME.png``. NAME is the frame's name without suffix.
-
-    The arrays are ``nodes_mm`` (G, 3), ``nodes_px`` (G, 2) in the frame, ``area_mm2`` (G,), ``force_n`` (G, 3), ``pressure_mpa`` (G,),
-    ``traction_mpa`` (G, 3) and ``patch`` (G,), of the grid's nodes, and ``resultant_n`` (3,) and ``torque_z_nmm``.
-    """
-    spec, name = estimator.sensor, Path(frame.name).stem
-    along = maps.traction_mpa / np.maximum(np.linalg.norm(maps.traction_mpa, axis=1, keepdims=True), 1e-12)
-    nodes_px, ends_px = (
-        from_raw(spec.recording, estimator.form, project(spec.view, places)) for places in (maps.nodes_mm, maps.nodes_mm + ARROW_MM * along)
-    )
-    arrays = {key: getattr(maps, key) for key in ("nodes_mm", "area_mm2", "force_n", "pressure_mpa", "traction_mpa", "patch")}
-    totals = {"resultant_n": maps.resultant_n, "torque_z_nmm": np.array(maps.torque_z_nmm)}
-    write_npz(folder / f"{name}.npz", arrays | totals | {"nodes_px": nodes_px})
-    shear = np.linalg.norm(maps.traction_mpa, axis=1)
-    shown = SkinPicture(frame.image, nodes_px, ends_px, maps.nodes_mm, maps.pressure_mpa, shear, maps.least_mpa)
-    force = ", ".join(f"{axis} {value:.2f}" for axis, value in zip("xyz", maps.resultant_n, strict=True))
-    draw_contact_maps(folder / f"{name}.png", shown, f"{frame.name}: force {force} N")
-    return [folder / f"{name}.npz", folder / f"{name}.png"]
-
-
-def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = None, sequence: bool = False) -> Predictions:
-    """Estimate the poses in the frames at a path with a trained model.
-
-    If the model uses displacements from rest and the recording has a frame without contact, displacements are computed from that frame.
-
-    Parameters
-    ----------
-    run : path
-        Path or name as for ``PoseEstimator.load``.
-    frames : path
-        Path as for ``open_recording``.
-    maps : path, optional
-        Folder for the contact maps of each frame.
-    sequence : bool
-        The frames are consecutive, so slip is also estimated (``PoseEstimator.remembering``).
-
-    Raises
-    ------
-    TrainingError
-        There is no such run, or contact maps or slip are requested and the run has no model of them.
-    FrameError
-        There are no such frames, or they belong to another sensor.
-    """
-    several = models_of_kinds(run, frames)
-    estimator = several or PoseEstimator.load(run)
-    recording = open_recording(frames, estimator.sensor, estimator.form)
-    if estimator.counts_from_rest:
-        if recording.reference is not None:
-            estimator = estimator.at_rest(recording.reference)
-        else:
-            recording_reference(estimator.recorded_sensor, recording, recording.problems)
-            estimator, other = estimator.at_rest_of(evenly_read(recording, MOST_CONTACTS))
-            recording.problems += [OTHER_UNIT] if other else []
-    if maps is not None:
-        if not isinstance(estimator, PoseEstimator):
-            raise TrainingError(f"{run}: models of several kinds of contact have no contact maps; leave --maps out")
-        estimator.require_maps()
-    if sequence:
-        if not isinstance(estimator, PoseEstimator) or estimator.slip is None:
-            raise TrainingError(
-                f"{run}: does not tell slip; train touch on simulated drags ('twin dataset --experiment drag --randomise drag "
-                "--states all'), or leave --sequence out"
-            )
-        estimator = estimator.remembering()
-    return Predictions(estimator, recording, maps)
-
-
 def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
     """A recording without a no-contact frame, relative to the pins at rest estimated from its contacts; other recordings unchanged."""
     if not estimator.counts_from_rest or is_simulated(data.folder):
@@ -204,17 +70,6 @@ def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
     if other is None:
         return data
     return replace(data, pins=replace(data.pins, reference=other, measured=True), problems=[*data.problems, OTHER_UNIT])
-
-
-def _said(made: PoseEstimate) -> str:
-    if not made.valid:
-        return f"not valid: {made.reason}"
-    rows = zip(made.names, made.units, made.value, made.low, made.high, strict=True)
-    pose = ", ".join(f"{name} {value:.3f} {unit} [{low:.3f}, {high:.3f}]" for name, unit, value, low, high in rows)
-    moved = "" if made.executed != made.executed else f", move executed {made.executed:.2f}"  # NaN: the model does not estimate it
-    kind = f"{made.contact}: " if made.contact else ""
-    notes = "".join(f"; {note}" for note in made.notes)
-    return f"{kind}{pose}{moved} ({made.ms:.1f} ms){notes}"
 
 
 @dataclass(frozen=True)

@@ -309,8 +309,8 @@ def evaluate(
 
 HELP_PREDICT = """Tell the pose in every frame, with its 90 % interval.
 
-The model contains its sensor and pipeline, and a frame of another sensor is refused. If a recording has a frame without contact
-(init_0.png), the pins are counted from that frame. The exit code is 0 if at least one frame gave a pose.
+The model contains its sensor and pipeline, and a frame of another sensor is refused. If there is a frame without contact (init_0.png) in
+the recording or beside a single picture, the pins are counted from that frame. The exit code is 0 if at least one frame gave a pose.
 
 With --maps DIR it also writes, for each frame, the pressure and the shear over the skin, the contact patch and the deformed skin: arrays
 (NAME.npz) and a picture (NAME.png). The model must be touch and have learnt from simulated contacts.
@@ -337,7 +337,7 @@ def predict(
     no_contact: NoContact = None,
     force: Force = False,
 ) -> None:
-    from training.studies.evaluation import predict_frames
+    from training.studies.prediction import predict_frames
     from twin.frames import frames_at
     from twin.store import overwriting
 

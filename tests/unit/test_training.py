@@ -22,6 +22,7 @@ from training.pins import PinTable
 from training.recipes import TrainingError
 from training.run import fold_rows, is_finished, train_run, training_rows
 from training.run_files import read_tensors
+from training.studies.evaluation import Evaluation
 from training.studies.prediction import Predictions
 from twin.errors import FrameError, warn_once
 from twin.pins import Pipeline, nominal_reference
@@ -331,3 +332,12 @@ def test_the_time_of_an_estimate_is_without_that_of_compiling():
 
     frames = [SimpleNamespace(name=name) for name in "ab"]
     assert list(Predictions(Counting(), frames)) == [("a", 2), ("b", 3)] and seen == ["a", "a", "b"]
+
+
+def test_labels_that_were_not_corrected_are_not_called_so():
+    def lines(raw, corrected):
+        errors = {kind: {"pose_2": {"mae": mae, "coverage_90": 0.9}} for kind, mae in (("raw", raw), ("corrected", corrected))}
+        return Evaluation(errors | {"leak_slope": None, "ms_per_frame": None}, [], {"pose_2": "mm"}, 3, [], []).lines()
+
+    assert "corrected" not in lines(0.1, 0.1)[0] and "0.1 mm" in lines(0.1, 0.1)[0]
+    assert "0.2 mm against corrected labels, 0.1 against raw" in lines(0.1, 0.2)[0]

@@ -105,6 +105,10 @@ class Evaluation:
         lines = [f"note: {problem}" for problem in self.problems]
         for name, unit in self.units.items():
             raw, corrected = self.metrics["raw"][name], self.metrics["corrected"][name]
+            if raw == corrected:
+                inside = f"{100 * raw['coverage_90']:.1f} % inside the 90 % intervals"
+                lines.append(f"{name}: mean error {raw['mae']:.4g} {unit}; {inside}")
+                continue
             lines.append(
                 f"{name}: mean error {corrected['mae']:.4g} {unit} against corrected labels, {raw['mae']:.4g} against raw; "
                 f"{100 * corrected['coverage_90']:.1f} % and {100 * raw['coverage_90']:.1f} % inside the 90 % intervals for them"

@@ -40,15 +40,20 @@ class RenderedContact:
 
     state: ContactState
     shot: Shot
+    look: Look
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """The result as lines of text: force, contact area and number of visible caps."""
+        """The result as lines of text: force, contact area and number of visible caps, and what the pipeline finds of them."""
         force = self.state.force_n.round(2) + 0.0  # 0.0 turns negative zeros into positive ones
         visible = self.shot.truth.visible
+        seen = self.look.observation
+        found = f"the pipeline finds {seen.found} of {len(seen.pins_px)} pins in the picture"
+        useless = f"note: the pipeline can't use the picture: {seen.reason}; 'twin check' tells where the specification is wrong"
         return [
             f"force {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f} N, contact area {self.state.area_mm2:.1f} mm2, "
-            f"{int(visible.sum())} of {len(visible)} caps in sight"
+            f"{int(visible.sum())} of {len(visible)} caps in sight",
+            found if seen.valid else useless,
         ]
 
 
@@ -95,18 +100,14 @@ def render_contact(
     with stage(progress, "render"):
         shot = simulator.shoot(state, form=form, seed=seed)
     with stage(progress, "pictures"):
-        written = write_contact(out, simulator, touched, pose, state, shot)
-    return RenderedContact(state, shot, written)
+        written, look = write_contact(out, simulator, touched, pose, state, shot)
+    return RenderedContact(state, shot, look, written)
 
 
-def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: Pose, state: ContactState, shot: Shot) -> list[Path]:
-    """Write all files of one contact into a folder.
-
-    Returns
-    -------
-    list of Path
-        The written files.
-    """
+def write_contact(
+    out: Path, simulator: Simulator, touched: ObjectSpec, pose: Pose, state: ContactState, shot: Shot
+) -> tuple[list[Path], Look]:
+    """Write all files of one contact into a folder. Returns the files, and what the pipeline sees in the picture."""
     spec = simulator.spec
     write_image(out / "frame.png", shot.frame.image)
     write_exr(out / "frame.exr", shot.linear, simulator.renderer.choice)
@@ -120,7 +121,7 @@ def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: Po
     look = look_at(simulator, shot)
     title = f"{spec.name} against {touched.name}, {pose.indent_mm:g} mm deep, {state.force_n[2]:.2f} N"
     save_figure(out / "panel.png", contact_panel(out / "skin.png", look, title), dpi=110)
-    return [out / name for name in FILES]
+    return [out / name for name in FILES], look
 
 
 def contact_arrays(state: ContactState) -> dict[str, FloatArray]:

@@ -7,6 +7,7 @@ import pytest
 
 from scenes import load_object, load_sensor
 from twin.mechanics.path import ContactPose
+from twin.one_contact import render_contact
 from twin.pins.graph import make_graph
 from twin.pins.pipeline import Pipeline
 from twin.pins.reference import nominal_reference
@@ -100,3 +101,13 @@ def test_the_same_contact_gives_the_same_frame(simulators):
     assert np.array_equal(states[0].nodes_mm, states[1].nodes_mm)
     shots = [simulator.shoot(state, seed=3) for state in states]
     assert np.array_equal(shots[0].frame.image, shots[1].frame.image)
+
+
+def test_a_picture_in_which_the_pipeline_finds_no_pins_is_said(tmp_path):
+    """The mask of this sensor looks beside the pins."""
+    spec = load_sensor("mg400-127")
+    aside = spec.pipeline.raw.model_copy(update={"mask_center_px": (60.0, 60.0), "mask_radius_px": 50.0})
+    blind = spec.model_copy(update={"pipeline": spec.pipeline.model_copy(update={"raw": aside})})
+    for sensor, word in ((spec, "127 of 127 pins in the picture"), (blind, "note: the pipeline can't use the picture: too few pins")):
+        made = render_contact(sensor, load_object("sphere"), ContactPose(indent_mm=1.0), tmp_path / sensor.name, quality="drawn")
+        assert word in made.lines()[1]

@@ -34,7 +34,7 @@ def own_name(text: str) -> str:
         There is no such file or function, or the file raises an error when it is run.
     """
     path, name = _parts(text)
-    _function(path, name, _digest(text))
+    _function(path, name, _digest(path))
     return name
 
 
@@ -48,8 +48,10 @@ def own_detector(text: str, spec: SensorSpec, form: Form) -> DetectorSpec:
     OptionError
         As `own_name`.
     """
-    name, (path, _) = own_name(text), _parts(text)
-    own = {"name": name, "method": OWN, "finder": f"{path}:{name}", "finder_digest": _digest(text)}
+    path, name = _parts(text)
+    digest = _digest(path)
+    _function(path, name, digest)
+    own = {"name": name, "method": OWN, "finder": f"{path}:{name}", "finder_digest": digest}
     return shipped_detector(spec, form).model_copy(update=own)
 
 
@@ -85,13 +87,12 @@ def _parts(text: str) -> tuple[Path, str]:
     return Path(file).resolve(), name
 
 
-def _digest(text: str) -> str:
+def _digest(path: Path) -> str:
     """Of the file's content."""
-    path, _ = _parts(text)
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
     except OSError as error:
-        raise OptionError(f"{text}: {path.name} can't be read ({error.strerror}); give FILE.py:FUNCTION") from error
+        raise OptionError(f"{path} can't be read ({error.strerror}); give FILE.py:FUNCTION") from error
 
 
 @cache
@@ -100,7 +101,7 @@ def _function(path: Path, name: str, digest: str) -> Callable[[np.ndarray], Any]
     described = importlib.util.spec_from_file_location(f"tactip_own_{digest}", path)
     if described is None or described.loader is None:
         raise OptionError(f"{path}: is no Python file; give FILE.py:FUNCTION")
-    if _digest(f"{path}:{name}") != digest:
+    if _digest(path) != digest:
         raise OptionError(f"{path}: was changed during the work; give the same command again")
     module = importlib.util.module_from_spec(described)
     if str(path.parent) not in sys.path:

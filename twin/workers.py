@@ -11,7 +11,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -146,6 +146,8 @@ class _Process:
 @contextmanager
 def _deaf_to_ctrl_c() -> Iterator[None]:
     """Context in which SIGINT is delayed until its end. Processes that are started in it do not receive SIGINT."""
+    if hasattr(signal, "pthread_sigmask"):
+        resource_tracker.ensure_running()  # the first process would start it, and Python unblocks SIGINT after that
     heard: list[tuple[int, FrameType | None]] = []
     before = None
     if threading.current_thread() is threading.main_thread():  # another thread may receive SIGINT; Python would then raise it here

@@ -17,6 +17,13 @@ from twin.workers import in_processes, outcomes
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)])}
+FIRST_PROCESSES = """
+from test_workers import blocked
+from twin.workers import in_processes
+if __name__ == "__main__":
+    print(*map(len, in_processes(blocked, (), [1, 2, 3], processes=2)))
+"""
 MAIN = """
 import signal
 import sys
@@ -79,6 +86,11 @@ def sleeping(folder):
     return sleep
 
 
+def blocked():
+    """Each call gives the signals that its process blocks."""
+    return lambda task: signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
 def listening(pid_text: str, index: int) -> list[str]:
     """Addresses on which the process that asks and those below it listen."""
     asks, found = psutil.Process(int(pid_text)), []
@@ -128,15 +140,22 @@ def test_processes_that_share_work_listen_nowhere():
     assert set(sum(outcomes(listening, str(os.getpid()), [0, 1], workers=2, scheduler=""), [])) <= before
 
 
+def test_the_first_processes_are_deaf_to_ctrl_c_from_their_start(tmp_path):
+    """Otherwise Ctrl-C prints the traceback of a process that still starts. Python's own helper is started with the first one."""
+    script = tmp_path / "main.py"
+    script.write_text(FIRST_PROCESSES)
+    told = subprocess.run([sys.executable, str(script)], env=ENVIRONMENT, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert told.stdout.split() == ["1"] * 3, told.stderr
+
+
 @pytest.mark.parametrize("moment", ["begun", "at work *"])
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda end: end.name)
 def test_no_process_is_left_when_the_main_one_ends(tmp_path, end, moment):
     """SIGINT comes to all processes of the terminal, as Ctrl-C does; the others to the main process alone."""
     script = tmp_path / "main.py"
     script.write_text(MAIN)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)])}
     run = [sys.executable, str(script), str(tmp_path)]
-    with subprocess.Popen(run, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+    with subprocess.Popen(run, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         ends = time.monotonic() + PATIENCE_S
         while not list(tmp_path.glob(moment)) and process.poll() is None and time.monotonic() < ends:
             time.sleep(0.01)

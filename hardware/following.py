@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hardware.arms.open_arm import kind_of
+from hardware.arms.open_arm import kind_of, open_arm
 from hardware.errors import DeviceError
 from hardware.last_axis import LastAxis, turns_back_mm
 from hardware.loop import ServoLoop
@@ -102,6 +102,7 @@ class FollowPlan:
             raise DeviceError(f"--steps {self.steps}: expected 1 to {MOST_STEPS}")
         if not self.camera:
             if kind_of(self.arm) != "simulated":
+                open_arm(self.arm)  # an arm that does not exist is said first; nothing is opened
                 raise OptionError(
                     f"--arm {shown(self.arm)} moves by what a camera sees: give the sensor's with --camera; '--camera twin' draws the "
                     "frames for the pose that the arm reports, and such a loop does not feel what it touches"

@@ -153,6 +153,12 @@ def test_wrong_files_are_refused_by_name(spec, tmp_path):
     path.write_text('method = "twim"\n')
     with pytest.raises(FrameError, match="bad.toml"):
         load_detector(path)
+    write_detector(path, shipped_detector(spec, Form.RAW))
+    for method, finder in ("own", ""), ("log", "mine.py:my_pins"):
+        wrong = path.read_text().replace('method = "twin"', f'method = "{method}"').replace('finder = ""', f'finder = "{finder}"')
+        (tmp_path / "own.toml").write_text(wrong)
+        with pytest.raises(FrameError, match="own.toml.*FILE.py:FUNCTION"):
+            load_detector(tmp_path / "own.toml")
     tuned = shipped_detector(spec, Form.RAW).model_copy(update={"pins_px": ((0.0, 0.0),)})
     with pytest.raises(FrameError, match="tuned for 1 pins"):
         make_detector(spec, tuned)

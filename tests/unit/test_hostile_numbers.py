@@ -55,6 +55,8 @@ def test_a_real_arm_is_not_moved_by_drawn_frames_unless_that_is_said(arm):
     thing, servo = load_object("can"), load_servo("surface")
     with pytest.raises(OptionError, match="give the sensor's with --camera"):
         FollowPlan(thing, servo, arm=arm)
+    with pytest.raises(DeviceError, match="no arm 'magicain:/dev/ttyUSB0'; there are: mg400"):
+        FollowPlan(thing, servo, arm="magicain:/dev/ttyUSB0")
     assert FollowPlan(thing, servo, arm=arm, camera="twin").camera == FollowPlan(thing, servo, arm="simulated:4").camera == "twin"
 
 

@@ -14,17 +14,15 @@ from scipy.spatial import cKDTree
 
 from scenes.sensor import SensorSpec, UsualCapsSpec
 from twin.camera.capture import expose
-from twin.camera.projection import project
 from twin.frames import spread
-from twin.frames.forms import from_raw, gray_levels
-from twin.geometry.pins import rest_pins
+from twin.frames.forms import gray_levels
 from twin.optics.preview import Preview
 from twin.pins.blobs import Mask
 from twin.pins.caps import Caps, measure_caps
 from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
 from twin.pins.identify import judge_layout
 from twin.pins.pipeline import Pipeline
-from twin.pins.reference import Reference, nominal_reference
+from twin.pins.reference import Reference, nominal_reference, seen_at_rest
 from twin.pins.tune import other_layout
 from twin.progress import Step
 from twin.types import Form, Frame, Observation
@@ -269,8 +267,8 @@ def _twin(spec: SensorSpec, form: Form, nominal: Reference) -> list[Finding]:
     blob = spec.pipeline.raw if form == Form.RAW else spec.pipeline.recording
     if blob is None or not blob.rest_px:
         return []
-    drawn_px = from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm))
-    rms, pitch = float(np.sqrt(np.mean(np.sum((nominal.pins_px - drawn_px) ** 2, axis=1)))), float(np.mean(nominal.spacing_px))
+    off_px = nominal.pins_px - seen_at_rest(spec, form)
+    rms, pitch = float(np.sqrt(np.mean(np.sum(off_px**2, axis=1)))), float(np.mean(nominal.spacing_px))
     text = f"the specification's camera sees its pins at rest {rms:.1f} px (rms), {rms / pitch:.2f} pitches, from where they were measured"
     remedy = (
         "lengths in mm, camera and rest_px do not belong together: the twin's pictures are not of this sensor; make the specification anew "

@@ -1,11 +1,11 @@
 """The parameters of a pin detector, as ``twin tune`` writes them and ``--pipeline`` reads them."""
 
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, Self, get_args
 
 import numpy as np
 import tomlkit
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from scenes.base import Fraction, Name, Positive, Section, SpecError
 from scenes.load import read_section
@@ -103,6 +103,12 @@ class DetectorSpec(Section):
     evidence: Evidence | None = None
     finder: str = ""
     finder_digest: str = ""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.method == OWN) != bool(self.finder):
+            raise ValueError(f'method = "{OWN}" needs finder = "FILE.py:FUNCTION", and no other method has a finder')
+        return self
 
     def stricter(self, levels: float) -> "DetectorSpec":
         """The same parameters with a threshold that is stricter by this number of gray levels. A function of the user has none."""

@@ -92,7 +92,12 @@ def nominal_reference(spec: SensorSpec, form: Form) -> Reference:
     blob = spec.pipeline.raw if form == Form.RAW else spec.pipeline.recording
     if blob is not None and blob.rest_px:
         return make_reference(np.array(blob.rest_px), spec.pins)
-    return make_reference(from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm)), spec.pins)
+    return make_reference(seen_at_rest(spec, form), spec.pins)
+
+
+def seen_at_rest(spec: SensorSpec, form: Form) -> np.ndarray:
+    """Places (N, 2) in px at which the specification's camera sees its caps at rest."""
+    return from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm))
 
 
 def _double_areas(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:

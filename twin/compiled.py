@@ -14,6 +14,9 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     Numba stores it beside the source, or else in the user's home. If neither folder can be written, or if the disk is full, the process
     gives one warning.
 
+    Write numbers one by one where that is short (``a[0] = b[0]``): for an assignment of arrays Numba also compiles the text of the error
+    for wrong shapes, which takes some seconds. Hand arrays over in one memory layout: each layout is compiled for itself.
+
     Parameters
     ----------
     options

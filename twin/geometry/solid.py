@@ -301,7 +301,9 @@ def rotations(matrices: FloatArray) -> FloatArray:
     cofactor = np.zeros((3, 3))
     for k in range(len(matrices)):
         r = out[k]
-        r[:] = matrices[k]
+        for i in range(3):
+            for a in range(3):
+                r[i, a] = matrices[k, i, a]
         for _ in range(_MOST_POLAR_ITERATIONS):
             for i in range(3):
                 j, m = (i + 1) % 3, (i + 2) % 3

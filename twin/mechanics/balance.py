@@ -228,14 +228,14 @@ class Problem:
     def balance(self, control: FloatArray, border: FloatArray) -> Balance | None:
         """The balance at a state; None if an element is inverted (det F <= 0)."""
         body, volume = self.body, 0.0
-        residual = np.zeros_like(control)
+        residual = np.zeros(control.shape)
         elastic_nmm = 0.0
         for number, (kind, given) in enumerate(zip(body.kinds, self._given, strict=True)):
             elastic_nmm += kind.add_forces(control, given, residual, border[1] if number else 0.0)
         if not np.isfinite(elastic_nmm):
             return None
         if body.sealed:
-            volume = self.volume(control, np.zeros_like(control))
+            volume = self.volume(control, np.zeros(control.shape))
             elastic_nmm -= border[1] * volume
         return self._with_contact(control, border, residual[body.free].ravel(), volume, elastic_nmm)
 

@@ -63,13 +63,13 @@ class Elements:
         ``stress`` (m, 8, 3, 3) is the given stress S in MPa, or (0, 8, 3, 3) for none. ``pressure_mpa`` (positive: tension) adds its work
         on the change of volume. If an element is inside out, the energy is infinite and ``out`` is not valid.
         """
-        return _forces(*self._arrays, control_mm, stress, pressure_mpa, out)
+        return _forces(*self._arrays, np.ascontiguousarray(control_mm), stress, pressure_mpa, out)
 
     def add_volume(self, control_mm: FloatArray, out: FloatArray) -> float:
         """Increase of the volume in mm^3. The method adds its gradient with respect to the controls, in mm^2, to ``out`` (n, 3)."""
-        cells = self.cells
+        cells, control = self.cells, np.ascontiguousarray(control_mm)
         return _forces(
-            cells.controls, cells.gradients, cells.weights_mm3, np.zeros(6), np.zeros(0), control_mm, np.zeros((0, 8, 3, 3)), 1.0, out
+            cells.controls, cells.gradients, cells.weights_mm3, np.zeros(6), np.zeros(0), control, np.zeros((0, 8, 3, 3)), 1.0, out
         )
 
     @property
@@ -80,12 +80,12 @@ class Elements:
     def distortion_stress(self, control_mm: FloatArray) -> FloatArray:
         """Second Piola-Kirchhoff stress of the law's distortion part at the Gauss points, (m, 8, 3, 3) in MPa."""
         cells = self.cells
-        return _distortion_stress(cells.controls, cells.gradients, cells.weights_mm3, self.law, control_mm)
+        return _distortion_stress(cells.controls, cells.gradients, cells.weights_mm3, self.law, np.ascontiguousarray(control_mm))
 
     def difference_stress(self, control_mm: FloatArray) -> FloatArray:
         """kappa_d times half the difference of the levels' volume strains, (m,) in MPa."""
         cells = self.cells
-        return self.law[5] * _half_difference(cells.controls, cells.gradients, cells.weights_mm3, control_mm)
+        return self.law[5] * _half_difference(cells.controls, cells.gradients, cells.weights_mm3, np.ascontiguousarray(control_mm))
 
     def stiffness(
         self, control_mm: FloatArray, stress: FloatArray, pressure_mpa: float, out: FloatArray, *, which: IntArray | None = None
@@ -95,12 +95,13 @@ class Elements:
         Block p couples direction ``PAIRS[p][0]`` of the first control with direction ``PAIRS[p][1]`` of the second; the other three blocks
         are transposes. With ``which`` (k,) int, only the blocks of these elements are computed.
         """
-        _stiffness(*self._arrays, np.arange(len(out)) if which is None else which, control_mm, stress, pressure_mpa, out)
+        which = np.arange(len(out)) if which is None else which
+        _stiffness(*self._arrays, which, np.ascontiguousarray(control_mm), stress, pressure_mpa, out)
 
     def changed(self, control_mm: FloatArray, at: FloatArray, strain: float) -> IntArray:
         """Elements (k,) in which an entry of F differs from ``at`` (m, 8, 3, 3) by more than ``strain``; ``at`` receives their new F."""
         cells = self.cells
-        return np.flatnonzero(_changed(cells.controls, cells.gradients, control_mm, strain, at))
+        return np.flatnonzero(_changed(cells.controls, cells.gradients, np.ascontiguousarray(control_mm), strain, at))
 
     @property
     def _arrays(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -171,7 +172,8 @@ def _changed(elements: IntArray, gradients: FloatArray, control: FloatArray, str
             most = max(most, abs(new[k] - last[k]))
         if most > strain:
             out[m] = True
-            at[m] = f
+            for k in range(72):
+                last[k] = new[k]
     return out
 
 

@@ -266,7 +266,7 @@ class Preview:
         if self.spec.camera.aperture_mm > 0:
             diameter, shift = circles_px(self.spec.view, np.concatenate([caps, self._belt_mm]))
             circles, outlines_px = diameter[:, None].astype(np.float32), outlines_px + shift[: len(caps), None, None]
-        return _Drawing(corners_px, outlines_px - self.window_px[:2], facing, far_first, circles, direct, kept)
+        return _Drawing(corners_px, np.ascontiguousarray(outlines_px - self.window_px[:2]), facing, far_first, circles, direct, kept)
 
     def _gel(self, drawing: _Drawing, shading: Shading) -> FloatArray:
         """Light (H, W, C) of skin and pins before it passes the window."""

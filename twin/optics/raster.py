@@ -133,12 +133,9 @@ def draw_pins(
                 for band in range(2):
                     for k in range(sides):
                         after = (k + 1) % sides
-                        quad[0], quad[1], quad[2], quad[3] = (
-                            shapes[band, k],
-                            shapes[band, after],
-                            shapes[band + 1, after],
-                            shapes[band + 1, k],
-                        )
+                        for x in range(2):
+                            quad[0, x], quad[1, x] = shapes[band, k, x], shapes[band, after, x]
+                            quad[2, x], quad[3, x] = shapes[band + 1, after, x], shapes[band + 1, k, x]
                         if sense * _area(quad) > 0:
                             _add_polygon(cover, quad, side_light[p, band * sides + k], x0, y0, sense)
                 if facing[p]:

@@ -1,6 +1,7 @@
 """Shared fixtures: shipped specifications, and the real recordings where this machine has them."""
 
 import os
+import sys
 from pathlib import Path
 
 # One thread for linear algebra, here and in the processes that tests start: the tests themselves run side by side, and threads that wait
@@ -8,7 +9,12 @@ from pathlib import Path
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
+# Python keeps what it compiles even where containers tell it not to: many tests start processes, and each would compile all modules again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 import pytest  # noqa: E402
+from compiling import compile_all  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 from scenes import load_sensor  # noqa: E402
@@ -20,13 +26,9 @@ settings.load_profile("same")
 
 
 def pytest_sessionstart(session):
-    """Before workers start, compile the kernels that most of them need, once: each would do so for itself (half a CPU minute)."""
+    """Before workers start, compile what most of them need, once: each would do so for itself (a CPU minute)."""
     if getattr(session.config.option, "numprocesses", None):
-        from scenes import load_object
-        from twin.geometry.solid import Resolution
-        from twin.mechanics import ContactPose, SkinSolver
-
-        SkinSolver(load_sensor("mg400-127"), resolution=Resolution(8)).press(load_object("plane"), ContactPose(1.0))
+        compile_all()
 
 
 @pytest.fixture(scope="session", autouse=True)

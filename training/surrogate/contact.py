@@ -213,7 +213,9 @@ def between(start: FloatArray, stop: FloatArray, steps: int) -> FloatArray:
     """Poses (steps, 4, 4) after each of equal steps of a path: the origin moves in a straight line, the object turns about a fixed axis."""
     T = np.empty((steps, 4, 4))
     for k in range(steps):
-        T[k] = stop
+        for i in range(4):
+            for j in range(4):
+                T[k, i, j] = stop[i, j]
     if steps == 1:
         return T
     turn = start[:3, :3].copy() @ stop[:3, :3].T.copy()
@@ -223,10 +225,14 @@ def between(start: FloatArray, stop: FloatArray, steps: int) -> FloatArray:
     there = stop[:3, :3].copy()
     for k in range(steps - 1):
         left = 1 - (k + 1) / steps
-        T[k, :3, 3] += left * (start[:3, 3] - stop[:3, 3])
+        for i in range(3):
+            T[k, i, 3] += left * (start[i, 3] - stop[i, 3])
         if sine > NO_TURN:
             axis = cross / sine
-            T[k, :3, :3] += (np.sin(angle * left) * axis + (1 - np.cos(angle * left)) * (axis @ axis)) @ there  # Rodrigues' formula
+            more = (np.sin(angle * left) * axis + (1 - np.cos(angle * left)) * (axis @ axis)) @ there  # Rodrigues' formula
+            for i in range(3):
+                for j in range(3):
+                    T[k, i, j] += more[i, j]
     return T
 
 
@@ -239,7 +245,9 @@ def _distances(
     for r in range(len(rows)):
         row, turn, place = rows[r], T[r, :3, :3], T[r, :3, 3]
         _seen_from(node, still, turn, place, points)
-        gap[r] = solid(points, kind[row], sizes[row])[0]
+        found, _, _ = solid(points, kind[row], sizes[row])
+        for i in range(len(node)):
+            gap[r, i] = found[i]
         _seen_from(origin, origin, turn, place, middle)
         distance, outward, _ = solid(middle, kind[row], sizes[row])
         centre[r, 0] = distance[0]
@@ -286,7 +294,9 @@ def _follow(
             T = _given_way(way[min(step, last)], turning[row], force[row])
             if step > last and _motion(taken[row], T, node[0, 2]) <= SETTLED_MM:
                 break
-            taken[row] = T
+            for p in range(4):
+                for q in range(4):
+                    taken[row, p, q] = T[p, q]
             turn, place = T[:3, :3], T[:3, 3]
             count = 0
             gap = before[row]
@@ -311,7 +321,10 @@ def _follow(
             if count:
                 _seen_from(node, moved[row], turn, place, here)
                 used[row] = _remember(near[:count], turn, here, normal, force[row], anchor[row], mu, held[row], slides[row])
-            seen[row], before[row] = here, gap
+            for i in range(len(node)):
+                before[row, i] = gap[i]
+                for p in range(3):
+                    seen[row, i, p] = here[i, p]
 
 
 @compiled()

@@ -335,7 +335,9 @@ def _stiffness(
                     s = s0 * grad[3 * q, a] + s1 * grad[3 * q + 1, a] + s2 * grad[3 * q + 2, a]
                     swell[0, i, a] += s
                     swell[1, i, a] += s * lean
-        right[:] = grad
+        for row_number in range(24):
+            for a in range(count):
+                right[row_number, a] = grad[row_number, a]
         np.dot(left.T, right, product)
         scale[0], scale[1] = law[4] / rest, law[5] / rest
         for p in range(6):

@@ -287,7 +287,7 @@ def _grow(
     labelled = 0
     for i in range(n):
         if blob[i] >= 0:
-            moved[i] = px[blob[i]]
+            moved[i, 0], moved[i, 1] = px[blob[i], 0], px[blob[i], 1]
             weight[i] = 1.0
             taken[blob[i]] = True
             labelled += 1
@@ -324,7 +324,7 @@ def _grow(
                 i = claim[k]
                 if i >= 0:
                     blob[i] = k
-                    moved[i] = px[k]
+                    moved[i, 0], moved[i, 1] = px[k, 0], px[k, 1]
                     weight[i] = 1.0
                     taken[k] = True
                     labelled += 1
@@ -393,7 +393,7 @@ def _trust(
     moved, weight = np.zeros((n, 2)), np.zeros(n)
     for i in range(n):
         if blob[i] >= 0:
-            moved[i] = px[blob[i]]
+            moved[i, 0], moved[i, 1] = px[blob[i], 0], px[blob[i], 1]
             weight[i] = 1.0
     predicted = predict_all(rest, neighbours, spacing, moved, weight)
     for i in range(n):

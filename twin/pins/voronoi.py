@@ -167,13 +167,15 @@ def _cells(nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, region:
         for k in range(count):
             inside = inside and (here[k, 0] - x0) ** 2 + (here[k, 1] - y0) ** 2 < radius2
         if not inside:
-            here[:m] = region
+            for k in range(m):
+                here[k, 0], here[k, 1] = region[k, 0], region[k, 1]
             count, here, there = _cell(i, nodes, start, neighbours, m, here, there)
         if count > 2:
             area[i] = polygon_area(here, count)
         while first[i] + count > len(store):
             store = np.concatenate((store, np.empty_like(store)))
-        store[first[i] : first[i] + count] = here[:count]
+        for k in range(count):
+            store[first[i] + k, 0], store[first[i] + k, 1] = here[k, 0], here[k, 1]
         first[i + 1] = first[i] + count
     return area, store, first
 

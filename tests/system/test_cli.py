@@ -35,6 +35,7 @@ def test_render_writes_what_it_says(rendered):
     out, said = rendered
     for name in ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "panel.png"):
         assert (out / name).stat().st_size > 0 and str(out / name) in said
+    assert "127 of 127 pins in the picture" in said
     truth = json.loads((out / "truth.json").read_text())
     assert truth["force_n"][2] > 0 and truth["area_mm2"] > 0
     assert truth["pose"]["shear_mm"] == [1.0, -0.5] and truth["sensor"]["name"] == "mg400-127"
@@ -80,7 +81,8 @@ def test_graph_of_a_frame_and_of_its_pins(rendered, pins, tmp_path, kind, edges)
 
 
 def test_the_releases_method_on_a_frame_in_the_recordings_form(tmp_path):
-    done = twin("render", "--sensor", "mg400-127", "--object", "plane", "--indent-mm", 0, "--form", "recording", "--out", tmp_path)
+    drawn = ("--form", "recording", "--quality", "drawn")
+    done = twin("render", "--sensor", "mg400-127", "--object", "plane", "--indent-mm", 0, *drawn, "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     assert cv2.imread(str(tmp_path / "frame.png"), cv2.IMREAD_UNCHANGED).shape == (256, 256)
     assert json.loads((tmp_path / "truth.json").read_text())["force_n"] == [0, 0, 0]

@@ -108,6 +108,5 @@ def test_a_picture_in_which_the_pipeline_finds_no_pins_is_said(tmp_path):
     spec = load_sensor("mg400-127")
     aside = spec.pipeline.raw.model_copy(update={"mask_center_px": (60.0, 60.0), "mask_radius_px": 50.0})
     blind = spec.model_copy(update={"pipeline": spec.pipeline.model_copy(update={"raw": aside})})
-    for sensor, word in ((spec, "127 of 127 pins in the picture"), (blind, "note: the pipeline can't use the picture: too few pins")):
-        made = render_contact(sensor, load_object("sphere"), ContactPose(indent_mm=1.0), tmp_path / sensor.name, quality="drawn")
-        assert word in made.lines()[1]
+    made = render_contact(blind, load_object("sphere"), ContactPose(indent_mm=1.0), tmp_path, quality="drawn")
+    assert "note: the pipeline can't use the picture: too few pins" in made.lines()[1]

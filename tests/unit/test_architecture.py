@@ -61,6 +61,13 @@ def nodes_of(source: str) -> tuple[ast.AST, ...]:
     return tuple(ast.walk(ast.parse(source)))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def forgotten():
+    """The trees of all modules take a gigabyte, which the tests after these do not need."""
+    yield
+    nodes_of.cache_clear()
+
+
 @cache
 def imports_of(path: Path) -> frozenset[str]:
     found = set()

@@ -14,6 +14,8 @@ from twin.optics.render import Renderer
 from twin.optics.sampling import PixelSamples, near_pins
 from twin.optics.variant import choose_variant, use_variant
 
+BRIGHT = {"pin_albedo": (0.9, 0.9, 0.9), "skin_albedo": (0.8, 0.8, 0.8)}  # many paths go on
+
 
 @pytest.fixture(scope="module")
 def small() -> SensorSpec:
@@ -126,12 +128,12 @@ def test_light_is_proportional_to_the_leds(small):
     np.testing.assert_allclose(two, 2 * one, rtol=rounding, atol=rounding * one.max())
 
 
-def test_the_same_seed_gives_the_same_image(small):
-    renderer = Renderer(small, spp=4)
-    first, again, other = renderer.render(seed=1), renderer.render(seed=1), renderer.render(seed=2)
-    accumulation = 1e-5  # parallel sums of floats come in any order
-    np.testing.assert_allclose(again, first, rtol=accumulation, atol=accumulation)
-    assert np.abs(other - first).max() > 100 * accumulation
+def test_the_same_seed_gives_the_same_image_to_the_last_bit(small):
+    """Also where threads add up normals and samples: they may do so in any order."""
+    renderer = Renderer(changed(small, appearance=BRIGHT), spp=4)
+    images = [renderer.render(seed=1) for _ in range(12)]
+    assert all(np.array_equal(image, images[0]) for image in images)
+    assert np.abs(renderer.render(seed=2) - images[0]).max() > 1e-3
 
 
 def test_variance_falls_at_least_as_one_over_samples(small):
@@ -161,7 +163,7 @@ def test_all_states_are_rendered_by_the_same_kernels(small):
     """Nothing of a state, not even its number of samples, is part of a kernel: only the first picture waits for the compiler."""
     import drjit as dr
 
-    bright = changed(small, appearance={"pin_albedo": (0.9, 0.9, 0.9), "skin_albedo": (0.8, 0.8, 0.8)})  # many paths go on
+    bright = changed(small, appearance=BRIGHT)
     renderer, rest = Renderer(bright, variant="llvm", spp=4), rest_pins(bright.geometry)
     moved = [replace(rest, caps_mm=rest.caps_mm + [0.3 * k, 0.2 * k, 0.0]) for k in range(4)]
     used = []

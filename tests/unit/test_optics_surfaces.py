@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from scenes import load_sensor
 from twin.camera.projection import distort
 from twin.geometry.pins import rest_pins
 from twin.optics.lens import WIDEST_FISHEYE, ray_table, valid_radius
-from twin.optics.surfaces import SkinSurface, caps, stems
+from twin.optics.surfaces import SkinSurface, caps, stems, vertex_normals
 
 
 def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
@@ -94,3 +95,16 @@ def test_rays_go_on_outwards_where_the_distortion_folds_back():
     assert np.isfinite(valid_radius(folding)) and valid_radius(camera.model_copy(update={"k1": 0.0, "k2": 0.0})) == np.inf
     row = ray_table(folding, (0, 0, 640, 480))[211, 330:, 0]
     assert (np.diff(row) > 0).all()
+
+
+def test_a_vertex_normal_does_not_depend_on_how_flat_sides_are_cut():
+    """A cube's corner has one normal, however its sides are cut into triangles, because faces count by their angles."""
+    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    box = ConvexHull(corners).simplices
+    outwards = np.sum(
+        np.cross(corners[box[:, 1]] - corners[box[:, 0]], corners[box[:, 2]] - corners[box[:, 0]]) * corners[box[:, 0]], axis=1
+    )
+    box[outwards < 0] = box[outwards < 0][:, ::-1]
+    np.testing.assert_allclose(vertex_normals(corners, box), corners / np.sqrt(3), atol=1e-12)
+    lone = np.concatenate([corners, [[5.0, 5.0, 5.0]]])  # a vertex of no face has none
+    assert not vertex_normals(lone, box)[-1].any()

@@ -254,22 +254,38 @@ class GelView:
 
     def gel_light(self, pixels: IntArray, spp: int, seed: int, state: PinState) -> FloatArray:
         """Mean light (n, 3) or (n, 1) of pixels (n,) of the window, numbered row by row. Bare skin gets fewer samples."""
-        mi, dr = self._mi, self._dr
+        mi = self._mi
         pins = near_pins(self._spec.view, self._spec.pins, self._spec.appearance, state, self._window_px).ravel()[pixels]
         passes, each, few = 1, spp, -(-spp // SKIN_SAVING)
         while each > 1 and each * len(pixels) > MOST_SAMPLES_AT_ONCE:
             passes, each, few = 2 * passes, -(-each // 2), -(-few // 2)  # half as many samples: a net with a power of two is most uniform
-        counts = np.where(pins, each, few)
-        rows = np.repeat(np.arange(len(pixels), dtype=np.uint32), counts)
-        index = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        row, total = mi.UInt32(with_room(rows, np.uint32)), np.zeros(1, np.float32)
-        pixel, number = mi.UInt32(with_room(pixels[rows], np.uint32)), mi.UInt32(with_room(index, np.uint32))
+        first = np.argsort(~pins, kind="stable")  # those near pins come first: each part has one number of samples, and sums by blocks
+        near = int(pins.sum())
+        parts = [(each, near), (few, len(pixels) - near)]
+        counts = np.repeat([each, few], [near, len(pixels) - near])
+        index = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        pixel, number = mi.UInt32(with_room(np.repeat(pixels[first], counts), np.uint32)), mi.UInt32(with_room(index, np.uint32))
+        total: FloatArray = np.zeros((1, 1))
         for k in range(passes):
-            light = self._light(pixel, number, each, (seed * 1009 + k) % 2**32)
-            found = dr.zeros(mi.Spectrum, len(pixels))
-            dr.scatter_add(found, light, row)
-            total = total + np.array(found).T
-        return total / (passes * counts[:, None])
+            total = total + self._sums(self._light(pixel, number, each, (seed * 1009 + k) % 2**32), parts)
+        light = np.empty(total.shape)
+        light[first] = total / (passes * counts[:, None])
+        return light
+
+    def _sums(self, light: DrJit, parts: list[tuple[int, int]]) -> FloatArray:
+        """Sums (n, 3) or (n, 1) of light over blocks of samples, given the samples of a block and the number of blocks of each part.
+
+        The sums do not depend on the threads, as those of atomic additions do.
+        """
+        mi, dr = self._mi, self._dr
+        sums, begin = [], 0
+        dr.eval(light)
+        for samples, blocks in parts:
+            if blocks:
+                at = dr.arange(mi.UInt32, samples * blocks) + dr.opaque(mi.UInt32, begin)
+                sums.append(np.array([dr.block_sum(channel, samples) for channel in dr.gather(mi.Spectrum, light, at)]).T)
+            begin += samples * blocks
+        return np.concatenate(sums)
 
     def trace(self, pixels: DrJit, spp: int, seed: int) -> DrJit:
         """Mean light of pixels as a spectrum of Dr.Jit. It can be differentiated by the values in the tracer and the scene."""

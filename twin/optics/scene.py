@@ -7,7 +7,7 @@ import numpy as np
 
 from scenes.sensor import AppearanceSpec
 from twin.optics.arrays import with_room
-from twin.optics.surfaces import Surface
+from twin.optics.surfaces import Surface, vertex_normals
 from twin.optics.tracer import luminance
 from twin.optics.variant import DrJit
 from twin.types import FloatArray
@@ -87,6 +87,7 @@ def mesh(mi: ModuleType, name: str, surface: Surface, bsdf: DrJit, *, smooth: bo
     params["faces"] = with_room(surface.faces.ravel(), np.uint32)
     params["vertex_positions"] = with_room(surface.vertices_mm.ravel(), np.float32)
     params.update()
+    _set_normals(params, {"": surface})
     made.set_id(name)
     return made
 
@@ -95,6 +96,19 @@ def move_meshes(params: DrJit, surfaces: dict[str, Surface]) -> None:
     """Move the vertices of a scene's meshes; ``params`` are the scene's traversed parameters, ``surfaces`` has the meshes' ids as keys."""
     for name, surface in surfaces.items():
         params[f"{name}.vertex_positions"] = with_room(surface.vertices_mm.ravel(), np.float32)
+    params.update()
+    _set_normals(params, {f"{name}.": surface for name, surface in surfaces.items()})
+
+
+def _set_normals(params: DrJit, surfaces: Mapping[str, Surface]) -> None:
+    """Set the vertex normals of smooth meshes, by the prefix of their parameters.
+
+    Mitsuba computes them, too, but its threads add to the same numbers in any order: last digits, and so pictures, would differ from run
+    to run.
+    """
+    for prefix, surface in surfaces.items():
+        if len(params[f"{prefix}vertex_normals"]):
+            params[f"{prefix}vertex_normals"] = with_room(vertex_normals(surface.vertices_mm, surface.faces).ravel(), np.float32)
     params.update()
 
 

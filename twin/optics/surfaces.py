@@ -114,6 +114,22 @@ def cap_outlines(look: AppearanceSpec, sides: int) -> FloatArray | None:
     return 1 + shapes[:, :1] + shapes[:, 1::2] @ np.cos(orders * turn) + shapes[:, 2::2] @ np.sin(orders * turn) + beside
 
 
+def vertex_normals(vertices_mm: FloatArray, faces: IntArray) -> FloatArray:
+    """Unit normals (n, 3) at vertices (n, 3): means of the normals of faces (m, 3), weighted by the angles at the vertex.
+
+    They are Mitsuba's (Thuermer and Wuethrich 1998), which it computes in another order of summation in each run.
+    """
+    corners = vertices_mm[faces]
+    sides = np.roll(corners, -1, axis=1) - corners
+    across = np.cross(sides[:, 0], sides[:, 1])
+    sides = sides / np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), np.finfo(float).tiny)
+    angle = np.arccos(np.clip(-np.sum(sides * np.roll(sides, 1, axis=1), axis=2), -1.0, 1.0))
+    across = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(float).tiny)
+    total = np.zeros(vertices_mm.shape)
+    np.add.at(total, faces, angle[..., None] * across[:, None])
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(float).tiny)
+
+
 def _fan_grid(rings: int, around: int) -> IntArray:
     """Triangles of an apex (vertex 0) and ``rings`` circles of ``around`` vertices; normals towards the inside of a dome."""
     k = np.arange(around)

@@ -289,8 +289,14 @@ def test_gymnasium_accepts_an_environment_on_finite_elements():
     check_env(gymnasium.make("tactip/SurfaceFollow-v0", steps=2, **FAST).unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize("observation", ["pins", "oracle", "graph", "image", "pose"])
-@pytest.mark.parametrize("name", ids())
+@pytest.mark.parametrize(
+    ("name", "observation"),
+    [
+        pytest.param(name, observation, marks=[pytest.mark.slow] * (number > 0 and observation != "pins"))
+        for number, name in enumerate(ids())
+        for observation in ("pins", "oracle", "graph", "image", "pose")
+    ],
+)
 def test_gymnasium_and_stable_baselines_accept_every_environment(name, observation):
     env = gymnasium.make(name, observation=observation, steps=3, disable_env_checker=True).unwrapped
     check_env(env, skip_render_check=True)

@@ -44,7 +44,7 @@ def test_an_undamaged_sensor_has_no_bad_finding():
     [
         ("exposure-low", 0.35, "brightness"),
         pytest.param("exposure-high", 0.4, "saturation", marks=pytest.mark.slow),
-        ("defocus", 0.15, "focus"),
+        pytest.param("defocus", 0.15, "focus", marks=pytest.mark.slow),
         ("glare", 0.4, "glare"),
         pytest.param("room-light", 0.5, "stray light", marks=pytest.mark.slow),
         ("caps-missing", 0.1, "pins"),

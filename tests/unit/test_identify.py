@@ -15,13 +15,13 @@ from twin.pins.identify import _matched, identify, judge_layout, symmetries
 from twin.types import Form, Frame
 
 LAYOUTS = [
-    PinsSpec(rings=5),
+    pytest.param(PinsSpec(rings=5), marks=pytest.mark.slow),
     PinsSpec(rings=10),
     PinsSpec(rings=8, missing=(40,)),
-    PinsSpec(layout="hexagon", rings=6),
+    pytest.param(PinsSpec(layout="hexagon", rings=6), marks=pytest.mark.slow),
     PinsSpec(layout="hexagon", rings=4),
     PinsSpec(layout="grid", columns=9, rows=7),
-    PinsSpec(layout="grid", columns=10, rows=10),
+    pytest.param(PinsSpec(layout="grid", columns=10, rows=10), marks=pytest.mark.slow),
 ]
 
 
@@ -180,7 +180,7 @@ def test_stray_light_and_specks_do_not_change_the_layout():
         pytest.param(PinsSpec(rings=10), PinsSpec(rings=9), marks=pytest.mark.slow),
         (PinsSpec(rings=6), PinsSpec(rings=4)),
         pytest.param(PinsSpec(rings=5), PinsSpec(rings=6), marks=pytest.mark.slow),
-        (PinsSpec(rings=6), PinsSpec(layout="hexagon", rings=4)),
+        pytest.param(PinsSpec(rings=6), PinsSpec(layout="hexagon", rings=4), marks=pytest.mark.slow),
         pytest.param(PinsSpec(layout="hexagon", rings=6), PinsSpec(rings=6), marks=pytest.mark.slow),
     ],
     ids=lambda p: p.in_words(),

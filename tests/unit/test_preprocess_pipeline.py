@@ -135,7 +135,7 @@ def test_a_displaced_view_keeps_its_pins(pipeline):
 
 
 @pytest.mark.parametrize("lost_share", [0.0, 0.05])
-@pytest.mark.parametrize("degrees", [-10, -6, -5, -3, 3, 5, 6, 10])
+@pytest.mark.parametrize("degrees", [-10, -5, 3, 6, *(pytest.param(more, marks=pytest.mark.slow) for more in (-6, -3, 5, 10))])
 def test_a_turned_view_keeps_every_pin_s_name(pipeline, degrees, lost_share):
     turn = np.exp(1j * np.radians(degrees))
     turning = np.array([[turn.real, turn.imag], [-turn.imag, turn.real]])

@@ -69,7 +69,9 @@ def test_a_turned_scene_turns_the_trajectory(mounting):
     np.testing.assert_allclose(turned[:, 5] - straight[:, 5], turn_deg, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["can", "square", "prism", "tin-box", "mesh-can"])
+@pytest.mark.parametrize(
+    "name", ["can", "square", "mesh-can", *(pytest.param(more, marks=pytest.mark.slow) for more in ("prism", "tin-box"))]
+)
 def test_a_perfect_estimator_goes_round_each_object(mounting, name):
     scene = placed(mounting, name)
     outline = scene.outline()

@@ -19,7 +19,8 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "no venv: install python3-venv, remove $(VENV) and run make again"; exit 1; }
 	@echo "installing Python packages into $(VENV) (3 to 7 GB, a few minutes the first time; docs/install.md says how to have the smaller)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c requirements.lock -e '.[dev]'
+	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib >/dev/null 2>&1 || true # on all cores, where pip uses one; some libraries ship files for other Pythons
 	@touch $@
 
 # out/demo is the program's own folder: a demo of an earlier version there is replaced. In another folder only own files are.

@@ -189,7 +189,7 @@ def explained(error: ValidationError, model: type[BaseModel]) -> str:
     problems = []
     found = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")  # a misspelt key is missing, too
     for item in found[:MOST_PROBLEMS]:
-        key = ".".join(shown(part) for part in item["loc"]) or "file"
+        key = ".".join(shown(part) for part in item["loc"])
         if item["type"] == "extra_forbidden":
             known = _keys_at(model, item["loc"][:-1])
             near = difflib.get_close_matches(shown(item["loc"][-1]), known, n=1)
@@ -198,7 +198,9 @@ def explained(error: ValidationError, model: type[BaseModel]) -> str:
             problems.append(f"key '{key}' is missing; add it (see the shipped specifications for examples)")
         else:
             came = "" if isinstance(item["input"], dict) else f", got {shown(repr(item['input']))}"
-            problems.append(f"{key}: {shown(item['msg'].removeprefix('Value error, '), 4 * LONGEST_SHOWN)}{came}")
+            said = shown(item["msg"].removeprefix("Value error, ").replace("Input should be", "must be"), 4 * LONGEST_SHOWN)
+            between = "" if not key else " " if said.startswith("must be") else ": "
+            problems.append(f"{key}{between}{said}{came}")
     if len(found) > MOST_PROBLEMS:
         problems.append(f"and {len(found) - MOST_PROBLEMS} more")
     return "; ".join(problems)

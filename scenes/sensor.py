@@ -700,7 +700,11 @@ class SensorSpec(Section):
             raise ValueError("pins.length_mm + pins.cap_height_mm must be smaller than a cap's inner radius, or a pad's gel is deep")
         self._check_reach()
         if self.camera.distance_mm <= -self.lens.back_mm:
-            raise ValueError("camera.distance_mm must put the pupil behind the window (greater than lens.thickness_mm - lens.z_mm)")
+            least, got = -self.lens.back_mm, self.camera.distance_mm
+            raise ValueError(
+                "camera.distance_mm must put the pupil behind the window: greater than lens.thickness_mm - lens.z_mm "
+                f"= {least:g}, got {got:g}"
+            )
         if self.leds.z_mm > self.lens.back_mm:
             raise ValueError("leds.z_mm must not lie in front of the window's back (lens.z_mm - lens.thickness_mm)")
         shapes = self.appearance.cap_shapes

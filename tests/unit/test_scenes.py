@@ -48,7 +48,8 @@ def test_pin_counts(sensor_name, pins):
             "thicknes_mm = 1.0",
             ["edited.toml", "skin.thicknes_mm", "did you mean 'thickness_mm'"],
         ),
-        ("sensors/mg400-331.toml", "thickness_mm = 1.0", "thickness_mm = -1.0", ["skin.thickness_mm", "greater than 0"]),
+        ("sensors/mg400-331.toml", "thickness_mm = 1.0", "thickness_mm = -1.0", ["skin.thickness_mm must be greater than 0, got -1.0"]),
+        ("sensors/mg400-331.toml", "distance_mm = 6.646", "distance_mm = -3.0", [".toml: camera.distance_mm must put", "got -3"]),
         ("sensors/mg400-331.toml", "thickness_mm = 1.0", "thickness_mm = 30.0", ["skin: thickness_mm must be smaller"]),
         (
             "sensors/mg400-331.toml",

@@ -26,7 +26,7 @@ from twin.optics.lights import lights
 from twin.optics.raster import PinOutlines, draw_pins, draw_triangles, side_normals
 from twin.optics.relief import Relief
 from twin.optics.static_layer import static_layer
-from twin.optics.surfaces import cap_albedo
+from twin.optics.surfaces import cap_albedo, unit
 from twin.optics.tracer import luminance
 from twin.optics.window import Window
 from twin.types import BoolArray, FloatArray, IntArray, PinState
@@ -253,7 +253,7 @@ class Preview:
         half = 0.5 * self.spec.pins.cap_height_mm
         places = [base, 0.5 * (base + caps), caps, caps + half * axis]
         side = toward - np.sum(toward * axis, axis=1, keepdims=True) * axis
-        lit = [self._light(place, normal) for place, normal in zip(places[:2], (axis, _unit(side)), strict=True)]
+        lit = [self._light(place, normal) for place, normal in zip(places[:2], (axis, unit(side)), strict=True)]
         lit += [self._cap_light(place, normal) for place, normal in zip(places[2:], (side_normals(axis), axis), strict=True)]
         skin = np.concatenate([base, self._belt_mm])
         kept = [self._kept(place, pupil) for place in (skin, *places[1:])]
@@ -321,7 +321,3 @@ def _transmittance(view: ViewSpec, window_px: tuple[int, int, int, int]) -> Floa
     cos_air = np.clip(0.25 * (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]), 1e-6, 1)
     cos_window, cos_gel = (np.sqrt(1 - (1 - cos_air**2) / n**2) for n in (view.lens.refractive_index, view.gel_index))
     return Window.of(view).transmittance(np, cos_air, cos_window, cos_gel)
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

@@ -121,13 +121,17 @@ def vertex_normals(vertices_mm: FloatArray, faces: IntArray) -> FloatArray:
     """
     corners = vertices_mm[faces]
     sides = np.roll(corners, -1, axis=1) - corners
-    across = np.cross(sides[:, 0], sides[:, 1])
-    sides = sides / np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), np.finfo(float).tiny)
+    across = unit(np.cross(sides[:, 0], sides[:, 1]))
+    sides = unit(sides)
     angle = np.arccos(np.clip(-np.sum(sides * np.roll(sides, 1, axis=1), axis=2), -1.0, 1.0))
-    across = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(float).tiny)
     total = np.zeros(vertices_mm.shape)
     np.add.at(total, faces, angle[..., None] * across[:, None])
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(float).tiny)
+    return unit(total)
+
+
+def unit(vectors: FloatArray) -> FloatArray:
+    """Vectors (..., 3) of length 1; a zero vector stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 def _fan_grid(rings: int, around: int) -> IntArray:

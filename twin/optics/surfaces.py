@@ -122,8 +122,8 @@ def vertex_normals(vertices_mm: FloatArray, faces: IntArray) -> FloatArray:
     corners = vertices_mm[faces]
     sides = np.roll(corners, -1, axis=1) - corners
     across = unit(np.cross(sides[:, 0], sides[:, 1]))
-    sides = unit(sides)
-    angle = np.arccos(np.clip(-np.sum(sides * np.roll(sides, 1, axis=1), axis=2), -1.0, 1.0))
+    along = unit(sides)
+    angle = np.arccos(np.clip(-np.sum(along * np.roll(along, 1, axis=1), axis=2), -1.0, 1.0))
     total = np.zeros(vertices_mm.shape)
     np.add.at(total, faces, angle[..., None] * across[:, None])
     return unit(total)

@@ -276,7 +276,7 @@ def test_twin_emulate_says_when_it_is_ready_and_ends_on_sigterm(device, tmp_path
     assert not link.exists()
 
 
-@pytest.mark.parametrize("device", ["mg400", "magician"])
+@pytest.mark.parametrize("device", ["mg400", pytest.param("magician", marks=pytest.mark.slow)])
 def test_twin_emulate_lists_its_faults(device):
     command = [sys.executable, "-c", "from twin.cli import main; main()", "emulate", device, "--fault", "help"]
     listed = subprocess.check_output(command, text=True)

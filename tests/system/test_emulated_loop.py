@@ -78,6 +78,7 @@ def test_it_follows_the_can_and_the_frames_show_the_contact(emulated):
     assert camera.sent > STEPS
 
 
+@pytest.mark.slow
 def test_a_learnt_policy_follows_the_can(emulated):
     """Trained on the surrogate, run on frames of the finite elements through the live pipeline and the safety layer."""
     rig, servo, camera, _, _ = emulated

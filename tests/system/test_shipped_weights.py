@@ -64,7 +64,7 @@ def test_the_tacpads_weights_tell_the_forces_of_its_frames(real_dir):
 
 
 @pytest.mark.parametrize("size", [QUICK, pytest.param(FULL, marks=pytest.mark.slow)], ids=["quick", "full"])
-@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "mg400-331")) for name in EXPERIMENTS])
 def test_shipped_weights_predict_within_their_stated_error(name, size, tmp_path):
     contacts, across = size
     estimator = PoseEstimator.load(name)

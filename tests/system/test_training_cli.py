@@ -76,7 +76,7 @@ def test_a_trained_run_is_judged_and_used(recording, run, tmp_path):
     assert "f_3.png: pose_2" in twin("predict", run, recording / "frames_bw" / "f_3.png")
 
 
-@pytest.mark.parametrize("model", ["gnn", "cnn-v2"])
+@pytest.mark.parametrize("model", ["gnn", pytest.param("cnn-v2", marks=pytest.mark.slow)])
 def test_the_papers_models_take_the_same_way(model, recording, tmp_path):
     common = ("--data", recording, "--out")
     twin("train", "--model", model, "--sensor", "mg400-127", *common, tmp_path / "run", "--epochs", 1)

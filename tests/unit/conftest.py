@@ -1,13 +1,18 @@
-"""A drawn data set, simulated contacts and models trained on them, shared by all tests of a process that only look at them."""
+"""A drawn data set, simulated contacts and models trained on them, shared by all tests that only look at them."""
 
+import os
+
+import numpy as np
 import pytest
 from drawn_recording import config_of, drawn_dataset
-from small_generation import small_config
+from filelock import FileLock
+from small_generation import SENSOR, small_config
 
-from scenes import load_experiment
+from scenes import load_experiment, load_sensor
 from training.generation import generate
 from training.run import train_run
 from training.train import train_model
+from twin.frames.images import write_image
 
 PRESSES = """
 description = "gentle presses and short drags"
@@ -33,19 +38,46 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def trained(data, tmp_path_factory):
-    """Folder of a finished run."""
-    out = tmp_path_factory.mktemp("trained")
-    assert train_run(config_of("vgnn", epochs=30, batch=16), data, out)
-    return out
+def made_once(tmp_path_factory):
+    """Gives a folder by its name. The first process that asks makes what is in it, the others wait."""
+    base = tmp_path_factory.getbasetemp()
+    home = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+    home.mkdir(exist_ok=True)
+
+    def folder(name, make):
+        made = home / name
+        with FileLock(home / f"{name}.lock"):
+            if not made.exists():
+                making = home / f"{name}-{os.getpid()}"
+                making.mkdir()
+                make(making)
+                making.rename(made)
+        return made
+
+    return folder
 
 
 @pytest.fixture(scope="session")
-def contacts(tmp_path_factory):
+def trained(data, made_once):
+    """Folder of a finished run."""
+    return made_once("trained", lambda out: train_run(config_of("vgnn", epochs=30, batch=16), data, out))
+
+
+@pytest.fixture(scope="session")
+def contacts(made_once):
     """Folder of a simulated data set, and of a run of ``touch`` that learnt from it."""
-    home = tmp_path_factory.mktemp("maps")
-    (home / "presses.toml").write_text(PRESSES)
-    config = small_config(home, experiment=load_experiment(home / "presses.toml"), states="all", randomisation=None)
-    generate(home / "set", config, 10)
-    train_model("touch", config.sensor, [home / "set"], home / "run", target="contact", members=1, kernel=False, epochs=20, split=None)
-    return home / "set", home / "run", config.sensor
+
+    def make(home):
+        (home / "presses.toml").write_text(PRESSES)
+        config = small_config(home, experiment=load_experiment(home / "presses.toml"), states="all", randomisation=None)
+        generate(home / "set", config, 10)
+        train_model("touch", config.sensor, [home / "set"], home / "run", target="contact", members=1, kernel=False, epochs=20, split=None)
+
+    home = made_once("maps", make)
+    return home / "set", home / "run", load_sensor(SENSOR)
+
+
+@pytest.fixture
+def undrawn_charts(monkeypatch):
+    """Charts of pages are made, but not drawn, which takes seconds: for tests that look at something else of a page."""
+    monkeypatch.setattr("twin.report.charts.save_figure", lambda path, figure, **_: write_image(path, np.zeros((8, 8), np.uint8)))

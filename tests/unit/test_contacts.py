@@ -198,7 +198,7 @@ def test_the_ur5s_weights_are_small_and_know_its_four_kinds_and_what_they_saw():
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * name.endswith("tap")) for name in UR5_SETS])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "edge-2d-shear")) for name in UR5_SETS])
 def test_the_ur5s_weights_tell_kind_and_pose_of_frames_that_they_did_not_see(real_dir, name):
     models = ContactEstimator.load(contacts_folder("ur5-331"))
     kind, stated = UR5_SETS[name]

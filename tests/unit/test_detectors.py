@@ -2,6 +2,7 @@
 
 import pickle
 import re
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from twin.types import Form, Frame
 # scale spaces give whole pixels; DoH, from an integral image, is off by about one
 CENTROID_PX = {"twin": 0.1, "legacy": 0.6, "adaptive": 0.6, "fixed": 0.6, "simple": 0.6, "log": 1.0, "dog": 1.0, "doh": 1.8}
 FOREIGN_PX = (400, 300)
+QUICK = ("twin", "legacy", "adaptive")  # methods that make test tunes; the others are tuned by make validate
 
 
 @pytest.fixture(scope="module")
@@ -52,15 +54,20 @@ def foreign(spec):
 
 
 @pytest.fixture(scope="module")
-def tuned(spec, foreign):
-    """By the default method."""
-    return tune(foreign[0], spec)
+def tuned_by(spec, foreign):
+    """A tuning by each method."""
+    return cache(partial(tune, foreign[0], spec))
 
 
-@pytest.mark.parametrize("method", [pytest.param(name, marks=pytest.mark.slow if name in ("doh", "log") else ()) for name in METHODS])
-def test_every_method_tunes_itself_and_finds_the_pins(spec, foreign, method):
+@pytest.fixture(scope="module")
+def tuned(tuned_by):
+    return tuned_by("twin")
+
+
+@pytest.mark.parametrize("method", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in METHODS])
+def test_every_method_tunes_itself_and_finds_the_pins(spec, foreign, tuned_by, method):
     frames, truths = foreign
-    detector = tune(frames, spec, method).detector
+    detector = tuned_by(method).detector
     find = make_detector(spec, detector)
     for frame, truth in zip(frames, truths, strict=True):
         found = find(frame)
@@ -138,14 +145,13 @@ def test_recordings_are_tuned_without_a_crop(spec):
     assert make_detector(spec, shipped_detector(spec, Form.RECORDING, "legacy"))(frames[0]).pins_px is None
 
 
-def test_stricter_raises_the_bar(spec, foreign):
-    frame = foreign[0][0]
-    for method in ("twin", "fixed", "legacy"):
-        detector = tune([frame], spec, method).detector
-        moved = [make_detector(spec, detector.stricter(levels), second_look=False) for levels in (0.0, 250.0)]
-        counts = [len(find(frame).claims_px) for find in moved]
-        assert counts[1] < 0.5 * counts[0], method
-        assert detector.stricter(0.0) == detector
+@pytest.mark.parametrize("method", [*QUICK, pytest.param("fixed", marks=pytest.mark.slow)])
+def test_stricter_raises_the_bar(spec, foreign, tuned_by, method):
+    detector = tuned_by(method).detector
+    moved = [make_detector(spec, detector.stricter(levels), second_look=False) for levels in (0.0, 250.0)]
+    counts = [len(find(foreign[0][0]).claims_px) for find in moved]
+    assert counts[1] < 0.5 * counts[0]
+    assert detector.stricter(0.0) == detector
 
 
 def test_wrong_files_are_refused_by_name(spec, tmp_path):

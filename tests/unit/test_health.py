@@ -42,13 +42,13 @@ def test_an_undamaged_sensor_has_no_bad_finding():
 @pytest.mark.parametrize(
     ("name", "severity", "finding"),
     [
-        ("exposure-low", 0.35, "brightness"),
+        pytest.param("exposure-low", 0.35, "brightness", marks=pytest.mark.slow),
         pytest.param("exposure-high", 0.4, "saturation", marks=pytest.mark.slow),
         pytest.param("defocus", 0.15, "focus", marks=pytest.mark.slow),
         ("glare", 0.4, "glare"),
         pytest.param("room-light", 0.5, "stray light", marks=pytest.mark.slow),
         ("caps-missing", 0.1, "pins"),
-        ("camera-shifted", 0.1, "shift"),
+        pytest.param("camera-shifted", 0.1, "shift", marks=pytest.mark.slow),
         pytest.param("camera-rolled", 0.08, "turn", marks=pytest.mark.slow),
         pytest.param("camera-zoomed", 0.2, "scale", marks=pytest.mark.slow),
     ],
@@ -78,7 +78,9 @@ def test_drift_is_the_planted_similarity():
     assert drift_of(pins, rest, rim) is None
 
 
-@pytest.mark.parametrize("contact", CONTACTS[1:], ids=lambda contact: contact.name)
+@pytest.mark.parametrize(
+    "contact", [pytest.param(each, id=each.name, marks=[pytest.mark.slow] * (each.name in ("edge", "flat"))) for each in CONTACTS[1:]]
+)
 def test_a_contact_is_not_taken_for_a_nearer_camera(contact):
     """The gel bulges at the rim by 1 to 4 %; what is left of the scale is within the limit of a well sensor, a zoomed camera is not."""
     spec = load_sensor("mg400-331")

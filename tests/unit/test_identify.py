@@ -65,7 +65,7 @@ def test_the_layout_is_found_and_its_pins_named(pins):
     assert np.median(nearest) < 2.4  # the contacts' median is not the rest
 
 
-@pytest.mark.parametrize("scale", [0.45, 5.0])
+@pytest.mark.parametrize("scale", [0.45, pytest.param(5.0, marks=pytest.mark.slow)])
 def test_the_frames_size_does_not_matter(scale):
     pins = PinsSpec(layout="hexagon", rings=6) if scale < 1 else PinsSpec(rings=4)
     size = (int(SIZE[0] * scale), int(SIZE[1] * scale))
@@ -85,7 +85,7 @@ def test_a_rim_that_the_frame_cuts_is_told_from_what_is_in_view():
     ("pins", "part"),
     [
         (PinsSpec(rings=6), np.s_[66:186, 78:234]),
-        (PinsSpec(layout="hexagon", rings=6), np.s_[66:186, 78:234]),
+        pytest.param(PinsSpec(layout="hexagon", rings=6), np.s_[66:186, 78:234], marks=pytest.mark.slow),
         (PinsSpec(layout="grid", columns=9, rows=9), np.s_[:, 90:210]),
     ],
     ids=lambda p: p.in_words() if isinstance(p, PinsSpec) else "",
@@ -112,8 +112,8 @@ def masked(images, rest, share, *, level=0.0, soft_px=0.0, noise_sd=3.0):
 @pytest.mark.parametrize(
     ("share", "look"),
     [
-        (0.86, {}),
-        (0.9, {"level": 12.0, "soft_px": 4.8}),
+        pytest.param(0.86, {}, marks=pytest.mark.slow),
+        pytest.param(0.9, {"level": 12.0, "soft_px": 4.8}, marks=pytest.mark.slow),
         (0.62, {"noise_sd": 8.0}),
     ],
     ids=["noise", "a soft gray edge", "much noise, two rings hidden"],

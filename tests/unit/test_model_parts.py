@@ -153,6 +153,8 @@ def names_asked_for(source: str, names: set[str]) -> list[int]:
         return of_text and any(isinstance(text, str) and len(text) > 2 and name.startswith(text) for text in texts for name in names)
 
     found = []
+    if not any(quote + name[:3] in source for quote in "'\"" for name in names):  # most modules: their code need not be read
+        return found
     for node in ast.walk(ast.parse(source)):
         ladder = isinstance(node, ast.Compare | ast.MatchValue) and named(node)
         table = isinstance(node, ast.Dict) and any(key is not None and named(key) for key in node.keys)

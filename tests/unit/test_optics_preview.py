@@ -215,7 +215,7 @@ def test_a_nearer_cap_hides_a_farther_one(small, towards_mm, seen):
     assert image[v, u] == pytest.approx(seen * 0.8 / np.pi, rel=window_takes)
 
 
-@pytest.mark.parametrize("channels", ["mono", "color"])
+@pytest.mark.parametrize("channels", [pytest.param("mono", marks=pytest.mark.slow), "color"])
 def test_calibration_finds_the_shading_of_a_frame(channels):
     """A frame drawn with a known shading gives that shading back."""
     spec = changed(plain(), pins={"rings": 4}, camera={"channels": channels}, appearance={"cap_levels": (), "cap_shapes": ()})

@@ -399,7 +399,7 @@ UR5_EVERY = 250  # one frame in so many: 20 of each set
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("kind", UR5_SETS)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * kind.endswith("tap")) for kind in UR5_SETS])
 def test_nearly_every_picture_of_the_ur5_shows_every_pin(real_dir, kind):
     spec = load_sensor("ur5-331")
     recording = open_recording(real_dir / f"ur5-331-{kind}", spec)

@@ -65,7 +65,9 @@ def test_turns_about_x_and_y_tilt_the_plates_normal():
     np.testing.assert_allclose(found, [[3 + nearer, -s, 0], [3 + nearer, 0, s], [2, 0, 0]], atol=1e-12)
 
 
-@pytest.mark.parametrize("start", [PLAIN, TRUE.model_copy(update={"contact_offset_mm": 0.0, "image_turn_deg": 80.0})])
+@pytest.mark.parametrize(
+    "start", [PLAIN, pytest.param(TRUE.model_copy(update={"contact_offset_mm": 0.0, "image_turn_deg": 80.0}), marks=pytest.mark.slow)]
+)
 def test_a_known_rig_is_recovered_from_its_pins(start):
     labels = spread(12)
     pins = AnalyticBank().pins_px(contacts_of(TRUE, SURFACE, labels, RADIUS_MM))

@@ -143,7 +143,7 @@ def real_plan(spec, frames):
     return Plan(source, detectors, cases, (0.0, 0.3, 1.0))
 
 
-def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path):
+def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path, undrawn_charts):
     plan = real_plan(spec, frames)
     counts = []
 
@@ -296,7 +296,7 @@ def careless(image):
 """
 
 
-def test_code_of_the_user_is_judged_like_the_others(spec, frames, tmp_path):
+def test_code_of_the_user_is_judged_like_the_others(spec, frames, tmp_path, undrawn_charts):
     mine, recording = tmp_path / "mine.py", tmp_path / "frames"
     recording.mkdir()
     for frame in frames:

@@ -34,7 +34,7 @@ def frame(k: int, image=None) -> Frame:
     return Frame(np.full((8, 8), k, np.uint8) if image is None else image, Form.RECORDING, f"f{k}", 0.5 * k, k + 1)
 
 
-@pytest.mark.parametrize("after_s", [0.05, 0.21, 0.43])
+@pytest.mark.parametrize("after_s", [0.21, *(pytest.param(more, marks=pytest.mark.slow) for more in (0.05, 0.43))])
 def test_killed_at_any_moment_it_is_whole_up_to_the_last_line(tmp_path, after_s):
     process = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path / "s")], stdout=subprocess.PIPE, env=os.environ)
     process.stdout.readline()

@@ -201,7 +201,7 @@ def edge_pins(labels, rest):
     return np.stack([field.real, field.imag], axis=-1)
 
 
-@pytest.mark.parametrize("sense", [1, -1])
+@pytest.mark.parametrize("sense", [-1, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_twin_read_backwards_finds_labels_and_learns_what_the_twin_misses(sense):
     """An edge around the circle, after moves that are found, too; the real pins are displaced, and move by a tenth more."""
     rng = np.random.default_rng(0)

@@ -70,6 +70,7 @@ def test_a_pressed_skin_is_recovered_from_its_pins(straight, fit, states, name):
     np.testing.assert_allclose(found.caps_mm - found.base_mm, length * found.axis, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_rotated_pins_give_the_rotated_skin(straight, fit, states):
     """A turn by 60 deg permutes the pins of ring i by i places."""
     state = states["tilted"]

@@ -280,7 +280,7 @@ def test_an_arm_that_gives_way_presses_less(surrogate, sensor):
     assert soft.felt.force_n[0, 2] == pytest.approx(stiff.felt.force_n[0, 2], rel=0.05)
 
 
-@pytest.mark.parametrize("thing", ["plane", "ball-40", "edge", "cylinder"])
+@pytest.mark.parametrize("thing", ["plane", "edge", *(pytest.param(more, marks=pytest.mark.slow) for more in ("ball-40", "cylinder"))])
 def test_pins_and_force_are_near_those_of_the_finite_elements(surrogate, sensor, thing):
     """Tap, shear and back: a path that no surrogate was trained on."""
     touched = load_object(thing)

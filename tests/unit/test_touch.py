@@ -109,7 +109,10 @@ def test_a_real_sensor_at_rest_is_at_rest(real_dir, folder, name):
 
 
 @pytest.mark.real
-@pytest.mark.parametrize(("folder", "name"), [("tac-vgnn-331", "mg400-331"), ("tac-vgnn-127", "mg400-127"), ("ur5-331-raw", "ur5-331")])
+@pytest.mark.parametrize(
+    ("folder", "name"),
+    [pytest.param("tac-vgnn-331", "mg400-331", marks=pytest.mark.slow), ("tac-vgnn-127", "mg400-127"), ("ur5-331-raw", "ur5-331")],
+)
 def test_a_real_contact_is_told(real_dir, folder, name):
     spec = load_sensor(name)
     recording = open_recording(real_dir / folder, spec)

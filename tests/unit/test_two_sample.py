@@ -32,6 +32,7 @@ def pictures(count, seed, *, blue=1.0):
     return out
 
 
+@pytest.mark.slow
 def test_sets_of_one_distribution_are_not_distinguished():
     outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1), INSIDE, judge=QUICK)
     assert outcome.accuracy == pytest.approx(0.5, abs=CHANCE)

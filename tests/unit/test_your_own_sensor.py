@@ -96,6 +96,7 @@ def test_the_size_of_the_tip_is_said_to_be_assumed(made):
     assert any(line.startswith("assumed: tip of radius 20 mm") and "--radius-mm" in line for line in made[0].lines())
 
 
+@pytest.mark.slow
 def test_a_tip_of_another_size_is_the_same_picture_with_other_lengths(made, tmp_path):
     usual, _, folder = made
     small = new_sensor(folder, tmp_path / "small.toml", radius_mm=8.0)
@@ -147,7 +148,7 @@ def test_the_minimal_specification_of_the_documentation_is_one(tmp_path):
     assert len([line for line in block.splitlines() if line.strip()]) <= 28
 
 
-@pytest.mark.parametrize("spacing", ["polar", "plan"])
+@pytest.mark.parametrize("spacing", ["polar", pytest.param("plan", marks=pytest.mark.slow)])
 def test_the_sizes_of_caps_decide_how_rings_are_spaced_where_contacts_blur_their_places(spacing):
     """Pins spread by contacts fit a lens of another kind better; their caps' sizes from the middle to the rim do not."""
     start = load_sensor("ur5-331")

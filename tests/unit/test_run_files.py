@@ -63,7 +63,7 @@ def refused(call, path):
 anything = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.lists(st.integers(), max_size=2)
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), value=anything | st.dictionaries(st.text(max_size=5), anything, max_size=2))
 def test_a_configuration_with_any_other_value_makes_a_model_or_is_refused(trained, tmp_path_factory, data, value):
     """Whatever key of any depth has whatever value: the run is loaded, or one line names it."""

@@ -106,7 +106,7 @@ class Rig:
     ----------
     source : FrameSource
     arm : Arm
-        A real or emulated arm is wrapped in a ``SafeArm``.
+        A real or emulated arm is wrapped in a ``SafeArm`` if limits are given, or if its kind has a file in ``hardware/limits``.
     placed : PlacedObject
     knows_truth : bool
         Whether the object's pose is exactly that of ``placed``. This is true in the twin.

@@ -88,6 +88,11 @@ class SafeArm:
         Direction in the base frame in which the tool leaves the object; ``normal`` can be set at any time.
     log : callable or None
         Called with every LoggedDecision. The newest are also kept in ``decisions``.
+
+    Raises
+    ------
+    DeviceError
+        The limits are for another number of joints than the arm has.
     """
 
     def __init__(
@@ -185,7 +190,8 @@ class SafeArm:
         Raises
         ------
         RefusedMoveError
-            The move was not allowed. The arm was stopped. If the contact is too deep, it also retreated.
+            The move was not allowed. An enabled arm was stopped. If the contact is too deep, or its force or torque is too large, the
+            arm also retreated.
         """
         state = self._newest_state("move_linear")
         decision = decide(pose, state, self.limits, now_s=time.monotonic(), kinematics=self.kinematics, sensed=self._sensed)
@@ -197,7 +203,15 @@ class SafeArm:
         return clip(pose, self._newest_state("clipped").pose, self.limits, self.kinematics)
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        """As ``Arm.move_joints``; see ``move_linear``."""
+        """As ``Arm.move_joints``. Returns the allowed joints.
+
+        Raises
+        ------
+        DeviceError
+            The arm's kinematics are not known.
+        RefusedMoveError
+            The move was not allowed; see ``move_linear``.
+        """
         if self.kinematics is None:
             raise DeviceError(f"{self.name}: its kinematics are not known, so a move of its joints can't be checked; use move_linear")
         state = self._newest_state("move_joints")

@@ -55,7 +55,7 @@ class SafetyLimits(Section):
     force_n, torque_nmm : float, optional
         Largest force, and largest torque about the sensor's axis, that the sensor may report. If one is exceeded, the arm retreats.
     hold_force_n, hold_torque_nmm : float, optional
-        Force and torque above which the arm holds still without a retreat.
+        Force and torque above which the arm holds still. A servo loop ends and retreats if this lasts longer than its ``give_up_s``.
     slip_share : float, optional
         Largest share of the contact that may slide. If it is exceeded, the arm holds still.
     slip_begins : float, optional
@@ -263,7 +263,7 @@ def decide(
     kinematics : Kinematics or None
         None: joints, linkage and reach are not checked.
     sensed : Sensed or None
-        None: neither the frame's age nor the depth is checked.
+        None: neither the frame's age nor the contact (depth, force, torque, slip) is checked.
     """
     if halted := _halt(state, limits, now_s=now_s, sensed=sensed):
         return halted

@@ -63,7 +63,8 @@ class CameraSpec(Section):
         Distance from the entrance pupil to the origin (the centre of a cap, or the outside of a pad): the pupil is at z = -distance. It is
         negative if the centre of a shallow cap is behind the pupil.
     tilt_x_deg, tilt_y_deg : float
-        Rotation of the camera about its pupil.
+        Rotation of the camera about its pupil. A positive ``tilt_x_deg`` turns the optical axis towards -y of the sensor frame, a
+        positive ``tilt_y_deg`` towards -x.
     k1, k2, p1, p2 : float
         Coefficients of the radial (k) and tangential (p) distortion of the ``projection``.
     aperture_mm : float
@@ -371,7 +372,7 @@ class AppearanceSpec(Section):
 class ResidualSpec(Section):
     """A small network that corrects the discrepancy of the light and camera models in a colour frame, before the stream rounds the frame.
 
-    It makes frames look like those of the camera. The pins do not need it: it moves their centroids by a few hundredths of a pixel. It is
+    It makes frames look like those of the camera. The pins do not need it: it moves their centroids by about a hundredth of a pixel. It is
     off unless ``used`` is set. It is valid only with the calibration with which it was trained.
 
     Attributes
@@ -408,7 +409,7 @@ class ResidualSpec(Section):
 
 
 class ResponseSpec(Section):
-    """The camera's response: from linear light to 8-bit gray levels. The steps are in the order of the keys.
+    """The camera's response: from linear light to 8-bit gray levels. ``twin.camera.capture.expose`` says in which order its steps act.
 
     The defaults are plausible numbers for a USB camera; 'twin calibrate optics' finds a sensor's own.
 
@@ -423,7 +424,7 @@ class ResponseSpec(Section):
     read_noise, shot_noise : float
         The noise has the variance ``read_noise^2 + shot_noise * light``; light 1 is saturation.
     noise_sigma_px : float
-        Standard deviation of the Gaussian with which the camera smooths the luma's noise.
+        Standard deviation of the Gaussian with which the camera smooths the noise of every channel.
     sharpening, sharpening_sigma_px : float
         Weight and standard deviation of the unsharp mask that the camera applies to the luma, but not to its noise.
     gamma, black_level : float

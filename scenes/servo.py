@@ -50,7 +50,7 @@ class ServoSpec(Section):
     integral_mm, integral_deg : float
         Bounds of the sums.
     largest_move_mm, largest_turn_deg : float
-        Bounds of the correction in one step.
+        Bounds of one step: of its whole translation (feed and correction of the depth), and of the correction of the angle.
     clear_mm : float
         Distance from the surface at which the approach starts, and to which the arm retreats.
     linear_mm_s, angular_deg_s : float

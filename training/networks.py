@@ -23,8 +23,10 @@ def choose_device(name: str) -> str:
 
     Raises
     ------
+    OptionError
+        The name is another one.
     TrainingError
-        The name is another one, or it is ``cuda`` and PyTorch finds no GPU.
+        It is ``cuda``, and PyTorch finds no GPU.
     """
     if name not in ("auto", "cpu", "cuda"):
         raise OptionError(f"--device must be auto, cpu or cuda, got {name!r}")

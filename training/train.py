@@ -120,8 +120,10 @@ def train_model(
 
     Raises
     ------
+    OptionError
+        ``device`` has no such value, or there are no such labels.
     TrainingError
-        There is no such model or device, or ``out`` holds another run.
+        There is no such model, PyTorch finds no GPU for ``cuda``, or ``out`` holds another run.
     FrameError
         The recordings have no such labels, or can't be joined.
     """
@@ -213,7 +215,7 @@ def columns_of(target: str) -> str | tuple[str, ...]:
 
     Raises
     ------
-    TrainingError
+    OptionError
         A name occurs twice, or there is no name.
     """
     names = tuple(name.strip() for name in target.split(",") if name.strip())

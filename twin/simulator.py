@@ -107,7 +107,13 @@ class Simulator:
         return self._rest_shots[form]
 
     def as_recorded(self, raw: Shot, state: ContactState) -> Shot:
-        """The shot of a raw frame in the form of the sensor's recordings."""
+        """The shot of a raw frame in the form of the sensor's recordings.
+
+        Raises
+        ------
+        FrameError
+            The sensor has no such form.
+        """
         if self.spec.recording is None:
             raise FrameError(f"{self.spec.name} has no recording form; give its specification the section 'recording', or use raw frames")
         image = record(raw.frame.image, self.spec.recording)

@@ -11,7 +11,6 @@ import os
 import pickle
 import shutil
 import struct
-import sys
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -21,15 +20,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import trimesh
+from drawn_frames import drawn_frame
 from forked_program import Program
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
-from drawn_frames import drawn_frame  # noqa: E402
-
-from scenes import load_sensor  # noqa: E402
-from scenes.load import SHIPPED  # noqa: E402
-from twin.pins import nominal_reference  # noqa: E402
-from twin.types import Form  # noqa: E402
+from scenes import load_sensor
+from scenes.load import SHIPPED
+from twin.pins import nominal_reference
+from twin.types import Form
 
 SENSOR, RAW_SENSOR = "mg400-127", "ur5-331"
 POLICIES = Path(__file__).parents[2] / "training" / "policies"

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from drawn_frames import draw_discs, smooth_warp
+from unknown_sensor import SIZE, frames_of, rest_of
 
 from scenes import load_sensor
 from scenes.pins import PinsSpec
@@ -23,30 +23,6 @@ LAYOUTS = [
     PinsSpec(layout="grid", columns=9, rows=7),
     pytest.param(PinsSpec(layout="grid", columns=10, rows=10), marks=pytest.mark.slow),
 ]
-
-
-SIZE, RADIUS = (300, 252), 108.0  # px: small frames, in which 331 pins still stand 11 px apart
-
-
-def rest_of(pins, *, size=SIZE, radius=RADIUS, turn_deg=11.0, bulge=-0.15):
-    """Where a camera that looks at a dome, turned and a little off, has the pins: px (N, 2)."""
-    place = pin_lattice(pins).places @ [1, 1j] * np.exp(1j * np.radians(turn_deg))
-    place = place * (1 + bulge * np.abs(place) ** 2) / (1 + bulge)
-    return np.column_stack([place.real, place.imag]) * radius + np.array(size) / 2 + [5.4, -3.6]
-
-
-def frames_of(rest, count=3, *, size=SIZE, contact_px=4.2, ring=True, level=(20, 120), seed=0):
-    """Gray frames of contacts: caps, and the bright ring of the housing."""
-    spacing = np.median(np.sort(np.linalg.norm(rest[:, None] - rest, axis=2), axis=1)[:, 1])
-    images = []
-    for k in range(count):
-        rng = np.random.default_rng(100 * seed + k)
-        image = draw_discs(size, smooth_warp(rest, contact_px, rng), 0.27 * spacing, level=level, blur_px=0.8, noise_sd=1.0, rng=rng)
-        if ring:
-            middle, radius = tuple(int(v) for v in rest.mean(axis=0)), np.linalg.norm(rest - rest.mean(axis=0), axis=1).max()
-            cv2.circle(image, middle, int(1.16 * radius), 200, max(round(0.04 * radius), 1))
-        images.append(image)
-    return images
 
 
 def same(found, pins):

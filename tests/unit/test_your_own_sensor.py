@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from drawn_frames import drawn_frame, smooth_warp
 from scipy.spatial import cKDTree
-from test_identify import RADIUS, SIZE, frames_of, rest_of
+from unknown_sensor import RADIUS, SIZE, frames_of, rest_of
 
 from scenes import load_sensor
 from scenes.pins import PinsSpec

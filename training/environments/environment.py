@@ -73,7 +73,15 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         return _row(self.batch.observation()), _row(self.batch.begun())
 
     def step(self, action: FloatArray) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
-        """Move the tool; see gymnasium."""
+        """Move the tool by an action (A,) from -1 to 1, where 1 is the task's largest move, mm or deg.
+
+        Returns observation, reward, terminated, truncated and info; see gymnasium.
+
+        Raises
+        ------
+        OptionError
+            ``reset`` was not called first, or the environment is closed.
+        """
         self._require_open()
         if self._state == "new":
             raise OptionError("step() before reset(); call reset() first")
@@ -85,7 +93,13 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         return _row(self.batch.observation()), float(done.reward[0]), bool(done.terminated[0]), bool(done.truncated[0]), info
 
     def render(self) -> ImageArray | None:
-        """The sensor's frame, (H, W, 3) uint8, if the render mode is ``rgb_array``; else None. With ``human`` each step is shown anyway."""
+        """The sensor's frame, (H, W, 3) uint8, if the render mode is ``rgb_array``; else None. With ``human`` each step is shown anyway.
+
+        Raises
+        ------
+        OptionError
+            ``reset`` was not called first, or the environment is closed.
+        """
         self._require_open()
         if self.render_mode != "rgb_array":
             return None
@@ -152,6 +166,11 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
         When the next episode begins: in the step after the end of an episode (gymnasium's default), or in the same step.
     render_mode, options
         As for ``TactileEnv``, but without ``human``, because a page shows one environment.
+
+    Raises
+    ------
+    OptionError
+        An option is not valid, or the mode is not offered.
     """
 
     def __init__(
@@ -199,7 +218,13 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
         return self.batch.observation(), _of_rows(self.batch.begun(), np.ones(self.num_envs, bool))
 
     def step(self, actions: FloatArray) -> tuple[Seen, FloatArray, Any, Any, dict[str, Any]]:
-        """Step every row; a row whose episode ended in the last step begins the next one instead (see ``autoreset_mode``)."""
+        """Step every row by its action, (B, A) from -1 to 1; a row whose episode ended begins the next one (see ``autoreset_mode``).
+
+        Raises
+        ------
+        OptionError
+            ``reset`` was not called first, or the environments are closed.
+        """
         self._require_open()
         if not self._begun:
             raise OptionError("step() before reset(); call reset() first")
@@ -232,7 +257,13 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
         return self.batch.observation(), done.reward, done.terminated, done.truncated, info
 
     def render(self) -> tuple[ImageArray, ...] | None:
-        """The frames of all rows, if the render mode is ``rgb_array``."""
+        """The frames of all rows, each (H, W, 3) uint8, if the render mode is ``rgb_array``; else None.
+
+        Raises
+        ------
+        OptionError
+            The environments are closed.
+        """
         self._require_open()
         return tuple(self.batch.picture(row) for row in range(self.num_envs)) if self.render_mode else None
 

@@ -73,7 +73,8 @@ class Judged:
     ----------
     reward : (B,) float
     failed : (B,) bool
-        Whether the episode ends as failed: the object is lost, or the sensor is too deep.
+        Whether the episode ends as failed: the object is lost, the sensor is too deep or too oblique, or, of some tasks, the goal is
+        out of reach.
     reached : (B,) bool
         Whether the episode ends as successful.
     good : (B,) bool

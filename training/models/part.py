@@ -288,7 +288,13 @@ class Model(ABC):
         raise TrainingError(f"a small copy of {self.name} is not provided for: what half precision does to it was never measured")
 
     def unpack(self, packed: Weights, blank: Weights) -> Weights:
-        """The weights of a network from its small copy ``packed``; ``blank`` are the weights of the network that ``build`` makes."""
+        """The weights of a network from its small copy ``packed``; ``blank`` are the weights of the network that ``build`` makes.
+
+        Raises
+        ------
+        TrainingError
+            The model has no small copy.
+        """
         raise TrainingError(f"a small copy of {self.name} is not provided for")
 
 

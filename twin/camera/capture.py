@@ -49,9 +49,10 @@ def expose(
 ) -> ImageArray:
     """The raw frame that gel, lens and camera make of the light.
 
-    Gel haze, lateral chromatic aberration, blur and vignetting act on light. They are followed by gain, noise, sharpening of the luma,
-    the response curve, loss of colour detail, the video stream and its compression (`GelSpec`, `CameraSpec`, `ResponseSpec`). If a residual
-    network is switched on, it acts before the stream. A step whose parameter is neutral changes nothing.
+    Gel haze, lateral chromatic aberration, blur and vignetting act on light. They are followed by gain, sharpening of the luma, the
+    response curve, loss of colour detail, the video stream and its compression (`GelSpec`, `CameraSpec`, `ResponseSpec`). Noise is added
+    to the sharpened light, and is not sharpened itself. If a residual network is switched on, it acts before the stream. A step whose
+    parameter is neutral changes nothing.
 
     Parameters
     ----------

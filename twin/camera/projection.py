@@ -41,7 +41,8 @@ def sensor_to_camera(camera: CameraSpec) -> FloatArray:
     """``T_camera_sensor`` (4, 4): camera looks along +z with x right and y down.
 
     The entrance pupil is at (0, 0, -distance) of the sensor frame; the camera is turned about it
-    by tilt_x (about x), then tilt_y (about y).
+    by tilt_x (about x), then tilt_y (about y). A positive tilt_x turns the optical axis towards -y of the sensor frame, a positive tilt_y
+    towards -x.
     """
     ax, ay = np.radians([camera.tilt_x_deg, camera.tilt_y_deg])
     rot_x = np.array([[1, 0, 0], [0, np.cos(ax), np.sin(ax)], [0, -np.sin(ax), np.cos(ax)]])

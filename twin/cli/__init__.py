@@ -97,7 +97,7 @@ def _tell_version(asked: bool) -> None:
     "Press a skin by finite elements, path-trace what the camera inside sees, find the pins, build the graph: "
     "on rendered, recorded and live frames alike.\n\n"
     "Start with 'twin doctor', then 'twin demo --out out/demo'.\n\n"
-    "Exit codes: 0 done, 1 failed, 2 wrong command line, 130 ended by Ctrl-C.",
+    "Exit codes: 0 done, 1 failed, 2 wrong command line, 3 a bad finding of 'twin check', 130 ended by Ctrl-C.",
 )
 def _twin(
     version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_tell_version, help="print the version and stop")] = False,

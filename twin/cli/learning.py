@@ -347,8 +347,8 @@ def predict(
 
 HELP_PACK = """Write a small copy of a finished training run.
 
-Its numbers have half the precision, and its size is less than a tenth. It can be given wherever a RUN is asked for. The shipped
-weights below training/weights were made with these commands:
+Its numbers have half the precision, and its size is less than a tenth. It can be given wherever a RUN is asked for. For example,
+the run of a study is packed so:
 
 \b
 Example:
@@ -374,8 +374,8 @@ HELP_SURROGATE = """Make a fast stand-in for a sensor's finite elements.
 
 Finite elements solve random contacts: plates, balls, cylinders, edges and prisms that press, shear, twist, roll, leave and return. The
 surrogate is the skin at small strain with exact contact and friction at 271 nodes, and a small network for what large deformations
-change. The network begins with that of mg400-331 and learns on. A surrogate takes about a thousandth of the time. Every fifth path is
-only judged with; the errors are printed and kept in the file.
+change. The network begins with that of mg400-331 and learns on. A surrogate takes about a sixtieth of the time, and less where
+many contacts are computed together. Every fifth path is only judged with; the errors are printed and kept in the file.
 
 Surrogates of the shipped sensors go with the package; the environments take others by surrogate=FILE.
 

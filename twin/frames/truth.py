@@ -25,7 +25,13 @@ def image_name(index: int, state: int) -> str:
 
 
 def open_truth(folder: Path) -> tuple[zarr.Group, str, Form]:
-    """The truth of a data set, the name of its sensor, and the form of its frames."""
+    """The truth of a data set, the name of its sensor, and the form of its frames.
+
+    Raises
+    ------
+    FrameError
+        The data set is damaged or not finished.
+    """
     path = folder / TRUTH
     try:
         truth = zarr.open_group(path, mode="r")
@@ -45,7 +51,13 @@ def row_of(truth: zarr.Group) -> dict[str, int]:
 
 
 def arrays_of(truth: zarr.Group, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Arrays of ``truth.zarr`` by name."""
+    """Arrays of ``truth.zarr`` by name.
+
+    Raises
+    ------
+    FrameError
+        An array is damaged or missing.
+    """
     found = {}
     for name in names:
         try:

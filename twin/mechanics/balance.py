@@ -55,6 +55,20 @@ class Friction:
 
     A point that has slid by s since it last stuck has the coefficient mu = kinetic + (static - kinetic) exp(-s / weakening_mm).
     The shear stress never exceeds ``shear_strength_mpa``.
+
+    Attributes
+    ----------
+    static, kinetic : float
+        Coefficients of a point that sticks, and of one that has slid far.
+    weakening_mm : float
+        Distance of sliding over which the coefficient falls.
+    shear_strength_mpa : float
+        Largest shear stress.
+
+    Raises
+    ------
+    ContactError
+        Not 0 <= kinetic <= static, or ``weakening_mm`` or ``shear_strength_mpa`` is not positive.
     """
 
     static: float

@@ -5,7 +5,7 @@ Energy of an element, with F, J at 2x2x2 Gauss points of rest volume w and the l
     W = sum_q w_q [W_distortion(F_q) + S_q : C_q / 2] + V kappa / 2 mean^2 + V kappa_d / 2 difference^2
 
 Each element has two levels through its depth, with the volume strains e = v / V - 1 (V = sum w and v = sum w J over the four points of a
-level). ``mean`` is the mean of the two strains, and ``difference`` is half their difference. Because there is only one volume ratio per
+level). ``mean`` is the strain of the whole element, and ``difference`` is half their difference. Because there is only one volume ratio per
 level, the element has no volumetric locking (mean dilatation, Simo & Taylor 1985). ``S`` is a given stress: the stress from the past in a
 viscoelastic body, and zero in an elastic one.
 

@@ -70,6 +70,11 @@ class ContactPath:
     times_s : (k,) float, optional
         Time at which each pose is reached, in rising order. It matters for viscoelastic sensors only. Between two equal poses the object
         stands still. Default: one second from pose to pose.
+
+    Raises
+    ------
+    ContactError
+        There are fewer than two poses, a pose is not finite or no rigid motion, or the times do not rise.
     """
 
     poses: FloatArray

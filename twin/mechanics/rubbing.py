@@ -2,8 +2,9 @@
 
 Friction depends on the path. A point at the edge of a growing contact first bears a small pressure and slips; when the edge has passed,
 the point sticks. In one long load step it would stick from the moment it touches, and the shear forces would be up to 10 % too small.
-Therefore a load step with friction is computed a second time in short substeps. They use the body's tangent K, condensed at the end of the
-step. The elastic force is linear in the controls x, plus a term that makes it exact at the start of the step (0) as well as at its end (1):
+Therefore a load step with friction in which new places touch is computed a second time in short substeps. They use the body's tangent K,
+condensed at the end of the step. The elastic force is linear in the controls x, plus a term that makes it exact at the start of the step
+(0) as well as at its end (1):
 
     f(x, t) = f_1 + K (x - x_1) + (1 - t) [f_0 - f_1 - K (x_0 - x_1)],    t from 0 to 1
 

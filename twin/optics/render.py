@@ -65,6 +65,11 @@ class Renderer:
         Number of scatterings of a light path after the first.
     shading : Shading, optional
         Shading of drawn pictures. Default: the shading of the frame at rest (`traced_shading`).
+
+    Raises
+    ------
+    RenderError
+        There is no such quality, the window is not within the frame, or ``spp`` is given for a drawn picture.
     """
 
     def __init__(
@@ -194,7 +199,13 @@ class Renderer:
             yield np.maximum(image, 0)
 
     def surfaces(self, state: PinState) -> dict[str, Surface]:
-        """Skin, stems and caps of a state, by the names of the scene's meshes."""
+        """Skin, stems and caps of a state, by the names of the scene's meshes.
+
+        Raises
+        ------
+        RenderError
+            The state has another number of pins than the sensor.
+        """
         if state.base_mm.shape != self._rest.base_mm.shape:
             raise RenderError(f"the state has {len(state.base_mm)} pins, {self.spec.name} has {len(self._rest.base_mm)}")
         nodes = getattr(state, "nodes_mm", None)

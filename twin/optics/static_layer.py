@@ -143,7 +143,7 @@ def housing_light(leds: LedRingSpec, ring: HousingSpec, at_mm: FloatArray) -> Fl
     """Radiance (..., 3) that the ring and wall send to the camera from places (..., 2) of their plane.
 
     ``albedo * power * (ambient * lit share of LEDs * exp(-(rho - aperture) / falloff)
-    + glow * sum over LEDs of balance * (1 + |p - led|^2 / h^2)^-n)``.
+    + glow * sum over LEDs of balance * (1 + |p - led|^2 / h^2)^-n)``. Beyond the lip this is multiplied by ``wall_fraction``.
     """
     patches = led_patches(leds)
     place = at_mm - ring.center_mm

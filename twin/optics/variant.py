@@ -134,7 +134,13 @@ def choose_variant(channels: str = "color", prefer: str | None = None, *, llvm_s
 
 
 def use_variant(choice: VariantChoice) -> ModuleType:
-    """Make ``choice`` Mitsuba's current variant and return the ``mitsuba`` module."""
+    """Make ``choice`` Mitsuba's current variant and return the ``mitsuba`` module.
+
+    Raises
+    ------
+    RenderError
+        A library of the system that Mitsuba needs is missing.
+    """
     if choice.llvm_path:
         os.environ[_LLVM_VARIABLE] = choice.llvm_path
     if missing := load_needed_libraries():
@@ -161,7 +167,13 @@ def one_thread(choice: VariantChoice) -> Iterator[None]:
 
 
 def available_variants() -> tuple[str, ...]:
-    """Names of the variants compiled into the installed Mitsuba, without importing it."""
+    """Names of the variants compiled into the installed Mitsuba, without importing it.
+
+    Raises
+    ------
+    RenderError
+        Mitsuba is not installed.
+    """
     spec = importlib.util.find_spec("mitsuba")
     if spec is None or spec.origin is None:
         raise RenderError("Mitsuba is not installed: pip install 'mitsuba>=3.9'")

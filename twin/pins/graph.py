@@ -32,6 +32,11 @@ def make_graph(kind: GraphKind, nodes_px: np.ndarray, *, outmost: np.ndarray | N
     ``knn``: edges to the 6 nearest other nodes. ``delaunay``: both directions of every side of the nodes' Delaunay triangles.
     ``voronoi``: the same edges, with clipped Voronoi areas and cells (``outmost`` as in ``voronoi``). If the nodes have no
     triangulation, because they are collinear or coincide, the edges are those of ``knn``.
+
+    Raises
+    ------
+    ValueError
+        There is no such kind.
     """
     none = np.full(len(nodes_px), np.nan)
     if kind == "knn":
@@ -52,6 +57,11 @@ def features(graph: PinGraph, reference: Reference, kind: Literal["relative", "p
     ``relative``: columns x, y, dx, dy[, area], independent of the image's scale. x and y are centred on their medians, dx and dy are the
     displacement from rest, all in mean rest spacings. A graph with a tessellation also has the area relative to the area at rest.
     ``pixels``: as published, x and y in px centred on their medians[, area in px^2].
+
+    Raises
+    ------
+    ValueError
+        There is no such kind.
     """
     centred = graph.nodes_px - np.median(graph.nodes_px, axis=0)
     areas = graph.kind == "voronoi"

@@ -78,8 +78,10 @@ def write_graphs_of(
 
     Raises
     ------
+    OptionError
+        ``legacy`` does not apply to the input.
     FrameError
-        No frame has a graph, the file is not a ``pins.npz`` of this sensor, or ``legacy`` does not apply to the input.
+        No frame has a graph, or the file is not a ``pins.npz`` of this sensor.
     """
     if legacy and (kind != "voronoi" or path.suffix == PINS):
         raise OptionError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")

@@ -235,6 +235,11 @@ def voronoi(nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, edges: n
         The outmost nodes, in order around the layout; their polygon is used if it is star-shaped.
     edges : (E, 2) int, optional
         The nodes' Delaunay edges as ``directed_edges`` gives them, if the caller has them.
+
+    Raises
+    ------
+    ValueError
+        ``nodes_px`` is not (N, 2), N >= 1, or not finite.
     """
     nodes_px = np.ascontiguousarray(nodes_px, float)
     if nodes_px.ndim != 2 or not len(nodes_px) or not np.isfinite(nodes_px).all():

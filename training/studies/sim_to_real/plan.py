@@ -58,6 +58,8 @@ class Plan:
 
     Raises
     ------
+    DatasetError
+        ``draws`` or ``count`` is out of range.
     TrainingError
         A folder of ``simulated`` holds no simulated data set.
     """

@@ -69,6 +69,7 @@ class LiveSource(Connection):
 
     is_live = True
     notices_still = True  # whether a picture that does not change is a fault
+    notices_late = True  # whether a picture that is older than ``LATE_S`` at its arrival is a fault
     _read_last: int  # sequence number of the frame that was read last
     _sequence: int
     _dropped: int
@@ -229,7 +230,7 @@ class LiveSource(Connection):
     def _look_at(self, picture: Picture) -> str:
         if picture.image.max(initial=0) < BLACK_LEVEL:
             return "the picture is black; check the sensor's lamps and the camera's exposure"
-        if (age_s := time.monotonic() - picture.time_s) > LATE_S:
+        if self.notices_late and (age_s := time.monotonic() - picture.time_s) > LATE_S:
             return (
                 f"the picture says that it is {age_s:.0f} s old; set the clock of the camera's computer to that of this one, "
                 "or look for what delays the pictures"

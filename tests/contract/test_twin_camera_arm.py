@@ -1,5 +1,7 @@
 """What the servo's twin shows is the contact that its sensor's rig makes of the arm's pose."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -41,3 +43,19 @@ def test_the_object_is_where_the_arms_force_leaves_it_and_rubs_as_the_rig_does(r
     rubbed = np.linalg.norm(state.tangential_n, axis=1)
     assert (rubbed <= 0.2 * state.normal_n * (1 + 1e-9)).all() and state.slipping.mean() > 0.5
     assert np.abs(held - commanded).max() > SETTLED_MM
+
+
+def test_a_picture_that_took_long_to_compute_is_shown(monkeypatch):
+    """On a slow or busy machine a contact takes seconds. That is no fault of a clock."""
+    spec = load_sensor("mg400-127")
+    placed = PlacedObject(load_object("plane"), PlacementSpec(), Mounting.of(spec, load_experiment("surface-2d")))
+    arm = SimulatedArm(axes=6, pose=placed.start_pose(-5.0), time_scale=np.inf)
+    arm.connect()
+    late_s = 0.1
+    with TwinCamera(spec, placed, arm.state, Form.RECORDING, on_demand=True) as camera:
+        camera.read(timeout_s=camera.first_frame_s)
+        move = camera._follower.move
+        monkeypatch.setattr(camera._follower, "move", lambda *told: time.sleep(2 * late_s) or move(*told))
+        monkeypatch.setattr("hardware.cameras.reader.LATE_S", late_s)
+        for _ in range(2):
+            camera.read_after(time.monotonic(), timeout_s=camera.first_frame_s)

@@ -46,13 +46,22 @@ def run_until_told(
     try:
         with device:
             on_ready(f"ready {ready()}")
-            while not told and signal.sigtimedwait(ends, CHECK_S) is None:
+            while not told and not _comes(ends):
                 if (error := failure()) is not None:
                     raise error
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for end, handler in handlers.items():
             signal.signal(end, handler)
+
+
+def _comes(ends: set[signal.Signals]) -> bool:
+    """Whether one of these signals comes within ``CHECK_S``.
+
+    A process that was stopped and continues gets an answer from ``sigtimedwait`` although no signal came: it holds no number of a signal.
+    """
+    found = signal.sigtimedwait(ends, CHECK_S)
+    return found is not None and found.si_signo in ends
 
 
 def emulate_mg400(

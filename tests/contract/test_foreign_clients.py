@@ -252,6 +252,24 @@ def test_an_emulator_ends_on_a_signal_that_another_thread_gets():
     assert done.returncode == 0 and done.stdout == "ready now\n", done.stderr
 
 
+def test_an_emulator_that_was_stopped_goes_on():
+    """As by Ctrl-Z and ``bg``."""
+    source = "import contextlib; from hardware.emulators.running import run_until_told; run_until_told(contextlib.nullcontext(), lambda: '')"
+    with subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE) as process:
+        try:
+            process.stdout.readline()
+            for _ in range(2):
+                process.send_signal(signal.SIGSTOP)
+                time.sleep(1.0)
+                process.send_signal(signal.SIGCONT)
+                time.sleep(0.2)
+            assert process.poll() is None
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(timeout=10) == 0
+        finally:
+            process.kill()
+
+
 @pytest.mark.parametrize("device", ["mg400", "magician"])
 def test_twin_emulate_says_when_it_is_ready_and_ends_on_sigterm(device, tmp_path):
     link = tmp_path / "arm"

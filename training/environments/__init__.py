@@ -1,7 +1,7 @@
 """Gymnasium environments of a TacTip's tasks, on the finite elements or on their surrogate.
 
-Importing this package registers them: ``gymnasium.make("tactip/EdgeFollow-v0")``. If the package is installed, gymnasium finds them without
-an import.
+Importing this package registers them: ``gymnasium.make("tactip/EdgeFollow-v0")``. ``training.environments:tactip/EdgeFollow-v0`` makes
+gymnasium import it.
 """
 
 try:
@@ -26,7 +26,7 @@ def ids() -> tuple[str, ...]:
 
 
 def register_all() -> None:
-    """Register the environments; a second call has no effect. Gymnasium calls it if the package is installed."""
+    """Register the environments; a second call has no effect. Some versions of gymnasium call it where the package is installed."""
     for name, full in zip(TASKS, ids(), strict=True):
         if full not in registry:
             where = "training.environments.environment"

@@ -696,6 +696,11 @@ class SensorSpec(Section):
             raise ValueError("lens.z_mm must not lie in front of skin.rim_z_mm")
         if self.lens.z_mm >= inside_mm:
             raise ValueError("lens.z_mm must lie behind the skin: below -skin.thickness_mm for a flat pad")
+        if skin.shape == "cap" and self.lens.radius_mm >= skin.outer_radius_mm:
+            raise ValueError(
+                f"lens.radius_mm must be smaller than skin.outer_radius_mm = {skin.outer_radius_mm:g}, got {self.lens.radius_mm:g}; "
+                "give a tip of another size its own lens.radius_mm and leds.radius_mm"
+            )
         room_mm = inside_mm if skin.shape == "cap" else inside_mm - self.lens.z_mm
         if pins.length_mm + pins.cap_height_mm >= room_mm:
             raise ValueError("pins.length_mm + pins.cap_height_mm must be smaller than a cap's inner radius, or a pad's gel is deep")

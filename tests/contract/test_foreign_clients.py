@@ -254,7 +254,9 @@ def test_an_emulator_ends_on_a_signal_that_another_thread_gets():
 
 def test_an_emulator_that_was_stopped_goes_on():
     """As by Ctrl-Z and ``bg``."""
-    source = "import contextlib; from hardware.emulators.running import run_until_told; run_until_told(contextlib.nullcontext(), lambda: '')"
+    source = (
+        "import contextlib; from hardware.emulators.running import run_until_told; run_until_told(contextlib.nullcontext(), lambda: '')"
+    )
     with subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE) as process:
         try:
             process.stdout.readline()

@@ -145,6 +145,14 @@ def test_recordings_are_tuned_without_a_crop(spec):
     assert make_detector(spec, shipped_detector(spec, Form.RECORDING, "legacy"))(frames[0]).pins_px is None
 
 
+def test_frames_of_a_sensor_without_a_recording_form_are_raw(spec, foreign, tmp_path):
+    """Whatever they look like: these are thresholded."""
+    for frame in foreign[0]:
+        cv2.imwrite(str(tmp_path / f"{frame.name}.png"), np.where(frame.image > 70, 255, 0).astype(np.uint8))
+    alone = spec.model_copy(update={"recording": None, "pipeline": spec.pipeline.model_copy(update={"recording": None})})
+    assert tune_on_frames(tmp_path, alone, limit=2).tuned.detector.form == Form.RAW
+
+
 @pytest.mark.parametrize("method", [*QUICK, pytest.param("fixed", marks=pytest.mark.slow)])
 def test_stricter_raises_the_bar(spec, foreign, tuned_by, method):
     detector = tuned_by(method).detector

@@ -74,6 +74,8 @@ def test_drift_is_the_planted_similarity():
     drift = drift_of(pins, rest, rim)
     assert drift.shift_px == pytest.approx([4.0, -2.0]) and drift.turn_deg == pytest.approx(3.0) and drift.scale == pytest.approx(1.05)
     assert drift.contact < 1e-9 and drift.scale_at_rest == pytest.approx(drift.scale)
+    flat = drift_of(pins * [1.0, 1.02], rest, rim, bulge=0.0)  # as a contact moves the pins of a pad, whose rim does not grow
+    assert flat.contact > 0.003 and flat.scale_at_rest == flat.scale
     pins[rim[: len(rim) // 2 + 1]] = np.nan
     assert drift_of(pins, rest, rim) is None
 

@@ -9,6 +9,7 @@ from finer_mesh import shaped
 
 from scenes.load import load_object
 from twin.camera.projection import project
+from twin.errors import ContactError
 from twin.geometry.solid import Resolution
 from twin.mechanics import ContactLaw, ContactPath, ContactPose, Friction, SkinSolver
 from twin.mechanics.balance import in_object
@@ -16,6 +17,7 @@ from twin.mechanics.contact import STICK_CREEP_MM, contact_forces, contact_point
 from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import plan_path
 from twin.objects import build_field
+from twin.objects.analytic import Sphere
 
 SOLVER_MM = 1e-4  # what the residual's tolerance leaves open in a position
 BETWEEN_MM = 0.02  # deepest place of the skin inside the object (measured 0.015; on a fillet of 0.1 mm 0.021)
@@ -382,3 +384,10 @@ def test_shear_stress_never_exceeds_its_bound(solver):
     assert np.hypot(*state.force_n[:2]) < 0.8 * np.hypot(*free.force_n[:2])
     high = bounded.model_copy(update={"shear_strength_mpa": 1e3})
     assert np.array_equal(solver.press(high, ContactPose(2.0, shear_mm=(3.0, 0.0))).force_n, free.force_n)
+
+
+def test_an_object_between_the_points_of_the_mesh_is_no_contact_without_force(solver):
+    """The skin would let it through, and the answer would be 0 N."""
+    with pytest.raises(ContactError, match=r"2\.0 mm inside the skin, and no point of the skin's mesh has met it.*larger object"):
+        solver.press(Sphere(0.3), ContactPose(2.0))
+    assert solver.press(Sphere(3.0), ContactPose(2.0)).force_n[2] > 0.1

@@ -169,6 +169,16 @@ def test_thresholded_frames_that_were_resized_are_still_such(scale):
         assert is_two_level(resized) == (form == Form.RECORDING)
 
 
+def test_a_picture_with_colours_was_not_thresholded():
+    """Also if it is dark beside a white housing. Gray pictures keep a little colour by JPEG."""
+    image = np.zeros((60, 80, 3), np.uint8)
+    image[:, 60:] = 255
+    noise = np.random.default_rng(0).integers(0, 6, image.shape, np.uint8)
+    assert is_two_level(np.clip(image.astype(int) - noise, 0, 255).astype(np.uint8))
+    image[20:40, 20:40] = (40, 90, 160)
+    assert not is_two_level(image)
+
+
 def test_nothing_usable_is_one_error_line(tmp_path, spec):
     empty = tmp_path / "empty"
     empty.mkdir()

@@ -176,6 +176,7 @@ def test_a_drawn_cap_is_where_its_pin_is_seen(name):
         ("pad-round", "skin", {"width_mm": 10.0}, "width_mm belongs to shape = 'rectangular-pad'"),
         ("pad-round", "skin", {"rim_z_mm": 2.0}, "rim_z_mm of a flat pad is 0"),
         ("pad-round", "skin", {"rim_z_mm": -1.5}, "at most -2 thickness_mm"),
+        ("tip-miniature", "lens", {"radius_mm": 19.25}, "lens.radius_mm must be smaller than skin.outer_radius_mm"),
         ("pad-round", "lens", {"z_mm": -2.5}, "must not lie in front of skin.rim_z_mm"),
         ("pad-rectangular", "skin", {"height_mm": None}, "needs width_mm and height_mm"),
         ("pad-rectangular", "skin", {"outer_radius_mm": 10.0}, "outer_radius_mm belongs to shape = 'cap'"),

@@ -253,7 +253,7 @@ def test_mesh_units_rotation_and_placement(tmp_path):
     assert place_mesh(ring).bounds[0, 2] == pytest.approx(0)
 
 
-@pytest.mark.parametrize("kind", ["open", "metre", "huge", "empty", "text", "missing"])
+@pytest.mark.parametrize("kind", ["open", "metre", "huge", "thin", "empty", "text", "missing"])
 def test_a_bad_mesh_says_what_is_wrong_and_what_to_do(tmp_path, kind):
     path, unit = tmp_path / f"{kind}.stl", "mm"
     box = trimesh.creation.box((80, 80, 80))
@@ -263,6 +263,8 @@ def test_a_bad_mesh_says_what_is_wrong_and_what_to_do(tmp_path, kind):
         box.apply_scale(1e-3)
     elif kind == "huge":
         unit = "m"
+    elif kind == "thin":
+        box = trimesh.creation.box((20, 20, 0.5))
     if kind == "text":
         path.write_text("hello")
     elif kind == "empty":
@@ -270,6 +272,7 @@ def test_a_bad_mesh_says_what_is_wrong_and_what_to_do(tmp_path, kind):
     elif kind != "missing":
         box.export(path)
     wanted = {"open": "not watertight: 3 open edges", "metre": "too small; scale the file to mm", "huge": "too large; scale the file to mm"}
+    wanted |= {"thin": r"walls are 0\.48 mm thick.*solid, or thicker"}
     with pytest.raises(MeshError, match=wanted.get(kind, path.name)) as caught:
         build_field(ObjectSpec(name="x", description="", shape=MeshShape(kind="mesh", file=str(path), unit=unit)))
     assert path.name in str(caught.value)

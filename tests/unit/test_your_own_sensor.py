@@ -90,6 +90,22 @@ def test_a_folder_of_frames_becomes_a_sensor(made):
     note, few = [line for line in found.lines() if line.startswith("note: ")]
     assert "skipped frame_4.png: truncated PNG" in note and "skipped frame_4.png" in page, "what was left out is told"
     assert "4 frames are few" in few, few
+    assert all(
+        f"--sensor {found.written[0]} --frames {folder} " in step for step in found.next_steps if "twin calibrate contact --" in step
+    )
+
+
+def test_the_next_steps_name_the_files_and_colour_frames_that_were_thresholded_get_no_light(tmp_path):
+    """They can be copied to the command line as they stand."""
+    rest = rest_of(PINS)
+    images = [np.where(image > 70, 255, 0).astype(np.uint8) for image in frames_of(rest, 4)]
+    folder = folder_of(tmp_path, [cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) for image in images])
+    (folder / "targets.csv").write_text("image_name,pose_2\n" + "".join(f"frame_{k}.png,{-k}\n" for k in range(4)))
+    out = tmp_path / "sub" / "mine.toml"
+    found = new_sensor(folder, out, form=Form.RECORDING)
+    (contact,) = [step for step in found.next_steps if "calibrate contact" in step]
+    assert contact.endswith(f"twin calibrate contact --sensor {out} --frames {folder} --out {tmp_path / 'sub' / 'mine-2.toml'}")
+    assert not [step for step in found.next_steps if "calibrate optics" in step]
 
 
 def test_the_size_of_the_tip_is_said_to_be_assumed(made):

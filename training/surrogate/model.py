@@ -248,7 +248,7 @@ def surrogate_of(sensor: SensorSpec, file: str | Path | None = None) -> Surrogat
         if FILE.about(path)["mechanics"] == wanted:
             return load_surrogate(path)
     raise SurrogateError(
-        f"no surrogate of {sensor.name} goes with the package; make one: twin surrogate --sensor {sensor.name} --out FILE, "
+        f"no surrogate of {sensor.name} goes with the package; make one: twin surrogate --sensor NAME_OR_FILE --out FILE, "
         "and give it as surrogate=FILE, or use backend='fem'"
     )
 

@@ -12,7 +12,7 @@ from twin.errors import FrameError
 from twin.fit.camera_pose import LEAST_PINS, MODEL_PX, CameraReport, fit_camera
 from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.fit.size import of_radius, require_radius
-from twin.frames import evenly_read, frames_at, open_recording, spread
+from twin.frames import Recording, evenly_read, frames_at, open_recording, spread
 from twin.frames.forms import gray_levels
 from twin.frames.images import write_image
 from twin.geometry.pins import rest_pins, usual_spacing
@@ -239,7 +239,7 @@ def new_sensor(
         odd = list(dict.fromkeys([*odd, *recording.notes(), *_doubtful(camera, rest, len(looked))]))
         health, pictures = _health(sensor, looked[0].form, judged, folder)
         size = _size(sensor, given=radius_mm is not None)
-        known, assumed, steps = _told(sensor, found, rest, camera, others, tuned, health, recording.labels)
+        known, assumed, steps = _told(sensor, found, rest, camera, others, tuned, health, recording, (frames, out))
         known, assumed = ((*known, size), assumed) if radius_mm is not None else (known, (size, *assumed))
         write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
         page = _page(folder, sensor, found, health, pictures, known, assumed, steps, odd)
@@ -518,9 +518,10 @@ def _told(
     other_cameras: tuple[str, ...],
     tuned: Tuned,
     health: Health,
-    labels: dict[str, np.ndarray],
+    recording: Recording,
+    paths: tuple[Path, Path],
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """What the frames determine, what is assumed, and how to learn more."""
+    """What the frames determine, what is assumed, and how to learn more. ``paths`` are those of the frames and of the specification."""
     evidence = tuned.detector.evidence
     known = (
         f"Layout: {found.best.line()}",
@@ -552,14 +553,14 @@ def _told(
         steps.append("record a frame without contact and run this again with --no-contact FRAME")
     if health.all_pins < FAIR_SHARE:
         steps.append("look at the overlay pictures: better light, focus or exposure helps most; then run this again")
-    if any(name.startswith("pose_") for name in labels):
-        steps.append(
-            f"fit the contact to the labels: twin calibrate contact --sensor {sensor.name}.toml --frames FRAMES --out {sensor.name}-2.toml"
-        )
+    frames, out = paths
+    files = f"--sensor {out} --frames {frames} --out {out.with_stem(f'{out.stem}-2')}"
+    if any(name.startswith("pose_") for name in recording.labels):
+        steps.append(f"fit the contact to the labels: twin calibrate contact {files}")
     else:
         steps.append("record labelled contacts (a table targets.csv beside the frames), then 'twin calibrate contact' and 'twin train'")
-    if sensor.camera.channels == "color":
-        steps.append(f"fit light and colours: twin calibrate optics --sensor {sensor.name}.toml --frames FRAMES --out {sensor.name}-2.toml")
+    if sensor.camera.channels == "color" and recording.form is Form.RAW:
+        steps.append(f"fit light and colours: twin calibrate optics {files}")
     return known, tuple(assumed), tuple(steps)
 
 

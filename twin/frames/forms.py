@@ -28,6 +28,8 @@ MOSTLY_BLACK, WHITE_OF_REST = 0.5, 0.1
 LEAST_OF_EACH_LEVEL = 0.005
 # Gray levels below which a pixel counts as black, and above which it counts as white.
 BLACK_BELOW, WHITE_ABOVE = 16, 239
+# Mean difference of a picture's colours, gray levels, above which it is not gray. JPEG gives gray pictures some colour.
+COLOURLESS_BELOW = 4.0
 # Number of frames by which the size and form of a recording are recognised.
 VOTES = 25
 
@@ -133,6 +135,8 @@ def times(size_px: Sequence[int]) -> str:
 
 def is_two_level(image: np.ndarray) -> bool:
     """Whether a picture was thresholded at capture: its pixels are black or white, apart from the edges that a resize leaves gray."""
+    if image.ndim == 3 and float(np.mean(np.ptp(image, axis=2))) > COLOURLESS_BELOW:
+        return False
     low, high = float(np.mean(image < BLACK_BELOW)), float(np.mean(image > WHITE_ABOVE))
     resized = low > MOSTLY_BLACK and high > WHITE_OF_REST * (1 - low)
     return (low + high > TWO_LEVEL_SHARE or resized) and min(low, high) > LEAST_OF_EACH_LEVEL

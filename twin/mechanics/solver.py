@@ -54,6 +54,8 @@ _TOUCH_MM = 1e-4
 """Tolerance of a first touch: largest distance between object and skin, mm."""
 _MOST_LIFTS = 60
 """Largest number of steps in which the object is moved to its first touch; three are usual."""
+_MISSED_MM = 0.5
+"""Largest depth of an object's origin inside the skin at rest, mm, at which the skin's mesh may not yet have met the object."""
 _START_INSIDE_MM = 0.05
 """Largest penetration of the undeformed skin at the start of a path, mm. It allows for the rounding of a first touch."""
 
@@ -164,6 +166,8 @@ class SkinSolver:
             where = f"load step {number} of {len(stops) - 1} ({stop / stops[-1]:.0%} of the path)"
             for at, state in contact.advance(pose_at, start, stop, plan.time_s, where):
                 force_n = state.force_n
+                if at >= stops[-1]:
+                    self._require_met(state)
                 yield float(at / stops[-1]), state
 
     def begin(self, field: ObjectField, law: ContactLaw, T: FloatArray, *, focus: Focus) -> OngoingContact:
@@ -211,6 +215,22 @@ class SkinSolver:
             deepest = np.minimum(deepest, gap)
         pressed = deepest < 0
         return skin_mm[pressed] if pressed.any() else skin_mm[[deepest.argmin()]]
+
+    def _require_met(self, state: ContactState) -> None:
+        """Raise a ContactError if an object's origin is inside the skin at rest and none of the skin's contact points has met the object.
+
+        A skin that relaxes may still have a dent where the object was.
+        """
+        if state.force_n.any() or self.spec.skin.relaxation or self.spec.gel.relaxation:
+            return
+        tip_mm = state.T_sensor_object[None, :3, 3]
+        above_mm = self.shape.on_outside(tip_mm)
+        inside_mm = float(np.sum((above_mm - tip_mm) * self.shape.normals(above_mm)))
+        if inside_mm > _MISSED_MM:
+            raise ContactError(
+                f"the object is {inside_mm:.1f} mm inside the skin, and no point of the skin's mesh has met it: "
+                "it is too small for this mesh; give a larger object"
+            )
 
     def focus(self, field: ObjectField, plan: ContactPath) -> Focus:
         """The fine part of the solid's grid for a path: the region that the object touches first.

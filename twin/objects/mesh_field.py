@@ -30,6 +30,9 @@ _SMALLEST_MM = 1.0
 """Length of an object's largest side below which the file is most likely in another unit."""
 _LARGEST_MM = 2000.0
 """Length of an object's largest side above which the file is most likely in another unit."""
+_THINNEST_MM = 0.6
+"""Least mean thickness of an object, twice its volume by its area. The contact points of the skin stand 0.3 to 0.5 mm apart, and those that
+are driven into a thinner wall leave it on its other side."""
 _REACH_MM = 40.0
 """Distance from the origin along each axis up to which the mesh is sampled: the dome's radius and its largest shear."""
 _MARGIN_MM = 4.0
@@ -146,6 +149,12 @@ def read_mesh(file: str, *, unit: str = "mm") -> trimesh.Trimesh:
         trimesh.repair.fix_winding(mesh)
     if mesh.volume < 0:
         mesh.invert()
+    thick_mm = 2 * float(mesh.volume / mesh.area)
+    if thick_mm < _THINNEST_MM:
+        raise MeshError(
+            f"{file}: its walls are {thick_mm:.2g} mm thick, and the skin's mesh would pass through walls thinner than "
+            f"{_THINNEST_MM:g} mm; make the object solid, or thicker"
+        )
     return mesh
 
 

@@ -30,8 +30,8 @@ from twin.types import Form, Frame, Observation
 LEAST_RIM = 0.5
 """Least share of the outermost pins that must be found."""
 BULGE = 1.0
-"""Relative growth of the rim by a contact, divided by the pins' rms motion relative to the rim's mean radius. Measured: 0.90, 0.98 and
-1.09 in recordings of three sensors, 0.7 to 1.4 in the twin."""
+"""Relative growth of the rim of a dome by a contact, divided by the pins' rms motion relative to the rim's mean radius. Measured: 0.90,
+0.98 and 1.09 in recordings of three sensors, 0.7 to 1.4 in the twin. The rim of a pad hardly grows."""
 SATURATED_LEVEL = 250
 """Least gray level of a saturated pixel."""
 STEADY = 0.5
@@ -118,7 +118,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
         _layout(frames, spec),
         _pins(seen, pipeline),
         _spots(seen, pipeline),
-        *_place(seen, nominal),
+        *_place(seen, nominal, BULGE if spec.skin.shape == "cap" else 0.0),
         *_twin(spec, form, nominal),
     ]
     return (
@@ -141,20 +141,23 @@ class Drift:
     scale : float
     contact : float
         Rms motion of the pins without the similarity, relative to the rim's mean radius. It measures how much a contact deforms the skin.
+    bulge : float
+        Relative growth of the rim by a contact, divided by ``contact``.
     """
 
     shift_px: np.ndarray
     turn_deg: float
     scale: float
     contact: float
+    bulge: float
 
     @property
     def scale_at_rest(self) -> float:
         """The scale without the effect of a contact. The gel keeps its volume, so it bulges at the rim when it is pressed in the middle."""
-        return self.scale / (1 + BULGE * self.contact)
+        return self.scale / (1 + self.bulge * self.contact)
 
 
-def drift_of(pins_px: np.ndarray, rest_px: np.ndarray, outmost: np.ndarray) -> Drift | None:
+def drift_of(pins_px: np.ndarray, rest_px: np.ndarray, outmost: np.ndarray, *, bulge: float = BULGE) -> Drift | None:
     """Drift by least squares over the outermost pins (m,) of pins (N, 2), which are NaN if lost. None if too few are found.
 
     With complex coordinates about the means, the similarity is ``a = sum conj(r) p / sum |r|^2`` (Horn 1987, in the plane).
@@ -169,7 +172,7 @@ def drift_of(pins_px: np.ndarray, rest_px: np.ndarray, outmost: np.ndarray) -> D
     shift = carried[outmost].mean() - rest[outmost].mean()
     radius = np.abs(rest[outmost] - rest[outmost].mean()).mean()
     contact = np.sqrt(np.nanmean(np.abs(seen - carried) ** 2)) / radius
-    return Drift(np.array([shift.real, shift.imag]), float(np.degrees(np.angle(a))), float(abs(a)), float(contact))
+    return Drift(np.array([shift.real, shift.imag]), float(np.degrees(np.angle(a))), float(abs(a)), float(contact), bulge)
 
 
 def _verdict(value: float, watch: float, bad: float) -> Grade:
@@ -237,10 +240,10 @@ def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
     return _finding("specks", steady / len(pipeline.reference.pins_px), (0.02, 0.2), f"{steady} steady bright spots among the pins", remedy)
 
 
-def _place(seen: list[Observation], nominal: Reference) -> list[Finding]:
+def _place(seen: list[Observation], nominal: Reference, bulge: float) -> list[Finding]:
     """Findings about the camera's place: in the frames with the least contact, the rim of pins is compared with the ``nominal`` one."""
     pitch = float(np.mean(nominal.spacing_px))
-    found = [d for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost))]
+    found = [d for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost, bulge=bulge))]
     if not found:
         return [
             Finding("place", Grade.BAD, np.nan, "the camera's place can't be told: too few pins at the rim", "see the other findings first")
@@ -248,13 +251,13 @@ def _place(seen: list[Observation], nominal: Reference) -> list[Finding]:
     found = sorted(found, key=lambda d: d.contact)[: max(round(LEAST_DEFORMED * len(found)), 1)]
     shift = np.median(np.stack([d.shift_px for d in found]), axis=0)
     turn, scale, seen_scale = (float(np.median([getattr(d, name) for d in found])) for name in ("turn_deg", "scale_at_rest", "scale"))
-    bulge = f" ({seen_scale:.3f} with the bulge of the contact)" if seen_scale - scale > TOLD_BULGE else ""
+    grown = f" ({seen_scale:.3f} with the bulge of the contact)" if seen_scale - scale > TOLD_BULGE else ""
     away = float(np.linalg.norm(shift))
     again = "fix the camera, or calibrate again ('twin calibrate optics'); 'twin tune' moves the mask"
     return [
         _finding("shift", away / pitch, (0.2, 1.0), f"displaced by ({shift[0]:.1f}, {shift[1]:.1f}) px, {away / pitch:.2f} pitches", again),
         _finding("turn", abs(turn), (1.5, 6.0), f"turned by {turn:.2f} deg", again),
-        _finding("scale", abs(scale - 1), (0.02, 0.1), f"{scale:.3f} times its calibrated size{bulge}", again),
+        _finding("scale", abs(scale - 1), (0.02, 0.1), f"{scale:.3f} times its calibrated size{grown}", again),
     ]
 
 

@@ -300,7 +300,7 @@ class Pipeline:
         rim = self.reference.outmost
         scale = _mean_radius(nodes_px[rim]) / _mean_radius(self.reference.pins_px[rim])
         if not 1 / MAX_RIM_SCALE < scale < MAX_RIM_SCALE:
-            return f"inconsistent pins: the rim is {scale:.2f} times its size at rest; another sensor's frame"
+            return f"inconsistent pins: the rim is {scale:.2f} times its size at rest; another sensor's frame, or a contact too deep"
         center = nodes_px.mean(axis=0)
         radius = np.linalg.norm(nodes_px - center, axis=1).max()
         extra = int((np.linalg.norm(extra_px - center, axis=1) < radius).sum())

@@ -89,7 +89,7 @@ def tune_on_frames(
     """
     if out is not None and out.suffix != ".toml":
         raise OptionError(f"--out {out}: give the name of a .toml file")
-    recording = open_recording(path, None, form)
+    recording = open_recording(path, None, form or (Form.RAW if sensor.recording is None else None))
     frames = evenly_read(recording, limit)
     odd = recording.notes() + _of_another_size(recording, sensor)
     with stage(progress, "tuning") as step:

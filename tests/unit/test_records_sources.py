@@ -99,6 +99,18 @@ def test_a_recordings_frames_are_episodes_and_states_of_one_contact_one_episode(
     assert [float(step.values["pose"][0]) for step in paths.episodes[0].steps()] == [1, 2]
 
 
+@pytest.mark.parametrize("to", FORMATS)
+def test_moves_that_were_not_executed_are_taken_out_and_said(tmp_path, to):
+    """Their labels say where the arm was about to go. A copy without this knowledge would teach wrong labels."""
+    source = recording(tmp_path / "r", pose_2=(1, 2, 3), pose_6=(10, 20, 30), move_1=(0.5, 1, 2), move_6=(4, 5, 6))
+    (source / "move_executed.csv").write_text("image_name,executed\n" + "".join(f"{name},{k % 2}\n" for k, name in enumerate(NAMES)))
+    done = convert([source], tmp_path / "out", to)
+    assert any("moves of 2 frames were not, or not surely, executed" in note for note in done.notes)
+    steps = [step.values for episode in open_records(tmp_path / "out").episodes for step in episode.steps()]
+    assert [step["pose"][[0, 1, 5]].tolist() for step in steps] == [[-0.5, 1, 6], [0, 2, 20], [-2, 3, 24]]
+    assert [step["move"][[0, 5]].tolist() for step in steps] == [[0, 0], [1, 5], [0, 0]]
+
+
 def test_a_picture_that_can_not_be_read_is_left_out_and_said(tmp_path):
     folder = recording(tmp_path / "a", pose_1=[1, 2, 3])
     (folder / "frames_bw" / NAMES[1]).write_bytes(b"no picture")

@@ -26,6 +26,7 @@ from twin.frames.images import write_image
 from twin.frames.tables import numbers
 from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, episode_of, format_of, read_json, read_sidecar
 from twin.records.record import CHANNELS, NOMINAL_HZ, About, Channel, Episode, RecordError, Records, Step, digest, float32, seconds
+from twin.rig.labels import read_executed
 from twin.rig.mounting import Mounting
 from twin.store import write_json, write_npz, write_text
 from twin.types import Form
@@ -63,6 +64,8 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
         return Records(read_sidecar(path)[0], [])
     recording = open_recording(path, None, form)
     values, estimates = _table_values(recording)
+    notes = list(recording.problems)
+    _take_out_moves(path, recording, values, notes)
     values |= _pins_beside(path, recording) | _truth_beside(path, recording) | _asked_beside(path, recording)
     values = {name: values[name] for name in CHANNELS if name in values}
     found = next(iter(recording), None)
@@ -84,7 +87,7 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
             raise RecordError(f"{path}: {PINS if missing == {'pins'} else TABLE} is missing, or lacks columns; {AGAIN}")
     carried = {column for name in values for column in columns_of(CHANNELS[name], about.axes(name))} | NOT_CARRIED
     left = [name for name, cells in recording.labels.items() if name not in carried and cells.dtype.kind == "f"]
-    notes = [*recording.problems, *([f"columns {', '.join(left)} are not taken over"] if left else [])]
+    notes += [f"columns {', '.join(left)} are not taken over"] if left else []
     records = Records(about, [], notes)
     rest = None if recording.reference is None else recording.reference.image
     facts = _own_facts(path) if own else []
@@ -153,6 +156,23 @@ def _table_values(recording: Recording) -> tuple[dict[str, np.ndarray], tuple[st
         missing = np.zeros(len(recording)) if channel.name in ("pose", "move") else np.full(len(recording), np.nan)
         found[channel.name] = np.stack([numbers(labels[c]) if c in labels else missing for c in columns], axis=1).astype(np.float32)
     return found, estimates
+
+
+def _take_out_moves(path: Path, recording: Recording, values: dict[str, np.ndarray], notes: list[str]) -> None:
+    """Take moves that were not executed before the picture out of poses and moves, if a file beside the table names them.
+
+    A record says where the tool stood and which move it had made. The labels of such frames say neither (``twin.rig.labels``).
+    """
+    if not {"pose", "move"} <= values.keys() or not path.is_dir():
+        return
+    known = read_executed(path, recording.names, notes)
+    undone = np.array([1.0 - known.get(name, 1.0) for name in recording.names], np.float32)
+    if undone.any():
+        notes.append(
+            f"the moves of {np.count_nonzero(undone)} frames were not, or not surely, executed: they are taken out of poses and moves"
+        )
+        values["pose"] = values["pose"] - undone[:, None] * values["move"]
+        values["move"] = (1 - undone[:, None]) * values["move"]
 
 
 def _pins_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:

@@ -2,6 +2,7 @@
 
 import pickle
 import re
+from dataclasses import replace
 from functools import cache, partial
 
 import cv2
@@ -143,6 +144,19 @@ def test_recordings_are_tuned_without_a_crop(spec):
     assert detector.form == Form.RECORDING and detector.recording is None and detector.blob.threshold_block_px == 0
     assert all(make_detector(spec, detector)(frame).valid for frame in frames)
     assert make_detector(spec, shipped_detector(spec, Form.RECORDING, "legacy"))(frames[0]).pins_px is None
+
+
+def test_a_tuning_that_is_worse_than_the_specification_says_so(spec, tuned, tmp_path, monkeypatch):
+    rest = nominal_reference(spec, Form.RAW).pins_px
+    for k in range(2):
+        frame = drawn_frame(spec, Form.RAW, smooth_warp(rest, 3.0, np.random.default_rng(k)))
+        cv2.imwrite(str(tmp_path / f"f_{k}.png"), frame.image)
+    for rate in (0.0, 1.0):
+        evidence = tuned.detector.evidence.model_copy(update={"exact_rate": rate, "low_rate": 0.0})
+        made = replace(tuned, detector=tuned.detector.model_copy(update={"evidence": evidence}))
+        monkeypatch.setattr("twin.pins.tune_files.tune", lambda *_, made=made, **__: made)
+        odd = tune_on_frames(tmp_path, spec).odd
+        assert any("specification itself finds all pins in 100% of these frames" in note for note in odd) == (rate == 0.0), odd
 
 
 def test_frames_of_a_sensor_without_a_recording_form_are_raw(spec, foreign, tmp_path):

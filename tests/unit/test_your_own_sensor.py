@@ -383,7 +383,7 @@ def test_without_a_no_contact_frame_shipped_weights_count_from_their_units_pins(
     cv2.imwrite(str(tmp_path / "f_0.png"), image)
     predictions = predict_frames(name, tmp_path)
     assert np.allclose(predictions.estimator.pipeline.reference.pins_px, known)
-    assert any("no no-contact frame was used" in problem for problem in predictions.recording.problems)
+    assert any("no frame without contact was used" in problem for problem in predictions.recording.problems)
     cv2.imwrite(str(tmp_path / "init_0.png"), image)
     again = predict_frames(name, tmp_path)
     assert not any("no-contact" in problem for problem in again.recording.problems)

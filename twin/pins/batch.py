@@ -32,18 +32,18 @@ GRAY = (28, 32, 38)
 FULL_CHANGE = 0.3
 """Relative change of a cell's area at both ends of the colour scale."""
 NO_REFERENCE = (
-    "no no-contact frame was used: the pins at rest are those of the specification, which makes errors of a pose up to four times larger; "
-    "record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+    "no frame without contact was used: the pins at rest are those of the specification, which makes errors of a pose up to four times "
+    "larger; record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
 )
 """Note for a recording without a usable no-contact frame."""
 NO_OWN_REFERENCE = (
-    "no no-contact frame was used: the pins at rest are those that were measured before on this unit; if the camera or the tip was touched "
-    "since, record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+    "no frame without contact was used: the pins at rest are those that were measured before on this unit; if the camera or the tip was "
+    "touched since, record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
 )
 """Note for a specification that holds the pins' measured places at rest."""
 MADE_FROM_CONTACTS = (
-    "no no-contact frame was used, and none when the specification was made: the pins' rest places were made from contacts; expect errors "
-    "of a tenth of a spacing or so; record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+    "no frame without contact was used, and none when the specification was made: the pins' rest places were made from contacts; expect "
+    "errors of a tenth of a spacing or so; record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
 )
 """Note for a specification whose places at rest were estimated from contacts."""
 MEASURED_BEFORE = "measured before"

@@ -8,10 +8,11 @@ from twin.errors import OptionError
 from twin.frames import Recording, evenly_read, open_recording
 from twin.frames.forms import known_frames, times
 from twin.pins.detector_spec import Evidence, Method, write_detector
+from twin.pins.pipeline import Pipeline
 from twin.pins.tune import Tuned, tune
 from twin.progress import Progress, silent, stage
 from twin.store import writes_file
-from twin.types import Form
+from twin.types import Form, Frame
 
 # Most frames that are used if no other number is given.
 LIMIT = 12
@@ -96,6 +97,7 @@ def tune_on_frames(
         found = tune(frames, sensor, method, given=recording.reference, progress=step)
     evidence = found.detector.evidence
     assert evidence is not None  # ``tune`` always gives evidence
+    odd += _worse(evidence, frames, sensor)
     if out is not None:
         write_detector(
             out,
@@ -103,6 +105,21 @@ def tune_on_frames(
             f"Found by 'twin tune' from {len(frames)} frames of {recording.path.name}; {evidence.sure}. {found.rest.line()}.",
         )
     return TunedOnFrames(found, evidence, [] if out is None else [out], odd)
+
+
+def _worse(evidence: Evidence, frames: list[Frame], sensor: SensorSpec) -> list[str]:
+    """A note if the specification's own detection finds all pins in more of the frames; none if the frames have the size of none of its forms."""
+    height, width = frames[0].image.shape[:2]
+    if known_frames(sensor).size_px.get(frames[0].form) != (width, height):
+        return []
+    own = Pipeline(sensor, frames[0].form)
+    rate = sum(seen.valid and seen.found == seen.expected for seen in map(own, frames)) / len(frames)
+    if rate <= evidence.exact_rate:
+        return []
+    return [
+        f"the detection of the specification itself finds all pins in {rate:.0%} of these frames: keep it, or tune with --method, other frames "
+        "or a frame without contact (--no-contact)"
+    ]
 
 
 def _of_another_size(recording: Recording, sensor: SensorSpec) -> list[str]:

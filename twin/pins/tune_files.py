@@ -108,7 +108,7 @@ def tune_on_frames(
 
 
 def _worse(evidence: Evidence, frames: list[Frame], sensor: SensorSpec) -> list[str]:
-    """A note if the specification's own detection finds all pins in more of the frames; none if the frames have the size of none of its forms."""
+    """A note if the specification's own detection finds all pins in more of the frames; none for frames of another size."""
     height, width = frames[0].image.shape[:2]
     if known_frames(sensor).size_px.get(frames[0].form) != (width, height):
         return []
@@ -117,8 +117,8 @@ def _worse(evidence: Evidence, frames: list[Frame], sensor: SensorSpec) -> list[
     if rate <= evidence.exact_rate:
         return []
     return [
-        f"the detection of the specification itself finds all pins in {rate:.0%} of these frames: keep it, or tune with --method, other frames "
-        "or a frame without contact (--no-contact)"
+        f"the detection of the specification itself finds all pins in {rate:.0%} of these frames: keep it, or tune with --method, other "
+        "frames or a frame without contact (--no-contact)"
     ]
 
 

@@ -15,7 +15,8 @@ from typing import Any
 from figures.jobs import FIGURES, ROOT, FiguresError, Value, read
 
 TEMPLATES = Path(__file__).with_name("templates")
-UNKNOWN = "?"
+UNKNOWN = "–"
+"""What a table shows for a figure that was not measured."""
 ALL_JOBS = "jobs"
 """Name of the table of all measurements."""
 MOST_COMMANDS = 3

@@ -152,7 +152,7 @@ def test_a_document_gets_its_tables_and_numbers(monkeypatch, tmp_path):
     entry = {"command": "twin probe", "date": "2026-01-02", "commit": "abc", "minutes": 1.5, "machine": "a desk"}
     jobs = {"probe.run": entry | {"figures": {"force": {"value": 1.25, "unit": "N"}}}}
     made = tables.filled(text, jobs)
-    assert "| --- | --- |\n| force | 1.2 N, ? N |\n\nMeasured by `twin probe`; 2026-01-02.\n" in made
+    assert "| --- | --- |\n| force | 1.2 N, – N |\n\nMeasured by `twin probe`; 2026-01-02.\n" in made
     assert "-->1.25<!-- /figure --> N." in made and "old" not in made and "share" not in made
     assert tables.filled(made, jobs) == made
     assert "Nobody has measured this table with this version: `make figures ONLY=probe` does." in tables.filled(text, {})

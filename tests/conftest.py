@@ -31,12 +31,18 @@ def pytest_sessionstart(session):
         compile_all()
 
 
-@pytest.fixture(scope="session", autouse=True)
-def own_cache(tmp_path_factory):
-    """The tests keep their arrays apart from the user's; what one worker has computed, the others read."""
+@pytest.fixture(scope="session")
+def of_all_workers(tmp_path_factory):
+    """The folder of this run that all workers share."""
     base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(of_all_workers):
+    """The tests keep their arrays apart from the user's; what one worker has computed, the others read."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TACTIP_CACHE", str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"))
+        patch.setenv("TACTIP_CACHE", str(of_all_workers / "cache"))
         yield
 
 

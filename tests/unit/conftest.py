@@ -38,10 +38,9 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def made_once(tmp_path_factory):
+def made_once(of_all_workers):
     """Gives a folder by its name. The first process that asks makes what is in it, the others wait."""
-    base = tmp_path_factory.getbasetemp()
-    home = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+    home = of_all_workers / "shared"
     home.mkdir(exist_ok=True)
 
     def folder(name, make):
@@ -60,7 +59,11 @@ def made_once(tmp_path_factory):
 @pytest.fixture(scope="session")
 def trained(data, made_once):
     """Folder of a finished run."""
-    return made_once("trained", lambda out: train_run(config_of("vgnn", epochs=30, batch=16), data, out))
+
+    def make(out):
+        assert train_run(config_of("vgnn", epochs=30, batch=16), data, out)
+
+    return made_once("trained", make)
 
 
 @pytest.fixture(scope="session")

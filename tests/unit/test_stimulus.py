@@ -271,8 +271,12 @@ def test_a_bad_mesh_says_what_is_wrong_and_what_to_do(tmp_path, kind):
         path.write_text("solid x\nendsolid x\n")
     elif kind != "missing":
         box.export(path)
-    wanted = {"open": "not watertight: 3 open edges", "metre": "too small; scale the file to mm", "huge": "too large; scale the file to mm"}
-    wanted |= {"thin": r"walls are 0\.48 mm thick.*solid, or thicker"}
+    wanted = {
+        "open": "not watertight: 3 open edges",
+        "metre": "too small; scale the file to mm",
+        "huge": "too large; scale the file to mm",
+        "thin": r"walls are 0\.48 mm thick.*solid, or thicker",
+    }
     with pytest.raises(MeshError, match=wanted.get(kind, path.name)) as caught:
         build_field(ObjectSpec(name="x", description="", shape=MeshShape(kind="mesh", file=str(path), unit=unit)))
     assert path.name in str(caught.value)

@@ -234,3 +234,8 @@ class Observation:
     graph: PinGraph | None
     extra_px: FloatArray
     ms: dict[str, float]
+
+    @property
+    def complete(self) -> bool:
+        """Whether the result is valid and all pins that should be visible were found."""
+        return self.valid and self.found == self.expected

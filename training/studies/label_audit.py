@@ -19,6 +19,7 @@ from twin.report.charts import muted, new_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, Picture
 from twin.report.table import Column
+from twin.rig.labels import as_executed
 from twin.store import made_by, write_json, write_text, writes
 from twin.types import Form
 
@@ -103,12 +104,11 @@ def _pose_and_move(data: Dataset) -> np.ndarray:
 def _corrected(data: Dataset, executed: np.ndarray, depth_per_move: float) -> dict[str, np.ndarray]:
     """The varying labels without moves that were not executed (M,), by their names."""
     pose, move = _pose_and_move(data)
-    undone = (1 - executed)[:, None]
-    before = pose - undone * move
+    before, made = as_executed(pose, move, executed)
     depth = max((k for k in range(3) if f"pose_{k + 1}" in data.targets.names), default=None)
     if depth is not None:
-        before[:, depth] += depth_per_move * undone[:, 0] * move[:, 0]
-    every = dict(zip(NAMES, np.hstack([before, (1 - undone) * move]).T, strict=True))
+        before[:, depth] += depth_per_move * (1 - executed) * move[:, 0]
+    every = dict(zip(NAMES, np.hstack([before, made]).T, strict=True))
     return {name: every[name] for name in data.targets.names if name in every}
 
 

@@ -239,7 +239,7 @@ def new_sensor(
         odd = list(dict.fromkeys([*odd, *recording.notes(), *_doubtful(camera, rest, len(looked))]))
         health, pictures = _health(sensor, looked[0].form, judged, folder)
         size = _size(sensor, given=radius_mm is not None)
-        known, assumed, steps = _told(sensor, found, rest, camera, others, tuned, health, recording, (frames, out))
+        known, assumed, steps = _told(sensor, found, rest, camera, others, tuned, health, recording, out)
         known, assumed = ((*known, size), assumed) if radius_mm is not None else (known, (size, *assumed))
         write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
         page = _page(folder, sensor, found, health, pictures, known, assumed, steps, odd)
@@ -468,7 +468,7 @@ def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -
     first = [next(f"{f.name}: {o.reason}" for f, o in zip(frames, seen, strict=True) if o.reason.startswith(r)) for r in reasons]
     health = Health(
         len(seen),
-        float(np.mean([o.valid and o.found == o.expected for o in seen])),
+        float(np.mean([o.complete for o in seen])),
         float(np.mean([o.found / max(o.expected, 1) for o in seen])),
         float(np.mean([o.valid for o in seen])),
         float(np.median([len(o.extra_px) for o in seen])),
@@ -519,9 +519,9 @@ def _told(
     tuned: Tuned,
     health: Health,
     recording: Recording,
-    paths: tuple[Path, Path],
+    out: Path,
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """What the frames determine, what is assumed, and how to learn more. ``paths`` are those of the frames and of the specification."""
+    """What the frames determine, what is assumed, and how to learn more. The specification is written to ``out``."""
     evidence = tuned.detector.evidence
     known = (
         f"Layout: {found.best.line()}",
@@ -553,8 +553,7 @@ def _told(
         steps.append("record a frame without contact and run this again with --no-contact FRAME")
     if health.all_pins < FAIR_SHARE:
         steps.append("look at the overlay pictures: better light, focus or exposure helps most; then run this again")
-    frames, out = paths
-    files = f"--sensor {out} --frames {frames} --out {out.with_stem(f'{out.stem}-2')}"
+    files = f"--sensor {out} --frames {recording.path} --out {out.with_stem(f'{out.stem}-2')}"
     if any(name.startswith("pose_") for name in recording.labels):
         steps.append(f"fit the contact to the labels: twin calibrate contact {files}")
     else:

@@ -105,7 +105,7 @@ def preprocess_recording(
     pipeline = Pipeline(spec, recording.form, reference)
     names, observations, unfit = _observed(recording, pipeline, pictures_dir, progress)
     arrays = _arrays(names, observations, spec.pins.count)
-    all_found = np.array([o.valid and o.found == o.expected for o in observations], bool)
+    all_found = np.array([o.complete for o in observations], bool)
     summary = {
         "sensor": spec.name,
         "frames": len(observations),

@@ -97,7 +97,7 @@ def tune_on_frames(
         found = tune(frames, sensor, method, given=recording.reference, progress=step)
     evidence = found.detector.evidence
     assert evidence is not None  # ``tune`` always gives evidence
-    odd += _worse(evidence, frames, sensor)
+    odd += _worse(evidence, recording, frames, sensor)
     if out is not None:
         write_detector(
             out,
@@ -107,13 +107,12 @@ def tune_on_frames(
     return TunedOnFrames(found, evidence, [] if out is None else [out], odd)
 
 
-def _worse(evidence: Evidence, frames: list[Frame], sensor: SensorSpec) -> list[str]:
+def _worse(evidence: Evidence, recording: Recording, frames: list[Frame], sensor: SensorSpec) -> list[str]:
     """A note if the specification's own detection finds all pins in more of the frames; none for frames of another size."""
-    height, width = frames[0].image.shape[:2]
-    if known_frames(sensor).size_px.get(frames[0].form) != (width, height):
+    if known_frames(sensor).size_px.get(recording.form) != recording.size_px:
         return []
-    own = Pipeline(sensor, frames[0].form)
-    rate = sum(seen.valid and seen.found == seen.expected for seen in map(own, frames)) / len(frames)
+    own = Pipeline(sensor, recording.form)
+    rate = sum(own(frame).complete for frame in frames) / len(frames)
     if rate <= evidence.exact_rate:
         return []
     return [

@@ -26,7 +26,7 @@ from twin.frames.images import write_image
 from twin.frames.tables import numbers
 from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, episode_of, format_of, read_json, read_sidecar
 from twin.records.record import CHANNELS, NOMINAL_HZ, About, Channel, Episode, RecordError, Records, Step, digest, float32, seconds
-from twin.rig.labels import read_executed
+from twin.rig.labels import as_executed, read_executed
 from twin.rig.mounting import Mounting
 from twin.store import write_json, write_npz, write_text
 from twin.types import Form
@@ -166,13 +166,10 @@ def _take_out_moves(path: Path, recording: Recording, values: dict[str, np.ndarr
     if not {"pose", "move"} <= values.keys() or not path.is_dir():
         return
     known = read_executed(path, recording.names, notes)
-    undone = np.array([1.0 - known.get(name, 1.0) for name in recording.names], np.float32)
-    if undone.any():
-        notes.append(
-            f"the moves of {np.count_nonzero(undone)} frames were not, or not surely, executed: they are taken out of poses and moves"
-        )
-        values["pose"] = values["pose"] - undone[:, None] * values["move"]
-        values["move"] = (1 - undone[:, None]) * values["move"]
+    executed = np.array([known.get(name, 1.0) for name in recording.names], np.float32)
+    if count := np.count_nonzero(executed != 1):
+        notes.append(f"the moves of {count} frames were not, or not surely, executed: they are taken out of poses and moves")
+        values["pose"], values["move"] = as_executed(values["pose"], values["move"], executed)
 
 
 def _pins_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:

@@ -88,6 +88,15 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
     return [ArmLabel(*row) for row in zip(values["pose"], values["move"], done, strict=True)]
 
 
+def as_executed(pose: np.ndarray, move: np.ndarray, executed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the arm stood, and the move that it had made, each (K, 6), by the labels' poses and moves (K, 6).
+
+    ``executed`` (K,) is 1 if the move was executed, 0 if it was not, or an estimate between them.
+    """
+    undone = 1 - executed[:, None]
+    return pose - undone * move, (1 - undone) * move
+
+
 def _varied_beyond(experiment: ExperimentSpec, values: dict[str, np.ndarray]) -> list[str]:
     """Names of the labels that vary in a table (``values``: (M, 6) for each kind), although the experiment keeps them constant."""
     ranges = experiment.ranges()

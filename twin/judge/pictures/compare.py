@@ -155,5 +155,4 @@ class _Shooter:
     def __call__(self, real: RealFrame, state: FittedPins | ContactState, remainder_px: float, *, seed: int) -> Pair:
         image = expose(self._renderer.render(state, seed=seed), self._spec.capture, np.random.default_rng(seed))
         seen = self._pipeline(replace(real.frame, image=image))
-        exact = seen.valid and seen.found == seen.expected
-        return Pair(real, state, image, compare_images(real.like(image), image, self._disc.inside), remainder_px, exact)
+        return Pair(real, state, image, compare_images(real.like(image), image, self._disc.inside), remainder_px, seen.complete)

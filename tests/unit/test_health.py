@@ -1,9 +1,11 @@
 """A well sensor is well; each planted fault is named."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import pytest
+from drawn_frames import drawn_frame
 from plain_sensor import changed, plain
 
 from scenes import load_sensor
@@ -56,6 +58,21 @@ def test_an_undamaged_sensor_has_no_bad_finding():
 def test_a_planted_fault_is_named(name, severity, finding):
     found = verdicts(frames(name, severity))
     assert found[finding].verdict is not Grade.GOOD and found[finding].remedy, found
+
+
+def test_a_white_housing_beside_a_pad_is_no_glare_and_a_white_patch_on_it_is():
+    pad = load_sensor("pad-rectangular")
+    rest = nominal_reference(pad, Form.RAW)
+    frame, pitch = drawn_frame(pad, Form.RAW, rest.pins_px), float(rest.spacing_px.mean())
+    low, high = (np.rint(end).astype(int) for end in (rest.pins_px.min(axis=0) - 1.5 * pitch, rest.pins_px.max(axis=0) + 1.5 * pitch))
+    housed = np.full_like(frame.image, 255)
+    housed[low[1] : high[1], low[0] : high[0]] = frame.image[low[1] : high[1], low[0] : high[0]]
+    glaring = housed.copy()
+    x, y = np.rint(rest.pins_px.mean(axis=0)).astype(int)
+    glaring[y - 25 : y + 25, x - 25 : x + 25] = 255
+    for image, verdict in ((housed, Grade.GOOD), (glaring, Grade.BAD)):
+        found = {each.name: each for each in examine([replace(frame, image=image)], pad)}
+        assert found["glare"].verdict is verdict, found["glare"]
 
 
 def test_a_black_frame_is_bad_and_nothing_crashes():

@@ -258,6 +258,21 @@ def test_rings_turned_on_by_a_pin_score_less_than_the_truth():
     assert right.score == pytest.approx(len(true), abs=0.1 * len(true))
 
 
+@pytest.mark.parametrize("lights", [0, 1, 2])
+def test_a_layout_that_lost_a_column_is_named_right_or_not_at_all(lights):
+    """Lights beside the first column look like pins of a layout that is a column apart, and this one would explain more of the frame."""
+    pipeline = Pipeline(load_sensor("pad-rectangular"), Form.RAW)
+    rest, pitch = pipeline.reference.pins_px, pitch_px(pipeline)
+    first, last = (np.flatnonzero(np.abs(rest[:, 0] - end) < pitch / 2) for end in (rest[:, 0].min(), rest[:, 0].max()))
+    for displaced in np.arange(0.0, 0.7, 0.1):
+        truth = rest + (displaced * pitch, 0)
+        seen_px = np.concatenate([np.delete(truth, last, axis=0), truth[first[:lights]] - (pitch, 0)])
+        observation = pipeline(draw(pipeline, seen_px, radius_px=0.28 * pitch))
+        assert not observation.valid or np.nanmax(errors_px(observation, truth)) < SAME_PIN_PX, displaced
+        assert observation.valid or "ambiguous" in observation.reason, displaced
+        assert observation.valid or displaced > 1 / 3, "near its place at rest a layout is never taken for one that is a column apart"
+
+
 def test_a_rim_of_another_size_is_not_valid(pipeline):
     rest = pipeline.reference.pins_px
     truth = pipeline.blob_spec.mask_center_px + 0.75 * (rest - pipeline.blob_spec.mask_center_px)

@@ -179,6 +179,17 @@ def test_a_picture_with_colours_was_not_thresholded():
     assert not is_two_level(image)
 
 
+def test_a_gray_picture_of_a_dark_skin_in_a_white_housing_was_not_thresholded():
+    """Most of it is black or white; but its caps are gray, with no white beside them."""
+    spec = load_sensor("pad-rectangular")
+    image = drawn_frame(spec, Form.RAW, nominal_reference(spec, Form.RAW).pins_px).image
+    gray = image if image.ndim == 2 else image[..., 0]
+    for widest in (10, 40):
+        housed = np.pad(np.where(gray > 100, 180, 4).astype(np.uint8), widest, constant_values=255)
+        assert not is_two_level(housed)
+        assert is_two_level(np.where(housed > 100, 255, 0).astype(np.uint8))
+
+
 def test_nothing_usable_is_one_error_line(tmp_path, spec):
     empty = tmp_path / "empty"
     empty.mkdir()

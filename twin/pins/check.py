@@ -17,7 +17,6 @@ from twin.camera.capture import expose
 from twin.frames import spread
 from twin.frames.forms import gray_levels
 from twin.optics.preview import Preview
-from twin.pins.blobs import Mask
 from twin.pins.caps import Caps, measure_caps
 from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
 from twin.pins.identify import judge_layout
@@ -49,7 +48,7 @@ LAYOUT_JUDGED = 4
 LISTED = 8
 """Most pins that a sentence lists by number."""
 BRIGHT_PERCENTILE = 99
-"""Percentile of the disc's gray levels that is taken as the caps' level if no pin is found."""
+"""Percentile of the gray levels around the pins that is taken as the caps' level if no pin is found."""
 USUAL_CAP_PX = 8.0
 """Assumed diameter of a cap, px, if none can be measured."""
 STRAY_PERCENTILE = 97
@@ -122,9 +121,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
         *_twin(spec, form, nominal),
     ]
     return (
-        findings
-        if form == Form.RECORDING
-        else [*_light(frames, seen, spec.pipeline.usual_caps or drawn_caps(spec), pipeline.mask), *findings]
+        findings if form == Form.RECORDING else [*_light(frames, seen, spec.pipeline.usual_caps or drawn_caps(spec), pipeline), *findings]
     )
 
 
@@ -280,12 +277,22 @@ def _twin(spec: SensorSpec, form: Form, nominal: Reference) -> list[Finding]:
     return [_finding("twin", rms / pitch, (0.2, 0.5), text, remedy)]
 
 
-def _light(frames: list[Frame], seen: list[Observation], expected: UsualCapsSpec | None, mask: Mask) -> list[Finding]:
-    """Findings about brightness, saturation, focus and glare of raw frames inside the mask, compared with the ``expected`` caps."""
+def _around_pins(pipeline: Pipeline) -> np.ndarray:
+    """The mask's disc (h, w) uint8 without what is more than a spacing outside the outermost pins: there lies a pad's housing."""
+    reference, (rows, columns) = pipeline.reference, pipeline.mask.window
+    rim = reference.pins_px[reference.outmost] - (columns.start, rows.start)
+    around = cv2.fillConvexPoly(np.zeros_like(pipeline.mask.disc), cv2.convexHull(np.rint(rim).astype(np.int32)), 1)
+    width = 2 * int(np.ceil(np.mean(reference.spacing_px))) + 1
+    within: np.ndarray = cv2.dilate(around, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width)))
+    return np.where(pipeline.mask.disc > 0, within, 0)
+
+
+def _light(frames: list[Frame], seen: list[Observation], expected: UsualCapsSpec | None, pipeline: Pipeline) -> list[Finding]:
+    """Findings about brightness, saturation, focus and glare of raw frames around the pins, compared with the ``expected`` caps."""
     looked = list(zip(frames, seen, strict=True))[:: -(-len(frames) // CAPS_MEASURED)]
     caps = [measure_caps(gray_levels(f.image), o.pins_px) for f, o in looked if np.isfinite(o.pins_px).any()]
-    windows = [gray_levels(np.ascontiguousarray(f.image[mask.window])) for f in frames]
-    brightest = float(np.median([np.percentile(w[mask.disc > 0], BRIGHT_PERCENTILE) for w in windows]))
+    windows, disc = [gray_levels(np.ascontiguousarray(f.image[pipeline.mask.window])) for f in frames], _around_pins(pipeline)
+    brightest = float(np.median([np.percentile(w[disc > 0], BRIGHT_PERCENTILE) for w in windows]))
     level, contrast, edge, diameter = (
         float(np.nanmedian([np.nanmedian(getattr(c, name)) for c in caps])) if caps else np.nan
         for name in ("level", "contrast", "edge_px", "diameter_px")
@@ -294,7 +301,7 @@ def _light(frames: list[Frame], seen: list[Observation], expected: UsualCapsSpec
     cap_px2 = np.pi / 4 * (diameter if np.isfinite(diameter) else USUAL_CAP_PX) ** 2
     stray, where = _stray(caps, [o for _, o in looked if np.isfinite(o.pins_px).any()], contrast)
     usual = uneven / promised
-    glare = float(np.median([_glare(w, mask.disc, cap_px2) for w in windows]))
+    glare = float(np.median([_glare(w, disc, cap_px2) for w in windows]))
     dark = (
         f"caps {level:.0f} gray levels, {contrast:.0f} above the skin ({promised:.0f} expected)"
         if caps
@@ -314,7 +321,7 @@ def _light(frames: list[Frame], seen: list[Observation], expected: UsualCapsSpec
             "glare",
             glare,
             (0.003, 0.03),
-            f"{100 * glare:.2f} % of the disc in white patches larger than caps",
+            f"{100 * glare:.2f} % of the area of the pins in white patches larger than caps",
             "shade the sensor; move or dim the LED",
         ),
         _finding(

@@ -13,7 +13,7 @@ Distances are in local spacings: the distance of a pin at rest to its nearest ne
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -65,8 +65,15 @@ INSIDE_SEEDS = 6
 """Approximate number of pins inside the rim from which labellings start."""
 SEED_RANKS = 3
 """Number of nearest blobs that are tried for each of these pins."""
-REFINED = 4
-"""Number of labellings that are refined if none reaches ``SETTLED``."""
+REFINED = 8
+"""Number of different labellings that are refined if none reaches ``SETTLED``: those with the most pins."""
+NEAR_REST = 0.35
+"""Displacement of the rim, in spacings, below which the first settled labelling ends the search, also if pins are missing: one that is a
+row apart is displaced by more than half a spacing."""
+DISPLACED_COST = 0.25
+"""Cost of a displacement of the rim by one spacing, in rows of pins (the square root of their number), when labellings are compared."""
+SAME_LABELLING = 0.5
+"""Share of equal pairs below which two labellings are quite different."""
 NEAR = 6
 """Number of neighbours of a lost pin whose labels are removed and grown anew first. After that the same is done with all neighbours."""
 LEAST_KEPT = 0.5
@@ -103,11 +110,14 @@ class Match:
     score : float
         Number of pins paired, minus their squared distances from the predictions relative to the gate, minus the cost of the rings'
         turn. Larger is better.
+    lead : float
+        Difference between the score and that of the best quite different labelling; infinite if none had to be tried.
     """
 
     blob: np.ndarray
     predicted_px: np.ndarray
     score: float
+    lead: float = float("inf")
 
 
 def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
@@ -134,7 +144,8 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
     layout = _layout(reference)
     cell = float(np.median(reference.spacing_px))
     buckets = _buckets(px, cell)
-    grown: list[tuple[float, np.ndarray, Match | None]] = []
+    grown: dict[bytes, np.ndarray] = {}
+    best = None
     for pin, blob in _seeds(reference, px):
         start = np.full(n, -1)
         start[pin] = blob
@@ -145,19 +156,42 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         count = int((labels >= 0).sum())
         if count >= NEARLY_ALL * n or (count >= NEARLY_ALL**2 * len(px) and count > MIN_SETTLED * n):
             found = _refine(layout, px, area_px2, labels, buckets, cell)
-            if found.score >= SETTLED * count:
-                grown = [(found.score, labels, found)]
+            if found.score >= SETTLED * count and (count >= NEARLY_ALL * n or _displaced(reference, px, found.blob) < NEAR_REST):
+                best = found
                 break
-        grown.append((count, labels, None))
-    grown.sort(key=lambda entry: -entry[0])
-    best = nothing
-    for _, labels, refined in grown[:REFINED]:
-        found = refined or _refine(layout, px, area_px2, labels, buckets, cell)
-        best = max(best, found, key=lambda entry: entry.score)
+        grown[labels.tobytes()] = labels
+    if best is None:
+        likely = sorted(grown.values(), key=lambda labels: -int((labels >= 0).sum()))[:REFINED]
+        best = _leading(reference, px, [_refine(layout, px, area_px2, labels, buckets, cell) for labels in likely])
+        if best.score < nothing.score:
+            return nothing
     lost = int((best.blob < 0).sum())
     if 0 < lost < MOST_REGROWN * n and len(px) > n - lost:
-        best = _regrown(layout, px, area_px2, best, buckets, cell)
+        best = replace(_regrown(layout, px, area_px2, best, buckets, cell), lead=best.lead)
     return best
+
+
+def _leading(reference: Reference, px: np.ndarray, refined: list[Match]) -> Match:
+    """The best of some labellings, with its lead over the best of those that are quite different from it.
+
+    They are compared by their scores, less a cost of the rim's displacement: a contact hardly moves the rim, because it is clamped.
+    """
+    cost = DISPLACED_COST * np.sqrt(len(reference.pins_px))
+    worth = [one.score - cost * _displaced(reference, px, one.blob) for one in refined]
+    first = int(np.argmax(worth))
+    best, paired = refined[first], refined[first].blob >= 0
+    same = SAME_LABELLING * paired.sum()
+    others = [w for w, one in zip(worth, refined, strict=True) if (one.blob == best.blob)[paired].sum() < same]
+    return replace(best, lead=worth[first] - max(others, default=-np.inf))
+
+
+def _displaced(reference: Reference, px: np.ndarray, blob: np.ndarray) -> float:
+    """Displacement of the rim from its place at rest by a labelling ``blob`` (N,): median over the rim's pins, in spacings."""
+    rim = reference.outmost[blob[reference.outmost] >= 0]
+    if not len(rim):
+        return 0.0
+    away = np.median(px[blob[rim]] - reference.pins_px[rim], axis=0)
+    return float(np.hypot(*away) / np.median(reference.spacing_px))
 
 
 def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray) -> Match:

@@ -4,6 +4,7 @@ The limits of an observation were chosen, not derived. A frame that is meant to 
 way that no displacement of the camera explains (`require_untouched`).
 """
 
+from dataclasses import replace
 from time import perf_counter
 
 import cv2
@@ -64,6 +65,10 @@ MOST_BETWEEN = 0.2
 """Largest share of pins that may stand between caps. It is not 0, because the midpoints of touching caps are bright, too."""
 LEAST_COMPARED = 12
 """Least number of found pins for this test."""
+LEAST_LEAD = 0.35
+"""Least lead of the labelling over the next, quite different one, in rows of pins (the square root of their number). If the whole layout
+is seen, a labelling that is a row apart lacks a row. If a row is lost, or lights beside the pins look like one, it explains the frame as
+well."""
 PREDICTED_WEIGHT = 0.1
 """Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
 MOST_DENT = 0.008
@@ -134,6 +139,11 @@ class Pipeline:
         ms["complete"], now = _since(now)
         expected = int((paired | ~self._cut_off(nodes_px)).sum())
         reason = self._reason(blobs, int(paired.sum()), expected, nodes_px, extra_px) or self._rim_lost(paired, nodes_px)
+        if not reason and found.lead < LEAST_LEAD * np.sqrt(len(paired)):
+            reason = (
+                "ambiguous pins: two ways to name them, a row apart, explain the frame nearly alike; press or shear less, and hide what "
+                "looks like pins beside them"
+            )
         if not reason and between > MOST_BETWEEN:
             reason = f"wrong pins: {between:.0%} of them stand between caps; stray light, a wrong threshold, or another sensor's frame"
         graph = None
@@ -227,7 +237,7 @@ class Pipeline:
             again = rematch(self.reference, parts.px, parts.area_px2, before)
             if again.score <= found.score:
                 break
-            blobs, found = parts, again
+            blobs, found = parts, replace(again, lead=found.lead)
         return blobs, found
 
     def _complete(self, pins_px: np.ndarray) -> np.ndarray:

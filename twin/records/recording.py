@@ -2,7 +2,6 @@
 
 Recordings of any origin, collections, and simulated data sets with their truth can be read. Each frame is its own episode, unless a column
 ``path_id`` states which frames are states of one contact.
-``path_id`` says which frames are states of one contact.
 """
 
 import csv

@@ -246,6 +246,7 @@ def test_names_are_unique_and_known_faults_are_of_entries() -> None:
     assert not [name for name in KNOWN if name not in names]
 
 
+@pytest.mark.slow
 def test_the_laws_refuse_what_they_should() -> None:
     """The judge itself: each kind of bad end is called one."""
     good = Ended(1, "", f"{ERROR}f_3.png: cut; copy it again\n", 1.0, 1.0, 2**28, False, 0)

@@ -54,7 +54,7 @@ def chances(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, float]:
     return float(stats.chi2.sf(np.sum(z**2), z.size)), float(2 * stats.norm.sf(abs(total)))
 
 
-@pytest.fixture(scope="module", params=[SMALL, pytest.param(LARGE, marks=pytest.mark.slow)], ids=["small", "large"])
+@pytest.fixture(scope="module", params=[SMALL, LARGE], ids=["small", "large"])
 def compared(request):
     """The laboratory, and Mitsuba's images of it."""
     size, batches, spp = request.param.values()
@@ -62,6 +62,7 @@ def compared(request):
     return spec, their_batches(spec, batches, spp)
 
 
+@pytest.mark.slow
 def test_the_light_is_that_of_plain_path_tracing(compared):
     spec, theirs = compared
     ours = our_batches(spec)
@@ -86,10 +87,8 @@ def another_index(spec, patch):
     return changed(spec, gel={"refractive_index": spec.gel.refractive_index + 0.05})
 
 
-slow = pytest.mark.slow
-
-
-@pytest.mark.parametrize("wrong", [all_passes, pytest.param(nothing_comes_back, marks=slow), pytest.param(another_index, marks=slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", [all_passes, nothing_comes_back, another_index])
 def test_the_comparison_sees_what_is_wrong(compared, wrong, monkeypatch):
     spec, theirs = compared
     ours = our_batches(wrong(spec, monkeypatch))

@@ -80,6 +80,7 @@ def test_graph_of_a_frame_and_of_its_pins(rendered, pins, tmp_path, kind, edges)
     assert np.isfinite(graphs[0]["area_px2"]).all() == (kind == "voronoi")
 
 
+@pytest.mark.slow
 def test_the_releases_method_on_a_frame_in_the_recordings_form(tmp_path):
     drawn = ("--form", "recording", "--quality", "drawn")
     done = twin("render", "--sensor", "mg400-127", "--object", "plane", "--indent-mm", 0, *drawn, "--out", tmp_path)

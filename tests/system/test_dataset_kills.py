@@ -96,6 +96,7 @@ def test_killed_twice_it_goes_on_to_the_same_bytes(tmp_path, undisturbed):
     assert contents(job.out) == undisturbed(COUNT)
 
 
+@pytest.mark.slow
 def test_a_killed_worker_is_replaced_and_a_killed_main_takes_its_workers_along(tmp_path, undisturbed):
     job = Job(tmp_path, COUNT)
     process = job.start(workers=2)

@@ -16,7 +16,7 @@ from twin.types import Form
 
 CENTROID_RMS_PX = 0.3  # detected against projected caps, no contact
 SLOPE_SHARE = 0.5  # a drag along one axis moves the pins at least this much more along it than across it
-FORMS = [(name, form) for name in ("mg400-331", "mg400-127") for form in Form] + [("ur5-331", Form.RAW)]
+FORMS = [(name, form) for name in ("mg400-331", "mg400-127") for form in Form] + [pytest.param("ur5-331", Form.RAW, marks=pytest.mark.slow)]
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def pressed(simulators):
     return simulator.shoot(simulator.press(load_object("plane"), ContactPose(indent_mm=3.0)))
 
 
-@pytest.mark.parametrize(("axis", "sign"), [(0, 1), (1, -1), *(pytest.param(*more, marks=pytest.mark.slow) for more in ((0, -1), (1, 1)))])
+@pytest.mark.parametrize(("axis", "sign"), [(1, -1), *(pytest.param(*more, marks=pytest.mark.slow) for more in ((0, 1), (0, -1), (1, 1)))])
 def test_a_drag_carries_the_pins_along(simulators, pressed, axis, sign):
     simulator = simulators["mg400-127"]
     shear = [0.0, 0.0]

@@ -16,7 +16,7 @@ from twin.types import Form, Frame
 
 LAYOUTS = [
     pytest.param(PinsSpec(rings=5), marks=pytest.mark.slow),
-    PinsSpec(rings=10),
+    pytest.param(PinsSpec(rings=10), marks=pytest.mark.slow),
     PinsSpec(rings=8, missing=(40,)),
     pytest.param(PinsSpec(layout="hexagon", rings=6), marks=pytest.mark.slow),
     PinsSpec(layout="hexagon", rings=4),

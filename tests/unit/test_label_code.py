@@ -55,6 +55,7 @@ def test_a_judge_takes_the_short_way_and_so_do_the_intervals():
     assert found["corrected"]["pose_6"]["mae"] == pytest.approx(1.0) and found["raw"]["pose_6"]["coverage_90"] == 1.0
 
 
+@pytest.mark.slow
 def test_a_model_learns_directions_across_the_jump(data, tmp_path):
     """The frames' angle, stretched to the whole circle: a model of degrees would err by some 10 deg where the circle closes."""
     stretched = data.targets.corrected.copy()

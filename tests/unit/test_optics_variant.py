@@ -54,6 +54,7 @@ def test_nothing_heavy_at_import():
     assert in_child(code).strip() == "[]"
 
 
+@pytest.mark.slow
 def test_without_any_llvm_the_scalar_variant_renders_and_says_what_to_install():
     out = in_child(RENDER_TINY.format(search="()"), DRJIT_LIBLLVM_PATH="", TACTIP_VARIANT="", CUDA_VISIBLE_DEVICES="-1")
     assert out.startswith("scalar_rgb") and "libllvm19" in out

@@ -86,7 +86,7 @@ def test_it_is_gone_on_with_and_no_episode_is_written_twice(tmp_path, to):
         assert_same(mine, its)
 
 
-@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("to", [pytest.param(name, marks=() if name in ("recording", "lerobot") else pytest.mark.slow) for name in FORMATS])
 def test_killed_at_any_moment_every_finished_episode_is_there(tmp_path, to):
     folders = [tmp_path / str(number) for number in range(2)]
     run = [sys.executable, "-c", KILLED, to, *map(str, folders)]

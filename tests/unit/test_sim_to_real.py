@@ -274,6 +274,7 @@ def test_the_covariance_of_what_is_left_is_that_of_the_frames_and_grows_with_the
     assert (left.weights(seen[:1] * 0 + 10) < left.weights(seen[:1] * 0 + 1)).all()
 
 
+@pytest.mark.slow
 def test_frames_without_labels_teach_what_the_twin_misses_where_few_have_labels(monkeypatch):
     rng = np.random.default_rng(1)
     rest = rng.uniform(-60, 60, (60, 2))

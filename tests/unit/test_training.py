@@ -30,7 +30,7 @@ from twin.store import contents
 from twin.types import Form, Frame
 
 
-@pytest.mark.parametrize("model", ["vgnn", "tac-vgnn-release"])
+@pytest.mark.parametrize("model", [pytest.param("vgnn", marks=pytest.mark.slow), "tac-vgnn-release"])
 def test_a_run_taken_up_again_ends_as_if_never_ended(data, tmp_path, model):
     config = config_of(model, epochs=3, batch=32, members=2, kernel=False)
     train_run(config, data, tmp_path / "whole")

@@ -44,12 +44,12 @@ class WatchedArm:
     """
 
     def __init__(self, text: str) -> None:
-        kind = kind_of(text)
+        arm, kind = open_arm(text), kind_of(text)
         if not (SHIPPED_LIMITS / f"{kind}.toml").is_file():
             raise DeviceError(
                 f"--arm {shown(text)}: no limits are known for '{shown(kind)}', so the page may not move it; write {shown(kind)}.toml"
             )
-        self._arm = SafeArm(open_arm(text), load_limits(kind))
+        self._arm = SafeArm(arm, load_limits(kind))
         self.name = self._arm.name
         self._armed = False
         self._moves = threading.Lock()

@@ -79,9 +79,10 @@ class StudioClient:
         return self.gui[self.uuid(label)]["value"]
 
     def html(self) -> str:
-        """All HTML of the page."""
+        """All HTML that the page shows."""
         with self._news:
-            return "\n".join(each["props"]["content"] for each in self.gui.values() if "content" in each.get("props", {}))
+            shown = [each["props"] for each in self.gui.values() if each.get("props", {}).get("visible", True)]
+            return "\n".join(props["content"] for props in shown if "content" in props)
 
     def wait(self, wanted, timeout_s: float = 30.0, *, since: int = 0) -> Update:
         """The first update from a place in ``updates`` on that is wanted."""

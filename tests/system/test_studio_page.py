@@ -5,21 +5,26 @@ import re
 import threading
 import time
 from pathlib import Path
-from urllib.request import Request, urlopen
+from urllib.request import Request as Asked
+from urllib.request import urlopen
 
 import cv2
 import numpy as np
 import pytest
 from drawn_frames import drawn_frame, smooth_warp
 from studio_client import StudioClient
-from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.datastructures import Headers
+from websockets.exceptions import InvalidStatus
+from websockets.http11 import Request
 
-from hardware.live_feed import CameraFeed
+from hardware.errors import DeviceError
+from hardware.live_feed import CameraFeed, WatchedArm
 from scenes import load_sensor
 from training.estimator import models_by_sensor
 from twin.errors import TwinError
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
+from twin.studio.page import from_own_page
 from twin.studio.scene import Scene
 from twin.studio.state import StudioState, first_state
 from twin.studio.studio import Studio, StudioPlan
@@ -157,13 +162,13 @@ def test_a_link_shows_its_state_again_and_not_from_a_foreign_page(studio, client
     drag(client, 2.0)
     for site in ("cross-site", "none"):
         since = len(client.updates)
-        with urlopen(Request(link.replace("depth_mm=1.5", f"depth_mm={len(site)}e-1"), headers={"Sec-Fetch-Site": site})) as page:
+        with urlopen(Asked(link.replace("depth_mm=1.5", f"depth_mm={len(site)}e-1"), headers={"Sec-Fetch-Site": site})) as page:
             assert b"<html" in page.read()
     update = client.wait(lambda u: u.number > 0 and u.depth_mm not in (2.0, 1.5), WAIT_S, since=since)
     client.wait(lambda u: abs(u.depth_mm - 0.4) < 1e-4, WAIT_S, since=since)
     assert update.depth_mm <= 0.4 + 1e-4
     client.set("link", "?sensor=nothing&object=sphere")
-    assert "nothing" in wait_html(client, "class='stop'")
+    wait_html(client, "no sensor named &#x27;nothing&#x27;")
 
 
 def test_an_answer_of_the_sensor_that_is_being_replaced_does_no_harm(studio, client, monkeypatch):
@@ -232,13 +237,17 @@ def test_a_recording_is_shown_with_labels_doubts_and_the_twins_picture(client, t
     client.set("mode", "Recording")
     client.set("folder or video", str(tmp_path / "nothing"))
     client.set("Open", True)
-    assert "nothing" in wait_html(client, "class='stop'")
+    wait_html(client, "nothing: ")
     client.set("folder or video", str(folder))
     client.set("Open", True)
     html = wait_html(client, "1 of 3")
+    assert "nothing: " not in html, "the earlier error is gone"
     assert "pose_2 is outside the 90 % interval" in html or "No estimate" in html
     client.set("frame number", 2)
     wait_html(client, "3 of 3")
+    for beyond, shown in ((-3, "1 of 3"), (7, "3 of 3")):
+        client.set("frame number", beyond)
+        wait_html(client, shown)
     client.set("mode", "Twin")
 
 
@@ -320,12 +329,43 @@ def test_a_specification_is_proposed_corrected_and_used(studio, client, tmp_path
     studio.twin.open(first_state(None, SENSOR, "sphere"))
 
 
-def test_a_page_of_another_site_is_refused(studio):
-    with (
-        pytest.raises((ConnectionClosed, InvalidHandshake, AssertionError)),
-        StudioClient(studio.page.url, origin="http://elsewhere.example") as foreign,
+@pytest.mark.parametrize("origin", ["http://elsewhere.example", "null", "file://", "http://127.0.0.1:1"])
+def test_a_page_of_another_site_is_refused_before_it_can_say_anything(studio, origin):
+    """Also a local file and a frame without rights, whose origin browsers call null."""
+    with pytest.raises(InvalidStatus) as refused, StudioClient(studio.page.url, origin=origin):
+        pass
+    assert refused.value.response.status_code == 403
+
+
+def test_a_name_that_leads_to_this_machine_by_chance_is_refused():
+    """Any site can give its name this machine's address, and its page would then be the server's own."""
+    hosts = ("127.0.0.1", "localhost")
+    for host, origin, own in (
+        ("localhost:8", "http://localhost:8", True),
+        ("localhost:8", None, True),
+        ("LOCALHOST:8", "http://localhost:8", True),
+        ("evil.example:8", "http://evil.example:8", False),
+        ("evil.example:8", None, False),
+        ("localhost:8", "http://localhost:9", False),
     ):
-        foreign.wait(lambda u: u.number > 0, 5)
+        headers = Headers({"Host": host} | ({} if origin is None else {"Origin": origin}))
+        assert from_own_page(Request("/", headers), hosts) is own, (host, origin)
+    assert from_own_page(Request("/", Headers({"Host": "tip.lab:8", "Origin": "http://tip.lab:8"})), ())
+    assert not from_own_page(Request("/", Headers()), ())
+
+
+def test_values_that_no_browser_gives_are_refused_and_put_back(client):
+    friction, touched = client.value("friction"), client.value("object")
+    for label, value, reason in (("friction", -1.0, "friction -1: give a number from 0 to"), ("friction", float("nan"), "friction nan"),
+                                 ("object", "../../x", "../../x")):  # fmt: skip
+        client.set(label, value)
+        wait_html(client, reason)
+        until(lambda: (client.value("friction"), client.value("object")) == (friction, touched))
+
+
+def test_an_arm_of_no_known_kind_is_told_from_one_without_limits():
+    with pytest.raises(DeviceError, match="no arm 'mg40:127.0.0.1'; there are"):
+        WatchedArm("mg40:127.0.0.1")
 
 
 def test_no_tunnel_is_ever_opened(studio):

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, redirect_stdout
+from http import HTTPStatus
 from io import StringIO
 from typing import Any, Protocol
 from urllib.parse import urlsplit
@@ -15,7 +16,6 @@ import numpy as np
 import viser
 import websockets.asyncio.server
 from viser import uplot
-from viser.infra import WebsockClientConnection
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
@@ -77,37 +77,39 @@ class _Server(viser.ViserServer):
         return None
 
 
-def refuse_foreign_pages(server: viser.ViserServer, hosts: Sequence[str]) -> None:
-    """Close connections of pages that come from other sites, or that used a host name not in ``hosts``.
+def from_own_page(request: Request, hosts: Sequence[str]) -> bool:
+    """Whether a request comes from a page of this server, or from a program that is no browser.
 
-    A browser lets any site open a websocket to this machine. It states the site in the header ``Origin``.
+    A browser lets any site open a websocket to this machine, and any site may have a name that leads here. It states the site in the header
+    ``Origin`` ("null" for a local file or a frame without rights), and the name that was used in ``Host``.
+
+    Parameters
+    ----------
+    hosts : sequence of str
+        Names by which this machine may be called; if empty, by any.
     """
-    websocket_server = server._websock_server
-
-    async def check(connection: WebsockClientConnection) -> None:
-        socket = websocket_server._live_connections.get(connection.client_id)
-        if socket is None or socket.request is None:
-            return
-        origin, host = (
-            urlsplit(text) for text in (socket.request.headers.get("Origin", ""), "//" + socket.request.headers.get("Host", ""))
-        )
-        if (origin.netloc and origin.netloc != host.netloc) or (hosts and host.hostname not in hosts):
-            await socket.close(1008, "only the studio's own page may connect")
-
-    websocket_server.on_client_connect(check)
+    used = request.headers.get_all("Host")
+    host = urlsplit("//" + used[0]) if len(used) == 1 else None
+    if host is None or (hosts and host.hostname not in hosts):
+        return False
+    origins = [urlsplit(origin) for origin in request.headers.get_all("Origin")]
+    return all(origin.scheme in ("http", "https") and origin.netloc.lower() == host.netloc.lower() for origin in origins)
 
 
 @contextmanager
-def told_addresses(tell: Callable[[str], None]) -> Iterator[None]:
-    """Context in which a new viser server reports the address of each loaded page that has a query.
+def guarded_server(hosts: Sequence[str], tell: Callable[[str], None]) -> Iterator[None]:
+    """Context in which a new viser server refuses requests of foreign pages, and reports the address of each loaded page that has a query.
 
-    viser itself ignores queries. Requests from pages of other sites are ignored, because such a page could load this page with any query
-    without the user's knowledge. The browser states the origin in ``Sec-Fetch-Site``.
+    A foreign page is refused before its connection is open, so that none of its messages is read (see ``from_own_page``). viser itself
+    ignores queries. Those that a page of another site links to are ignored, because such a page could load this page with any query without
+    the user's knowledge. The browser states the origin in ``Sec-Fetch-Site``.
     """
     serve = websockets.asyncio.server.serve
 
     def serving(*args: Any, process_request: Callable[[ServerConnection, Request], Response | None] | None = None, **more: Any) -> Any:
         def heard(connection: ServerConnection, request: Request) -> Response | None:
+            if not from_own_page(request, hosts):
+                return connection.respond(HTTPStatus.FORBIDDEN, "only the studio's own page may connect\n")
             address = urlsplit(request.path)
             if address.path == "/" and address.query and request.headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin"):
                 tell(request.path)
@@ -214,12 +216,12 @@ class Page:
         self.on_address: Callable[[str], None] = lambda address: None
         try:
             port = free_port(host, port)
-            with redirect_stdout(StringIO()), told_addresses(lambda address: self.on_address(address)):  # viser prints its own addresses
+            hosts = LOCAL if host in LOCAL else ()
+            with redirect_stdout(StringIO()), guarded_server(hosts, lambda address: self.on_address(address)):  # viser prints its addresses
                 self.server = _Server(host=host, port=port, label=title, verbose=False)
         except (OSError, RuntimeError) as error:
             raise TwinError(f"--host {host} --port {port}: can't listen there ({error}); give another --host or --port") from error
         self._host = host
-        refuse_foreign_pages(self.server, LOCAL if host in LOCAL else ())
         gui = self.gui = self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         pictures = gui.add_panel(order=0)
@@ -323,6 +325,7 @@ class Page:
         def called(event: object) -> None:
             if getattr(event, "client", self) is None:
                 return
+            self.hush()
             try:
                 action()
             except (TwinError, SpecError) as error:
@@ -335,6 +338,10 @@ class Page:
         self._said.content = boxed(paragraph(text, "stop" if bad else "said"))
         self._said.visible = True
         self._forget_s = time.monotonic() + SAID_S
+
+    def hush(self) -> None:
+        """Hide the message: the user does something else."""
+        self._said.visible = False
 
     def __enter__(self) -> "Page":
         return self

@@ -203,6 +203,7 @@ class RecordingMode(PageMode):
 
     def open(self, path: str) -> None:
         """Show another recording. Errors are shown on the page."""
+        self._page.hush()
         try:
             if not path.strip():
                 raise TwinError("give a recording's folder or video first")
@@ -216,7 +217,7 @@ class RecordingMode(PageMode):
 
     def _slid(self, event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
         if event.client is not None:  # otherwise this program moved the slider
-            self._wanted.give(int(event.target.value))
+            self._go(int(event.target.value))
 
     def _go(self, index: int) -> None:
         if self._view is not None:

@@ -309,11 +309,18 @@ class TwinMode(PageMode):
 
     def _change_friction(self) -> None:
         friction = float(self._friction.value)
+        if not 0.0 <= friction <= MOST_FRICTION:  # no browser's slider gives that
+            put(self._friction, self._own_friction())
+            raise TwinError(f"friction {friction:g}: give a number from 0 to {MOST_FRICTION:g}")
         self.worker.do(lambda: self.contact.change(friction=friction))
         self.worker.ask(self._wish)
 
     def _change_object(self) -> None:
-        touched = load_object(self._object.value)
+        try:
+            touched = load_object(self._object.value)
+        except SpecError:
+            put(self._object, self._state.object)
+            raise
         self._state = self._state.model_copy(update={"object": self._object.value})
 
         def change() -> None:
@@ -326,7 +333,11 @@ class TwinMode(PageMode):
         self.worker.ask(self._wish)
 
     def _change_sensor(self) -> None:
-        self.open(self.state.model_copy(update={"sensor": self._sensor.value, "form": str(Form.RAW)}))
+        try:
+            self.open(self.state.model_copy(update={"sensor": self._sensor.value, "form": str(Form.RAW)}))
+        except (TwinError, SpecError):
+            put(self._sensor, self._state.sensor)
+            raise
 
     def open(self, state: StudioState) -> None:
         """Show another state. With another sensor everything is built again, which takes some seconds.

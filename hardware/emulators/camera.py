@@ -9,7 +9,7 @@ import numpy as np
 
 from hardware.cameras.mjpeg import CONTENT_TYPE, hold_little, jpeg_of, write_part
 from hardware.cameras.source import FrameSource, await_frame
-from hardware.emulators.faults import Faults
+from hardware.emulators.faults import EVERY_NTH, SECONDS, Faults
 from hardware.errors import DeviceError, cannot_listen
 from twin.errors import TwinError
 
@@ -23,6 +23,8 @@ FAULTS = {
     "unplugged": (1.0, "the connection is cut and none taken for this many seconds, once"),
     "silent": (None, "connections stay open, nothing comes"),
 }
+# The values that the faults may have.
+RANGES = {"dropped": EVERY_NTH, "late": SECONDS, "torn": EVERY_NTH, "unplugged": SECONDS}
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class CameraEmulator:
     """
 
     def __init__(self, source: FrameSource, *, host: str = "127.0.0.1", port: int = 0, faults: tuple[str, ...] = ()) -> None:
-        self.faults = Faults(FAULTS, faults)
+        self.faults = Faults(FAULTS, RANGES, faults)
         self._source, self._address = source, (host, port)
         self._new = threading.Condition()
         self._part: _Part | None = None
@@ -157,7 +159,7 @@ class CameraEmulator:
 
     def _every(self, fault: str) -> bool:
         value = self.faults.value(fault)
-        return value is not None and self.made % max(1, round(value)) == 0
+        return value is not None and self.made % int(value) == 0
 
 
 class _Server(ThreadingHTTPServer):

@@ -1,9 +1,34 @@
 """Faults of an emulated device, switched on by name: ``NAME`` or ``NAME=VALUE``."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from difflib import get_close_matches
 
 from scenes.files import shown
 from twin.errors import TwinError
+
+
+@dataclass(frozen=True)
+class Range:
+    """The values that a fault may have, ends included."""
+
+    low: float
+    high: float
+    whole: bool = False
+
+    def __contains__(self, value: float) -> bool:
+        return self.low <= value <= self.high and (not self.whole or value == int(value))
+
+    def __str__(self) -> str:
+        return f"{'a whole number' if self.whole else 'a number'} from {self.low:g} to {self.high:g}"
+
+
+# A fault of every n-th reply, packet or picture.
+EVERY_NTH = Range(1, 100_000, whole=True)
+# A share of a time or of a speed. At a share of 0 a move would never end, and above 1 it would be no fault.
+SHARE = Range(0.001, 1)
+# A time in s, up to about a day, because a timer can't wait for a time of any length.
+SECONDS = Range(0, 100_000)
 
 
 class Faults:
@@ -13,22 +38,31 @@ class Faults:
     ----------
     known : dict of str to (float or None, str)
         Default value (None: a switch without a value) and effect of every fault.
+    ranges : mapping of str to Range
+        The values that are allowed, for every fault with a value.
     given : iterable of str
         ``NAME`` or ``NAME=VALUE``.
 
     Raises
     ------
     TwinError
-        A fault is not known, or its value is not a number.
+        A fault is not known, or its value is not a number or not allowed.
     """
 
-    def __init__(self, known: dict[str, tuple[float | None, str]], given: tuple[str, ...] = ()) -> None:
-        self.known = known
+    def __init__(self, known: dict[str, tuple[float | None, str]], ranges: Mapping[str, Range], given: tuple[str, ...] = ()) -> None:
+        self.known, self._ranges = known, ranges
         self._on: dict[str, float] = {}
         for text in given:
             self.add(text)
 
     def add(self, text: str) -> None:
+        """Switch a fault on, ``NAME`` or ``NAME=VALUE``.
+
+        Raises
+        ------
+        TwinError
+            The fault is not known, or its value is not a number or not allowed.
+        """
         name, _, value = text.partition("=")
         if name not in self.known:
             close = get_close_matches(name, self.known, n=1)
@@ -36,10 +70,19 @@ class Faults:
                 f"no fault '{shown(name)}'{f' (did you mean {close[0]}?)' if close else ''}; there are: {', '.join(self.known)}"
             )
         default = self.known[name][0]
+        if default is None:
+            if value:
+                raise TwinError(f"fault '{shown(text)}': {name} is a switch and takes no value; give {name} alone")
+            self._on[name] = 1.0
+            return
+        example = f"for example {name}={default:g}"
         try:
-            self._on[name] = float(value) if value else (1.0 if default is None else default)
+            number = float(value) if value else default
         except ValueError as error:
-            raise TwinError(f"fault '{text}': '{value}' is not a number; for example {name}={default or 1:g}") from error
+            raise TwinError(f"fault '{shown(text)}': '{shown(value)}' is not a number; {example}") from error
+        if number not in self._ranges[name]:
+            raise TwinError(f"fault '{shown(text)}': {name} must be {self._ranges[name]}, not {shown(value)}; {example}")
+        self._on[name] = number
 
     def clear(self) -> None:
         """Switch all faults off."""

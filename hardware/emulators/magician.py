@@ -16,7 +16,7 @@ from threading import Event, Lock, Thread, Timer
 import numpy as np
 
 from hardware.arms.magician_wire import Message, take_message
-from hardware.emulators.faults import Faults
+from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Faults, Range
 from hardware.emulators.magician_controller import START_JOINTS_DEG, MagicianController
 from twin.errors import TwinError
 
@@ -34,6 +34,13 @@ FAULTS = {
     "ignore-moves": (None, "moves are accepted and not executed"),
     "slow": (0.1, "moves at this share of the speed"),
     "wide-queue-space": (None, "the queue's space is told in 8 bytes instead of 4"),
+}
+# The values that the faults may have.
+RANGES = {
+    "noise": Range(1, 1000, whole=True),
+    **dict.fromkeys(("wrong-checksum", "lost-reply"), EVERY_NTH),
+    **dict.fromkeys(("split-frames", "unplugged"), SECONDS),
+    **dict.fromkeys(("lost-steps", "stall", "slow"), SHARE),
 }
 
 
@@ -64,7 +71,7 @@ class MagicianEmulator:
         joints_deg: Sequence[float] = START_JOINTS_DEG,
         time_scale: float = 1.0,
     ) -> None:
-        self.faults = Faults(FAULTS, faults)
+        self.faults = Faults(FAULTS, RANGES, faults)
         self.arm = MagicianController(self.faults, joints_deg=joints_deg, time_scale=time_scale)
         self.device = ""
         self._link = link

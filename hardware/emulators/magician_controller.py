@@ -1,5 +1,7 @@
 """The emulated Magician's controller: commands, queue and alarms. It does not use a serial port."""
 
+import logging
+import math
 import struct
 import time
 from collections.abc import Sequence
@@ -10,9 +12,10 @@ import numpy as np
 
 from hardware.arms.kinematics import MAGICIAN, NO_INVERSE, OutOfReachError, Violation
 from hardware.arms.magician_wire import Id, Message, Ptp
-from hardware.arms.motion import MotionTrack, Speeds, circle
+from hardware.arms.motion import MotionTrack, Speeds, check_line, circle
 from hardware.emulators.faults import Faults
 
+LOG = logging.getLogger(__name__)
 # Largest number of commands in the queue.
 QUEUE_N = 32
 # Numbers of alarms (see ``hardware.arms.dobot_alarms``).
@@ -48,6 +51,14 @@ NOT_ATTACHED: dict[int, tuple[int, bytes]] = {
     Id.COLOR: (3, bytes(3)),
     Id.INFRARED: (2, bytes(1)),
 }
+# Commands that tell what the device is, with their replies to a read. The values are chosen for the emulator.
+DEVICE_SERIAL, DEVICE_NAME, DEVICE_VERSION, POSE_L = 0, 1, 2, 13
+TOLD: dict[int, bytes] = {
+    DEVICE_SERIAL: b"EMULATED",
+    DEVICE_NAME: b"Dobot Magician",
+    DEVICE_VERSION: bytes([3, 7, 0]),  # major, minor, revision
+    POSE_L: struct.pack("<f", 0.0),  # place of the arm on a slide, mm; there is none
+}
 # Numbers of bytes that a command's parameters may have. pydobot sends CP without its last number: 14 bytes.
 SIZES: dict[int, tuple[int, ...]] = {
     Id.RESET_POSE: (9,),
@@ -59,6 +70,32 @@ SIZES: dict[int, tuple[int, ...]] = {
     Id.ARC: (32,),
     Id.WAIT: (4,),
 }
+# Floating-point numbers at the beginning of a command's parameters. All must be finite.
+NUMBERS: dict[int, struct.Struct] = {
+    id: struct.Struct(form)
+    for id, form in {
+        Id.RESET_POSE: "<x2f",
+        Id.HOME_PARAMS: "<4f",
+        Id.END_EFFECTOR: "<3f",
+        Id.JOG_JOINT_PARAMS: "<8f",
+        Id.JOG_COORDINATE_PARAMS: "<8f",
+        Id.JOG_COMMON_PARAMS: "<2f",
+        Id.PTP_JOINT_PARAMS: "<8f",
+        Id.PTP_COORDINATE_PARAMS: "<4f",
+        Id.PTP_JUMP_PARAMS: "<2f",
+        Id.PTP_COMMON_PARAMS: "<2f",
+        Id.PTP: "<x4f",
+        Id.CP_PARAMS: "<3f",
+        Id.CP: "<x3f",
+        Id.CP_LASER: "<x4f",
+        Id.ARC_PARAMS: "<4f",
+        Id.ARC: "<8f",
+    }.items()
+}
+# Parameters that are speeds and accelerations, which must be above 0, because a move at 0 or less has no time.
+SPEEDS = {Id.PTP_JOINT_PARAMS, Id.PTP_COORDINATE_PARAMS, Id.PTP_COMMON_PARAMS, Id.CP_PARAMS, Id.ARC_PARAMS}
+# Speeds and accelerations of jogs may be 0. Clients send 0 for the axes that stand still.
+JOG_SPEEDS = {Id.JOG_JOINT_PARAMS, Id.JOG_COORDINATE_PARAMS, Id.JOG_COMMON_PARAMS}
 
 
 @dataclass(frozen=True)
@@ -113,7 +150,7 @@ class MagicianController:
         return Message(message.id, message.ctrl)
 
     def advance(self) -> float:
-        """Execute the queue up to the present time, which is returned."""
+        """Execute the queue up to the present time, which is returned. A command that fails ends with an alarm and is not tried again."""
         now_s = time.monotonic()
         with self.lock:
             if self._lost_at_s <= now_s:
@@ -123,7 +160,11 @@ class MagicianController:
                 head = self._queue[0]
                 if not self._begun:
                     begins_s = max(self._since_s, head.time_s)
-                    self._ends_s = self._do(head.message, begins_s)
+                    try:
+                        self._ends_s = self._do(head.message, begins_s)
+                    except Exception:
+                        LOG.exception("emulated Magician: queued command %d failed and was dropped", head.message.id)
+                        self._ends_s = self._alarm(NOT_UNDERSTOOD, begins_s)
                     self._begun = True
                 if self._ends_s > now_s:
                     break
@@ -132,14 +173,29 @@ class MagicianController:
             return now_s
 
     def _understood(self, message: Message) -> bool:
+        """Whether a command is known and its parameters are allowed. A read of anything unknown is allowed: clients ask what there is."""
         writes = message.is_write or message.is_queued
+        return self._has_its_form(message, writes=writes) and (not writes or self._has_allowed_numbers(message))
+
+    @staticmethod
+    def _has_its_form(message: Message, *, writes: bool) -> bool:
         if message.id in SIZES:
             return writes and len(message.params) in SIZES[message.id]
         if message.id in PARAMETERS:
             return not writes or len(message.params) == len(PARAMETERS[message.id])
         if message.id in NOT_ATTACHED:
             return not writes or len(message.params) == NOT_ATTACHED[message.id][0]
-        return message.id in set(Id)
+        return not writes or message.id in set(Id)
+
+    @staticmethod
+    def _has_allowed_numbers(message: Message) -> bool:
+        """Whether all numbers are finite, and speeds and accelerations are above 0."""
+        if message.id not in NUMBERS:
+            return True
+        numbers = NUMBERS[message.id].unpack_from(message.params)
+        if not all(map(math.isfinite, numbers)):
+            return False
+        return min(numbers) > 0 if message.id in SPEEDS else min(numbers) >= 0 or message.id not in JOG_SPEEDS
 
     def _read(self, message: Message, now_s: float) -> bytes:
         if message.id == Id.GET_POSE:
@@ -153,6 +209,8 @@ class MagicianController:
             return struct.pack("<Q" if "wide-queue-space" in self.faults else "<I", max(0, QUEUE_N - len(self._queue)))
         if message.id in NOT_ATTACHED:
             return NOT_ATTACHED[message.id][1]
+        if message.id in TOLD:
+            return TOLD[message.id]
         return self._params.get(message.id, b"")
 
     def _write(self, message: Message, now_s: float) -> bytes:
@@ -262,8 +320,11 @@ class MagicianController:
     def _go(self, end: np.ndarray, speeds: Speeds, begins_s: float, *, linear: bool) -> float:
         if self.alarms or "ignore-moves" in self.faults:
             return begins_s
-        speeds = speeds.scaled(self._time_scale * (self.faults.value("slow") or 1.0))
-        piece = self.track.move(end, speeds, linear=linear, now_s=begins_s)
+        slow = self.faults.value("slow")
+        speeds = speeds.scaled(self._time_scale * (1.0 if slow is None else slow))
+        # The end comes first: the places along a line to a far one are too many to count.
+        broken = check_line(self.kinematics, end, end) if linear else None
+        piece = broken or self.track.move(end, speeds, linear=linear, now_s=begins_s)
         if isinstance(piece, Violation):
             return self._alarm(piece.code, begins_s)
         share = self.faults.value("stall")

@@ -23,7 +23,7 @@ from hardware.arms.mg400_wire import (
     Mode,
     require_ports,
 )
-from hardware.emulators.faults import Faults
+from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Faults, Range
 from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame
 from hardware.emulators.mg400_grammar import RefusedError, Request, take_request
@@ -64,6 +64,13 @@ FAULTS = {
     "six-value-pose": (None, "GetPose() gives six values"),
     "error-groups": (7.0, "GetErrorID() gives this many groups"),
     "die": (5.0, "the arm goes dead, this many seconds after the start"),
+}
+# The values that the faults may have.
+RANGES = {
+    **dict.fromkeys(("short-packets", "wrong-test-value"), EVERY_NTH),
+    **dict.fromkeys(("emergency-stop", "silent-feedback", "frozen", "die"), SECONDS),
+    **dict.fromkeys(("collision", "stall", "slow"), SHARE),
+    "error-groups": Range(1, 100, whole=True),
 }
 
 
@@ -108,7 +115,7 @@ class Mg400Emulator:
             raise TwinError(str(error)) from error
         require_ports(port_offset or 0)
         self.host, self._port_offset = host, port_offset
-        self.faults = Faults(FAULTS, faults)
+        self.faults = Faults(FAULTS, RANGES, faults)
         self.arm = Mg400Controller(self.faults, joints_deg=joints_deg, time_scale=time_scale)
         self._commands = Mg400Commands(self.arm, version)
         self._bare = version < FIRST_NUMBERED_REPLIES
@@ -213,14 +220,17 @@ class Mg400Emulator:
                     self._run(self._serve, client, port)
 
     def _serve(self, client: socket.socket, port: int) -> None:
-        with contextlib.suppress(OSError, ValueError):
-            if port in FEEDBACK_PERIOD_S:
-                self._feed(client, FEEDBACK_PERIOD_S[port])
-            else:
-                self._converse(client, port)
-        with self._lock:
-            self._clients.pop(client, None)
-        client.close()
+        """Serve a client until it has gone. It is hung up on even if serving fails, so that it does not wait for ever."""
+        try:
+            with contextlib.suppress(OSError, ValueError):
+                if port in FEEDBACK_PERIOD_S:
+                    self._feed(client, FEEDBACK_PERIOD_S[port])
+                else:
+                    self._converse(client, port)
+        finally:
+            with self._lock:
+                self._clients.pop(client, None)
+            client.close()
 
     def _feed(self, client: socket.socket, period_s: float) -> None:
         begun_s = due_s = time.monotonic()
@@ -256,9 +266,6 @@ class Mg400Emulator:
     def _answer(self, client: socket.socket, port: int, request: Request) -> None:
         try:
             values = self._execute(port, request)
-            if request.name in ("sync", "syncall") and not self._wait_until_done(client):
-                return
-            reply = f"0,{{{values}}},{request.text};"
         except Exception as error:
             refusal = error if isinstance(error, RefusedError) else RefusedError(ErrorId.FAILED)
             if refusal is not error:
@@ -269,6 +276,10 @@ class Mg400Emulator:
                 reply = f"{request.text};"
             else:
                 reply = f"{refusal.error_id},{{}},{request.text};"
+        else:  # a connection that is lost while it waits is no command that failed
+            if request.name in ("sync", "syncall") and not self._wait_until_done(client):
+                return
+            reply = f"0,{{{values}}},{request.text};"
         if port == MOTION_PORT and "no-move-reply" in self.faults and request.name not in ("sync", "syncall"):
             return
         if not self._bare:
@@ -330,6 +341,7 @@ def feedback_packet(arm: Mg400Controller) -> np.ndarray:
         (("queue_runs",), arm.queue_runs),
         (("paused",), arm.paused),
         (("enabled",), arm.enabled),
+        (("drag",), mode == Mode.BACKDRIVE),
         (("running",), mode == Mode.RUNNING),
         (("error",), bool(arm.alarms)),
         (("jog",), mode == Mode.JOG),

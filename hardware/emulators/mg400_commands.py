@@ -9,10 +9,10 @@ import numpy as np
 from hardware.arms.mg400_wire import ErrorId
 from hardware.arms.motion import Speeds, circle
 from hardware.emulators.mg400_controller import Mg400Controller, Order, PlanarFrame
-from hardware.emulators.mg400_grammar import Parameter, RefusedError, Request, keyword_number, read_numbers, read_table
+from hardware.emulators.mg400_grammar import FARTHEST, Parameter, RefusedError, Request, keyword_number, read_numbers, read_table
 
 # A coordinate or an angle of any size.
-NUMBER = Parameter()
+NUMBER = Parameter(most=FARTHEST)
 # A speed or an acceleration, percent.
 PERCENT = Parameter(integer=True, low=1, high=100)
 # Ratio of continuous-path blending, percent.

@@ -6,10 +6,18 @@ from dataclasses import dataclass
 
 from hardware.arms.mg400_wire import ErrorId
 
+# Most characters of a request that is not complete. No command of the arm is nearly as long.
+LONGEST_REQUEST = 4096
+# Largest coordinate, mm, and angle, deg. A larger one counts as this one: no arm gets there either, and sums and products stay finite.
+FARTHEST = 1e5
+
 
 @dataclass(frozen=True)
 class Request:
-    """One request: name in lower case, parameters, keywords in lower case, and the received text."""
+    """One request: name in lower case, parameters, keywords in lower case, and the received text.
+
+    A malformed request has no name, so it is no command.
+    """
 
     name: str
     values: tuple[str, ...]
@@ -26,16 +34,31 @@ class RefusedError(Exception):
 
 
 def take_request(buffer: str) -> tuple[Request | None, str]:
-    """The first complete request in the received text (None if there is none), and the rest of the text.
+    """The first request in the received text (None if there is none), and the rest of the text.
 
-    A request ends at its closing ``)``. It needs no newline.
+    A request ends at its closing ``)``. It needs no newline. A request that is not closed ends at a newline, or when it is longer than
+    ``LONGEST_REQUEST``. It is malformed, so that it is refused and what follows it is understood.
     """
-    depth = 0
+    depth = begin = 0
     for n, letter in enumerate(buffer):
         depth += {"(": 1, ")": -1}.get(letter, 0)
         if letter == ")" and depth <= 0:
-            return _parse(buffer[: n + 1].strip(" \r\n\t;")), buffer[n + 1 :]
-    return None, buffer
+            return _parse(_bare(buffer[begin : n + 1])), buffer[n + 1 :]
+        if letter == "\n":
+            if text := _bare(buffer[begin:n]):
+                return _malformed(text), buffer[n + 1 :]
+            begin = n + 1
+    rest = buffer[begin:]
+    return (_malformed(_bare(rest)), "") if len(rest) > LONGEST_REQUEST else (None, rest)
+
+
+def _bare(text: str) -> str:
+    """The text without what may separate requests."""
+    return text.strip(" \r\n\t;")
+
+
+def _malformed(text: str) -> Request:
+    return Request("", (), {}, text)
 
 
 def _parse(text: str) -> Request:
@@ -52,11 +75,12 @@ def _parse(text: str) -> Request:
 
 @dataclass(frozen=True)
 class Parameter:
-    """Type and range of a command's parameter."""
+    """Type and range of a command's parameter. A number whose size is above ``most`` counts as that size."""
 
     integer: bool = False
     low: float = float("-inf")
     high: float = float("inf")
+    most: float = float("inf")
 
 
 def read_numbers(request: Request, parameters: tuple[Parameter, ...], counts: tuple[int, ...]) -> list[float]:
@@ -86,7 +110,7 @@ def read_table(text: str, counts: tuple[int, ...], n: int) -> list[float]:
         raise RefusedError(ErrorId.PARAMETER_TYPE - n) from error
     if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
         raise RefusedError(ErrorId.PARAMETER_RANGE - n)
-    return numbers
+    return [_at_most(number, FARTHEST) for number in numbers]
 
 
 def keyword_number(request: Request, key: str, parameter: Parameter, default: float) -> float:
@@ -101,6 +125,11 @@ def _number(text: str, parameter: Parameter, n: int) -> float:
         number = int(text) if parameter.integer else float(text)
     except ValueError as error:
         raise RefusedError(ErrorId.PARAMETER_TYPE - n) from error
-    if not (math.isfinite(number) and parameter.low <= number <= parameter.high):
+    if not (parameter.low <= number <= parameter.high and math.isfinite(number)):  # a whole number may be too large for isfinite
         raise RefusedError(ErrorId.PARAMETER_RANGE - n)
-    return number
+    return _at_most(number, parameter.most)
+
+
+def _at_most(number: float, most: float) -> float:
+    """The number with its sign, and with a size of ``most`` if it is larger."""
+    return min(max(number, -most), most)

@@ -322,3 +322,32 @@ def test_an_alarm_that_came_before_a_reset_is_told_without_anyone_listening_to_t
         assert dashboard.recv(1024).startswith(b"0,{[[17]")
         dashboard.close()
         motion.close()
+
+
+def test_a_client_that_is_lost_while_it_waits_is_no_failed_command(caplog):
+    """A reset connection, as of a program that was killed."""
+    with Mg400Emulator(port_offset=None) as emulator:
+        client = PlainClient(emulator, 30004)
+        client.ask(client.dashboard, "EnableRobot()")
+        client.ask(client.motion, "JointMovJ(30,20,40,0,SpeedJ=1)")
+        client.motion.sendall(b"Sync()")
+        time.sleep(0.1)  # until it waits
+        client.motion.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        client.motion.close()
+        deadline = time.monotonic() + 5
+        while 30003 in emulator._clients.values():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert client.ask(client.dashboard, "RobotMode()") == "0,{7},RobotMode();"
+        client.close()
+    assert not caplog.records
+
+
+def test_a_lost_bracket_costs_one_command():
+    with Mg400Emulator(port_offset=None) as emulator:
+        client = PlainClient(emulator, 30004)
+        assert client.ask(client.dashboard, "SpeedFactor(50\n") == "-10000,{},SpeedFactor(50;"
+        assert client.ask(client.dashboard, "RobotMode\r\n") == "-10000,{},RobotMode;"
+        assert client.ask(client.dashboard, "RobotMode()\n") == "0,{4},RobotMode();"
+        assert emulator.arm.percent["speedfactor"] == 100.0
+        client.close()

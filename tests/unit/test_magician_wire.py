@@ -1,5 +1,6 @@
 """The Magician's frames, against frames checked on real arms."""
 
+import math
 import struct
 
 import pytest
@@ -8,8 +9,8 @@ from hypothesis import strategies as st
 
 from hardware.arms.magician_wire import QUEUED, WRITE, Id, Message, Ptp, take_message
 from hardware.emulators.faults import Faults
-from hardware.emulators.magician import FAULTS
-from hardware.emulators.magician_controller import MagicianController
+from hardware.emulators.magician import FAULTS, RANGES
+from hardware.emulators.magician_controller import JOG_SPEEDS, NUMBERS, PARAMETERS, SIZES, SPEEDS, MagicianController
 
 CHECKED = {
     "GetPose": (Message(10), "AA AA 02 0A 00 F6"),
@@ -64,7 +65,7 @@ def test_aa_within_a_payload_is_legal():
 
 @pytest.fixture
 def arm():
-    return MagicianController(Faults(FAULTS), time_scale=1e6)
+    return MagicianController(Faults(FAULTS, RANGES), time_scale=1e6)
 
 
 def ask(arm, id, params=b"", ctrl=0):
@@ -175,3 +176,75 @@ def test_alarms_are_told_by_their_bit_and_cleared_by_a_write_to_20(arm):
 def test_the_queue_space_may_be_wide(arm):
     arm.faults.add("wide-queue-space")
     assert ask(arm, Id.QUEUE_SPACE) == struct.pack("<Q", 32)
+
+
+def alarms(arm):
+    """Numbers of the alarms."""
+    bits = int.from_bytes(ask(arm, Id.ALARMS), "little")
+    return [n for n in range(128) if bits >> n & 1]
+
+
+@pytest.mark.parametrize("ctrl", [WRITE, WRITE | QUEUED])
+@pytest.mark.parametrize("id", NUMBERS)
+def test_numbers_that_no_arm_can_use_are_an_alarm_and_change_nothing(arm, id, ctrl):
+    """Not finite, or a speed or acceleration that is not above 0."""
+    size = len(PARAMETERS[id]) if id in PARAMETERS else SIZES[id][0]
+    form = NUMBERS[id]
+    count = form.size // 4
+    bad = [math.nan, math.inf, -math.inf, *([0.0, -50.0] if id in SPEEDS else [-50.0] if id in JOG_SPEEDS else [])]
+    start(arm)
+    before = pose(arm), ask(arm, id) if id in PARAMETERS else b""
+    for value in bad:
+        for n in range(count):
+            numbers = [50.0] * count
+            numbers[n] = value
+            assert ask(arm, id, form.pack(*numbers).ljust(size, b"\0"), ctrl) == b"" and alarms(arm) == [1]
+            ask(arm, Id.ALARMS, ctrl=WRITE)
+    assert (pose(arm), ask(arm, id) if id in PARAMETERS else b"") == before and struct.unpack("<I", ask(arm, Id.QUEUE_SPACE)) == (32,)
+
+
+@pytest.mark.parametrize("id", JOG_SPEEDS)
+def test_a_jog_at_speed_0_is_allowed_and_stands_still(arm, id):
+    before = pose(arm)
+    ask(arm, id, bytes(NUMBERS[id].size), WRITE)
+    ask(arm, Id.JOG, bytes([int(id == Id.JOG_JOINT_PARAMS), 1]), WRITE)
+    assert pose(arm) == before and not alarms(arm)
+
+
+@pytest.mark.parametrize(("x", "y"), [(1e6, 0.0), (1e9, 0.0), (3e38, -3e38)])
+@pytest.mark.parametrize("mode", [Ptp.JUMP_XYZ, Ptp.MOVJ_XYZ, Ptp.MOVL_XYZ, Ptp.MOVL_INC, Ptp.MOVJ_ANGLE])
+def test_a_place_far_away_is_an_alarm_at_once(arm, mode, x, y):
+    start(arm)
+    ask(arm, Id.PTP, struct.pack("<B4f", mode, x, y, 0, 0), 3)
+    assert len(alarms(arm)) == 1
+
+
+@pytest.mark.filterwarnings("ignore:divide by zero")
+def test_a_command_that_fails_is_dropped_and_the_queue_goes_on(arm, caplog):
+    """Such a command once failed again at each later command, even at the one that clears the queue."""
+    move = struct.pack("<B4f", Ptp.MOVL_XYZ, 200, 10, 20, 30)
+    arc = struct.pack("<8f", 1e30, 0, 0, 0, 1e30, 1e30, 0, 0)  # its circle is too large to be cut into lines
+    start(arm)
+    assert ask(arm, Id.ARC, arc, 3) == struct.pack("<Q", 1)
+    assert alarms(arm) == [1] and "queued command 101 failed" in caplog.text
+    ask(arm, Id.ALARMS, ctrl=WRITE)
+    assert ask(arm, Id.QUEUE_INDEX) == struct.pack("<Q", 1) and struct.unpack("<I", ask(arm, Id.QUEUE_SPACE)) == (32,)
+    assert ask(arm, Id.PTP, move, 3) == struct.pack("<Q", 2)
+    _finish(arm, 2)
+    assert pose(arm)[:4] == pytest.approx((200, 10, 20, 30), abs=1e-3)
+    assert ask(arm, Id.QUEUE_CLEAR, ctrl=WRITE) == b"" and not alarms(arm)
+
+
+def test_what_a_makers_client_asks_first_is_told_and_is_no_alarm(arm):
+    serial, name, version, slide = (ask(arm, id) for id in (0, 1, 2, 13))
+    assert serial.isascii() and name == b"Dobot Magician" and len(version) == 3 and struct.unpack("<f", slide) == (0.0,)
+    assert not alarms(arm)
+
+
+@pytest.mark.parametrize("id", sorted(set(range(256)) - set(Id)))
+def test_a_read_of_anything_unknown_is_no_alarm_and_a_write_is(arm, id):
+    ask(arm, id)
+    assert not alarms(arm)
+    for ctrl in (WRITE, QUEUED, WRITE | QUEUED):
+        assert ask(arm, id, b"", ctrl) == b"" and alarms(arm) == [1]
+        ask(arm, Id.ALARMS, ctrl=WRITE)

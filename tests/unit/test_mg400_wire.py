@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from hardware.arms.dobot_alarms import ALARMS, explain
 from hardware.arms.mg400_wire import PACKET_BYTES, TEST_VALUE, Mode, newest_packet, take_reply, why_refused
 from hardware.emulators.faults import Faults
-from hardware.emulators.mg400 import FAULTS, feedback_packet
+from hardware.emulators.mg400 import FAULTS, RANGES, feedback_packet
 from hardware.emulators.mg400_commands import Mg400Commands
 from hardware.emulators.mg400_controller import Mg400Controller, PlanarFrame
-from hardware.emulators.mg400_grammar import RefusedError, take_request
+from hardware.emulators.mg400_grammar import LONGEST_REQUEST, RefusedError, take_request
 
 
 def commands(firmware=(1, 7, 0), faults=(), enabled=True):
-    arm = Mg400Controller(Faults(FAULTS, faults), time_scale=1000.0)
+    arm = Mg400Controller(Faults(FAULTS, RANGES, faults), time_scale=1000.0)
     table = Mg400Commands(arm, firmware)
 
     def run(text):
@@ -161,10 +161,71 @@ def test_a_pose_has_four_values_or_more(count):
         ("GetPose(User=1,Tool=0)", -30001),  # firmware 1.7
         ("InverseSolution(900,0,0,0,0,0)", -1),
         ("PositiveSolution(0,0,61,0,0,0)", -1),
+        ("InverseSolution(1e308,1e308,1e308,1,0,0)", -1),
+        (f"SpeedFactor({10**400})", -40001),
     ],
 )
 def test_what_a_command_answers(text, expected):
     assert commands()[1](text) == expected
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("text", ["MovL(300,0,-300,0)", "MovJ(1e5,0,0,0)"])
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_place_that_can_not_be_reached_is_accepted_and_ends_in_an_alarm(text, paused):
+    _reaches_nothing(text, paused=paused)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "text",
+    [
+        "MovL(1e308,1e308,1e308,1)",
+        "MovL(1e12,0,0,0)",
+        "MovL(0,0,0,-1e308)",
+        "MovLIO(1e308,-1e308,0,0,{0,50,1,1})",
+        "MovJ(-1e308,1e308,0,1e308)",
+        "RelMovL(1e308,0,0,0)",
+        "RelMovJTool(0,1e308,0,1e308,0)",
+        "JointMovJ(1e308,0,0,0)",
+    ],
+)
+def test_a_place_beyond_all_numbers_is_one_that_can_not_be_reached(text):
+    _reaches_nothing(text, paused=False)
+
+
+@pytest.mark.filterwarnings("error")
+def test_frames_beyond_all_numbers_are_far_away():
+    _, run = commands()
+    for text in ("SetUser(1,{1e308,-1e308,1e308,1e308})", "SetTool(1,{1e308,1e308,1e308,1e308})", "User(1)", "Tool(1)"):
+        assert run(text) == ""
+    assert all(np.isfinite(float(value)) for value in run("GetPose()").split(","))
+
+
+def _reaches_nothing(text, *, paused):
+    arm, run = commands()
+    before = arm.track.pose(time.monotonic())
+    assert not paused or run("Pause()") == ""
+    assert run(text) == ""
+    assert not paused or run("Continue()") == ""
+    arm.update()
+    assert len(arm.alarms) == 1 and np.array_equal(arm.track.pose(time.monotonic()), before)
+
+
+def test_a_wait_is_as_long_as_it_may_be():
+    arm, run = commands()
+    assert run("wait(3600000)") == ""
+    assert arm.track.target().duration_s == 3600.0
+
+
+def test_the_packet_tells_that_the_arm_is_dragged():
+    arm, run = commands()
+    told = []
+    for text in ("StartDrag()", "StopDrag()"):
+        run(text)
+        data = feedback_packet(arm).tobytes()
+        told.append((data[24], data[1027]))
+    assert told == [(6, 1), (5, 0)]
 
 
 def test_solutions_and_poses_agree():
@@ -193,6 +254,28 @@ def test_requests_in_pieces_and_in_a_row():
     assert take_request(rest) == (None, rest)
     assert take_request("\r\n;Sync()")[0].name == "sync"
     assert take_request("MovLIO(1,2,3,4,(0,50,1,0))")[1] == ""
+
+
+# Pieces of requests that never close.
+OPEN = st.text(st.characters(codec="ascii", exclude_characters="\r\n)"), min_size=1, max_size=30).filter(lambda text: text.strip(" \t;"))
+
+
+@given(OPEN, st.sampled_from(["\n", "\r\n", " \n\n"]))
+def test_a_newline_ends_a_request_that_is_not_closed_and_what_follows_is_understood(text, newline):
+    stream, buffer, found = f"{text}{newline}RobotMode(){newline}", "", []
+    for letter in stream:  # split anywhere
+        request, buffer = take_request(buffer + letter)
+        found += [request] if request is not None else []
+    assert [one.text for one in found] == [text.strip(" \t;"), "RobotMode()"] and not buffer.strip()
+    assert not found[0].name and not found[0].values and found[1].name == "robotmode"
+
+
+def test_a_request_that_never_ends_is_refused_at_its_largest_length():
+    assert take_request("x" * LONGEST_REQUEST) == (None, "x" * LONGEST_REQUEST)
+    request, rest = take_request("(" * (LONGEST_REQUEST + 1))
+    assert (request.name, request.text, rest) == ("", "(" * (LONGEST_REQUEST + 1), "")
+    many = "RobotMode()" * LONGEST_REQUEST  # complete ones may come in any number
+    assert take_request(many)[1] == many[len("RobotMode()") :]
 
 
 @pytest.mark.parametrize("alarm", [17, 18, 23, *range(64, 74), 85, 112, -2])

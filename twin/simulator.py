@@ -6,6 +6,7 @@ from time import perf_counter
 
 import numpy as np
 
+from scenes.base import SpecError
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.camera.capture import expose, record
@@ -53,11 +54,18 @@ class Simulator:
         A solver of the same sensor. Default: a new one with the usual resolution.
     shading : Shading, optional
         Shading of drawn pictures (see `Renderer`).
+
+    Raises
+    ------
+    SpecError
+        ``spec`` is no specification.
     """
 
     def __init__(
         self, spec: SensorSpec, *, quality: Quality = "standard", solver: SkinSolver | None = None, shading: Shading | None = None
     ) -> None:
+        if not isinstance(spec, SensorSpec):
+            raise SpecError(f"a SensorSpec is expected, got {spec!r}; give load_sensor({str(spec)!r})")
         self.spec = spec
         self.solver = solver or SkinSolver(spec)
         self.rest = self.solver.rest()
@@ -77,9 +85,13 @@ class Simulator:
 
         Raises
         ------
+        SpecError
+            ``touched`` is no specification.
         ContactError
             If the pose is out of reach, or if the solver does not converge.
         """
+        if not isinstance(touched, ObjectSpec):
+            raise SpecError(f"an ObjectSpec is expected, got {touched!r}; give load_object({str(touched)!r})")
         return self.solver.press(touched, pose, progress=None if progress is None else lambda fraction, _: progress(fraction))
 
     def shoot(self, state: ContactState, *, form: Form = Form.RAW, seed: int = 0, name: str = "frame.png") -> Shot:
@@ -88,7 +100,7 @@ class Simulator:
         Raises
         ------
         FrameError
-            The sensor has no recording form.
+            The sensor has no recording form, or there is no such form.
         RenderError
             The renderer does not work on this machine.
         """
@@ -98,7 +110,7 @@ class Simulator:
         image = expose(linear, self.spec.capture, np.random.default_rng(seed))
         seconds = perf_counter() - start
         raw = Shot(Frame(image, Form.RAW, name), linear, cap_truth(self.spec, self.rest, state, Form.RAW), seconds)
-        return raw if form is Form.RAW else self.as_recorded(raw, state)
+        return raw if form == Form.RAW else self.as_recorded(raw, state)
 
     def shoot_rest(self, form: Form) -> Shot:
         """The frame without contact in the given form. It is rendered once and then stored."""

@@ -15,7 +15,7 @@ import numpy as np
 from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
 from scenes.sensor import SensorSpec
 from twin.camera.capture import record
-from twin.frames.forms import frame_size, gray_levels
+from twin.frames.forms import form_named, frame_size, gray_levels
 from twin.types import Form, Frame
 
 # Most failed reads in a row. After more of them the reader ends.
@@ -77,7 +77,7 @@ class LiveSource(Connection):
     fps = 5.0  # frame rate; if the device does not report one, the slowest useful rate
 
     def __init__(self, name: str, form: Form) -> None:
-        self.name, self.form = name, Form(form)
+        self.name, self.form = name, form_named(form)
         self.failed = 0  # total number of failed reads
         self._new = threading.Condition()
         self._end = threading.Event()
@@ -254,14 +254,17 @@ def capture(image: np.ndarray, spec: SensorSpec | None, form: Form) -> np.ndarra
     ------
     DeviceError
         The picture's size is not that of the sensor's camera.
+    FrameError
+        There is no such form.
     """
+    form = form_named(form)
     if spec is None:
         return image
     size = (spec.camera.width_px, spec.camera.height_px)
     if image.shape[1::-1] != size:
-        if form is Form.RECORDING and image.shape[1::-1] == frame_size(spec, form):
+        if form == Form.RECORDING and image.shape[1::-1] == frame_size(spec, form):
             return gray_levels(image)  # thresholded by the sender
         raise DeviceError(f"delivers {image.shape[1]}x{image.shape[0]}, {spec.name} has {size[0]}x{size[1]}; give the matching sensor")
     if spec.camera.channels == "mono":
         image = gray_levels(image)
-    return record(image, spec.recording) if form is Form.RECORDING and spec.recording is not None else image
+    return record(image, spec.recording) if form == Form.RECORDING and spec.recording is not None else image

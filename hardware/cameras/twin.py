@@ -158,7 +158,7 @@ class TwinCamera(LiveSource):
 
 def preview_of(spec: SensorSpec, form: Form) -> Preview:
     """The preview of the part of the raw frame that a form needs."""
-    return Preview(spec, window_px=spec.recording.crop_px if form is Form.RECORDING and spec.recording is not None else None)
+    return Preview(spec, window_px=spec.recording.crop_px if form == Form.RECORDING and spec.recording is not None else None)
 
 
 def steady(image: np.ndarray, response: ResponseSpec, rng: np.random.Generator) -> np.ndarray:

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from scenes import load_object, load_sensor
+from scenes import SpecError, load_object, load_sensor
 from twin.mechanics.path import ContactPose
 from twin.one_contact import RenderedContact, look_at
 from twin.pins.graph import make_graph
@@ -63,6 +63,20 @@ def test_cells_at_the_contact_grow_with_depth(simulators):
     middle = np.arange(37)  # the inner three rings and the centre
     means = [graph.area_px2[middle].mean() for graph in graphs]
     assert means == sorted(means) and means[-1] > 1.1 * means[0]
+
+
+def test_a_form_may_be_given_by_its_name(simulators):
+    simulator = simulators["mg400-127"]
+    for form in Form:
+        shot = simulator.shoot(simulator.rest, form=str(form))
+        assert shot.frame.form is form and shot.frame.image.shape == simulator.shoot_rest(form).frame.image.shape
+
+
+def test_a_name_is_no_specification(simulators):
+    with pytest.raises(SpecError, match=r"give load_sensor\('mg400-127'\)"):
+        Simulator("mg400-127")
+    with pytest.raises(SpecError, match=r"give load_object\('sphere'\)"):
+        simulators["mg400-127"].press("sphere", ContactPose(indent_mm=1.0))
 
 
 @pytest.fixture(scope="module")

@@ -233,8 +233,10 @@ def test_wrong_calls_are_named():
     env.reset(seed=0)
     with pytest.raises(OptionError, match="NaN"):
         env.step(np.array([np.nan, 0.0]))
-    with pytest.raises(OptionError, match="shape"):
+    with pytest.raises(OptionError, match=r"an action of shape \(2,\) is expected .*, got \(3,\)"):
         env.step(np.zeros(3))
+    with pytest.raises(OptionError, match="autoreset_mode='foo' is not offered; give 'NextStep' or 'SameStep'"):
+        TactileVectorEnv("SurfaceFollow", 2, autoreset_mode="foo")
     env.close()
     env.close()  # gymnasium: a second close has no effect
     with pytest.raises(OptionError, match="closed"):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import Voronoi
 
+from scenes import load_sensor
 from twin.frames.forms import from_raw, recording_to_raw
 from twin.pins import features, make_graph, nominal_reference
 from twin.pins.legacy import LEGACY, legacy_graph
@@ -104,6 +105,8 @@ def test_relative_features_don_t_know_the_scale(sensor):
     np.testing.assert_allclose(features(small, rest), features(large, scaled), rtol=1e-9, atol=1e-9)
     assert features(small, rest).shape == (sensor.pins.count, 5)
     assert features(small, rest, "pixels").shape == (sensor.pins.count, 3)
+    with pytest.raises(ValueError, match="they are of two sensors"):
+        features(small, nominal_reference(load_sensor("mg400-331" if sensor.pins.count == 127 else "mg400-127"), Form.RAW))
 
 
 def test_at_rest_the_relative_features_say_so(sensor):

@@ -12,11 +12,12 @@ import pytest
 from drawn_frames import drawn_frame, smooth_warp
 from PIL import Image
 
+from hardware.cameras.reader import capture
 from scenes import load_sensor
 from training.targets import choose_targets
 from twin.errors import FrameError, StoreError
 from twin.frames import evenly_read, natural_key, open_recording, read_image
-from twin.frames.forms import is_two_level
+from twin.frames.forms import frame_size, is_two_level
 from twin.frames.images import write_image
 from twin.frames.videos import is_cut
 from twin.pins import Pipeline, nominal_reference
@@ -157,6 +158,17 @@ def test_form_is_told_by_size_and_can_be_given(tmp_path, spec):
     cv2.imwrite(str(tmp_path / "odd.png"), np.zeros((50, 60), np.uint8))
     with pytest.raises(FrameError, match="expected 640x480.*got 60x50"):
         open_recording(tmp_path / "odd.png", spec)
+
+
+def test_a_form_may_be_given_by_its_name_and_an_unknown_one_names_the_known(spec):
+    raw = drawn_frame(spec, Form.RAW, nominal_reference(spec, Form.RAW).pins_px)
+    assert Pipeline(spec, "raw").form is Form.RAW and frame_size(spec, "recording") == frame_size(spec, Form.RECORDING)
+    assert np.array_equal(capture(raw.image, spec, "recording"), capture(raw.image, spec, Form.RECORDING))
+    for unknown in (lambda: Pipeline(spec, "foo"), lambda: frame_size(spec, "foo"), lambda: capture(raw.image, spec, "foo")):
+        with pytest.raises(FrameError, match="no form is called 'foo'; there are: raw, recording"):
+            unknown()
+    with pytest.raises(FrameError, match=r"a twin.types.Frame is expected, got ndarray; give Frame\(image, Form.RAW\)"):
+        Pipeline(spec, Form.RAW)(raw.image)
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.7, 1.9])

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from made_records import ABOUT, COLOUR, assert_same, made_episode
 
-from twin.errors import StoreError, TwinError
+from scenes import load_sensor
+from twin.errors import FrameError, StoreError, TwinError
 from twin.frames import open_recording
-from twin.records import FORMATS, RecordError, convert, open_records, open_writer, record
+from twin.records import FORMATS, RecordError, Records, convert, open_records, open_writer, record, with_pins
 from twin.records.folder import SIDECAR
 
 KILLED = """
@@ -84,6 +85,17 @@ def test_it_is_gone_on_with_and_no_episode_is_written_twice(tmp_path, to):
     assert (again.before, again.episodes) == (3, 3)
     for mine, its in zip(EPISODES, open_records(tmp_path / "out").episodes, strict=True):
         assert_same(mine, its)
+
+
+def test_paths_may_be_text_and_the_pins_of_another_sensor_are_refused(tmp_path):
+    folder = str(written(tmp_path / "a", "recording"))
+    assert len(open_records(folder).episodes) == len(EPISODES)
+    assert convert([folder], str(tmp_path / "b"), "mcap").episodes == len(EPISODES)
+    other = load_sensor("mg400-127")
+    found = {"pins": 2 * other.pins.count + 2}
+    of_another = replace(ABOUT, numbers=found)
+    with pytest.raises(FrameError, match="127; leave --sensor out, or give the matching one"):
+        with_pins(Records(of_another, []), other)
 
 
 @pytest.mark.parametrize("to", [pytest.param(name, marks=() if name in ("recording", "lerobot") else pytest.mark.slow) for name in FORMATS])

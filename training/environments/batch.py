@@ -288,7 +288,8 @@ class Batch:
         """
         actions = np.asarray(actions, float)
         if actions.shape != self._action.shape:
-            raise OptionError(f"actions of shape {self._action.shape} are expected ({', '.join(self.axes)}), got {actions.shape}")
+            expected, got = (shape[1:] if self.count == 1 else shape for shape in (self._action.shape, actions.shape))
+            raise OptionError(f"an action of shape {expected} is expected ({', '.join(self.axes)}), got {got}")
         if not np.isfinite(actions[rows]).all():
             raise OptionError(f"an action is not a finite number: {actions[rows]}; look for NaN in the policy")
         self._action[rows] = np.clip(actions[rows], -1.0, 1.0)

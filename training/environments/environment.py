@@ -182,9 +182,9 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
+        if autoreset_mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, "NextStep", "SameStep"):
+            raise OptionError(f"autoreset_mode={autoreset_mode!r} is not offered; give 'NextStep' or 'SameStep'")
         mode = AutoresetMode(autoreset_mode)
-        if mode is AutoresetMode.DISABLED:
-            raise OptionError("autoreset_mode='Disabled' is not offered; give 'NextStep' or 'SameStep'")
         if not isinstance(num_envs, int) or num_envs < 1:
             raise OptionError(f"num_envs={num_envs!r}: expected a whole number of at least 1")
         if render_mode == "human":

@@ -211,7 +211,7 @@ def caps_px(sensor: SensorSpec, form: Form, caps_mm: FloatArray) -> FloatArray:
 
 def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[PinState, np.random.Generator], Frame]:
     """Function that makes a frame of one environment's state."""
-    recording = sensor.recording if form is Form.RECORDING else None
+    recording = sensor.recording if form == Form.RECORDING else None
     window_px = recording.crop_px if recording else None
     preview = Preview(sensor, window_px=window_px)
     renderer = Renderer(sensor, quality="preview", window_px=window_px) if pictures == "traced" else None

@@ -63,15 +63,29 @@ def from_raw(recording: RecordingSpec | None, form: Form, raw_px: np.ndarray) ->
     return raw_to_recording(recording, raw_px) if form == Form.RECORDING else np.asarray(raw_px, float)
 
 
+def form_named(name: str) -> Form:
+    """The form of a name, "raw" say.
+
+    Raises
+    ------
+    FrameError
+        There is no such form.
+    """
+    try:
+        return Form(name)
+    except ValueError:
+        raise FrameError(f"no form is called {name!r}; there are: {', '.join(Form)}") from None
+
+
 def frame_size(spec: SensorSpec, form: Form) -> tuple[int, int]:
     """(width, height) in px of the sensor's frames of a form.
 
     Raises
     ------
     FrameError
-        The sensor has no recording form.
+        The sensor has no recording form, or there is no such form.
     """
-    known = known_frames(spec)
+    known, form = known_frames(spec), form_named(form)
     if form not in known.size_px:
         raise FrameError(f"sensor '{spec.name}' has no recording form: its recordings are raw frames; use the raw form")
     return known.size_px[form]
@@ -178,7 +192,7 @@ def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form 
         The frame's size is not one of the sensor's, or not that of the given form.
     """
     if form is not None:
-        form = Form(form)
+        form = form_named(form)
     if known is None:
         return form or (Form.RECORDING if is_two_level(image) else Form.RAW)
     try:

@@ -61,8 +61,10 @@ def features(graph: PinGraph, reference: Reference, kind: Literal["relative", "p
     Raises
     ------
     ValueError
-        There is no such kind.
+        There is no such kind, or the reference has another number of pins.
     """
+    if len(graph.nodes_px) != len(reference.pins_px):
+        raise ValueError(f"the graph has {len(graph.nodes_px)} pins, the reference {len(reference.pins_px)}: they are of two sensors")
     centred = graph.nodes_px - np.median(graph.nodes_px, axis=0)
     areas = graph.kind == "voronoi"
     if kind == "pixels":

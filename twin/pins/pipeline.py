@@ -12,7 +12,7 @@ import numpy as np
 
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
-from twin.frames.forms import blob_spec, frame_size, gray_levels
+from twin.frames.forms import blob_spec, form_named, frame_size, gray_levels
 from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.matching import Match, match, predict_all, rematch
@@ -102,7 +102,7 @@ class Pipeline:
         graph: GraphKind = "voronoi",
         second_look: bool = True,
     ) -> None:
-        self.spec, self.form, self.graph, self.second_look = spec, Form(form), graph, second_look
+        self.spec, self.form, self.graph, self.second_look = spec, form_named(form), graph, second_look
         self.size_px = frame_size(spec, self.form)
         self.blob_spec = blob_spec(spec.pipeline, self.form)
         self.reference = nominal_reference(spec, self.form) if reference is None else reference
@@ -155,6 +155,8 @@ class Pipeline:
 
     def check(self, frame: Frame) -> None:
         """Raise ``FrameError`` if the size, type or form of a frame is not that of this sensor and form."""
+        if not isinstance(frame, Frame):
+            raise FrameError(f"a twin.types.Frame is expected, got {type(frame).__name__}; give Frame(image, Form.{self.form.name})")
         image, (width, height) = frame.image, self.size_px
         where = frame.name or "frame"
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8:

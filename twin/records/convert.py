@@ -40,7 +40,7 @@ ALSO = tuple(name for name in FORMATS if name != RecordingWriter.FORMAT)
 """Formats in which a record can be kept in addition to its own."""
 
 
-def open_records(path: Path) -> Records:
+def open_records(path: str | Path) -> Records:
     """Records of any format: a session, a recording, a data set, or the result of a translation.
 
     Raises
@@ -50,6 +50,7 @@ def open_records(path: Path) -> Records:
     FrameError
         A recording or session can't be read.
     """
+    path = Path(path)
     if not path.exists():
         raise RecordError(f"{shown(path, LONGEST_PATH)}: no such file or folder; give a recording, a session or a translated record")
     if path.suffix == ".mcap":
@@ -77,9 +78,12 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
     Raises
     ------
     FrameError
-        The pictures were not made by this sensor.
+        The pictures, or the pins that the records have, are not of this sensor.
     """
     if "pins" in records.about.numbers:
+        if spec is not None and (found_pins := records.about.numbers["pins"] // 2) != spec.pins.count:
+            told = f"the record has {found_pins} pins of '{records.about.sensor}', {spec.name} has {spec.pins.count}"
+            raise FrameError(f"{told}; leave --sensor out, or give the matching one")
         return records
     if spec is None:
         try:
@@ -178,8 +182,8 @@ class Converted:
 
 @writes(gone_on=tuple(dict.fromkeys((SIDECAR, RESTS, *(name for each in WRITERS.values() for name in each.NAMES)))))
 def convert(
-    sources: Sequence[Path],
-    out: Path,
+    sources: Sequence[str | Path],
+    out: str | Path,
     to: str,
     *,
     sensor: SensorSpec | None = None,
@@ -191,7 +195,7 @@ def convert(
 
     Parameters
     ----------
-    sources : sequence of Path
+    sources : sequence of str or Path
         Paths as for ``open_records``.
     out : Path
         A new or empty folder, or one with records of the same format and sensor, and with the same numbers in each step.
@@ -213,7 +217,8 @@ def convert(
     StoreError
         The folder can't be written to, or another run uses it.
     """
-    opened = [with_pins(open_records(Path(source)), sensor).named(task) for source in sources]
+    out = Path(out)
+    opened = [with_pins(open_records(source), sensor).named(task) for source in sources]
     if not any(records.episodes for records in opened):
         named = ", ".join(map(str, sources[:3])) or "nothing was given"
         raise RecordError(f"{named}: no finished episode to translate; give a recording, a session or a translated record")

@@ -35,7 +35,7 @@ def dome_window(spec: SensorSpec) -> tuple[int, int, int, int]:
 
 def dome_part(spec: SensorSpec, image: ImageArray, form: Form) -> ImageArray:
     """The dome's part of a raw frame. A recording's frame is returned whole, because it shows nothing else."""
-    if form is Form.RECORDING:
+    if form == Form.RECORDING:
         return image
     x0, y0, x1, y1 = dome_window(spec)
     return image[y0:y1, x0:x1]

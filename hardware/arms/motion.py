@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass, replace
+from itertools import chain
 from threading import Lock
 
 import numpy as np
@@ -105,7 +106,7 @@ def between(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, share: f
 def check_line(kinematics: Kinematics, start: np.ndarray, end: np.ndarray) -> Violation | None:
     """The first limit that a straight move would violate: its end is checked first, then its path."""
     steps = max(1, int(np.ceil(np.linalg.norm(end[:3] - start[:3]) / LINE_STEP_MM)))
-    for n in (steps, *range(1, steps)):
+    for n in chain((steps,), range(1, steps)):  # a tuple of the steps to a place far away would fill the memory
         try:
             broken = kinematics.violation(kinematics.inverse(between(kinematics, start, end, n / steps, True)))
         except OutOfReachError as error:

@@ -107,6 +107,13 @@ def test_a_line_may_leave_the_workspace_between_good_ends():
     assert check_line(MG400, left, MG400.forward(np.array([0.0, 0, 70, 0]))).code == TARGET_LIMIT
 
 
+def test_a_line_to_a_place_far_away_is_refused_at_its_end_at_once():
+    """Its steps would fill the memory."""
+    start = MG400.forward(np.array([0.0, 20.0, 20.0, 0.0]))
+    far = start + (1e15, 0, 0, 0, 0, 0)
+    assert check_line(MG400, start, far) is not None
+
+
 @pytest.mark.parametrize("acceleration", [np.inf, 200.0, 20.0])
 def test_a_move_keeps_speed_and_acceleration(acceleration):
     track = MotionTrack(MG400, np.array([0.0, 20, 40, 0]))

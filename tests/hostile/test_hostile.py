@@ -29,6 +29,7 @@ PROGRESS = re.compile(  # what only progress prints: bars, or a line every ten s
 )
 ERROR = "twin: error: "
 NOTED = re.compile(r"^twin: warning: .*(results|functions) can't be kept|^jit_kernel_write\(\)")  # a full disk may be that of caches, too
+TOLD = re.compile(r"^twin: warning: 90 % intervals from \d+ frames that training did not see are too narrow; ")  # few frames were given
 OWN = (LOCK, WRITTEN)  # what the store keeps in a folder for itself
 VARYING = re.compile(r"\d+\.?\d* ms\b")
 
@@ -169,8 +170,8 @@ def how_it_ended(entry: Entry, ended: Ended) -> list[str]:
             found.append("usage without a line of error")
         if entry.end[0] and len(lines) > 2:
             found.append(f"{len(lines)} lines at its end")
-        if not ended.exit and lines and not entry.end[0]:
-            found.append(f"warns: {lines[0][:200]}")
+        if not ended.exit and not entry.end[0] and (warned := [line for line in lines if not TOLD.search(line)]):
+            found.append(f"warns: {warned[0][:200]}")
     missing = [word for word in entry.says if not any(either in said for either in word.split("|"))]
     if missing:
         found.append(f"does not say {', '.join(missing)}")

@@ -99,7 +99,7 @@ class Collection:
         DeviceError
             The folder holds something else, or a collection with other settings.
         """
-        self.pictures = self.folder / ("frames_bw" if self.form is Form.RECORDING else "images")
+        self.pictures = self.folder / ("frames_bw" if self.form == Form.RECORDING else "images")
         self.folder.mkdir(parents=True, exist_ok=True)
         meta, about = self.folder / META, json.loads(json.dumps(self.about))
         if meta.is_file():

@@ -1,5 +1,6 @@
 """Safety limits of an arm, and the decision before every move whether it is allowed. A decision has a code and no side effects."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -10,10 +11,11 @@ import numpy as np
 from pydantic import AfterValidator
 
 from hardware.arms.arm import FEEDBACK_AGE_S, ArmState
-from hardware.arms.kinematics import LINKAGE_ABOVE, LINKAGE_BELOW, Kinematics, OutOfReachError
+from hardware.arms.kinematics import LINKAGE_ABOVE, LINKAGE_BELOW, Kinematics, OutOfReachError, finite_numbers
 from hardware.arms.motion import check_line, turn_between_deg
 from hardware.errors import DeviceError
 from scenes.base import Fraction, NonNegative, Positive, Section, SpecError
+from scenes.files import LONGEST_PATH, shown
 from scenes.load import read_section
 
 # Number of bisections of a path in the search for its last allowed place: 100 mm are divided to 0.01 mm.
@@ -95,19 +97,22 @@ class SafetyLimits(Section):
 def load_limits(name_or_path: str | Path) -> SafetyLimits:
     """Limits by name (``mg400``, ``magician``) or by the path of their TOML file.
 
+    A text is a path if it is no name, and has a suffix or something is there.
+
     Raises
     ------
     DeviceError
-        The file does not exist, or its content is not valid.
+        There are no such limits, the file does not exist, or its content is not valid.
     """
-    path = Path(name_or_path)
-    if path.suffix != ".toml":
-        path = SHIPPED_LIMITS / f"{name_or_path}.toml"
+    shipped = {file.stem: file for file in sorted(SHIPPED_LIMITS.glob("*.toml"))}
+    path, example = shipped.get(str(name_or_path), Path(name_or_path)), SHIPPED_LIMITS / "mg400.toml"
+    if not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
+        told = f"{shown(path, LONGEST_PATH)}: no such file" if path.suffix else f"no limits are called '{shown(name_or_path)}'"
+        raise DeviceError(f"{told}; give one of {', '.join(shipped)}, or the path of a TOML file like {example}")
     try:
         return read_section(path, SafetyLimits)
     except SpecError as error:
-        shipped = ", ".join(sorted(file.stem for file in SHIPPED_LIMITS.glob("*.toml")))
-        raise DeviceError(f"{error}; give one of {shipped}, or the path of a TOML file like {SHIPPED_LIMITS / 'mg400.toml'}") from error
+        raise DeviceError(f"{error}; a file like {example} is expected") from error
 
 
 class Code(StrEnum):
@@ -267,9 +272,10 @@ def decide(
     """
     if halted := _halt(state, limits, now_s=now_s, sensed=sensed):
         return halted
-    target = np.asarray(target, float)
-    if target.shape != (6,) or not np.isfinite(target).all():
-        return Decision(Action.REFUSE, Code.NOT_A_NUMBER, f"the target {target} is not six numbers")
+    try:
+        target = finite_numbers("the target", target, 6)
+    except DeviceError as error:
+        return Decision(Action.REFUSE, Code.NOT_A_NUMBER, str(error))
     unwrapped = kinematics is not None and kinematics.axes == 4
     if kinematics is not None and unwrapped:
         target = kinematics.nearest_pose(target)
@@ -316,9 +322,10 @@ def decide_joints(
     """Decide whether the joints may move to angles. Every degree of the path is checked. Too long a move is refused, not shortened."""
     if halted := _halt(state, limits, now_s=now_s, sensed=sensed):
         return halted
-    end = np.asarray(joints_deg, float)
-    if not np.isfinite(end).all():
-        return Decision(Action.REFUSE, Code.NOT_A_NUMBER, f"the joints {end} are not numbers")
+    try:
+        end = finite_numbers("the joints", joints_deg, len(state.joints_deg))
+    except DeviceError as error:
+        return Decision(Action.REFUSE, Code.NOT_A_NUMBER, str(error))
     steps = max(1, int(np.ceil(np.abs(end - state.joints_deg).max())))
     for share in np.arange(1, steps + 1) / steps:
         joints = state.joints_deg + share * (end - state.joints_deg)

@@ -29,7 +29,7 @@ from training.targets import limits_of
 from training.touched import TouchAnswer
 from twin.errors import FrameError
 from twin.estimate import SensorModel
-from twin.frames.forms import blob_spec
+from twin.frames.forms import blob_spec, form_named
 from twin.mechanics.skin_map import ContactMaps
 from twin.pins import Pipeline, Reference, make_reference, measure_reference, nominal_reference
 from twin.store import fingerprint
@@ -278,10 +278,11 @@ class PoseEstimator:
         ------
         FrameError
         """
-        if sensor.name != self.sensor.name or sensor.pins.count != self.sensor.pins.count or Form(form) != self.form:
+        form = form_named(form)
+        if sensor.name != self.sensor.name or sensor.pins.count != self.sensor.pins.count or form != self.form:
             raise FrameError(
                 f"the model was trained on {self.form} frames of '{self.sensor.name}' ({self.sensor.pins.count} pins), "
-                f"these are {Form(form)} frames of '{sensor.name}' ({sensor.pins.count} pins); give a model trained for them"
+                f"these are {form} frames of '{sensor.name}' ({sensor.pins.count} pins); give a model trained for them"
             )
 
     def __call__(self, frame: Frame) -> PoseEstimate:

@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from hardware.errors import DeviceError
+from scenes.files import shown
 
 # Numbers of the Dobots' alarms that planning raises (see ``hardware.arms.dobot_alarms``).
 NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23
@@ -158,32 +159,44 @@ class StageKinematics:
         return np.array(pose, float)
 
 
-def linear_target(name: str, kinematics: LinkageKinematics, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pose (6,) nearest to the requested one that the arm can take, and its joints (4,); NaN where a number is missing.
+def finite_numbers(what: str, given: np.ndarray, count: int) -> np.ndarray:
+    """The target of a move (count,), whatever a caller gave for it.
 
     Raises
     ------
     DeviceError
-        The pose is out of reach.
+        It is not so many finite numbers. The message begins with ``what``.
     """
-    sent = kinematics.nearest_pose(pose)
     try:
-        return sent, kinematics.inverse(sent) if np.isfinite(sent).all() else np.full(4, np.nan)
+        numbers = np.array(given, float)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise DeviceError(f"{what} must be {count} finite numbers, not {shown(repr(given))}")
+    return numbers
+
+
+def linear_target(name: str, kinematics: LinkageKinematics, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pose (6,) nearest to the requested one that the arm can take, and its joints (4,).
+
+    Raises
+    ------
+    DeviceError
+        The pose is not six finite numbers, or out of reach.
+    """
+    sent = kinematics.nearest_pose(finite_numbers(f"{name}: the pose", pose, 6))
+    try:
+        return sent, kinematics.inverse(sent)
     except OutOfReachError as error:
         raise DeviceError(f"{name}: {error}; nothing was sent") from error
 
 
-def joint_target(name: str, joints_deg: np.ndarray) -> np.ndarray:
-    """Joint angles (4,), or ``DeviceError`` where they are not four."""
-    sent = np.array(joints_deg, float)
-    if sent.shape != (4,):
-        raise DeviceError(f"{name}: {sent.size} joint angles; it has 4 joints")
-    return sent
+def joint_target(name: str, joints_deg: np.ndarray, axes: int = 4) -> np.ndarray:
+    """Joint angles (J,), or ``DeviceError`` if they are not a finite number for each of the arm's axes."""
+    return finite_numbers(f"{name}: the joint angles", joints_deg, axes)
 
 
-def require_possible(name: str, kinematics: LinkageKinematics, numbers: np.ndarray, joints_deg: np.ndarray) -> None:
-    """Raise ``DeviceError`` unless the joints (4,) are finite and within the limits. ``numbers`` are the values that would be sent."""
-    if not np.isfinite(joints_deg).all():
-        raise DeviceError(f"{name}: the target {numbers} is not a number; nothing was sent")
+def require_possible(name: str, kinematics: LinkageKinematics, joints_deg: np.ndarray) -> None:
+    """Raise ``DeviceError`` unless the joints (4,) are within the limits."""
     if violation := kinematics.violation(joints_deg):
         raise DeviceError(f"{name}: {violation.text}; nothing was sent. Choose a target within reach and limits")

@@ -162,7 +162,7 @@ class Magician(BaseArm):
 
     def _move(self, mode: Ptp, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray, *, wait: bool, timeout_s: float) -> None:
         self._require_enabled()
-        require_possible(self.name, self.kinematics, numbers, joints)
+        require_possible(self.name, self.kinematics, joints)
         if alarms := self._alarms():
             raise DeviceError(f"{self.name}: {explain(alarms)}")
         begun_s = time.monotonic()

@@ -283,7 +283,7 @@ class MG400(BaseArm):
         self, command: str, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float
     ) -> None:
         self._require_connected()
-        require_possible(self.name, self.kinematics, numbers, joints)
+        require_possible(self.name, self.kinematics, joints)
         packet, _ = self._feedback.newest(SILENCE_S)  # checked here, because old firmware does not report a refusal
         if int(packet["mode"]) == Mode.ERROR:
             raise DeviceError(f"{self.name}: {self._alarm()}")

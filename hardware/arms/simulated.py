@@ -7,7 +7,7 @@ from enum import StrEnum
 import numpy as np
 
 from hardware.arms.arm import FEEDBACK_AGE_S, ArmState, BaseArm
-from hardware.arms.kinematics import MG400, Kinematics, StageKinematics, Violation
+from hardware.arms.kinematics import MG400, Kinematics, StageKinematics, Violation, finite_numbers, joint_target
 from hardware.arms.motion import MotionTrack, Speeds
 from hardware.errors import DeviceError, StaleDataError
 
@@ -121,15 +121,13 @@ class SimulatedArm(BaseArm):
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         with self._watched():
-            sent = self.kinematics.nearest_pose(pose)
+            sent = self.kinematics.nearest_pose(finite_numbers(f"{self.name}: the pose", pose, 6))
             self._move(sent, linear=True, wait=wait, settled=sent, timeout_s=timeout_s)
         return sent
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         with self._watched():
-            sent = np.array(joints_deg, float)
-            if sent.shape != (self.axes,):
-                raise DeviceError(f"{self.name}: {sent.size} joint angles; it has {self.axes} joints")
+            sent = joint_target(self.name, joints_deg, self.axes)
             self._move(sent, linear=False, wait=wait, settled=self.kinematics.forward(sent), timeout_s=timeout_s)
         return sent
 
@@ -140,8 +138,6 @@ class SimulatedArm(BaseArm):
             raise DeviceError(f"{self.name}: {error}; call clear_error(), then enable()")
         if not self._enabled:
             raise DeviceError(f"{self.name}: not enabled; call enable() first")
-        if not np.isfinite(end).all():
-            raise DeviceError(f"{self.name}: the target {end} is not a number; nothing was sent")
         if SimulatedFault.IGNORE not in self.faults:
             self._begin(end, linear, now_s)
         if wait:

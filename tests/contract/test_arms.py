@@ -77,8 +77,15 @@ def test_joints_move_too(ready):
     joints = ready.arm.state().joints_deg + 2.0
     assert np.allclose(ready.arm.move_joints(joints), joints)
     assert np.allclose(ready.arm.state().joints_deg, joints, atol=0.01)
-    with pytest.raises(DeviceError, match="joints"):
-        ready.arm.move_joints(np.zeros(3))
+
+
+@pytest.mark.parametrize("given", [np.zeros(3), "home", None, [np.nan] * 6, [[0.0] * 6]], ids=repr)
+def test_a_target_that_is_not_numbers_is_told_and_nothing_moves(ready, given):
+    joints = f"the joint angles must be {ready.arm.axes} finite numbers"
+    for move, told in ((ready.arm.move_joints, joints), (ready.arm.move_linear, "the pose must be 6 finite numbers")):
+        with pytest.raises(DeviceError, match=told):
+            move(given)
+    assert np.allclose(ready.arm.state().pose, ready.home, atol=0.01) and not ready.arm.state().moving
 
 
 def test_four_axes_keep_level_and_turn_as_suits_the_wrist(ready):

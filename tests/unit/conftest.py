@@ -37,10 +37,15 @@ def data(tmp_path_factory):
     return drawn_dataset(tmp_path_factory.mktemp("drawn"))
 
 
+def written_at(folder):
+    """When each file below a folder was written."""
+    return {str(path): path.stat().st_mtime_ns for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
 @pytest.fixture(scope="session")
 def made_once(of_all_workers):
-    """Gives a folder by its name. The first process that asks makes what is in it, the others wait."""
-    home = of_all_workers / "shared"
+    """Gives a folder by its name. The first process that asks makes what is in it, the others wait; no test writes into it."""
+    home, given = of_all_workers / "shared", {}
     home.mkdir(exist_ok=True)
 
     def folder(name, make):
@@ -51,9 +56,12 @@ def made_once(of_all_workers):
                 making.mkdir()
                 make(making)
                 making.rename(made)
+        given.setdefault(made, written_at(made))
         return made
 
-    return folder
+    yield folder
+    for made, then in given.items():
+        assert written_at(made) == then, f"a test has written into {made}, which other tests read at the same time: let it use a copy"
 
 
 @pytest.fixture(scope="session")

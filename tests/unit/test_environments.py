@@ -237,6 +237,11 @@ def test_wrong_calls_are_named():
         env.step(np.zeros(3))
     with pytest.raises(OptionError, match="autoreset_mode='foo' is not offered; give 'NextStep' or 'SameStep'"):
         TactileVectorEnv("SurfaceFollow", 2, autoreset_mode="foo")
+    one = TactileVectorEnv("SurfaceFollow", 1, **FAST)
+    one.reset(seed=0)
+    with pytest.raises(OptionError, match=r"an action of shape \(1, 2\) is expected .*, got \(2,\)"):
+        one.step(np.zeros(2))
+    one.close()
     env.close()
     env.close()  # gymnasium: a second close has no effect
     with pytest.raises(OptionError, match="closed"):

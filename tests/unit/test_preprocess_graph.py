@@ -105,7 +105,7 @@ def test_relative_features_don_t_know_the_scale(sensor):
     np.testing.assert_allclose(features(small, rest), features(large, scaled), rtol=1e-9, atol=1e-9)
     assert features(small, rest).shape == (sensor.pins.count, 5)
     assert features(small, rest, "pixels").shape == (sensor.pins.count, 3)
-    with pytest.raises(ValueError, match="they are of two sensors"):
+    with pytest.raises(ValueError, match="they are of two sensors; give the reference of the Pipeline"):
         features(small, nominal_reference(load_sensor("mg400-331" if sensor.pins.count == 127 else "mg400-127"), Form.RAW))
 
 

@@ -10,18 +10,22 @@ import cv2
 import numpy as np
 import pytest
 from drawn_frames import drawn_frame, smooth_warp
+from made_records import ABOUT, made_episode
 from PIL import Image
 
 from hardware.cameras.reader import capture
+from hardware.collect import Collection
 from scenes import load_sensor
+from training.estimator import PoseEstimator
 from training.targets import choose_targets
 from twin.errors import FrameError, StoreError
 from twin.frames import evenly_read, natural_key, open_recording, read_image
-from twin.frames.forms import frame_size, is_two_level
+from twin.frames.forms import blob_spec, frame_size, from_raw, is_two_level
 from twin.frames.images import write_image
 from twin.frames.videos import is_cut
 from twin.pins import Pipeline, nominal_reference
 from twin.pins.batch import overlay_name, preprocess_recording, summary_lines
+from twin.records import open_writer
 from twin.rig.labels import read_arm_labels
 from twin.store import write_text
 from twin.types import Form
@@ -160,15 +164,41 @@ def test_form_is_told_by_size_and_can_be_given(tmp_path, spec):
         open_recording(tmp_path / "odd.png", spec)
 
 
-def test_a_form_may_be_given_by_its_name_and_an_unknown_one_names_the_known(spec):
+def test_a_form_may_be_given_by_its_name_and_an_unknown_one_names_the_known(tmp_path, spec):
     raw = drawn_frame(spec, Form.RAW, nominal_reference(spec, Form.RAW).pins_px)
     assert Pipeline(spec, "raw").form is Form.RAW and frame_size(spec, "recording") == frame_size(spec, Form.RECORDING)
     assert np.array_equal(capture(raw.image, spec, "recording"), capture(raw.image, spec, Form.RECORDING))
-    for unknown in (lambda: Pipeline(spec, "foo"), lambda: frame_size(spec, "foo"), lambda: capture(raw.image, spec, "foo")):
-        with pytest.raises(FrameError, match="no form is called 'foo'; there are: raw, recording"):
+    write_image(tmp_path / "raw.png", raw.image)
+    for unknown in (
+        lambda: Pipeline(spec, "foo"),
+        lambda: frame_size(spec, "foo"),
+        lambda: capture(raw.image, spec, "foo"),
+        lambda: from_raw(spec.recording, "foo", np.zeros((1, 2))),
+        lambda: blob_spec(spec.pipeline, "foo"),
+        lambda: nominal_reference(spec, "foo"),
+        lambda: open_recording(tmp_path / "raw.png", spec, "foo"),
+    ):
+        with pytest.raises(FrameError, match="^no form is called 'foo'; there are: raw, recording"):
             unknown()
     with pytest.raises(FrameError, match=r"a twin.types.Frame is expected, got ndarray; give Frame\(image, Form.RAW\)"):
         Pipeline(spec, Form.RAW)(raw.image)
+
+
+@pytest.mark.parametrize(("form", "folder"), [("raw", "images"), ("recording", "frames_bw")])
+def test_frames_of_a_form_that_is_given_by_its_name_get_that_forms_folder(tmp_path, form, folder):
+    assert Collection(tmp_path / "collected", {}, form).pictures.name == folder
+    with open_writer(tmp_path / "written", "recording", replace(ABOUT, form=form), 10) as writer:
+        writer.write(iter([made_episode(0)]))
+    assert (tmp_path / "written" / folder).is_dir()
+
+
+def test_a_model_refuses_an_unknown_form_as_it_refuses_the_other_one():
+    model = PoseEstimator.load("mg400-127")
+    model.check(model.sensor, "recording")
+    with pytest.raises(FrameError, match="these are raw frames of"):
+        model.check(model.sensor, "raw")
+    with pytest.raises(FrameError, match="no form is called 'foo'"):
+        model.check(model.sensor, "foo")
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.7, 1.9])

@@ -98,6 +98,20 @@ def test_paths_may_be_text_and_the_pins_of_another_sensor_are_refused(tmp_path):
         with_pins(Records(of_another, []), other)
 
 
+@pytest.mark.parametrize(
+    ("named", "told"),
+    [("ur5-331", "331 pins of 'ur5-331', the given sensor 'mg400-331' has 331; leave --sensor out"), ("mg400-331", ""), ("", "")],
+)
+def test_pins_of_a_sensor_of_another_name_are_refused_though_their_number_fits(named, told):
+    given = load_sensor("mg400-331")
+    records = Records(replace(ABOUT, sensor=named, numbers={"pins": 2 * given.pins.count}), [])
+    if not told:
+        assert with_pins(records, given) is records
+        return
+    with pytest.raises(FrameError, match=told):
+        with_pins(records, given)
+
+
 @pytest.mark.parametrize("to", [pytest.param(name, marks=() if name in ("recording", "lerobot") else pytest.mark.slow) for name in FORMATS])
 def test_killed_at_any_moment_every_finished_episode_is_there(tmp_path, to):
     folders = [tmp_path / str(number) for number in range(2)]

@@ -12,7 +12,7 @@ from hardware.arms.kinematics import MG400
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.errors import DeviceError
 from hardware.safe_arm import RefusedMoveError, SafeArm
-from hardware.safety import Action, Code, SafetyLimits, Sensed, clip, decide, decide_joints, load_limits
+from hardware.safety import SHIPPED_LIMITS, Action, Code, SafetyLimits, Sensed, clip, decide, decide_joints, load_limits
 
 NOW_S = 1000.0
 HOME = np.array([300.0, 0, 0, 0, 0, 0])
@@ -42,6 +42,9 @@ def decided(target, limits=FREE, *, at=HOME, sensed=None, **told):
         (decided(HOME + 1), Action.MOVE, Code.OK),
         (decided(HOME + [50, 0, 0, 0, 0, 0], LIMITS), Action.MOVE, Code.STEP_SHORTENED),
         (decided(HOME * np.nan), Action.REFUSE, Code.NOT_A_NUMBER),
+        (decided("home"), Action.REFUSE, Code.NOT_A_NUMBER),
+        (decided(None), Action.REFUSE, Code.NOT_A_NUMBER),
+        (decided(HOME[:3]), Action.REFUSE, Code.NOT_A_NUMBER),
         (decided(HOME, enabled=False), Action.REFUSE, Code.NOT_ENABLED),
         (decided(HOME, error="alarm 17"), Action.HOLD, Code.ARM_ERROR),
         (decided(HOME, age_s=1.1), Action.HOLD, Code.STALE_FEEDBACK),
@@ -118,7 +121,7 @@ def test_joint_moves_are_checked_on_their_way():
     assert decided(here + [0, 0, 0, 500]) == Code.JOINT_LIMIT
     assert decided(here + [80, 0, 0, 0]) == Code.OUTSIDE_BOX
     assert decided(here + [5, 0, 0, 0], LIMITS) == Code.STEP_TOO_LONG
-    assert decided([np.nan] * 4) == Code.NOT_A_NUMBER
+    assert decided([np.nan] * 4) == decided([0.0, 0.0]) == Code.NOT_A_NUMBER
     outside_between = [*(-here[:1] + 100), *here[1:]]  # both ends may be allowed: the way between is looked at too
     assert decided(outside_between) == Code.OUTSIDE_BOX
 
@@ -131,8 +134,33 @@ def test_limits_are_checked_data(tmp_path):
         path.write_text(text)
         with pytest.raises(DeviceError, match=f"{path}: .*like .*mg400.toml"):
             load_limits(path)
-    with pytest.raises(DeviceError, match="give one of magician, mg400, simulated"):
-        load_limits("mg40")
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ("mg40", "no limits are called 'mg40'; give one of"),
+        ("mine.toml", "mine.toml: no such file; give one of"),
+        ("mine.png", "mine.png: no such file"),
+    ],
+)
+def test_limits_that_are_not_there_are_told_with_one_remedy(tmp_path, monkeypatch, given, told):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DeviceError, match=f"^{told}.* magician, mg400, simulated, or the path of a TOML file like") as caught:
+        load_limits(given)
+    assert str(caught.value).count("give ") == 1
+
+
+def test_a_file_is_read_as_limits_whatever_its_name_and_a_name_comes_before_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mg400").mkdir()
+    assert load_limits("mg400") == load_limits(SHIPPED_LIMITS / "mg400.toml")
+    for name in ("mine", "mine.txt"):
+        (tmp_path / name).write_text((SHIPPED_LIMITS / "mg400.toml").read_text())
+        assert load_limits(name) == load_limits("mg400")
+    (tmp_path / "fake.png").write_text("a picture")
+    with pytest.raises(DeviceError, match="^fake.png: not readable as TOML"):
+        load_limits("fake.png")
 
 
 @pytest.fixture

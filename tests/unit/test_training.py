@@ -53,11 +53,12 @@ def test_time_that_is_up_after_a_networks_last_epoch_ends_the_run(data, tmp_path
 
 
 def test_another_run_in_the_same_folder_is_refused(data, trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "finished")
     with pytest.raises(TrainingError, match="finished run"):
-        train_run(config_of("vgnn", epochs=30, batch=16), data, trained)
-    train_run(config_of("vgnn", epochs=3), data, tmp_path, max_minutes=0)
+        train_run(config_of("vgnn", epochs=30, batch=16), data, tmp_path / "finished")
+    train_run(config_of("vgnn", epochs=3), data, tmp_path / "begun", max_minutes=0)
     with pytest.raises(TrainingError, match="other settings"):
-        train_run(config_of("vgnn", epochs=4), data, tmp_path)
+        train_run(config_of("vgnn", epochs=4), data, tmp_path / "begun")
 
 
 def in_another_order(data):

@@ -278,6 +278,19 @@ class Batch:
         self._move(rows)
         self._look(rows, first=True)
 
+    def as_numbers(self, action: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+        """The action of one row, or those of all rows, as numbers of the shape that the caller's action space has.
+
+        Raises
+        ------
+        OptionError
+            It has another shape.
+        """
+        action = np.asarray(action, float)
+        if action.shape != shape:
+            raise OptionError(f"an action of shape {shape} is expected ({', '.join(self.axes)}), got {action.shape}")
+        return action
+
     def step(self, actions: FloatArray, rows: IntArray) -> Stepped:
         """Move the tools of some rows by actions (B, A); the other rows of the results are zero.
 
@@ -286,10 +299,7 @@ class Batch:
         OptionError
             An action is not finite or has a wrong shape.
         """
-        actions = np.asarray(actions, float)
-        if actions.shape != self._action.shape:
-            expected, got = (shape[1:] if self.count == 1 else shape for shape in (self._action.shape, actions.shape))
-            raise OptionError(f"an action of shape {expected} is expected ({', '.join(self.axes)}), got {got}")
+        actions = self.as_numbers(actions, self._action.shape)
         if not np.isfinite(actions[rows]).all():
             raise OptionError(f"an action is not a finite number: {actions[rows]}; look for NaN in the policy")
         self._action[rows] = np.clip(actions[rows], -1.0, 1.0)

@@ -80,12 +80,12 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         Raises
         ------
         OptionError
-            ``reset`` was not called first, or the environment is closed.
+            ``reset`` was not called first, the action is not finite or has a wrong shape, or the environment is closed.
         """
         self._require_open()
         if self._state == "new":
             raise OptionError("step() before reset(); call reset() first")
-        done = self.batch.step(np.asarray(action, float)[None], np.zeros(1, int))
+        done = self.batch.step(self.batch.as_numbers(action, (len(self.batch.axes),))[None], np.zeros(1, int))
         info = {
             name: value.item() if isinstance(value, np.generic) else value for name, value in _row(done.info).items() if value is not None
         }

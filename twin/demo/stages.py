@@ -9,6 +9,7 @@ import numpy as np
 
 from scenes import load_object, load_sensor
 from twin.camera.projection import project
+from twin.frames.forms import form_named
 from twin.mechanics.path import ContactPose
 from twin.one_contact import look_at
 from twin.pins.graph import make_graph
@@ -68,10 +69,10 @@ class ContactResult:
 
 def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form: Form, *, progress: Step | None = None) -> ContactResult:
     """Press, render, capture, detect, and build the graph, for one contact and for no contact."""
-    timed = Timed()
+    form, timed = form_named(form), Timed()
     state = timed.run("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
     raw = timed.run("render", lambda: simulator.shoot(state))
-    shot = raw if form is Form.RAW else timed.run("capture", lambda: simulator.as_recorded(raw, state))
+    shot = raw if form == Form.RAW else timed.run("capture", lambda: simulator.as_recorded(raw, state))
     look = look_at(simulator, shot)
     seconds = timed.seconds | {"pins and graph": look.observation.ms["total"] / 1e3}
     return ContactResult(simulator.spec.name, object_name, pose, state, raw, look, seconds)

@@ -59,8 +59,8 @@ def recording_to_raw(recording: RecordingSpec | None, recording_px: np.ndarray) 
 
 
 def from_raw(recording: RecordingSpec | None, form: Form, raw_px: np.ndarray) -> np.ndarray:
-    """Pixels (..., 2) of the camera's frame to pixels of the given form; raises as ``raw_to_recording``."""
-    return raw_to_recording(recording, raw_px) if form == Form.RECORDING else np.asarray(raw_px, float)
+    """Pixels (..., 2) of the camera's frame to pixels of the given form; raises as ``raw_to_recording``, or if there is no such form."""
+    return raw_to_recording(recording, raw_px) if form_named(form) == Form.RECORDING else np.asarray(raw_px, float)
 
 
 def form_named(name: str) -> Form:
@@ -97,9 +97,9 @@ def blob_spec(pipeline: PipelineSpec, form: Form) -> BlobSpec:
     Raises
     ------
     FrameError
-        The sensor has no recording form.
+        The sensor has no recording form, or there is no such form.
     """
-    found = pipeline.raw if form == Form.RAW else pipeline.recording
+    found = pipeline.raw if form_named(form) == Form.RAW else pipeline.recording
     if found is None:
         raise FrameError("the sensor has no recording form ([pipeline.recording]): its recordings are raw frames; use the raw form")
     return found

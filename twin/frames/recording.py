@@ -12,7 +12,7 @@ from scenes.files import LONGEST_PATH, shown
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, odd_entries, references_in, the_video_in
-from twin.frames.forms import FrameKind, KnownFrames, common_kind, form_of, known_frames, times
+from twin.frames.forms import FrameKind, KnownFrames, common_kind, form_named, form_of, known_frames, times
 from twin.frames.images import read_image
 from twin.frames.lerobot import INFO, RESTS, LeRobotFrames, is_lerobot, open_lerobot
 from twin.frames.tables import TABLES, order_by_table, read_metadata
@@ -306,8 +306,9 @@ def open_recording(
     Raises
     ------
     FrameError
-        There is nothing at ``path``, or no frame is usable.
+        There is nothing at ``path``, no frame is usable, or there is no such form.
     """
+    form = None if form is None else form_named(form)
     table, no_contact = (path.table, path.no_contact) if isinstance(path, FramesAt) else (None, None)
     path = Path(path)
     if table is not None and not table.is_file() and not is_lerobot(table):

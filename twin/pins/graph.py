@@ -64,7 +64,8 @@ def features(graph: PinGraph, reference: Reference, kind: Literal["relative", "p
         There is no such kind, or the reference has another number of pins.
     """
     if len(graph.nodes_px) != len(reference.pins_px):
-        raise ValueError(f"the graph has {len(graph.nodes_px)} pins, the reference {len(reference.pins_px)}: they are of two sensors")
+        told = f"the graph has {len(graph.nodes_px)} pins, the reference {len(reference.pins_px)}: they are of two sensors"
+        raise ValueError(f"{told}; give the reference of the Pipeline that made the graph")
     centred = graph.nodes_px - np.median(graph.nodes_px, axis=0)
     areas = graph.kind == "voronoi"
     if kind == "pixels":

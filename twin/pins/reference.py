@@ -9,7 +9,7 @@ from scenes.pins import PinsSpec
 from scenes.sensor import SensorSpec
 from twin.camera.projection import project
 from twin.errors import FrameError
-from twin.frames.forms import from_raw
+from twin.frames.forms import form_named, from_raw
 from twin.geometry.pins import pin_lattice, rest_pins
 from twin.pins.voronoi import voronoi
 from twin.types import Form
@@ -88,8 +88,14 @@ def make_reference(pins_px: np.ndarray, pins: PinsSpec) -> Reference:
 
 
 def nominal_reference(spec: SensorSpec, form: Form) -> Reference:
-    """Reference from the specification alone: the measured places of its pins at rest, or its caps at rest projected by its camera."""
-    blob = spec.pipeline.raw if form == Form.RAW else spec.pipeline.recording
+    """Reference from the specification alone: the measured places of its pins at rest, or its caps at rest projected by its camera.
+
+    Raises
+    ------
+    FrameError
+        The sensor has no recording form, or there is no such form.
+    """
+    blob = spec.pipeline.raw if form_named(form) == Form.RAW else spec.pipeline.recording
     if blob is not None and blob.rest_px:
         return make_reference(np.array(blob.rest_px), spec.pins)
     return make_reference(seen_at_rest(spec, form), spec.pins)

@@ -81,9 +81,8 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
         The pictures, or the pins that the records have, are not of this sensor.
     """
     if "pins" in records.about.numbers:
-        if spec is not None and (found_pins := records.about.numbers["pins"] // 2) != spec.pins.count:
-            told = f"the record has {found_pins} pins of '{records.about.sensor}', {spec.name} has {spec.pins.count}"
-            raise FrameError(f"{told}; leave --sensor out, or give the matching one")
+        if spec is not None:
+            _require_pins_of(spec, records.about)
         return records
     if spec is None:
         try:
@@ -100,6 +99,16 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
     about = replace(records.about, sensor=spec.name, numbers=numbers)
     found = [replace(episode, steps=partial(_seen, episode, about, spec, records.notes)) for episode in records.episodes]
     return Records(about, found, records.notes)
+
+
+def _require_pins_of(spec: SensorSpec, about: About) -> None:
+    """Refuse a sensor if the pins of a record are those of another one, by its name or by their number."""
+    count = about.numbers["pins"] // 2
+    if about.sensor in ("", spec.name) and count == spec.pins.count:
+        return
+    owner = f" of '{about.sensor}'" if about.sensor else ""
+    told = f"the record has {count} pins{owner}, the given sensor '{spec.name}' has {spec.pins.count}"
+    raise FrameError(f"{told}; leave --sensor out, or give the matching one")
 
 
 def _seen(episode: Episode, about: About, spec: SensorSpec, notes: list[str]) -> Iterator[Step]:

@@ -268,7 +268,7 @@ class RecordingWriter(FolderWriter):
 
     @property
     def _pictures(self) -> Path:
-        return self.folder / ("frames_bw" if self.about.form is Form.RECORDING else "images")
+        return self.folder / ("frames_bw" if self.about.form == Form.RECORDING else "images")
 
     def _begin(self) -> None:
         self._rows: list[list[str]] = []

@@ -275,19 +275,20 @@ def test_a_file_that_a_run_goes_on_from_is_left_to_that_run(tmp_path: Path) -> N
         assert (tmp_path / "state").read_text() == "damaged"
 
 
-@pytest.mark.parametrize("wrote", [False, True])
-def test_a_failed_run_leaves_no_empty_folder(tmp_path: Path, wrote: bool) -> None:
+@pytest.mark.parametrize("wrote", ["", "table.csv", "deep/in/it.csv"])
+def test_a_failed_run_leaves_no_empty_folder(tmp_path: Path, wrote: str) -> None:
     folder = tmp_path / "new" / "out"
 
-    @writes(*NAMES)
+    @writes(*NAMES, "deep")
     def fails(out: Path) -> None:
+        (out / "deep" / "in").mkdir(parents=True)
         if wrote:
-            write_text(out / "table.csv", "half")
+            write_text(out / wrote, "half")
         raise ValueError("no such sensor")
 
     with pytest.raises(ValueError, match="no such sensor"):
         fails(folder)
-    assert folder.exists() == wrote and (tmp_path / "new").exists() == wrote
+    assert folder.exists() == (tmp_path / "new").exists() == bool(wrote)
     (tmp_path / "there").mkdir()
     with pytest.raises(ValueError, match="no such sensor"):
         fails(tmp_path / "there")

@@ -12,6 +12,7 @@ import hashlib
 import inspect
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar
@@ -236,18 +237,24 @@ def _write_list(folder: Path, content: dict[str, str]) -> None:
 
 @contextmanager
 def _unmade_if_empty(folder: Path) -> Iterator[None]:
-    """Context that removes the folders again which were made in it, if it ends with an error and nothing was written there."""
+    """Context that removes the folders again which were made in it, if it ends with an error and there is no file in them."""
     made = [each for each in (folder, *folder.parents) if not os.path.exists(each)]
     try:
         yield
     except BaseException:
         with suppress(StoreError, OSError):  # another run is at work there, or a parent holds something
-            if made and not contents(folder):
+            if made and _holds_no_file(folder):
                 with locked(folder):
-                    (folder / LOCK).unlink()
-                    for each in made:
+                    shutil.rmtree(folder)
+                    for each in made[1:]:
                         each.rmdir()
         raise
+
+
+def _holds_no_file(folder: Path) -> bool:
+    """Whether there are only folders in a folder, and only folders in these, apart from the store's own files."""
+    within = [folder / name for name in contents(folder)]
+    return all(path.is_dir() and not path.is_symlink() and _holds_no_file(path) for path in within)
 
 
 @contextmanager

@@ -106,7 +106,7 @@ def load_limits(name_or_path: str | Path) -> SafetyLimits:
     """
     shipped = {file.stem: file for file in sorted(SHIPPED_LIMITS.glob("*.toml"))}
     path, example = shipped.get(str(name_or_path), Path(name_or_path)), SHIPPED_LIMITS / "mg400.toml"
-    if not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
+    if not str(name_or_path) or not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
         told = f"{shown(path, LONGEST_PATH)}: no such file" if path.suffix else f"no limits are called '{shown(name_or_path)}'"
         raise DeviceError(f"{told}; give one of {', '.join(shipped)}, or the path of a TOML file like {example}")
     try:
@@ -326,9 +326,11 @@ def decide_joints(
         end = finite_numbers("the joints", joints_deg, len(state.joints_deg))
     except DeviceError as error:
         return Decision(Action.REFUSE, Code.NOT_A_NUMBER, str(error))
+    if refused := _broken_joints(end, limits, kinematics):
+        return refused
     steps = max(1, int(np.ceil(np.abs(end - state.joints_deg).max())))
-    for share in np.arange(1, steps + 1) / steps:
-        joints = state.joints_deg + share * (end - state.joints_deg)
+    for n in range(1, steps + 1):
+        joints = state.joints_deg + n / steps * (end - state.joints_deg)
         pose = kinematics.forward(joints)
         if refused := _broken_joints(joints, limits, kinematics) or _place(pose, pose, limits):
             return refused

@@ -13,6 +13,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
+from hardware.arms.kinematics import FARTHEST
 from hardware.arms.motion import turn_between_deg
 from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError, also
 
@@ -20,8 +21,6 @@ from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError
 POLL_S = 0.005
 # Largest age, s, of feedback that is used. Therefore a lost or frozen arm is stopped and reported within a second.
 FEEDBACK_AGE_S = 0.8
-# Largest number of a reported pose, mm or deg. A report with a larger number is not valid.
-FARTHEST = 1e5
 # Longest time, s, until a commanded move shows in feedback. An arm that rests elsewhere for longer does not execute the move.
 BELIEVE_REST_S = 0.15
 # Longest rest, s, of an arm in a wait with a long time limit. The arm may rest for a tenth of the limit, but not longer than this, before

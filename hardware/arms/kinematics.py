@@ -19,6 +19,8 @@ NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23
 # Alarm of J1 above its range. The following numbers are J1 below, J2 above, ... up to 71.
 FIRST_JOINT_ALARM = 64
 LINKAGE_ABOVE, LINKAGE_BELOW = 72, 73
+# Largest number that is believed in a pose or joint angle, mm or deg. No arm reaches ten metres, or turns a joint that far.
+FARTHEST = 1e4
 # Largest violation of a limit, deg, that is accepted, because the inverse kinematics has rounding errors.
 LIMIT_TOLERANCE_DEG = 1e-6
 
@@ -165,14 +167,17 @@ def finite_numbers(what: str, given: np.ndarray, count: int) -> np.ndarray:
     Raises
     ------
     DeviceError
-        It is not so many finite numbers. The message begins with ``what``.
+        It is not so many finite numbers, or one is beyond what any arm reaches. The message begins with ``what``.
     """
     try:
-        numbers = np.array(given, float)
-    except (TypeError, ValueError):
-        numbers = np.array(np.nan)
+        numbers = np.asanyarray(given)
+    except (TypeError, ValueError):  # rows of different lengths
+        numbers = np.array("")
+    numbers = np.ma.filled(numbers.astype(float), np.nan) if numbers.dtype.kind in "iuf" else np.array(np.nan)
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise DeviceError(f"{what} must be {count} finite numbers, not {shown(repr(given))}")
+        raise DeviceError(f"{what} must be {count} finite numbers (mm, deg), not {shown(repr(given))}")
+    if not (np.abs(numbers) < FARTHEST).all():
+        raise DeviceError(f"{what} {shown(repr(given))} is farther than any arm reaches; give mm and deg")
     return numbers
 
 

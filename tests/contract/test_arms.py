@@ -8,6 +8,8 @@ from arms import ARMS, bench
 
 from hardware.arms.open_arm import open_arm
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
+from hardware.safe_arm import SafeArm
+from hardware.safety import load_limits
 
 SETTLED_MM = 0.1  # repeatability of the arms is half of it
 SLOW_MM_S, FAST_MM_S = 20.0, 200.0
@@ -79,13 +81,39 @@ def test_joints_move_too(ready):
     assert np.allclose(ready.arm.state().joints_deg, joints, atol=0.01)
 
 
-@pytest.mark.parametrize("given", [np.zeros(3), "home", None, [np.nan] * 6, [[0.0] * 6]], ids=repr)
+BAD = [
+    np.zeros(3),
+    "home",
+    "123456",
+    None,
+    [np.nan] * 6,
+    [[0.0] * 6],
+    [10**400] * 6,
+    np.ones(6) * 1j,
+    np.ma.masked_all(6),
+    ["1"] * 6,
+    [[1], [1, 2]],
+]
+
+
+@pytest.mark.parametrize("given", BAD, ids=lambda given: repr(given)[:12])
 def test_a_target_that_is_not_numbers_is_told_and_nothing_moves(ready, given):
     joints = f"the joint angles must be {ready.arm.axes} finite numbers"
     for move, told in ((ready.arm.move_joints, joints), (ready.arm.move_linear, "the pose must be 6 finite numbers")):
         with pytest.raises(DeviceError, match=told):
             move(given)
     assert np.allclose(ready.arm.state().pose, ready.home, atol=0.01) and not ready.arm.state().moving
+
+
+@pytest.mark.parametrize("far", [2e4, 1e12, 1e300])
+def test_a_target_farther_than_any_arm_reaches_is_told_at_once(ready, far):
+    begun = time.monotonic()
+    safe = SafeArm(ready.arm, load_limits("simulated").model_copy(update={"joints_deg": None}))
+    for arm in (ready.arm, safe):
+        for move, count in ((arm.move_joints, arm.axes), (arm.move_linear, 6)):
+            with pytest.raises(DeviceError, match="farther than any arm reaches; give mm and deg"):
+                move([*[0.0] * (count - 1), far], wait=False)
+    assert time.monotonic() - begun < 2.0
 
 
 def test_four_axes_keep_level_and_turn_as_suits_the_wrist(ready):

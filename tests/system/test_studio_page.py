@@ -347,6 +347,8 @@ def test_a_name_that_leads_to_this_machine_by_chance_is_refused():
         ("evil.example:8", "http://evil.example:8", False),
         ("evil.example:8", None, False),
         ("localhost:8", "http://localhost:9", False),
+        ("[x", None, False),
+        ("localhost:8", "http://[evil", False),
     ):
         headers = Headers({"Host": host} | ({} if origin is None else {"Origin": origin}))
         assert from_own_page(Request("/", headers), hosts) is own, (host, origin)
@@ -355,12 +357,13 @@ def test_a_name_that_leads_to_this_machine_by_chance_is_refused():
 
 
 def test_values_that_no_browser_gives_are_refused_and_put_back(client):
-    friction, touched = client.value("friction"), client.value("object")
+    held = {name: client.value(name) for name in ("friction", "object", "frame", "pins by")}
     for label, value, reason in (("friction", -1.0, "friction -1: give a number from 0 to"), ("friction", float("nan"), "friction nan"),
-                                 ("object", "../../x", "../../x")):  # fmt: skip
+                                 ("object", "../../x", "../../x"),
+                                 ("frame", "cooked", "'cooked' is no value"), ("pins by", "smell", "'smell' is no value")):  # fmt: skip
         client.set(label, value)
         wait_html(client, reason)
-        until(lambda: (client.value("friction"), client.value("object")) == (friction, touched))
+        until(lambda: [client.value(name) for name in held] == list(held.values()))
 
 
 def test_an_arm_of_no_known_kind_is_told_from_one_without_limits():

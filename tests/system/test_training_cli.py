@@ -151,15 +151,15 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
     (tmp_path / "gentle.toml").write_text(EXPERIMENT)
     gentle = ("--sensor", SENSOR, "--experiment", tmp_path / "gentle.toml", "--across", ACROSS, "--workers", 1)
     twin("dataset", *gentle, "--images", "none", "--count", 20, "--seed", 7, "--randomise", "contact", "--out", tmp_path / "frames")
-    command = ("study", "sim-to-real", *gentle, "--frames", tmp_path / "frames", "--labels", 8, "--count", 12, "--draws", 1)
+    command = ("study", "sim-to-real", *gentle, "--frames", tmp_path / "frames", "--labels", 10, "--count", 16, "--draws", 1)
     command += (*(["--ablate"] if left_out else []), "--epochs", 2, "--out", tmp_path / "study")
     said, sims = twin(*command), tmp_path / "study" / "sim"
     rows = list(csv.DictReader((tmp_path / "study" / "study.csv").open()))
-    told = [("simulated", "0"), ("simulated and real", "8"), *((name, "0") for name in left_out), ("real", "8")]
+    told = [("simulated", "0"), ("simulated and real", "10"), *((name, "0") for name in left_out), ("real", "10")]
     assert [(row["trained_on"], row["labelled_frames"]) for row in rows[: len(told)]] == told
     assert all(np.isfinite(float(row["pose_2_corrected"])) for row in rows)
     assert "averaged with a Gaussian process" in (tmp_path / "study" / "index.html").read_text()
-    trained = [tmp_path / "study" / run / "weights.pt" for run in (*(["sim_bare"] if left_out else []), "real_8", "real_all")]
+    trained = [tmp_path / "study" / run / "weights.pt" for run in (*(["sim_bare"] if left_out else []), "real_10", "real_all")]
     written = [weights.stat().st_mtime_ns for weights in trained]
     judged = [line for line in said.splitlines() if "labelled" in line and "pose_2" in line]
     assert len(judged) == len(rows) and [line for line in twin(*command).splitlines() if line in judged] == judged

@@ -237,6 +237,9 @@ def test_wrong_calls_are_named():
         env.step(np.zeros(3))
     with pytest.raises(OptionError, match="autoreset_mode='foo' is not offered; give 'NextStep' or 'SameStep'"):
         TactileVectorEnv("SurfaceFollow", 2, autoreset_mode="foo")
+    for given in ("up", [[1.0], [1.0, 2.0]], {"x": 1}):
+        with pytest.raises(OptionError, match=r"an action of shape \(2,\) is expected .*, got "):
+            env.step(given)
     one = TactileVectorEnv("SurfaceFollow", 1, **FAST)
     one.reset(seed=0)
     with pytest.raises(OptionError, match=r"an action of shape \(1, 2\) is expected .*, got \(2,\)"):

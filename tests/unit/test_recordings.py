@@ -211,6 +211,15 @@ def test_thresholded_frames_that_were_resized_are_still_such(scale):
         assert is_two_level(resized) == (form == Form.RECORDING)
 
 
+def test_a_few_gray_pixels_make_no_thresholded_frame_a_gray_picture(spec):
+    image = drawn_frame(spec, Form.RECORDING, nominal_reference(spec, Form.RECORDING).pins_px).image.copy()
+    assert is_two_level(image) and is_two_level(image[..., None])
+    image[0, 0] = 128
+    assert is_two_level(image) and is_two_level(image[..., None])
+    image[:4] = 128  # a broken row, or a text
+    assert is_two_level(image)
+
+
 def test_a_picture_with_colours_was_not_thresholded():
     """Also if it is dark beside a white housing. Gray pictures keep a little colour by JPEG."""
     image = np.zeros((60, 80, 3), np.uint8)

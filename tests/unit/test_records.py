@@ -94,13 +94,18 @@ def test_paths_may_be_text_and_the_pins_of_another_sensor_are_refused(tmp_path):
     other = load_sensor("mg400-127")
     found = {"pins": 2 * other.pins.count + 2}
     of_another = replace(ABOUT, numbers=found)
-    with pytest.raises(FrameError, match="127; leave --sensor out, or give the matching one"):
+    with pytest.raises(FrameError, match="is 'mg400-127' .127 pins.; leave --sensor out, or give the matching one"):
         with_pins(Records(of_another, []), other)
 
 
 @pytest.mark.parametrize(
     ("named", "told"),
-    [("ur5-331", "331 pins of 'ur5-331', the given sensor 'mg400-331' has 331; leave --sensor out"), ("mg400-331", ""), ("", "")],
+    [
+        ("ur5-331", "'ur5-331' .331 pins., the given sensor is 'mg400-331' .331 pins.; leave --sensor out"),
+        ("mg400-331", ""),
+        ("/home/u/mg400-331.toml", ""),
+        ("", ""),
+    ],
 )
 def test_pins_of_a_sensor_of_another_name_are_refused_though_their_number_fits(named, told):
     given = load_sensor("mg400-331")

@@ -7,7 +7,7 @@ import pytest
 from scenes import load_experiment
 from twin.errors import FrameError
 from twin.frames import open_recording
-from twin.rig.labels import read_arm_labels
+from twin.rig.labels import as_executed, read_arm_labels
 
 
 def recording(folder, table, names=("a.png", "b.png")):
@@ -25,6 +25,13 @@ def test_labels_know_whether_the_move_was_executed(tmp_path):
     assert second.executed and second.pose.tolist() == [0, -3.5, 0, 0, 0, 10]
     (tmp_path / "move_executed.csv").write_text("image_name,executed_estimate\nb.png,0\na.png,1\n")
     assert [label.executed for label in read_arm_labels(open_recording(tmp_path))] == [False, True]
+
+
+def test_a_move_that_is_not_known_spoils_no_pose_that_is():
+    pose, move, unknown = np.full((1, 6), 3.0), np.full((1, 6), 2.0), np.full((1, 6), np.nan)
+    for executed, given, stood, moved in ((1.0, unknown, 3, np.nan), (0.0, unknown, np.nan, 0), (0.0, move, 1, 0), (0.25, move, 1.5, 0.5)):
+        for found, expected in zip(as_executed(pose, given, np.array([executed])), (stood, moved), strict=True):
+            assert np.array_equal(found, np.full((1, 6), expected), equal_nan=True), (executed, given)
 
 
 def test_what_is_missing_is_said(tmp_path):

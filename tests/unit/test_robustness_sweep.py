@@ -318,3 +318,8 @@ def test_code_of_the_user_is_judged_like_the_others(spec, frames, tmp_path, undr
     assert recall("my_pins")[0.0] == 0.0
     with pytest.raises(TwinError, match=r"undegraded frame .*: careless failed: ValueError: not today"):
         recall("careless")
+    with pytest.raises(TwinError, match="careless failed"):
+        degradation.run(
+            degradation.Plan(spec, pipelines=(f"{mine}:careless",), sweep=sweep, frames=recording, rendered=False), tmp_path / "new"
+        )
+    assert not (tmp_path / "new").exists()

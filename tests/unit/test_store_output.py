@@ -275,24 +275,32 @@ def test_a_file_that_a_run_goes_on_from_is_left_to_that_run(tmp_path: Path) -> N
         assert (tmp_path / "state").read_text() == "damaged"
 
 
-@pytest.mark.parametrize("wrote", ["", "table.csv", "deep/in/it.csv"])
-def test_a_failed_run_leaves_no_empty_folder(tmp_path: Path, wrote: str) -> None:
+@pytest.mark.parametrize("wrote", [False, True])
+def test_a_failed_run_leaves_no_empty_folder(tmp_path: Path, wrote: bool) -> None:
     folder = tmp_path / "new" / "out"
 
-    @writes(*NAMES, "deep")
+    @writes(*NAMES)
     def fails(out: Path) -> None:
-        (out / "deep" / "in").mkdir(parents=True)
         if wrote:
-            write_text(out / wrote, "half")
+            write_text(out / "table.csv", "half")
         raise ValueError("no such sensor")
 
     with pytest.raises(ValueError, match="no such sensor"):
         fails(folder)
-    assert folder.exists() == (tmp_path / "new").exists() == bool(wrote)
+    assert folder.exists() == wrote and (tmp_path / "new").exists() == wrote
     (tmp_path / "there").mkdir()
     with pytest.raises(ValueError, match="no such sensor"):
         fails(tmp_path / "there")
     assert (tmp_path / "there").exists()  # it was not made by the run
+
+
+def test_a_failed_run_keeps_the_folder_in_which_another_will_write(tmp_path: Path) -> None:
+    out = tmp_path / "new"
+    with output_file(out / "b.toml"):
+        with pytest.raises(ValueError, match="no fit"), output_file(out / "a.toml"):
+            raise ValueError("no fit")
+        write_text(out / "b.toml", "fitted")
+    assert json.loads((out / WRITTEN).read_text()).keys() == {"b.toml"}
 
 
 def test_a_failed_run_leaves_no_empty_folder_around_a_file(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from scenes import ObjectSpec, RandomisationSpec, SensorSpec, load_experiment, load_object, load_randomisation, load_sensor
+from scenes.files import shown
 from training.environments.observe import IMAGE_PX, KINDS, LARGEST, PICTURES, Eye, Kind, Pictures
 from training.environments.tasks import TASKS, Judged, Seen
 from training.environments.world import AXES, Surfaces, Tool, motions
@@ -284,12 +285,16 @@ class Batch:
         Raises
         ------
         OptionError
-            It has another shape.
+            It is no array of numbers, or has another shape.
         """
-        action = np.asarray(action, float)
-        if action.shape != shape:
-            raise OptionError(f"an action of shape {shape} is expected ({', '.join(self.axes)}), got {action.shape}")
-        return action
+        expected = f"an action of shape {shape} is expected ({', '.join(self.axes)})"
+        try:
+            numbers = np.asarray(action, float)
+        except (TypeError, ValueError):
+            raise OptionError(f"{expected}, got {shown(repr(action))}") from None
+        if numbers.shape != shape:
+            raise OptionError(f"{expected}, got {numbers.shape}")
+        return numbers
 
     def step(self, actions: FloatArray, rows: IntArray) -> Stepped:
         """Move the tools of some rows by actions (B, A); the other rows of the results are zero.

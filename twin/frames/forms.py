@@ -30,6 +30,9 @@ LEAST_OF_EACH_LEVEL = 0.005
 # edges. (Measured: 0.72 and more in thresholded frames of three sensors, resized by 0.5 to 1.9; 0.04 for a gray picture of dark skin, gray
 # caps and a white housing.)
 AT_EDGES, EDGE_PX = 0.4, 2
+# Share of a picture's pixels that are gray and away from white ones, below which it is thresholded nevertheless: a line of text, a broken
+# row. The caps of a gray picture are 4 % of it or more.
+FEW_AWAY = 0.03
 # Gray levels below which a pixel counts as black, and above which it counts as white.
 BLACK_BELOW, WHITE_ABOVE = 16, 239
 # Mean difference of a picture's colours, gray levels, above which it is not gray. JPEG gives gray pictures some colour.
@@ -155,6 +158,7 @@ def is_two_level(image: np.ndarray) -> bool:
     """Whether a picture was thresholded at capture: its pixels are black or white, apart from the edges that a resize leaves gray."""
     if image.ndim == 3 and float(np.mean(np.ptp(image, axis=2))) > COLOURLESS_BELOW:
         return False
+    image = gray_levels(image)
     black, white = image < BLACK_BELOW, image > WHITE_ABOVE
     low, high = float(np.mean(black)), float(np.mean(white))
     resized = low > MOSTLY_BLACK and high > WHITE_OF_REST * (1 - low)
@@ -162,7 +166,8 @@ def is_two_level(image: np.ndarray) -> bool:
         return False
     gray, width = ~(black | white), 2 * EDGE_PX + 1
     beside_white = cv2.dilate(white.astype(np.uint8), np.ones((width, width), np.uint8)) > 0
-    return not gray.any() or float(np.mean(beside_white[gray])) > AT_EDGES
+    away = float(np.mean(gray & ~beside_white))
+    return away < FEW_AWAY or 1 - away / float(np.mean(gray)) > AT_EDGES
 
 
 def tell_form(known: KnownFrames, image: np.ndarray) -> Form:

@@ -111,7 +111,8 @@ class Match:
         Number of pins paired, minus their squared distances from the predictions relative to the gate, minus the cost of the rings'
         turn. Larger is better.
     lead : float
-        Difference between the score and that of the best quite different labelling; infinite if none had to be tried.
+        Difference between the scores of this and the best quite different labelling, each less the cost of its displacement from the
+        places at rest; infinite if none had to be tried.
     """
 
     blob: np.ndarray

@@ -104,10 +104,11 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
 def _require_pins_of(spec: SensorSpec, about: About) -> None:
     """Refuse a sensor if the pins of a record are those of another one, by its name or by their number."""
     count = about.numbers["pins"] // 2
-    if about.sensor in ("", spec.name) and count == spec.pins.count:
+    name = Path(about.sensor).stem
+    if name in ("", spec.name) and count == spec.pins.count:
         return
-    owner = f" of '{about.sensor}'" if about.sensor else ""
-    told = f"the record has {count} pins{owner}, the given sensor '{spec.name}' has {spec.pins.count}"
+    owner = f"of the sensor '{name}' ({count} pins)" if name else f"of a sensor with {count} pins"
+    told = f"the record holds pins {owner}, the given sensor is '{spec.name}' ({spec.pins.count} pins)"
     raise FrameError(f"{told}; leave --sensor out, or give the matching one")
 
 

@@ -91,10 +91,10 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
 def as_executed(pose: np.ndarray, move: np.ndarray, executed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where the arm stood, and the move that it had made, each (K, 6), by the labels' poses and moves (K, 6).
 
-    ``executed`` (K,) is 1 if the move was executed, 0 if it was not, or an estimate between them.
+    ``executed`` (K,) is 1 if the move was executed, 0 if it was not. Of an estimate between them, this share of the move counts.
     """
-    undone = 1 - executed[:, None]
-    return pose - undone * move, (1 - undone) * move
+    done = executed[:, None]
+    return pose - np.where(done < 1, (1 - done) * move, 0.0), np.where(done > 0, done * move, 0.0)  # a move may be unknown (NaN)
 
 
 def _varied_beyond(experiment: ExperimentSpec, values: dict[str, np.ndarray]) -> list[str]:

@@ -12,7 +12,6 @@ import hashlib
 import inspect
 import json
 import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar
@@ -105,7 +104,7 @@ def output_file(path: Path, *beside: str) -> Iterator[None]:
             yield
         finally:
             with suppress(StoreError), _held_once(folder, wait_s=_WAIT_S):
-                _enter(folder, names)
+                _enter(folder, names, alone=False)
 
 
 def writes(*names: str, gone_on: tuple[str, ...] = (), to: str = "out") -> Callable[[Callable[Given, Made]], Callable[Given, Made]]:
@@ -197,11 +196,15 @@ def _is_ours(path: Path, known: dict[str, str]) -> bool:
     return digest in (_ANY, _digest(path))
 
 
-def _enter(folder: Path, names: Sequence[str], gone_on: Sequence[str] = ()) -> None:
-    """Enter the existing files with these names into the list, with their digests except for ``gone_on``; remove names without a file."""
+def _enter(folder: Path, names: Sequence[str], gone_on: Sequence[str] = (), *, alone: bool = True) -> None:
+    """Enter the existing files with these names into the list, with their digests except for ``gone_on``; remove names without a file.
+
+    Names of other runs without a file are removed if this run is ``alone``: those runs were killed. Otherwise they may be at work.
+    """
     known = {name: digest for name, digest in _read_list(folder).items() if name not in names}
-    found = {name: _ANY if name in gone_on else _digest(folder / name) for name in _there(folder, names)}
-    _write_list(folder, {name: digest for name, digest in (known | found).items() if digest != _ANY or (folder / name).exists()})
+    if alone:
+        known = {name: digest for name, digest in known.items() if digest != _ANY or (folder / name).exists()}
+    _write_list(folder, known | {name: _ANY if name in gone_on else _digest(folder / name) for name in _there(folder, names)})
 
 
 def _digest(path: Path) -> str:
@@ -237,24 +240,19 @@ def _write_list(folder: Path, content: dict[str, str]) -> None:
 
 @contextmanager
 def _unmade_if_empty(folder: Path) -> Iterator[None]:
-    """Context that removes the folders again which were made in it, if it ends with an error and there is no file in them."""
+    """Context that removes the folders again which were made in it, if it ends with an error and nothing was written there."""
+    folder = Path(os.path.abspath(folder))  # the run may change the working folder
     made = [each for each in (folder, *folder.parents) if not os.path.exists(each)]
     try:
         yield
     except BaseException:
         with suppress(StoreError, OSError):  # another run is at work there, or a parent holds something
-            if made and _holds_no_file(folder):
+            if made and not contents(folder) and not _read_list(folder):  # a list has the names that another run may still write
                 with locked(folder):
-                    shutil.rmtree(folder)
-                    for each in made[1:]:
+                    (folder / LOCK).unlink()
+                    for each in made:
                         each.rmdir()
         raise
-
-
-def _holds_no_file(folder: Path) -> bool:
-    """Whether there are only folders in a folder, and only folders in these, apart from the store's own files."""
-    within = [folder / name for name in contents(folder)]
-    return all(path.is_dir() and not path.is_symlink() and _holds_no_file(path) for path in within)
 
 
 @contextmanager

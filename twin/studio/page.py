@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from contextlib import contextmanager, redirect_stdout
 from http import HTTPStatus
 from io import StringIO
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -20,9 +20,12 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from scenes.base import SpecError
+from scenes.files import shown
 from twin.errors import TwinError
 from twin.studio.pictures import boxed, paragraph
 from twin.types import ImageArray
+
+Value = TypeVar("Value")
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 """Hosts that only this machine reaches."""
@@ -64,6 +67,22 @@ class Mode(Protocol):
         """The user has chosen another mode."""
 
 
+def value_of(control: viser.GuiInputHandle[Any], kind: Callable[[Any], Value], now: object) -> Value:
+    """A control's value as a ``kind``. One that no browser gives is replaced by the present value ``now``.
+
+    Raises
+    ------
+    TwinError
+        It is no such value.
+    """
+    given = control.value
+    try:
+        return kind(given)
+    except (TypeError, ValueError, OverflowError):
+        put(control, now)
+        raise TwinError(f"'{shown(given)}' is no value of this control; choose one that the page offers") from None
+
+
 def put(control: viser.GuiInputHandle[Any], value: object) -> None:
     """Set a control's value in all browsers."""
     setattr(control, "value", value)  # noqa: B010  # by its annotations the value can't be set
@@ -89,10 +108,13 @@ def from_own_page(request: Request, hosts: Sequence[str]) -> bool:
         Names by which this machine may be called; if empty, by any.
     """
     used = request.headers.get_all("Host")
-    host = urlsplit("//" + used[0]) if len(used) == 1 else None
+    try:
+        host = urlsplit("//" + used[0]) if len(used) == 1 else None
+        origins = [urlsplit(origin) for origin in request.headers.get_all("Origin")]
+    except ValueError:  # no address
+        return False
     if host is None or (hosts and host.hostname not in hosts):
         return False
-    origins = [urlsplit(origin) for origin in request.headers.get_all("Origin")]
     return all(origin.scheme in ("http", "https") and origin.netloc.lower() == host.netloc.lower() for origin in origins)
 
 

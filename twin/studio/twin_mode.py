@@ -17,7 +17,7 @@ from twin.frames.images import write_image
 from twin.pins import nominal_reference
 from twin.studio.contact import Answer, Light, MovingContact, Setup
 from twin.studio.mode import PageMode
-from twin.studio.page import Chart, Page, put
+from twin.studio.page import Chart, Page, put, value_of
 from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, spoken, unit_of
 from twin.studio.scene import FULL_SCALE, Scene, Shown
@@ -293,7 +293,7 @@ class TwinMode(PageMode):
         self.worker.ask(self._wish)
 
     def _change_form(self) -> None:
-        form = Form(self._form.value)
+        form = value_of(self._form, Form, str(self.contact.setup.form))
 
         def change() -> None:
             self.contact.change(form=form)
@@ -303,7 +303,8 @@ class TwinMode(PageMode):
         self.worker.do(change)
 
     def _change_look(self) -> None:
-        self._shown, self._drawn = Shown(self._colour.value), Drawn(self._drawing.value)
+        self._shown = value_of(self._colour, Shown, str(self._shown))
+        self._drawn = value_of(self._drawing, Drawn, str(self._drawn))
         if self.worker.newest is not None:
             self._publisher.give(self.worker.newest)
 

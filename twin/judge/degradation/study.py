@@ -172,7 +172,6 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
     TwinError
         A file cannot be read (`check_pipelines` finds this before any work is done), or a function fails on the first undegraded frame.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     chosen, inputs = [], inputs_digest(spec, [frame.image for frame in frames])
     for k, name in enumerate(names):
         progress(k, len(names))
@@ -187,6 +186,7 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
             item = Item(f"{method}-{spec.name}", (tune,), [method, inputs])
             kept = folder / f"{item.file}.toml"
             if not kept.is_file():
+                folder.mkdir(parents=True, exist_ok=True)
                 tuned = tune(frames, spec, method).detector
                 write_detector(kept, tuned, f"Tuned on undegraded frames.\nmade_by = {json.dumps(item.made_by)}")
             chosen.append(load_detector(kept).model_copy(update={"name": method}))

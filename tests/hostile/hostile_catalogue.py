@@ -104,6 +104,7 @@ READ_RAW = {
     "calibrate optics": f"calibrate optics {U} --frames {{data}} --out {{out}}/spec.toml --limit 1",
     "robustness": f"robustness {U} --frames {{data}} --out {{out}} --no-rendered --jobs 1 --limit 2",
 }
+READ_NAMED = ("preprocess", "graph", "predict")  # these name every frame that shows no pins
 READ_ALL_PICTURES = ("preprocess", "check")  # the others read them by the same reader
 SOME_PICTURES = ("cut", "text", "half the size", "NaN levels", "claims 60000 x 60000", "named pipe", "folder", "endless device")
 NOT_TOLD = ("negative", "white", "black", "noise")  # readable pictures: that they show no pins is told as any frame's
@@ -128,10 +129,12 @@ def _pictures() -> list[Entry]:
         for what, edit in given.VIDEOS.items():
             partly = what.startswith(("damaged", "a picture"))  # some of it can be read
             ends = (DONE, REFUSED, BAD_SENSOR) if partly or what == "cut at half" else (REFUSED,)
-            make, says = (
-                {"data": edited("video", "", edit)},
-                ("clip", *{"cut at half": ("cut",), "damaged in the middle": ("damaged|cut",)}.get(what, ())),
-            )
+            make = {"data": edited("video", "", edit)}
+            says = ("clip", *{"cut at half": ("cut",), "damaged in the middle": ("damaged|cut",)}.get(what, ()))
+            if (what, command) == ("damaged in the middle", "tune"):  # it reads four frames, and those that it reads are whole
+                says = ("clip",)
+            elif what == "a picture by its content" and command not in READ_NAMED:  # a video of one black frame
+                says = ()
             leaves = ("pins.npz", "summary.json") if partly else ()
             found.append(Entry("videos", what, call, make, ends, says, leaves, sample=command == "predict" and what == "text"))
         for what, make in FOLDERS.items():

@@ -358,9 +358,13 @@ def test_a_name_that_leads_to_this_machine_by_chance_is_refused():
 
 def test_values_that_no_browser_gives_are_refused_and_put_back(client):
     held = {name: client.value(name) for name in ("friction", "object", "frame", "pins by")}
-    for label, value, reason in (("friction", -1.0, "friction -1: give a number from 0 to"), ("friction", float("nan"), "friction nan"),
-                                 ("object", "../../x", "../../x"),
-                                 ("frame", "cooked", "cooked&#x27; is no value"), ("pins by", "smell", "smell&#x27; is no value")):  # fmt: skip
+    for label, value, reason in (
+        ("friction", -1.0, "friction -1: give a number from 0 to"),
+        ("friction", float("nan"), "friction nan"),
+        ("object", "../../x", "../../x"),
+        ("frame", "cooked", "cooked&#x27; is no value"),
+        ("pins by", "smell", "smell&#x27; is no value"),
+    ):
         client.set(label, value)
         wait_html(client, reason)
         until(lambda: [client.value(name) for name in held] == list(held.values()))

@@ -30,6 +30,7 @@ from hardware.watch import ArmWatch
 from scenes import ObjectSpec, SensorSpec, ServoSpec
 from scenes.experiment import LABELS, ExperimentSpec
 from scenes.files import shown
+from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
 from twin.pins import require_untouched
 from twin.progress import Progress, Step, silent, stage
@@ -99,7 +100,7 @@ class Collection:
         DeviceError
             The folder holds something else, or a collection with other settings.
         """
-        self.pictures = self.folder / ("frames_bw" if self.form == Form.RECORDING else "images")
+        self.pictures = self.folder / pictures_folder(self.form)
         self.folder.mkdir(parents=True, exist_ok=True)
         meta, about = self.folder / META, json.loads(json.dumps(self.about))
         if meta.is_file():

@@ -326,8 +326,6 @@ def decide_joints(
         end = finite_numbers("the joints", joints_deg, len(state.joints_deg))
     except DeviceError as error:
         return Decision(Action.REFUSE, Code.NOT_A_NUMBER, str(error))
-    if refused := _broken_joints(end, limits, kinematics):
-        return refused
     steps = max(1, int(np.ceil(np.abs(end - state.joints_deg).max())))
     for n in range(1, steps + 1):
         joints = state.joints_deg + n / steps * (end - state.joints_deg)

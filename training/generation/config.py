@@ -13,6 +13,7 @@ from scenes.object import ObjectSpec
 from scenes.randomisation import FrictionSpread, RandomisationSpec, number_type
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError, DatasetError
+from twin.frames.folders import pictures_folder
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
 from twin.types import FINE, Form
@@ -68,7 +69,7 @@ class GenerationConfig(Section):
     @property
     def image_folder(self) -> str:
         """Name of the subfolder of a recording that holds pictures of this kind."""
-        return "frames_bw" if self.images == "recording" else "images"
+        return pictures_folder(self.images)
 
     def text(self) -> str:
         """The configuration as JSON. Equal configurations give equal texts."""

@@ -25,6 +25,11 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
+def pictures_folder(form: str) -> str:
+    """Name of the subfolder that a written recording has for its pictures, by their form."""
+    return "frames_bw" if form == Form.RECORDING else "images"
+
+
 def distinct_stems(names: list[str]) -> list[str]:
     """File names for the frames: each frame's name without suffix, or with it if another frame has the same stem."""
     stems = [Path(name).stem for name in names]

@@ -21,6 +21,7 @@ from scenes.base import SpecError
 from scenes.files import read_regular
 from twin.errors import FrameError
 from twin.frames import Recording, open_recording
+from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
 from twin.frames.tables import numbers
 from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, episode_of, format_of, read_json, read_sidecar
@@ -268,7 +269,7 @@ class RecordingWriter(FolderWriter):
 
     @property
     def _pictures(self) -> Path:
-        return self.folder / ("frames_bw" if self.about.form == Form.RECORDING else "images")
+        return self.folder / pictures_folder(self.about.form)
 
     def _begin(self) -> None:
         self._rows: list[list[str]] = []

@@ -97,6 +97,12 @@ def as_executed(pose: np.ndarray, move: np.ndarray, executed: np.ndarray) -> tup
     return pose - np.where(done < 1, (1 - done) * move, 0.0), np.where(done > 0, done * move, 0.0)  # a move may be unknown (NaN)
 
 
+def poses_and_moves(labels: Sequence[ArmLabel]) -> tuple[np.ndarray, np.ndarray]:
+    """Where the arm stood at each label, and the move that it had made, each (K, 6) (see ``as_executed``)."""
+    pose, move = (np.array([getattr(label, kind) for label in labels], float).reshape(-1, 6) for kind in ("pose", "move"))
+    return as_executed(pose, move, np.array([label.executed for label in labels], float))
+
+
 def _varied_beyond(experiment: ExperimentSpec, values: dict[str, np.ndarray]) -> list[str]:
     """Names of the labels that vary in a table (``values``: (M, 6) for each kind), although the experiment keeps them constant."""
     ranges = experiment.ranges()

@@ -67,8 +67,8 @@ class Mode(Protocol):
         """The user has chosen another mode."""
 
 
-def value_of(control: viser.GuiInputHandle[Any], kind: Callable[[Any], Value], now: object) -> Value:
-    """A control's value as a ``kind``. One that no browser gives is replaced by the present value ``now``.
+def value_of(control: viser.GuiInputHandle[str], kind: Callable[[str], Value], now: str) -> Value:
+    """A choice's value as a ``kind``. One that no browser gives is replaced by the present value ``now``.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def value_of(control: viser.GuiInputHandle[Any], kind: Callable[[Any], Value], n
     given = control.value
     try:
         return kind(given)
-    except (TypeError, ValueError, OverflowError):
+    except ValueError:
         put(control, now)
         raise TwinError(f"'{shown(given)}' is no value of this control; choose one that the page offers") from None
 

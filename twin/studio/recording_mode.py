@@ -13,10 +13,10 @@ from twin.frames import Recording, open_recording
 from twin.pins.batch import recording_reference
 from twin.pins.pipeline import Pipeline
 from twin.rig.contact import RigContact
-from twin.rig.labels import ArmLabel, as_executed, read_arm_labels
+from twin.rig.labels import ArmLabel, poses_and_moves, read_arm_labels
 from twin.studio.contact import MovingContact, experiment_of
 from twin.studio.mode import PageMode
-from twin.studio.page import CELLS, Page, put, value_of
+from twin.studio.page import CELLS, Page, put
 from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
 from twin.studio.twin_mode import TwinMode
 from twin.types import FloatArray, Form, Frame, Observation
@@ -152,7 +152,7 @@ class RecordingView:
 
 def _told(label: ArmLabel) -> dict[str, float]:
     """A label's values by the tables' names: the arm's real pose and move, which differ from the table's if the move was not executed."""
-    (pose,), (move,) = as_executed(label.pose[None], label.move[None], np.array([float(label.executed)]))
+    (pose,), (move,) = poses_and_moves([label])
     return {f"pose_{axis + 1}": float(value) for axis, value in enumerate(pose)} | {
         f"move_{axis + 1}": float(value) for axis, value in enumerate(move)
     }
@@ -185,7 +185,7 @@ class RecordingMode(PageMode):
             doubt = gui.add_button("Next doubt", hint="the next frame whose label is doubted")
             self._against = gui.add_checkbox("the twin's picture beside it", True)
         opened.on_click(lambda event: self.open(self._path.value))
-        self._number.on_update(page.guarded(self._slid))
+        self._number.on_update(page.guarded(lambda: self._go(int(self._number.value))))
         steps.on_click(lambda event: self._go(int(self._number.value) + int(event.target.value)))
         doubt.on_click(lambda event: self._wanted.give(-1))
         self._against.on_update(lambda event: self._wanted.give(int(self._number.value)))
@@ -213,9 +213,6 @@ class RecordingMode(PageMode):
         self._number.max = max(1, len(self._view) - 1)
         self._number.disabled = False
         self._go(0)
-
-    def _slid(self) -> None:
-        self._go(value_of(self._number, int, 0))
 
     def _go(self, index: int) -> None:
         if self._view is not None:

@@ -31,7 +31,7 @@ from training.studies.sim_to_real.twins import contact_of
 from twin.frames import open_recording
 from twin.judge.labelled.model import MeasuredFrames
 from twin.progress import Step
-from twin.rig.labels import ArmLabel, as_executed, read_arm_labels
+from twin.rig.labels import ArmLabel, poses_and_moves, read_arm_labels
 from twin.store import output, overwriting, write_text, writes
 
 # Epochs of a training on thousands of simulated states. More epochs do not change the errors.
@@ -107,10 +107,7 @@ def arm_labels(data: Dataset) -> list[ArmLabel]:
 
 def stands_and_moves(labels: Sequence[ArmLabel]) -> np.ndarray:
     """(K, 12) where the arm stands, and the move that it made, mm and deg."""
-    if not len(labels):
-        return np.zeros((0, 12))
-    pose, move = np.stack([label.pose for label in labels]), np.stack([label.move for label in labels])
-    return np.hstack(as_executed(pose, move, np.array([float(label.executed) for label in labels])))
+    return np.hstack(poses_and_moves(labels))
 
 
 def with_missing(

@@ -8,7 +8,7 @@ import numpy as np
 from twin.errors import ContactError
 from twin.judge.labelled.model import ContactModel, MeasuredFrames
 from twin.progress import Step
-from twin.rig.labels import as_executed
+from twin.rig.labels import poses_and_moves
 
 FRICTIONS = (0.0, 0.15, 0.25, 0.32, 0.4, 0.5, 0.65, 1.0, 2.0)
 """Coefficients of friction among which a frame's individual friction is chosen."""
@@ -124,8 +124,7 @@ def _evenly(rows: np.ndarray, count: int) -> np.ndarray:
 def _measures(model: ContactModel, measured: MeasuredFrames) -> dict[str, np.ndarray]:
     """The measures (M,) of all frames by which the errors are tabled."""
     axis = model.experiment.axis
-    given = (np.array([getattr(label, kind) for label in measured.labels], float) for kind in ("pose", "move", "executed"))
-    poses, moves = as_executed(*given)
+    poses, moves = poses_and_moves(measured.labels)
     return {
         "depth_mm": poses[:, axis],
         "angle_deg": np.linalg.norm(poses[:, 3:], axis=1),

@@ -142,9 +142,7 @@ class ContactEstimator:
         seen = self._any.pins_in(frame)
         if isinstance(seen, Unseen):
             return self._any.unseen(seen, started)
-        kind = str(self.contacts.tell(seen.pins)[0])
-        if not kind:
-            return self._any.unseen(Unseen(f"no contact that the weights know ({', '.join(self.parts)})", seen.touched), started)
+        kind = str(self.contacts.likeliest(seen.pins, tuple(self.parts))[0])
         return self.parts[kind].estimate_one(seen, started, kind)
 
     def taken_for(self, pins: PinTable) -> dict[str, float]:

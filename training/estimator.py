@@ -16,6 +16,7 @@ from training.assemble import Ensemble
 from training.contact_maps import MAPS, MapModel, read_maps
 from training.dataset import Dataset
 from training.displacements import DISPLACEMENTS, Displacements, other_rest, read_displacements
+from training.domain import DOMAIN, FEWEST, Domain, Verdict, read_domain
 from training.models import model_named
 from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
@@ -40,6 +41,8 @@ LOST_USUAL = 0.02
 LOST_WIDENS = 2.0
 """Growth of the intervals with the share of lost pins. With a hidden patch of 15 or 30 % of the pins, errors of depth in the twin grow by a
 factor of 1.2 or 1.6."""
+USUAL_FRAME = Verdict("")
+"""Verdict on a frame about which nothing strange is known."""
 SIMULATED_FORCES = ("force_x", "force_y", "force_z", "torque_z")
 """Labels that are proportional to the stiffness of the simulated sensor."""
 
@@ -133,6 +136,7 @@ class PoseEstimator:
         self.maps: MapModel | None = None
         self.slip: SlipModel | None = None
         self.displacements: Displacements | None = None
+        self.domain: Domain | None = None
         self._tracker: SlipTracker | None = None
 
     @classmethod
@@ -169,6 +173,8 @@ class PoseEstimator:
             found.slip = read_slip(run / SLIP)
         if (run / DISPLACEMENTS).is_file():
             found.displacements = read_displacements(run / DISPLACEMENTS, found.sensor.pins.count)
+        if (run / DOMAIN).is_file():
+            found.domain = read_domain(run / DOMAIN, found.sensor.pins.count, len(found.names))
         return found
 
     @property
@@ -223,7 +229,11 @@ class PoseEstimator:
 
     def at_known_rest(self) -> "PoseEstimator":
         """The same model for frames without a no-contact frame, taken by the unit from which its weights were learnt."""
-        return self._counted_from(nominal_reference(self.recorded_sensor, self.form)) if self._known_rest_px is not None else self
+        if self._known_rest_px is None:
+            return self
+        found = self._counted_from(nominal_reference(self.recorded_sensor, self.form))
+        found._trained = replace(found._trained, touched=TouchAnswer(found.pipeline.reference))
+        return found
 
     def other_rest(self, start: Reference, nodes_px: np.ndarray) -> Reference | None:
         """The rest layout estimated from contacts with pins (M, N, 2), if it differs from ``start``, the assumed one.
@@ -295,18 +305,19 @@ class PoseEstimator:
         """
         started = perf_counter()
         if not isinstance(self.part, PinModel):
-            return self._as_estimate(self.part.estimate_frame(self._trained, frame), started)
+            return self._as_estimate(self.part.estimate_frame(self._trained, frame), started, verdict=self._verdict_of(frame))
         seen = self.pins_in(frame)
-        if isinstance(seen, Unseen):
-            if self._tracker is not None:
-                self._tracker.forget()
-            return self._as_estimate(seen, started)
-        return self.estimate_one(seen, started, "")
+        return self.unseen(seen, started) if isinstance(seen, Unseen) else self.estimate_one(seen, started, "")
 
     @property
     def caveats(self) -> list[str]:
         """Reasons why the intervals of all frames are wider than the model's own, one line each."""
         found = []
+        if self.domain is None:
+            found.append(
+                "the run does not hold the patterns of pins that it learnt from (an earlier version, or fewer frames than "
+                f"{FEWEST}): a strange frame gets an estimate like any other; train it again"
+            )
         if self._unmeasured > 1:
             found.append(
                 f"no frame without contact shows where the camera sits: all intervals are {self._unmeasured:g} times wider; give one "
@@ -336,15 +347,19 @@ class PoseEstimator:
         """(K,) bool: labels that are forces or torques of simulated contacts. They are proportional to the sensor's stiffness."""
         return np.array([name in SIMULATED_FORCES for name in self.config["columns"]])
 
-    def _widened(self, value: np.ndarray, half: np.ndarray, lost_share: float) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    def _widened(
+        self, value: np.ndarray, half: np.ndarray, lost_share: float, verdict: Verdict, excess: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
         """Low and high ends (K,) of the intervals with all unknown effects, and notes on this frame."""
         lost = 1.0 + LOST_WIDENS * lost_share if lost_share > LOST_USUAL else 1.0
-        half = half * lost * self._unmeasured
+        if verdict.notes and self.domain is not None:
+            half = np.maximum(half, self.domain.least) * verdict.factor + verdict.added
+        half = half * lost * self._unmeasured + excess
         more, less = value * (self._stiffness - 1), value * (1 / self._stiffness - 1)
         low = value - half + np.where(self._force, np.minimum(more, less), 0.0)
         high = value + half + np.where(self._force, np.maximum(more, less), 0.0)
         notes = (f"{lost_share:.0%} of the pins were not found: intervals are {lost:.1f} times wider",) if lost > 1 else ()
-        return low, high, notes
+        return low, high, (*verdict.notes, *notes)
 
     def contact_maps(self, frame: Frame) -> tuple[PoseEstimate, ContactMaps | None]:
         """The estimate of one frame, with the pressure and shear over the skin; no maps if the estimate is not valid.
@@ -388,15 +403,29 @@ class PoseEstimator:
         return self.ensemble.modes(inputs, rows).inputs
 
     def _as_estimate(
-        self, made: Prediction | Unseen, started: float, contact: str = "", slip: Slip | None = None, lost: float = 0.0
+        self,
+        made: Prediction | Unseen,
+        started: float,
+        contact: str = "",
+        slip: Slip | None = None,
+        lost: float = 0.0,
+        verdict: Verdict = USUAL_FRAME,
     ) -> PoseEstimate:
+        excess = np.zeros(len(self._bounds[0]))
+        if isinstance(made, Prediction) and self.domain is not None:
+            reason = verdict.reason
+            if not reason:
+                reason, excess = self.domain.outside_range(made.mean[0], self.names, self.units)
+            made = Unseen(reason, made.touched, made.seen) if reason else made
         if isinstance(made, Unseen):
+            if self._tracker is not None:
+                self._tracker.forget()
             none = np.full(len(self.names), np.nan)
             return PoseEstimate(
                 self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched, seen=made.seen
             )
         value, half, executed = made.mean[0], made.half_width[0], float(made.executed[0])
-        low, high, notes = self._widened(value, half, lost)
+        low, high, notes = self._widened(value, half, lost, verdict, excess)
         value, low, high = (np.clip(each, *self._bounds) for each in (value, low, high))
         if slip is not None:
             value, low, high = (np.concatenate(pair) for pair in zip((value, low, high), slip.values, strict=True))
@@ -418,8 +447,32 @@ class PoseEstimator:
         contact : str
             Kind of the frame's contact.
         """
+        verdict = self._verdict(seen.pins.nodes_px[0], seen.pins.lost[0])
+        if verdict.reason:
+            return self.unseen(Unseen(verdict.reason, seen.touched, seen.seen), started)
+        if self.domain is not None and verdict.camera.any():
+            pins = seen.pins
+            places = self.domain.without_camera(pins.nodes_px[0], pins.area_px2[0], verdict.camera, pins.reference.spacing_px.mean())
+            seen = replace(seen, pins=replace(pins, nodes_px=places[0][None], area_px2=places[1][None]))
         slip = None if self._tracker is None else self._tracker(self.modes_of(seen.pins)[0])
-        return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip, seen.lost_share)
+        return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip, seen.lost_share, verdict)
+
+    def _verdict(self, nodes_px: np.ndarray, lost: np.ndarray) -> Verdict:
+        """Whether pins (N, 2), some of them ``lost`` (N,), are a pattern that the model was trained on."""
+        if self.domain is None:
+            return USUAL_FRAME
+        reference = self.pipeline.reference
+        moved = (nodes_px - reference.pins_px) / reference.spacing_px.mean()
+        return self.domain.judge(moved, lost, reference, corrects=isinstance(self.part, PinModel))
+
+    def _verdict_of(self, frame: Frame) -> Verdict:
+        """The verdict on a frame for a model that does not look for pins itself."""
+        if self.domain is None:
+            return USUAL_FRAME
+        seen = self.pipeline(frame)
+        if not seen.valid or seen.graph is None:
+            return Verdict(seen.reason)
+        return self._verdict(seen.graph.nodes_px, np.isnan(seen.pins_px[:, 0]))
 
     def unseen(self, seen: Unseen, started: float) -> PoseEstimate:
         """The estimate of a frame that shows no known pose."""

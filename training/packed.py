@@ -18,6 +18,7 @@ from safetensors.numpy import load, save
 from scenes.sensor import SensorSpec
 from training.contact_maps import MAPS
 from training.displacements import DISPLACEMENTS
+from training.domain import DOMAIN
 from training.identity import ASIDE
 from training.models import model_named
 from training.recipes import TrainingError
@@ -46,7 +47,7 @@ def shipped_names() -> list[str]:
     return sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS}"))
 
 
-@writes(WEIGHTS, "config.json", MAPS, SLIP, DISPLACEMENTS)
+@writes(WEIGHTS, "config.json", MAPS, SLIP, DISPLACEMENTS, DOMAIN)
 def pack(run: Path, out: Path) -> int:
     """Write the small copy of a finished run, and return its size in bytes.
 
@@ -82,7 +83,7 @@ def pack(run: Path, out: Path) -> int:
     about = {key: value for key, value in config.items() if key not in ASIDE} | {SHA256: hashlib.sha256(weights).hexdigest()}
     about |= {RECORDINGS: [Path(folder).name for folder in config.get("data", "").split(", ") if folder]}
     write_text(out / CONFIG, json.dumps(about) + "\n")
-    for name in (MAPS, SLIP, DISPLACEMENTS):
+    for name in (MAPS, SLIP, DISPLACEMENTS, DOMAIN):
         if (run / name).is_file():
             write_bytes(out / name, (run / name).read_bytes())
     return (out / WEIGHTS).stat().st_size

@@ -11,9 +11,11 @@ from scenes import SensorSpec
 from training.contact_maps import FEWEST_STATES, MAPS, learn_maps, write_maps
 from training.dataset import Dataset, joined, load_dataset, told_apart, with_common_labels
 from training.displacements import DISPLACEMENTS, learn_displacements, write_displacements
+from training.domain import DOMAIN, learn_domain, write_domain
 from training.estimator import PoseEstimator
 from training.loop import epoch_step
 from training.models import model_named, recipe_of
+from training.models.part import LIKELY
 from training.models.touch.model import TOUCH
 from training.networks import choose_device
 from training.run import RUN_FILES, RunConfig, train_run, training_rows
@@ -21,6 +23,7 @@ from training.run_files import CHECKPOINT, CONFIG, TENSORS
 from training.simulated import is_simulated
 from training.slip import FEWEST_DRAGS, SLIP, Eyes, drags_of, learn_slip, write_slip
 from training.targets import CONTACT, PRESETS
+from training.touched import TouchAnswer
 from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.store import writes
@@ -28,7 +31,7 @@ from twin.types import Form
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helper labels
 SHEAR_HELPERS = ("move_1", "move_6")  # these moves
-FILES = (CONFIG, "curves.csv", TENSORS, MAPS, SLIP, DISPLACEMENTS)  # files of a finished run
+FILES = (CONFIG, "curves.csv", TENSORS, MAPS, SLIP, DISPLACEMENTS, DOMAIN)  # files of a finished run
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,7 @@ def train_model(
             found.problems.extend(add_slip(out, config, parts))
     if finished:
         add_displacements(out, config, found)
+        add_domain(out, config, found)
     return Trained(out, finished, len(found), found.targets.names, labels, found.problems)
 
 
@@ -176,6 +180,26 @@ def add_displacements(run: Path, config: RunConfig, data: Dataset) -> None:
     pins = data.in_order().pins.rows(training_rows(config, data.in_order()))
     if (known := learn_displacements(pins.nodes_px - pins.reference.pins_px)) is not None:
         write_displacements(run / DISPLACEMENTS, known)
+
+
+def add_domain(run: Path, config: RunConfig, data: Dataset) -> None:
+    """Learn the domain from the frames that a finished run learnt from, and write it beside its weights.
+
+    Nothing is written if there are too few frames.
+    """
+    data = data.in_order()
+    rows, estimator = training_rows(config, data), PoseEstimator.load(run)
+    pins, targets = data.pins.rows(rows), data.targets.rows(rows)
+    moved = (pins.nodes_px - pins.reference.pins_px) / pins.reference.spacing_px.mean()
+    least = np.median(estimator.predict_rows(data, rows).half_width, axis=0)
+    labels = targets.corrected if config.labels == "corrected" else targets.raw
+    touched = TouchAnswer(pins.reference)
+    apart = np.array([touched(nodes_px, lost) < LIKELY for nodes_px, lost in zip(pins.nodes_px, pins.lost, strict=True)])
+    labels = np.where(apart[:, None], np.nan, labels)  # a state before first touch has a label, but no pattern of its own
+    group = None if data.group is None else data.group[rows]
+    known = learn_domain(moved, labels, pins.reference, targets.units, least=least, lost=pins.lost, group=group, seed=config.seed)
+    if known is not None:
+        write_domain(run / DOMAIN, known)
 
 
 def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str]:

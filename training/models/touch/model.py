@@ -36,6 +36,8 @@ ROUNDS = 2
 """Rounds in which the modes are learnt. Pins that were not trusted in the round before are filled in."""
 LIGHT_WEIGHT = 0.2
 """Weight of the light among the inputs of the Gaussian process. Light mostly shows the state of the lamps."""
+BRIGHTER = 0.05
+"""Common change of the light of all caps (logarithm of levels) above which no contact causes it. Contacts cause 0.023 (rms)."""
 LIGHT_DECIMALS = 4
 """Decimals of the caps' light (logarithms of levels) that are compared between frames."""
 
@@ -95,7 +97,7 @@ class TouchModel(PinModel):
         if bases.light_mean.any() and not pins.light.any():
             raise TrainingError("the model learnt from the light on the caps as well, and these pins come without it; give it frames")
         moved = _moved(registration, pins, reference, _untrusted(registration, pins, reference), together=together)
-        return TouchInputs(bases(moved, pins.light))
+        return TouchInputs(bases(moved, _as_bright(pins.light, bases)))
 
     def initialise(self, network: torch.nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
         """See ``Model``. Sets the largest size of each feature in training."""
@@ -124,6 +126,13 @@ def _moved(registration: Registration, pins: PinTable, reference: Reference, los
     if not pins.measured:
         nodes_px = registration(nodes_px, pins.area_px2, together=together)[0]
     return ((nodes_px - reference.pins_px) / reference.spacing_px.mean()).reshape(len(nodes_px), -1)
+
+
+def _as_bright(light: np.ndarray, bases: Bases) -> np.ndarray:
+    """Light (M, N) without a common change of all caps that is larger than contacts cause: the camera's exposure, or the lamps."""
+    brighter = ((light - bases.light_mean) * bases.seen).sum(axis=1, keepdims=True) / bases.seen.sum()
+    found: np.ndarray = light - np.where(np.abs(brighter) > BRIGHTER, brighter, 0.0)
+    return found
 
 
 def _untrusted(registration: Registration, pins: PinTable, reference: Reference) -> np.ndarray:

@@ -17,6 +17,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
+from twin import require_own
 from twin.errors import OptionError, StoreError, TwinError
 
 # Modules of commands, in the order in which 'twin --help' lists them, each with the title above its commands.
@@ -120,6 +121,13 @@ def main() -> None:
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a letter that the encoding lacks is printed as its code, as on stderr
+    try:
+        os.getcwd()  # libraries fail without one, each in its own way
+        require_own("training", "hardware")
+    except (OSError, ImportError) as error:
+        reason = error if isinstance(error, ImportError) else "the working folder was deleted; change into a folder that exists"
+        print(f"twin: error: {reason}", file=sys.stderr)
+        sys.exit(FAILED)
     warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {' '.join(str(message).split())}\n"
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # without a writable home directory it prints four lines of warnings
     try:

@@ -27,6 +27,12 @@ CALLED_HERE = {
     **{f"observation.state.{axis}.pos": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
     **{axis: f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
 }
+# Ranges of poses and moves in mm, between which a sensor's contacts lie: below the first they are probably in m (contacts within 100 mm),
+# above the second, which no arm here reaches, in um.
+MM_RANGES = (0.1, 2000.0)
+# Range of poses and moves in deg below which they are probably in rad (within 34 deg), and the share by which a range may differ from a
+# quarter, a half or a whole turn in rad.
+RAD_RANGE, TURN_SHARE = 1.2, 0.01
 # Characters that may separate the cells of a row. The most frequent one in the header is used.
 SEPARATORS = (",", ";", "\t")
 # Largest size of a table or of metadata, bytes: a million rows of a hundred characters.
@@ -228,6 +234,32 @@ def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -
 def called_here(labels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Columns (M,). Columns with names of other conventions are also given under the names used here."""
     return labels | {here: cells for name, cells in labels.items() if (here := CALLED_HERE.get(name.casefold())) and here not in labels}
+
+
+def unlikely_units(labels: dict[str, np.ndarray]) -> list[str]:
+    """Doubts about the unit of a table's poses and moves, one line each. Lengths are in mm, angles in deg.
+
+    A table has one unit for all lengths, and one for all angles, so the widest column of each decides. A column that is constant tells
+    nothing.
+    """
+    widest = {"mm": (0.0, ""), "deg": (0.0, "")}
+    for name, cells in labels.items():
+        kind, _, axis = name.partition("_")
+        if kind in ("pose", "move") and axis in ("1", "2", "3", "4", "5", "6"):
+            values = numbers(cells)
+            if np.isfinite(values).any():
+                unit = "mm" if axis in "123" else "deg"
+                widest[unit] = max(widest[unit], (float(np.nanmax(values) - np.nanmin(values)), name))
+    (length, wide), (angle, turned) = widest["mm"], widest["deg"]
+    found = []
+    if 0 < length < MM_RANGES[0] or length > MM_RANGES[1]:
+        found.append((wide, length, "mm", "m" if length < MM_RANGES[0] else "um"))
+    if 0 < angle < RAD_RANGE or any(abs(angle / turn - 1) < TURN_SHARE for turn in (np.pi / 2, np.pi, 2 * np.pi)):
+        found.append((turned, angle, "deg", "rad"))
+    return [
+        f"labels in another unit? Of the columns in {unit}, {name} has the widest range: {span:.3g}; if they are in {other}, convert them"
+        for name, span, unit, other in found
+    ]
 
 
 def _as_array(cells: list[str]) -> np.ndarray:

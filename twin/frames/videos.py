@@ -1,25 +1,45 @@
 """Reads videos frame by frame, counts their frames, and finds out which frames can be used.
 
-Motion JPEG is read picture by picture, so that a damaged frame is noticed and left out. A video decoder would fill the missing part with a
-guess, without a message. A frame of another codec cannot be checked in this way.
+Motion JPEG is read picture by picture, so that a damaged frame is noticed and left out. Of other codecs those frames are left out of which
+the decoder reports damage, with those that are predicted from them, and those that the decoder would scale to the first frame's size.
+Pixels are taken as they are stored: a flag that says how a player should turn the picture is stated, and not applied.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import re
+import struct
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from scenes.files import require_regular
+from scenes.files import require_regular, shown
 from twin.errors import FrameError
-from twin.frames.images import picture_of, quiet
+from twin.frames.av1 import decode_av1
+from twin.frames.images import NOT_TURNED, overheard, picture_of, quiet
 
-MOTION_JPEG = "MJPG"
-"""Four-letter code of the codec whose frames are JPEG pictures."""
+MOTION_JPEG, AV1 = b"MJPG", b"AV01"
+"""Four-letter codes of the codec whose frames are JPEG pictures, and of one that OpenCV can't decode."""
 AS_STORED = -1.0
 """Value of OpenCV's format setting that gives a video's frames without decoding them."""
 MS_PER_S = 1e3
+COMPLAINT = re.compile(
+    r"(?:\[[^\]]*\] )?(.*(?:error|damage|corrupt|conceal|invalid|truncat|missing|mismatch|premature|not reached).*)", re.IGNORECASE
+)
+"""A decoder's message about a damaged frame, behind the name of the decoder."""
+CODEC = re.compile(rb"stsd.{12}(\w{4})|vids(\w{4})|(V_[\w/]{3,20})", re.DOTALL)
+"""Name of the codec in an MP4, AVI or Matroska file, which states it even if nothing here can open it."""
+LOOKED_BYTES = 16_000_000
+"""Bytes of a video that are searched for this name at a time."""
+DELAY = 4
+"""Most frames by which a decoder's message usually comes before the frame that it is about."""
+HEAD_BYTES, MOST_HEADS = 48, 300
+"""Bytes of a key frame that hold its size, and the most different ones of a video from which a size is read."""
+PAUSE = 3.0
+"""A pause is longer than this many times the usual time from frame to frame."""
 
 
 @dataclass(frozen=True)
@@ -32,26 +52,25 @@ class Video:
     count : int
         Number of frames; of a truncated video without the last one.
     first : (H, W) or (H, W, 3) uint8
-        The first usable frame, RGB.
+        The first usable frame of the most frequent size, RGB.
     problems : list of str
         Irregularities, one line each.
-    oddly_stored : bool
-        Whether most frames hold extra bytes that belong to no part of them, as some cameras write them. If only a few frames hold such
-        bytes, these frames are damaged.
+    faults : dict of int to str
+        Frames that can't be used, and the reasons.
     """
 
     path: Path
     count: int
     first: np.ndarray
     problems: list[str] = field(default_factory=list)
-    oddly_stored: bool = False
+    faults: dict[int, str] = field(default_factory=dict)
 
     def frames(self) -> Iterator[tuple[int, float, np.ndarray | str]]:
         """Index, time (s) and picture of each frame, in order. A damaged frame gives the reason, a text, instead of the picture."""
         for index, time_s, image, said in _read(self.path):
             if index >= self.count:
                 return
-            yield index, time_s, said if image is None or (said and not self.oddly_stored) else image
+            yield index, time_s, self.faults.get(index) or (said if image is None else image)
 
 
 def open_video(path: Path) -> Video:
@@ -66,28 +85,61 @@ def open_video(path: Path) -> Video:
         require_regular(path)
     except OSError as error:
         raise FrameError(f"{path}: can't be read ({error.strerror}); give a video") from error
-    first, first_index, odd, count = None, 0, dict[int, str](), 0
-    for index, _, image, said in _read(path):
-        count = index + 1
-        if image is None:
-            continue
+    stored = _stored(path)
+    times_s: list[float] = []
+    faults, notes, sizes, firsts = dict[int, str](), dict[int, str](), dict[int, tuple[int, ...]](), dict[tuple[int, ...], np.ndarray]()
+    repeated, before = 0, None
+    for index, time_s, image, said in _read(path, stored):
+        times_s.append(time_s)
         if said:
-            odd[index] = said
-        if first is None:
-            first, first_index = image, index
-    if first is None:
-        raise FrameError(f"{path}: no frame can be decoded; check that it is a video, or record it again")
-    oddly_stored = 2 * len(odd) > count
-    problems = [f"{path.name}: {said} ({len(odd)} such frames)" for said in list(odd.values())[:1] if oddly_stored]
-    promised = _promised(path)
-    if promised > count or is_cut(path):
+            (faults if image is None else notes)[index] = said
+        if image is not None:
+            sizes[index] = image.shape[1::-1]
+            firsts.setdefault(image.shape[1::-1], image)
+            repeated += before is not None and np.array_equal(before, image)
+            before = image
+    count = len(times_s)
+    if not sizes:
+        raise FrameError(f"{path}: no frame can be decoded{stored.remedy(path, faults.get(0, ''))}")
+    problems = [f"{path.name}: {NOT_TURNED.format(f'{stored.turned} deg')}"] if stored.turned else []
+    oddly_stored = stored.codec == MOTION_JPEG and 2 * len(notes) > count
+    problems += [f"{path.name}: {said} ({len(notes)} such frames)" for said in list(notes.values())[:1] if oddly_stored]
+    promised, lasts_s = _promised(path)
+    # The number that a header states can be an estimate from the duration, which a pause makes too large.
+    ends_early = promised > count and times_s[-1] + 1.5 * (np.median(np.diff(times_s)) if count > 1 else lasts_s / promised) < lasts_s
+    if ends_early or is_cut(path):
         # The decoder fills the missing part of a truncated frame with a guess, without a message.
         decoded = f"{count} of {max(promised, count)} frames can be decoded"
         problems.append(f"{path.name}: cut, {decoded}; the last of them may lack a part and is left out")
         count -= 1
-    if first_index >= count:
+    if min(sizes) >= count:
         raise FrameError(f"{path}: cut within its first frame; copy it again, or record it again")
-    return Video(path, count, first, problems, oddly_stored)
+    if stored.codec == MOTION_JPEG:
+        faults |= {} if oddly_stored else notes
+    else:
+        faults |= stored.faults(faults | notes, np.array(times_s), sizes[min(sizes)])
+    size = Counter(each for index, each in sizes.items() if index not in faults).most_common(1)
+    if not size:
+        raise FrameError(f"{path}: no usable frame ({next(iter(faults.values()))}); record it again")
+    faults = {index: said for index, said in faults.items() if index < count}
+    others = Counter(each for index, each in sizes.items() if index not in faults and each != size[0][0])
+    problems += [f"{path.name}: {n} of {count} frames are left out: {said}" for said, n in Counter(faults.values()).most_common(3)]
+    problems += [f"{path.name}: {n} of {count} frames have another size ({w}x{h}) and are left out" for (w, h), n in others.items()]
+    problems += [f"{path.name}: {repeated} of {count} frames repeat the one before them"] if repeated else []
+    problems += [f"{path.name}: {said}" for said in [describe_pauses(times_s)] if said]
+    return Video(path, count, firsts[size[0][0]], problems, faults)
+
+
+def describe_pauses(times_s: Sequence[float] | np.ndarray) -> str:
+    """Pauses between frames with these times, in words; "" if there are none."""
+    steps_s = np.diff(times_s)
+    usual_s = float(np.median(steps_s)) if len(steps_s) else 0.0
+    long = np.flatnonzero(steps_s > PAUSE * usual_s) if usual_s > 0 else []
+    if not len(long):
+        return ""
+    most = int(np.argmax(steps_s))
+    known = f"the longest {steps_s[most]:.3g} s after frame {most}; usually {usual_s:.3g} s from frame to frame"
+    return f"{len(long)} {'pause' if len(long) == 1 else 'pauses'}, {steps_s[long].sum():.3g} s in all, {known}"
 
 
 def is_cut(path: Path) -> bool:
@@ -114,42 +166,161 @@ def is_cut(path: Path) -> bool:
         return start > size
 
 
-def _promised(path: Path) -> int:
-    """Number of frames that the file states in its header."""
+@dataclass(frozen=True)
+class _Stored:
+    """What a video's file holds without decoding: codec, angle of its flag (deg), and of its key frames number and size ((), if unknown).
+
+    Of an AV1 video also all packets, the codec's configuration and the size.
+    """
+
+    codec: bytes = b""
+    turned: int = 0
+    keys: list[int] = field(default_factory=list)
+    sizes: list[tuple[int, ...]] = field(default_factory=list)
+    key_times_s: list[float] = field(default_factory=list)
+    count: int = 0
+    packets: list[tuple[float, bytes]] = field(default_factory=list)
+    config: bytes = b""
+    size_px: tuple[int, int] = (0, 0)
+
+    def faults(self, complaints: dict[int, str], times_s: np.ndarray, size: tuple[int, ...]) -> dict[int, str]:
+        """Reasons against decoded frames: damage, up to the next key frame, and a size that the decoder has scaled to the first frame's."""
+        found, last = dict[int, str](), len(times_s) - 1
+        by_time = self.count != len(times_s) and bool((np.diff(self.key_times_s) > 0).all())
+        part = np.searchsorted(*((self.key_times_s, times_s) if by_time else (self.keys, np.arange(len(times_s)))), side="right") - 1
+        for index, said in complaints.items():
+            after = np.flatnonzero(part <= part[min(index + DELAY, last)])
+            found |= dict.fromkeys(after[after >= index].tolist(), f"{said}, or predicted from such a frame")
+        slack = 0 if by_time else abs(self.count - len(times_s))  # frames whose packet is not known for sure
+        soonest = part[np.minimum(np.arange(len(part)) + slack, last)]
+        for k, of_key in enumerate(self.sizes):
+            if of_key and of_key != size:
+                said = "another size ({}x{}), which the decoder scales to {}x{}".format(*of_key, *size)
+                found |= dict.fromkeys(np.flatnonzero((part <= k) & (soonest >= k)).tolist(), said)
+        return found
+
+    def remedy(self, path: Path, said: str) -> str:
+        """Why no frame of a video can be decoded, and what helps."""
+        codec = self.codec.strip(b"\0")
+        with path.open("rb") as file:
+            while not codec and (part := file.read(LOOKED_BYTES)):
+                named = CODEC.search(part)
+                codec = named[named.lastindex or 0] if named else b""
+        if not codec:
+            return "; check that it is a video, or record it again"
+        name = shown(codec.decode("ascii", "replace"))
+        return (
+            f": its codec is {name}{f' ({said})' if said else ''}; convert it without loss, for example with "
+            "'ffmpeg -i VIDEO -c:v libx264 -qp 0 OTHER.mp4'"
+        )
+
+
+def _capture(path: Path) -> cv2.VideoCapture:
+    """An open video. One thread decodes it, so that messages belong to the frame that is read; nothing is turned."""
     with quiet():
-        capture = cv2.VideoCapture(str(path))
+        capture = cv2.VideoCapture(str(path), cv2.CAP_ANY, [cv2.CAP_PROP_N_THREADS, 1])
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    return capture
+
+
+def _stored(path: Path) -> _Stored:
+    capture = _capture(path)
     try:
-        return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+        if not capture.isOpened():
+            return _Stored()
+        codec = (int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little")
+        found = _Stored(codec, round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360, size_px=_size_px(capture))
+        if codec == MOTION_JPEG or not capture.set(cv2.CAP_PROP_FORMAT, AS_STORED):
+            return found
+        known: dict[bytes, tuple[int, ...]] = {}
+        number = 0
+        while True:
+            with quiet():
+                good, data = capture.read()
+            if not good:
+                break
+            time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / MS_PER_S
+            if capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME):
+                head = data.tobytes()[:HEAD_BYTES]
+                if head not in known and len(known) < MOST_HEADS:
+                    known[head] = _size_in(data.tobytes(), codec)
+                found.keys.append(number)
+                found.sizes.append(known.get(head, ()))
+                found.key_times_s.append(time_s)
+            if codec == AV1:
+                found.packets.append((time_s, data.tobytes()))
+            number += 1
+        place = int(capture.get(cv2.CAP_PROP_CODEC_EXTRADATA_INDEX))
+        config = capture.retrieve(flag=place)[1] if codec == AV1 else None
+        return replace(found, count=number, config=b"" if config is None else config.tobytes())
     finally:
         capture.release()
 
 
-def _read(path: Path) -> Iterator[tuple[int, float, np.ndarray | None, str]]:
-    """Index, time (s), picture (RGB) and irregularities of each frame; None and the reason for a frame that can't be used."""
-    with quiet():
-        capture = cv2.VideoCapture(str(path))
+def _size_in(packet: bytes, codec: bytes) -> tuple[int, ...]:
+    """Width and height of a key frame by its own data, which are put into a file without stated size; () if they do not hold it."""
+    head = struct.pack("<4s2H4s2H4I", b"DKIF", 0, 32, codec, 0, 0, 30, 1, 1, 0) + struct.pack("<IQ", len(packet), 0)
+    for content in (head + packet, packet):  # an IVF file, and the data alone for codecs that IVF does not have
+        with tempfile.NamedTemporaryFile(suffix=".ivf") as file:
+            file.write(content)
+            file.flush()
+            capture = _capture(Path(file.name))
+            size = _size_px(capture)
+            capture.release()
+        if min(size) > 0:
+            return size
+    return ()
+
+
+def _size_px(capture: cv2.VideoCapture) -> tuple[int, int]:
+    return int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+
+
+def _promised(path: Path) -> tuple[int, float]:
+    """Number of frames and duration (s) that the file states in its header."""
+    capture = _capture(path)
     try:
-        stored = _gives_pictures(capture) and capture.set(cv2.CAP_PROP_FORMAT, AS_STORED)
+        count, fps = (capture.get(key) if capture.isOpened() else 0.0 for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
+        return int(count), count / fps if fps > 0 else 0.0
+    finally:
+        capture.release()
+
+
+def _read(path: Path, stored: _Stored | None = None) -> Iterator[tuple[int, float, np.ndarray | None, str]]:
+    """Index, time (s), picture (RGB) and irregularities of each frame; None and the reason for a frame that can't be used."""
+    capture = _capture(path)
+    try:
+        codec = (int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little") if capture.isOpened() else b""
+        if codec == AV1:
+            yield from _read_av1(stored or _stored(path))
+            return
+        pictures = codec == MOTION_JPEG and capture.set(cv2.CAP_PROP_FORMAT, AS_STORED)
         index = 0
         while True:
-            with quiet():
+            with overheard() as said:
                 good, image = capture.read()
             if not good:
                 return
             time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / MS_PER_S
-            if not stored:
-                yield index, time_s, image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), ""
-            else:
+            if pictures:
                 yield index, time_s, *_picture(image)
+            else:
+                complaint = COMPLAINT.search(said[0])
+                rgb = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+                yield index, time_s, rgb, f"damaged ({complaint[1]})" if complaint else ""
             index += 1
     finally:
         capture.release()
 
 
-def _gives_pictures(capture: cv2.VideoCapture) -> bool:
-    """Whether a video's frames are JPEG pictures."""
-    code = int(capture.get(cv2.CAP_PROP_FOURCC)) if capture.isOpened() else 0
-    return code & 0xFFFFFFFF == cv2.VideoWriter.fourcc(*MOTION_JPEG)
+def _read_av1(stored: _Stored) -> Iterator[tuple[int, float, np.ndarray | None, str]]:
+    times_s, packets = zip(*stored.packets, strict=True)
+    try:
+        for index, image in enumerate(decode_av1(packets, stored.keys, stored.config, stored.size_px)):
+            bad = isinstance(image, str)
+            yield index, times_s[index], None if bad else image, image if bad else ""
+    except OSError as error:
+        yield 0, 0.0, None, str(error)
 
 
 def _picture(stored: np.ndarray) -> tuple[np.ndarray | None, str]:

@@ -4,11 +4,10 @@
 it for the recordings' form.
 """
 
-import re
 import threading
 import time
 from abc import abstractmethod
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -31,8 +30,6 @@ FROZEN_S, FROZEN_N = 0.5, 5
 LATE_S = 5.0
 # Gray level (0 to 255) that at least one pixel of a picture must reach. Otherwise the picture is black, because the lamps are off.
 BLACK_LEVEL = 16
-# Numbers in the messages about damaged pictures; messages that differ in them alone are counted as one.
-DIGITS = re.compile(r"\d+")
 # Longest time, s, to the first picture of a real camera after opening. In addition it may take FIRST_PERIODS periods of its frames.
 START_S = 4.0
 FIRST_PERIODS = 5
@@ -145,13 +142,12 @@ class LiveSource(Connection):
     def notes(self) -> list[str]:
         """Outages, torn and repeated pictures, and irregular files so far, one line each."""
         with self._new:
-            outages_s, torn, found = list(self._outages_s), self._torn.copy(), list(self._notes)
+            outages_s, torn, found = list(self._outages_s), list(self._torn), list(self._notes)
         if outages_s:
-            count = f"{len(outages_s)} {'outage' if len(outages_s) == 1 else 'outages'} of the camera"
-            found.append(f"{count}, {sum(outages_s):.1f} s in all, the longest {max(outages_s):.1f} s: no picture came")
+            spent = f"{sum(outages_s):.1f} s in all, the longest {max(outages_s):.1f} s: no picture came"
+            found.append(f"{len(outages_s)} {'outage' if len(outages_s) == 1 else 'outages'} of the camera, {spent}")
         if torn:
-            (kind, _), count = torn.most_common(1)[0], sum(torn.values())
-            found.append(f"{count} pictures came torn or damaged and were left out; most of them: {kind}")
+            found.append(f"{len(torn)} pictures came torn or damaged and were left out; the last: {torn[-1]}")
         if self._repeated:
             found.append(f"{self._repeated} of {self._sequence} pictures repeat the one before them")
         return found
@@ -219,12 +215,12 @@ class LiveSource(Connection):
         self._fault = ""
         self._read_last, self._sequence, self._dropped, self._delivered = -1, 0, 0, 0
         self._still: tuple[np.ndarray, float, int] | None = None  # picture, since when, how often
-        self._came_s = float("nan")
+        self._came_s = 0.0
         self._periods_s: deque[float] = deque([1.0 / self.fps], maxlen=KEPT_PERIODS)
         self._outages_s: list[float] = []
-        self._torn: Counter[str] = Counter()
+        self._torn: list[str] = []
+        self._notes: set[str] = set()
         self._repeated = 0
-        self._notes: dict[str, None] = {}
 
     def _run(self) -> None:
         in_a_row = 0
@@ -237,7 +233,7 @@ class LiveSource(Connection):
                 in_a_row += 1
                 if isinstance(failure, TornPicture):
                     with self._new:
-                        self._torn[DIGITS.sub("...", str(failure))] += 1
+                        self._torn.append(str(failure))
                 if in_a_row > MOST_FAILED_READS:
                     self._give_up(
                         DeviceError(f"{in_a_row} reads in a row failed, the last: {failure}; check camera and cable, then connect again")
@@ -268,16 +264,11 @@ class LiveSource(Connection):
 
     def _look_back(self, picture: Picture) -> None:
         """Count an outage before this picture, and note what is irregular in it."""
-        came_s = time.monotonic()
-        if not np.isnan(self._came_s):
-            period_s = came_s - self._came_s
-            if period_s > max(OUTAGE_S, OUTAGE_PERIODS * float(np.median(self._periods_s))):
-                self._outages_s.append(period_s)
-            else:
-                self._periods_s.append(period_s)
-        self._came_s = came_s
-        if picture.note:
-            self._notes[picture.note] = None
+        period_s, self._came_s = time.monotonic() - self._came_s, time.monotonic()
+        if self._sequence:  # the first picture comes when the device is ready
+            outage = period_s > max(OUTAGE_S, OUTAGE_PERIODS * float(np.median(self._periods_s)))
+            (self._outages_s if outage else self._periods_s).append(period_s)
+        self._notes |= {picture.note} - {""}
 
     def _look_at(self, picture: Picture) -> str:
         if picture.image.max(initial=0) < BLACK_LEVEL:

@@ -162,7 +162,9 @@ def av1_video(path):
     """An MP4 with AV1, made of the AVIF sequence that Pillow writes: the same boxes with other labels."""
     pictures = [Image.fromarray(scene(k)) for k in range(COUNT)]
     pictures[0].save(path, "AVIF", save_all=True, append_images=pictures[1:], duration=40, quality=90)
-    data = path.read_bytes().replace(b"ftypavis", b"ftypisom").replace(b"meta", b"free", 1)
+    data = path.read_bytes()
+    for label, other in ((b"avis", b"isom"), (b"avif", b"iso2"), (b"mif1", b"av01"), (b"meta", b"free")):
+        data = data.replace(label, other)
     at = data.index(b"pict", data.index(b"moov"))
     path.write_bytes(data[:at] + b"vide" + data[at + 4 :])
     return path

@@ -17,7 +17,6 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from twin import require_own
 from twin.errors import OptionError, StoreError, TwinError
 
 # Modules of commands, in the order in which 'twin --help' lists them, each with the title above its commands.
@@ -123,7 +122,7 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # a letter that the encoding lacks is printed as its code, as on stderr
     try:
         os.getcwd()  # libraries fail without one, each in its own way
-        require_own("training", "hardware")
+        import_module("twin").require_own("training", "hardware")
     except (OSError, ImportError) as error:
         reason = error if isinstance(error, ImportError) else "the working folder was deleted; change into a folder that exists"
         print(f"twin: error: {reason}", file=sys.stderr)

@@ -62,7 +62,6 @@ class LeRobotFrames:
     _feature: str = field(default="", repr=False)
     _group: tuple[Path, int] | None = field(default=None, repr=False)
     _cells: list[Any] = field(default_factory=list, repr=False)
-    _said: set[str] = field(default_factory=set, repr=False)
 
     def frames(self, chosen: Collection[int]) -> Iterator[tuple[int, np.ndarray | str]]:
         """Index and picture of chosen frames, in order. A damaged frame gives the reason, a text, instead of the picture."""
@@ -73,7 +72,8 @@ class LeRobotFrames:
         for index in wanted:
             try:
                 image, note = picture_of(self._stored(*self._places[index]))
-                self._say(f"{self.names[index]}: {note} (the first such frame)" if note else "", note)
+                said = f"{self.path.name}: pictures of {self._feature}: {note}"
+                self.problems += [said] if note and said not in self.problems else []
                 yield index, self._as_first(image)
             except FrameError as error:
                 yield index, str(error)
@@ -82,8 +82,7 @@ class LeRobotFrames:
         for path in dict.fromkeys(self._places[index][0] for index in wanted):
             number = {self._places[index][2]: index for index in wanted if self._places[index][0] == path}
             video = open_video(path)
-            for problem in video.problems:
-                self._say(problem, problem)
+            self.problems += [problem for problem in video.problems if problem not in self.problems]
             for k, _, image in video.frames():
                 if k in number:
                     yield number.pop(k), image if isinstance(image, str) else self._as_first(image)
@@ -111,12 +110,6 @@ class LeRobotFrames:
             return read_regular(self.path / named, LARGEST_BYTES)
         except OSError as error:
             raise FrameError(f"{named}: can't be read ({error.strerror})") from error
-
-    def _say(self, problem: str, kind: str) -> None:
-        """Add an irregularity, if it is one and none of its kind was added."""
-        if problem and kind not in self._said:
-            self._said.add(kind)
-            self.problems.append(problem)
 
     def _as_first(self, image: np.ndarray) -> np.ndarray:
         return image[..., 0] if image.ndim == 3 and self.first.ndim == 2 and self.first.size else image

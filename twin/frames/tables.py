@@ -32,7 +32,7 @@ CALLED_HERE = {
 MM_RANGES = (0.1, 2000.0)
 # Range of poses and moves in deg below which they are probably in rad (within 34 deg), and the share by which a range may differ from a
 # quarter, a half or a whole turn in rad.
-RAD_RANGE, TURN_SHARE = 1.2, 0.01
+RAD_RANGE, TURN_SHARE, TURNS_RAD = 1.2, 0.01, (np.pi / 2, np.pi, 2 * np.pi)
 # Characters that may separate the cells of a row. The most frequent one in the header is used.
 SEPARATORS = (",", ";", "\t")
 # Largest size of a table or of metadata, bytes: a million rows of a hundred characters.
@@ -242,23 +242,17 @@ def unlikely_units(labels: dict[str, np.ndarray]) -> list[str]:
     A table has one unit for all lengths, and one for all angles, so the widest column of each decides. A column that is constant tells
     nothing.
     """
-    widest = {"mm": (0.0, ""), "deg": (0.0, "")}
+    ranges = {"mm": [(0.0, "")], "deg": [(0.0, "")]}
     for name, cells in labels.items():
-        kind, _, axis = name.partition("_")
-        if kind in ("pose", "move") and axis in ("1", "2", "3", "4", "5", "6"):
-            values = numbers(cells)
-            if np.isfinite(values).any():
-                unit = "mm" if axis in "123" else "deg"
-                widest[unit] = max(widest[unit], (float(np.nanmax(values) - np.nanmin(values)), name))
-    (length, wide), (angle, turned) = widest["mm"], widest["deg"]
-    found = []
-    if 0 < length < MM_RANGES[0] or length > MM_RANGES[1]:
-        found.append((wide, length, "mm", "m" if length < MM_RANGES[0] else "um"))
-    if 0 < angle < RAD_RANGE or any(abs(angle / turn - 1) < TURN_SHARE for turn in (np.pi / 2, np.pi, 2 * np.pi)):
-        found.append((turned, angle, "deg", "rad"))
+        if re.fullmatch("(pose|move)_[1-6]", name) and np.isfinite(values := numbers(cells)).any():
+            ranges["mm" if name[-1] in "123" else "deg"].append((float(np.nanmax(values) - np.nanmin(values)), name))
+    (length, _), (angle, _) = widest = [max(each) for each in ranges.values()]
+    others = ["m" if 0 < length < MM_RANGES[0] else "um" if length > MM_RANGES[1] else ""]
+    others += ["rad" if 0 < angle < RAD_RANGE or any(abs(angle / turn - 1) < TURN_SHARE for turn in TURNS_RAD) else ""]
     return [
         f"labels in another unit? Of the columns in {unit}, {name} has the widest range: {span:.3g}; if they are in {other}, convert them"
-        for name, span, unit, other in found
+        for unit, (span, name), other in zip(ranges, widest, others, strict=True)
+        if other
     ]
 
 

@@ -5,12 +5,14 @@ the decoder reports damage, with those that are predicted from them, and those t
 Pixels are taken as they are stored: a flag that says how a player should turn the picture is stated, and not applied.
 """
 
+import itertools
 import re
 import struct
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -19,6 +21,7 @@ import numpy as np
 from scenes.files import require_regular, shown
 from twin.errors import FrameError
 from twin.frames.av1 import decode_av1
+from twin.frames.forms import times
 from twin.frames.images import NOT_TURNED, overheard, picture_of, quiet
 
 MOTION_JPEG, AV1 = b"MJPG", b"AV01"
@@ -38,6 +41,8 @@ DELAY = 4
 """Most frames by which a decoder's message usually comes before the frame that it is about."""
 HEAD_BYTES, MOST_HEADS = 48, 300
 """Bytes of a key frame that hold its size, and the most different ones of a video from which a size is read."""
+MOST_SAID = 3
+"""Most reasons against frames that are stated, the most frequent ones."""
 PAUSE = 3.0
 """A pause is longer than this many times the usual time from frame to frame."""
 
@@ -66,7 +71,7 @@ class Video:
     faults: dict[int, str] = field(default_factory=dict)
 
     def frames(self) -> Iterator[tuple[int, float, np.ndarray | str]]:
-        """Index, time (s) and picture of each frame, in order. A damaged frame gives the reason, a text, instead of the picture."""
+        """Index, time (s) and picture of each frame, in order. A frame that can't be used gives the reason, a text, instead."""
         for index, time_s, image, said in _read(self.path):
             if index >= self.count:
                 return
@@ -87,47 +92,46 @@ def open_video(path: Path) -> Video:
         raise FrameError(f"{path}: can't be read ({error.strerror}); give a video") from error
     stored = _stored(path)
     times_s: list[float] = []
-    faults, notes, sizes, firsts = dict[int, str](), dict[int, str](), dict[int, tuple[int, ...]](), dict[tuple[int, ...], np.ndarray]()
+    said: dict[int, str] = {}
+    sizes: dict[int, tuple[int, ...]] = {}
+    firsts: dict[tuple[int, ...], np.ndarray] = {}
     repeated, before = 0, None
-    for index, time_s, image, said in _read(path, stored):
+    for index, time_s, image, note in _read(path):
         times_s.append(time_s)
-        if said:
-            (faults if image is None else notes)[index] = said
+        said |= {index: note} if note else {}
         if image is not None:
             sizes[index] = image.shape[1::-1]
-            firsts.setdefault(image.shape[1::-1], image)
+            firsts.setdefault(sizes[index], image)
             repeated += before is not None and np.array_equal(before, image)
             before = image
     count = len(times_s)
     if not sizes:
-        raise FrameError(f"{path}: no frame can be decoded{stored.remedy(path, faults.get(0, ''))}")
-    problems = [f"{path.name}: {NOT_TURNED.format(f'{stored.turned} deg')}"] if stored.turned else []
-    oddly_stored = stored.codec == MOTION_JPEG and 2 * len(notes) > count
-    problems += [f"{path.name}: {said} ({len(notes)} such frames)" for said in list(notes.values())[:1] if oddly_stored]
-    promised, lasts_s = _promised(path)
+        raise FrameError(f"{path}: no frame can be decoded{_remedy(path, stored.codec, said.get(0, ''))}")
+    problems = [NOT_TURNED.format(f"{stored.turned} deg")] if stored.turned else []
+    odd = [note for index, note in said.items() if index in sizes]
+    if stored.codec == MOTION_JPEG and 2 * len(odd) > count:  # so its camera stores them
+        problems.append(f"{odd[0]} ({len(odd)} such frames)")
+        said = {index: note for index, note in said.items() if index not in sizes}
     # The number that a header states can be an estimate from the duration, which a pause makes too large.
-    ends_early = promised > count and times_s[-1] + 1.5 * (np.median(np.diff(times_s)) if count > 1 else lasts_s / promised) < lasts_s
-    if ends_early or is_cut(path):
+    step_s = np.median(np.diff(times_s)) if count > 1 else 0.0
+    if (stored.promised > count and times_s[-1] + 1.5 * step_s < stored.lasts_s) or is_cut(path):
         # The decoder fills the missing part of a truncated frame with a guess, without a message.
-        decoded = f"{count} of {max(promised, count)} frames can be decoded"
-        problems.append(f"{path.name}: cut, {decoded}; the last of them may lack a part and is left out")
+        decoded = f"{count} of {max(stored.promised, count)} frames can be decoded"
+        problems.append(f"cut, {decoded}; the last of them may lack a part and is left out")
         count -= 1
     if min(sizes) >= count:
         raise FrameError(f"{path}: cut within its first frame; copy it again, or record it again")
-    if stored.codec == MOTION_JPEG:
-        faults |= {} if oddly_stored else notes
-    else:
-        faults |= stored.faults(faults | notes, np.array(times_s), sizes[min(sizes)])
-    size = Counter(each for index, each in sizes.items() if index not in faults).most_common(1)
-    if not size:
+    faults = said if stored.codec == MOTION_JPEG else stored.faults(said, np.array(times_s), sizes[min(sizes)])
+    usable = Counter(size for index, size in sizes.items() if index not in faults and index < count).most_common()
+    if not usable:
         raise FrameError(f"{path}: no usable frame ({next(iter(faults.values()))}); record it again")
-    faults = {index: said for index, said in faults.items() if index < count}
-    others = Counter(each for index, each in sizes.items() if index not in faults and each != size[0][0])
-    problems += [f"{path.name}: {n} of {count} frames are left out: {said}" for said, n in Counter(faults.values()).most_common(3)]
-    problems += [f"{path.name}: {n} of {count} frames have another size ({w}x{h}) and are left out" for (w, h), n in others.items()]
-    problems += [f"{path.name}: {repeated} of {count} frames repeat the one before them"] if repeated else []
-    problems += [f"{path.name}: {said}" for said in [describe_pauses(times_s)] if said]
-    return Video(path, count, firsts[size[0][0]], problems, faults)
+    others = {index: size for index, size in sizes.items() if size != usable[0][0]}
+    faults = {index: f"another size ({times(size)}) than the others" for index, size in others.items()} | faults
+    faults = {index: fault for index, fault in faults.items() if index < count}
+    problems += [f"{n} of {count} frames are left out: {fault}" for fault, n in Counter(faults.values()).most_common(MOST_SAID)]
+    problems += [f"{repeated} of {count} frames repeat the one before them"] if repeated else []
+    problems += filter(None, [describe_pauses(times_s)])
+    return Video(path, count, firsts[usable[0][0]], [f"{path.name}: {problem}" for problem in problems], faults)
 
 
 def describe_pauses(times_s: Sequence[float] | np.ndarray) -> str:
@@ -166,95 +170,88 @@ def is_cut(path: Path) -> bool:
         return start > size
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Stored:
-    """What a video's file holds without decoding: codec, angle of its flag (deg), and of its key frames number and size ((), if unknown).
+    """What a video's file holds without decoding it.
 
-    Of an AV1 video also all packets, the codec's configuration and the size.
+    Codec, number of frames and duration that its header states, angle of its flag (deg), number of packets, and of its key frames number,
+    time (s) and size (() if unknown).
     """
 
     codec: bytes = b""
+    promised: int = 0
+    lasts_s: float = 0.0
     turned: int = 0
-    keys: list[int] = field(default_factory=list)
-    sizes: list[tuple[int, ...]] = field(default_factory=list)
-    key_times_s: list[float] = field(default_factory=list)
     count: int = 0
-    packets: list[tuple[float, bytes]] = field(default_factory=list)
-    config: bytes = b""
-    size_px: tuple[int, int] = (0, 0)
+    keys: list[int] = field(default_factory=list)
+    key_times_s: list[float] = field(default_factory=list)
+    sizes: list[tuple[int, ...]] = field(default_factory=list)
 
-    def faults(self, complaints: dict[int, str], times_s: np.ndarray, size: tuple[int, ...]) -> dict[int, str]:
+    def faults(self, damaged: dict[int, str], times_s: np.ndarray, size: tuple[int, ...]) -> dict[int, str]:
         """Reasons against decoded frames: damage, up to the next key frame, and a size that the decoder has scaled to the first frame's."""
-        found, last = dict[int, str](), len(times_s) - 1
+        found: dict[int, str] = {}
+        frame, last = np.arange(len(times_s)), len(times_s) - 1
         by_time = self.count != len(times_s) and bool((np.diff(self.key_times_s) > 0).all())
-        part = np.searchsorted(*((self.key_times_s, times_s) if by_time else (self.keys, np.arange(len(times_s)))), side="right") - 1
-        for index, said in complaints.items():
-            after = np.flatnonzero(part <= part[min(index + DELAY, last)])
-            found |= dict.fromkeys(after[after >= index].tolist(), f"{said}, or predicted from such a frame")
+        keys, places = (self.key_times_s, times_s) if by_time else (self.keys, frame)
+        part = np.searchsorted(keys, places, side="right") - 1
+        for index, said in damaged.items():
+            after = (frame >= index) & (part <= part[min(index + DELAY, last)])
+            found |= dict.fromkeys(np.flatnonzero(after).tolist(), f"{said}, or predicted from such a frame")
         slack = 0 if by_time else abs(self.count - len(times_s))  # frames whose packet is not known for sure
-        soonest = part[np.minimum(np.arange(len(part)) + slack, last)]
+        soonest = part[np.minimum(frame + slack, last)]
         for k, of_key in enumerate(self.sizes):
             if of_key and of_key != size:
-                said = "another size ({}x{}), which the decoder scales to {}x{}".format(*of_key, *size)
+                said = f"another size ({times(of_key)}), which the decoder scales to {times(size)}"
                 found |= dict.fromkeys(np.flatnonzero((part <= k) & (soonest >= k)).tolist(), said)
         return found
 
-    def remedy(self, path: Path, said: str) -> str:
-        """Why no frame of a video can be decoded, and what helps."""
-        codec = self.codec.strip(b"\0")
-        with path.open("rb") as file:
-            while not codec and (part := file.read(LOOKED_BYTES)):
-                named = CODEC.search(part)
-                codec = named[named.lastindex or 0] if named else b""
-        if not codec:
-            return "; check that it is a video, or record it again"
-        name = shown(codec.decode("ascii", "replace"))
-        return (
-            f": its codec is {name}{f' ({said})' if said else ''}; convert it without loss, for example with "
-            "'ffmpeg -i VIDEO -c:v libx264 -qp 0 OTHER.mp4'"
-        )
+
+def _remedy(path: Path, codec: bytes, said: str) -> str:
+    """Why no frame of a video can be decoded, and what helps."""
+    with path.open("rb") as file:
+        while not codec and (part := file.read(LOOKED_BYTES)):
+            named = CODEC.search(part)
+            codec = named[named.lastindex or 0] if named else b""
+    if not codec:
+        return "; check that it is a video, or record it again"
+    why = f"{shown(codec.decode('ascii', 'replace'))}{f' ({said})' if said else ''}"
+    return f": its codec is {why}; convert it without loss, for example with 'ffmpeg -i VIDEO -c:v libx264 -qp 0 OTHER.mp4'"
 
 
-def _capture(path: Path) -> cv2.VideoCapture:
-    """An open video. One thread decodes it, so that messages belong to the frame that is read; nothing is turned."""
+@contextmanager
+def _capture(path: Path) -> Iterator[tuple[cv2.VideoCapture, bytes]]:
+    """An open video and its codec. One thread decodes it, so that messages belong to the frame that is read; nothing is turned."""
     with quiet():
         capture = cv2.VideoCapture(str(path), cv2.CAP_ANY, [cv2.CAP_PROP_N_THREADS, 1])
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    return capture
+    code = int(capture.get(cv2.CAP_PROP_FOURCC)) if capture.isOpened() else 0
+    try:
+        yield capture, (code & 0xFFFFFFFF).to_bytes(4, "little").strip(b"\0")
+    finally:
+        capture.release()
 
 
 def _stored(path: Path) -> _Stored:
-    capture = _capture(path)
-    try:
+    with _capture(path) as (capture, codec):
         if not capture.isOpened():
             return _Stored()
-        codec = (int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little")
-        found = _Stored(codec, round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360, size_px=_size_px(capture))
-        if codec == MOTION_JPEG or not capture.set(cv2.CAP_PROP_FORMAT, AS_STORED):
-            return found
+        promised, fps = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), capture.get(cv2.CAP_PROP_FPS)
+        found = _Stored(codec, promised, promised / fps if fps > 0 else 0.0, round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360)
         known: dict[bytes, tuple[int, ...]] = {}
-        number = 0
-        while True:
+        more = codec != MOTION_JPEG and capture.set(cv2.CAP_PROP_FORMAT, AS_STORED)
+        while more:
             with quiet():
-                good, data = capture.read()
-            if not good:
-                break
-            time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / MS_PER_S
-            if capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME):
-                head = data.tobytes()[:HEAD_BYTES]
+                more, data = capture.read()
+            if more and capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME):
+                packet = data.tobytes()
+                head = packet[:HEAD_BYTES]
                 if head not in known and len(known) < MOST_HEADS:
-                    known[head] = _size_in(data.tobytes(), codec)
-                found.keys.append(number)
+                    known[head] = _size_in(packet, codec)
+                found.keys.append(found.count)
+                found.key_times_s.append(capture.get(cv2.CAP_PROP_POS_MSEC) / MS_PER_S)
                 found.sizes.append(known.get(head, ()))
-                found.key_times_s.append(time_s)
-            if codec == AV1:
-                found.packets.append((time_s, data.tobytes()))
-            number += 1
-        place = int(capture.get(cv2.CAP_PROP_CODEC_EXTRADATA_INDEX))
-        config = capture.retrieve(flag=place)[1] if codec == AV1 else None
-        return replace(found, count=number, config=b"" if config is None else config.tobytes())
-    finally:
-        capture.release()
+            found.count += more
+        return found
 
 
 def _size_in(packet: bytes, codec: bytes) -> tuple[int, ...]:
@@ -264,39 +261,21 @@ def _size_in(packet: bytes, codec: bytes) -> tuple[int, ...]:
         with tempfile.NamedTemporaryFile(suffix=".ivf") as file:
             file.write(content)
             file.flush()
-            capture = _capture(Path(file.name))
-            size = _size_px(capture)
-            capture.release()
+            with _capture(Path(file.name)) as (capture, _):
+                size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         if min(size) > 0:
             return size
     return ()
 
 
-def _size_px(capture: cv2.VideoCapture) -> tuple[int, int]:
-    return int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-
-
-def _promised(path: Path) -> tuple[int, float]:
-    """Number of frames and duration (s) that the file states in its header."""
-    capture = _capture(path)
-    try:
-        count, fps = (capture.get(key) if capture.isOpened() else 0.0 for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
-        return int(count), count / fps if fps > 0 else 0.0
-    finally:
-        capture.release()
-
-
-def _read(path: Path, stored: _Stored | None = None) -> Iterator[tuple[int, float, np.ndarray | None, str]]:
+def _read(path: Path) -> Iterator[tuple[int, float, np.ndarray | None, str]]:
     """Index, time (s), picture (RGB) and irregularities of each frame; None and the reason for a frame that can't be used."""
-    capture = _capture(path)
-    try:
-        codec = (int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little") if capture.isOpened() else b""
+    with _capture(path) as (capture, codec):
         if codec == AV1:
-            yield from _read_av1(stored or _stored(path))
+            yield from decode_av1(path)
             return
         pictures = codec == MOTION_JPEG and capture.set(cv2.CAP_PROP_FORMAT, AS_STORED)
-        index = 0
-        while True:
+        for index in itertools.count():
             with overheard() as said:
                 good, image = capture.read()
             if not good:
@@ -308,19 +287,6 @@ def _read(path: Path, stored: _Stored | None = None) -> Iterator[tuple[int, floa
                 complaint = COMPLAINT.search(said[0])
                 rgb = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
                 yield index, time_s, rgb, f"damaged ({complaint[1]})" if complaint else ""
-            index += 1
-    finally:
-        capture.release()
-
-
-def _read_av1(stored: _Stored) -> Iterator[tuple[int, float, np.ndarray | None, str]]:
-    times_s, packets = zip(*stored.packets, strict=True)
-    try:
-        for index, image in enumerate(decode_av1(packets, stored.keys, stored.config, stored.size_px)):
-            bad = isinstance(image, str)
-            yield index, times_s[index], None if bad else image, image if bad else ""
-    except OSError as error:
-        yield 0, 0.0, None, str(error)
 
 
 def _picture(stored: np.ndarray) -> tuple[np.ndarray | None, str]:

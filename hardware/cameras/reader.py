@@ -144,7 +144,7 @@ class LiveSource(Connection):
         with self._new:
             outages_s, torn, found = list(self._outages_s), list(self._torn), list(self._notes)
         if outages_s:
-            spent = f"{sum(outages_s):.1f} s in all, the longest {max(outages_s):.1f} s: no picture came"
+            spent = f"{sum(outages_s):.1f} s in all, the longest {max(outages_s):.1f} s: no new picture came"
             found.append(f"{len(outages_s)} {'outage' if len(outages_s) == 1 else 'outages'} of the camera, {spent}")
         if torn:
             found.append(f"{len(torn)} pictures came torn or damaged and were left out; the last: {torn[-1]}")
@@ -264,10 +264,11 @@ class LiveSource(Connection):
 
     def _look_back(self, picture: Picture) -> None:
         """Count an outage before this picture, and note what is irregular in it."""
-        period_s, self._came_s = time.monotonic() - self._came_s, time.monotonic()
-        if self._sequence:  # the first picture comes when the device is ready
+        if self._still is None or self._still[2] == 1:  # a server may send its last picture again when it is asked anew
+            period_s, self._came_s = time.monotonic() - self._came_s, time.monotonic()
             outage = period_s > max(OUTAGE_S, OUTAGE_PERIODS * float(np.median(self._periods_s)))
-            (self._outages_s if outage else self._periods_s).append(period_s)
+            if self._sequence:  # the first picture comes when the device is ready
+                (self._outages_s if outage else self._periods_s).append(period_s)
         self._notes |= {picture.note} - {""}
 
     def _look_at(self, picture: Picture) -> str:

@@ -138,7 +138,7 @@ def describe_pauses(times_s: Sequence[float] | np.ndarray) -> str:
     """Pauses between frames with these times, in words; "" if there are none."""
     steps_s = np.diff(times_s)
     usual_s = float(np.median(steps_s)) if len(steps_s) else 0.0
-    long = np.flatnonzero(steps_s > PAUSE * usual_s) if usual_s > 0 else []
+    long = np.flatnonzero((steps_s > PAUSE * usual_s) & (usual_s > 0))
     if not len(long):
         return ""
     most = int(np.argmax(steps_s))

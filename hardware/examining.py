@@ -8,7 +8,7 @@ from hardware.cameras.source import await_frame
 from scenes import SensorSpec
 from twin.errors import FrameError
 from twin.frames import evenly_read, open_recording
-from twin.pins import DetectorSpec, Finding, Grade, examine
+from twin.pins import DetectorSpec, Finding, Grade, examine, with_detector
 from twin.progress import Progress, silent, stage
 from twin.types import Form, Frame
 
@@ -69,7 +69,8 @@ def examine_sensor(
         raise FrameError(
             f"{detector.name}: tuned for method '{detector.method}', --pipeline takes method 'twin'; run 'twin tune' without --method"
         )
-    frames, notes = frames_of(source, sensor, form, limit)
+    seeing = sensor if detector is None else with_detector(sensor, detector)  # frames have the size for which the detector was tuned
+    frames, notes = frames_of(source, seeing, form, limit)
     with stage(progress, "frames") as step:
         return Examination(examine(frames, sensor, detector, progress=step), notes)
 

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from hardware.cameras.choose import open_camera
-from hardware.cameras.recorded import SequentialSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.rerun_view import RerunView
@@ -289,7 +288,7 @@ class Watched:
     frames : int
         Number of frames.
     notes : list of str
-        Irregularities of the recording or session.
+        Irregularities of the recording, the session, or the camera's frames.
     valid : int
         Number of frames with a valid estimate.
     invalid : str
@@ -382,8 +381,7 @@ def watch(
         except KeyboardInterrupt:
             interrupted = True
         same = (same_estimates(source.steps, found), len(found)) if isinstance(source, SessionSource) else None
-        notes = source.notes() if isinstance(source, SequentialSource) else []
-        return Watched(session.timing(), interrupted, same, plan.record, session.count, notes, session.valid, session.invalid)
+        return Watched(session.timing(), interrupted, same, plan.record, session.count, source.notes(), session.valid, session.invalid)
 
 
 def _catch_up(session: LiveSession, kept: KeptAlso) -> None:

@@ -201,6 +201,7 @@ class ServoLoop:
             self.source.dropped,
             len(self.decided) / spent_s,
             {str(code): count for code in Decided if (count := sum(one is code for one, _ in self.decided))},
+            self.source.notes(),
         )
 
     def _follow(self) -> None:

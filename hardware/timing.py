@@ -48,6 +48,8 @@ class Timing:
         Decisions per second: to move (a step), to wait for the arm or the camera, or to hold still. NaN if the loop makes no decisions.
     decided : dict of str to int
         Number of decisions of each kind.
+    notes : list of str
+        Irregularities of the camera's frames, one line each.
     """
 
     steps: int
@@ -59,6 +61,7 @@ class Timing:
     dropped: int
     decided_hz: float = float("nan")
     decided: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         """The figures as lines of text.
@@ -71,6 +74,7 @@ class Timing:
         taken = "at each decision" if total else "when it was taken"
         spreads = {f"exposure to {made}": self.latency_s, f"age of the frame {taken}": self.age_s, f"frame to {made}": self.compute_s}
         return [
+            *(f"note: {note}" for note in self.notes),
             *(decided if total else []),
             f"{self.steps} steps at {self.rate_hz:.1f} Hz, fresh frames at {self.fresh_hz:.1f} Hz, {self.dropped} frames dropped",
             *(f"{what}: {spread}" for what, spread in spreads.items() if np.isfinite(spread.p50)),

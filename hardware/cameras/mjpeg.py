@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 
-from hardware.cameras.reader import LiveSource, Picture, ReadFailed, capture
+from hardware.cameras.reader import LiveSource, Picture, ReadFailed, TornPicture, capture
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
@@ -148,12 +148,12 @@ class MjpegCamera(LiveSource):
         except (OSError, EOFError, http.client.HTTPException) as error:
             self._close()  # so that it is opened again
             raise ReadFailed(str(error) or type(error).__name__) from error
-        image = decode_jpeg(data)
+        image, note = decode_jpeg(data)
         number = int(headers["x-sequence"]) if headers.get("x-sequence", "").isdecimal() else None
         lost = max(0, number - self._last - 1) if number is not None and self._last is not None else 0
         if number is not None:
             self._last = number
-        return Picture(image, stamped_s(headers), lost)
+        return Picture(image, stamped_s(headers), lost, note)
 
     def _finish(self, image: np.ndarray) -> np.ndarray:
         return capture(image, self._spec, self.form)
@@ -180,14 +180,17 @@ def next_part(stream: Readable) -> tuple[dict[str, str], bytes]:
     return headers, data
 
 
-def decode_jpeg(data: bytes) -> np.ndarray:
-    """A JPEG as gray (H, W) or RGB (H, W, 3) uint8. An incomplete or damaged one raises ``ReadFailed``, because decoders guess the rest."""
+def decode_jpeg(data: bytes) -> tuple[np.ndarray, str]:
+    """A JPEG as gray (H, W) or RGB (H, W, 3) uint8, and a note as of ``picture_of``.
+
+    An incomplete or damaged one raises ``TornPicture``, because decoders guess the rest.
+    """
     if not data.startswith(START) or not data.rstrip(b"\0\r\n").endswith(END):
-        raise ReadFailed(f"a torn JPEG ({len(data)} bytes, without its {'end' if data.startswith(START) else 'start'})")
+        raise TornPicture(f"a torn JPEG ({len(data)} bytes, without its {'end' if data.startswith(START) else 'start'})")
     try:
-        return picture_of(data)[0]
+        return picture_of(data)
     except FrameError as error:
-        raise ReadFailed(f"a damaged JPEG: {error}") from error
+        raise TornPicture(f"a damaged JPEG: {error}") from error
 
 
 def stamped_s(headers: dict[str, str]) -> float:

@@ -7,6 +7,7 @@ it for the recordings' form.
 import threading
 import time
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -32,6 +33,10 @@ BLACK_LEVEL = 16
 # Longest time, s, to the first picture of a real camera after opening. In addition it may take FIRST_PERIODS periods of its frames.
 START_S = 4.0
 FIRST_PERIODS = 5
+# An outage is longer than this many usual times between pictures, and than this time in s.
+OUTAGE_PERIODS, OUTAGE_S = 5.0, 0.25
+# Number of newest times between pictures, of which the median is the usual one.
+KEPT_PERIODS = 30
 
 
 @dataclass(frozen=True)
@@ -46,15 +51,22 @@ class Picture:
         Time of the exposure in ``time.monotonic()`` seconds, as precisely as it is known.
     lost : int
         Number of pictures before this one that the device reports as lost.
+    note : str
+        What was irregular in its file ("" if nothing).
     """
 
     image: np.ndarray
     time_s: float
     lost: int = 0
+    note: str = ""
 
 
 class ReadFailed(Exception):  # noqa: N818  (no error until it happens too often)
     """A picture could not be read; the reader tries again."""
+
+
+class TornPicture(ReadFailed):
+    """A picture came incomplete or damaged."""
 
 
 class LiveSource(Connection):
@@ -127,6 +139,19 @@ class LiveSource(Connection):
         """Number of frames from the device so far, including lost ones."""
         return self._sequence
 
+    def notes(self) -> list[str]:
+        """Outages, torn and repeated pictures, and irregular files so far, one line each."""
+        with self._new:
+            outages_s, torn, found = list(self._outages_s), list(self._torn), list(self._notes)
+        if outages_s:
+            spent = f"{sum(outages_s):.1f} s in all, the longest {max(outages_s):.1f} s: no new picture came"
+            found.append(f"{len(outages_s)} {'outage' if len(outages_s) == 1 else 'outages'} of the camera, {spent}")
+        if torn:
+            found.append(f"{len(torn)} pictures came torn or damaged and were left out; the last: {torn[-1]}")
+        if self._repeated:
+            found.append(f"{self._repeated} of {self._sequence} pictures repeat the one before them")
+        return found
+
     @property
     def fault(self) -> str:
         """The fault of the pictures, in words: frozen, black or late; "" if there is none."""
@@ -190,6 +215,12 @@ class LiveSource(Connection):
         self._fault = ""
         self._read_last, self._sequence, self._dropped, self._delivered = -1, 0, 0, 0
         self._still: tuple[np.ndarray, float, int] | None = None  # picture, since when, how often
+        self._came_s = 0.0
+        self._periods_s: deque[float] = deque([1.0 / self.fps], maxlen=KEPT_PERIODS)
+        self._outages_s: list[float] = []
+        self._torn: list[str] = []
+        self._notes: set[str] = set()
+        self._repeated = 0
 
     def _run(self) -> None:
         in_a_row = 0
@@ -200,6 +231,9 @@ class LiveSource(Connection):
             except ReadFailed as failure:
                 self.failed += 1
                 in_a_row += 1
+                if isinstance(failure, TornPicture):
+                    with self._new:
+                        self._torn.append(str(failure))
                 if in_a_row > MOST_FAILED_READS:
                     self._give_up(
                         DeviceError(f"{in_a_row} reads in a row failed, the last: {failure}; check camera and cable, then connect again")
@@ -212,6 +246,7 @@ class LiveSource(Connection):
                 in_a_row = 0
                 with self._new:
                     self._fault = self._look_at(picture)
+                    self._look_back(picture)
                     self._sequence += 1 + picture.lost
                     self._dropped += 1 + picture.lost
                     name = f"frame_{self._sequence:06d}.png"
@@ -227,6 +262,15 @@ class LiveSource(Connection):
             self._error = error
             self._new.notify_all()
 
+    def _look_back(self, picture: Picture) -> None:
+        """Count an outage before this picture, and note what is irregular in it."""
+        if self._still is None or self._still[2] == 1:  # a server may send its last picture again when it is asked anew
+            period_s, self._came_s = time.monotonic() - self._came_s, time.monotonic()
+            outage = period_s > max(OUTAGE_S, OUTAGE_PERIODS * float(np.median(self._periods_s)))
+            if self._sequence:  # the first picture comes when the device is ready
+                (self._outages_s if outage else self._periods_s).append(period_s)
+        self._notes |= {picture.note} - {""}
+
     def _look_at(self, picture: Picture) -> str:
         if picture.image.max(initial=0) < BLACK_LEVEL:
             return "the picture is black; check the sensor's lamps and the camera's exposure"
@@ -240,6 +284,7 @@ class LiveSource(Connection):
         if self._still is None or not np.array_equal(self._still[0], picture.image):
             self._still = (picture.image, picture.time_s, 1)
             return ""
+        self._repeated += 1
         image, since_s, count = self._still
         self._still = (image, since_s, count + 1)
         if count + 1 >= FROZEN_N and picture.time_s - since_s >= FROZEN_S:

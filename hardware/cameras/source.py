@@ -36,6 +36,9 @@ class FrameSource(Protocol):
     def fault(self) -> str:
         """What is wrong with the pictures ("" if nothing)."""
 
+    def notes(self) -> list[str]:
+        """What was irregular in the frames so far, one line each: pauses, damaged, repeated and unreadable frames."""
+
     def connect(self) -> None: ...
 
     def disconnect(self) -> None: ...

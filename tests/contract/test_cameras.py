@@ -1,5 +1,6 @@
 """One suite over every frame source: the twin, a folder, a video, a session, a stream over a real socket, a USB camera."""
 
+import re
 import socket
 import threading
 import time
@@ -212,6 +213,7 @@ class TestStream:
         emulator.faults.clear()
         self._until(lambda: not camera.fault)
         assert camera.read(timeout_s=2).image.size
+        assert any("pictures repeat the one before them" in note for note in camera.notes())
 
     def test_a_black_picture_is_noticed(self, stream):
         emulator, camera = stream
@@ -227,6 +229,7 @@ class TestStream:
         frames = [camera.read(timeout_s=2) for _ in range(5)]
         assert all(frame.image.shape == (48, 64) for frame in frames)
         assert all(frame.image[-8:].std() > 10 for frame in frames)  # noise down to the last rows
+        assert any(re.match(r"[3-9]\d* pictures came torn or damaged and were left out; the last: a torn JPEG", n) for n in camera.notes())
 
     def test_lost_pictures_are_counted(self, stream):
         emulator, camera = stream
@@ -256,6 +259,7 @@ class TestStream:
             camera.read_after(time.monotonic() + 0.1, timeout_s=0.5)
         assert camera.read_after(time.monotonic(), timeout_s=5).image.size
         assert camera.failed > 0
+        assert re.match(r"1 outage of the camera, [01]\.\d s in all, the longest", camera.notes()[0])
 
     def test_unplugged_for_good_ends_with_a_clear_error(self, stream):
         emulator, camera = stream

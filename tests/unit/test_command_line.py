@@ -6,6 +6,7 @@ import io
 import os
 import re
 import subprocess
+import sys
 from collections.abc import Iterator
 from importlib import import_module, metadata
 from pathlib import Path
@@ -121,6 +122,30 @@ def test_make_demo_replaces_a_demo_of_an_earlier_version_in_its_own_folder_alone
     call = told.splitlines()[-1].split()
     assert call[:2] == [".venv/bin/twin", "demo"]
     assert ("--force" in call) == forced
+
+
+def in_a_new_process(code, folder, path):
+    """Exit code and stderr of Python code that runs in a folder, with these folders before the installed ones."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, path))}
+    done = subprocess.run([sys.executable, "-P", "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
+    return done.returncode, done.stderr
+
+
+def test_a_deleted_working_folder_is_one_line(tmp_path):
+    (tmp_path / "gone").mkdir()
+    code = "import os; os.rmdir(os.getcwd()); import sys; sys.argv = ['twin', 'sensors']; from twin.cli import main; main()"
+    code, err = in_a_new_process(code, tmp_path / "gone", [ROOT])
+    assert code == 1 and err == "twin: error: the working folder was deleted; change into a folder that exists\n"
+
+
+@pytest.mark.parametrize("name", ["training", "hardware", "scenes"])
+def test_a_folder_that_hides_a_package_is_named(tmp_path, name):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "__init__.py").touch()
+    code, err = in_a_new_process("from twin.cli import main; main()", tmp_path, [tmp_path, ROOT])
+    assert code == 1 and err.splitlines()[-1].endswith(
+        f"{tmp_path / name} hides {ROOT / name} of tactip-twin; rename it, or start in another folder"
+    )
 
 
 @pytest.mark.parametrize("path", sorted(CLI.glob("*.py")), ids=lambda path: path.stem)

@@ -5,17 +5,20 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from drawn_frames import drawn_frame
+from drawn_frames import draw_discs, drawn_frame
 from plain_sensor import changed, plain
 
+from hardware.examining import examine_sensor
 from scenes import load_sensor
 from twin.camera.truth import cap_truth
+from twin.frames.forms import blob_spec, frame_size
+from twin.frames.images import write_image
 from twin.geometry.pins import rest_pins
 from twin.judge.degradation.condition import Case
 from twin.judge.degradation.conditions import CONDITIONS
 from twin.judge.degradation.shots import CONTACTS, Contact, RenderedSource, pins_under
 from twin.mechanics.path import ContactPose
-from twin.pins import Grade, examine
+from twin.pins import DetectorSpec, Grade, examine
 from twin.pins.check import drift_of
 from twin.pins.reference import nominal_reference
 from twin.types import Form, Frame
@@ -109,3 +112,20 @@ def test_a_contact_is_not_taken_for_a_nearer_camera(contact):
     assert drift.scale > 1.008 and abs(drift.scale_at_rest - 1) < 0.015
     zoomed = drift_of(1.05 * seen, reference.pins_px, reference.outmost)
     assert zoomed.scale_at_rest == pytest.approx(1.05 * drift.scale_at_rest, rel=0.01)
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 6.0])
+def test_frames_of_the_size_for_which_the_detector_was_tuned_are_checked(tmp_path, shift_px):
+    """A recording of another size than the specification's: 'twin tune' takes it, so 'twin check' takes it with what that wrote.
+
+    The pins are compared with the calibrated ones in the other size, not with those of the tuning itself."""
+    spec, size_px = load_sensor("mg400-127"), (320, 320)
+    scale = np.array(size_px) / frame_size(spec, Form.RECORDING)
+    rest_px = (nominal_reference(spec, Form.RECORDING).pins_px + 0.5) * scale - 0.5 + [shift_px, 0.0]
+    write_image(tmp_path / "a.png", draw_discs(size_px, rest_px, 5.0, level=(0, 255)))
+    blob = blob_spec(spec.pipeline, Form.RECORDING).model_copy(update={"mask_center_px": (159.5, 159.5), "mask_radius_px": 158.0})
+    places = tuple(map(tuple, rest_px.tolist()))
+    tuned = DetectorSpec(name="mine", method="twin", form=Form.RECORDING, size_px=size_px, blob=blob, pins_px=places)
+    found = {each.name: each for each in examine_sensor(str(tmp_path / "a.png"), spec, detector=tuned).findings}
+    assert found["pins"].verdict is Grade.GOOD
+    assert (found["shift"].verdict is Grade.GOOD) == (not shift_px), found

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from twin.frames.tables import numbers, order_by_table
+from scenes import list_experiments, load_experiment
+from twin.frames.tables import numbers, order_by_table, unlikely_units
 
 MANY = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 FRAMES = [f"f_{k}.png" for k in range(6)]
@@ -142,3 +143,36 @@ def test_a_number_with_an_underscore_is_a_slip_of_the_hand_and_no_number(tmp_pat
     """Python itself reads 1_5 as 15."""
     found, _ = read(tmp_path, Written([(name, ("1_5", "2.5")) for name in FRAMES], LABELS))
     assert np.isnan(found["f_0.png"]["pose_2"]) and found["f_0.png"]["pose_6"] == 2.5
+
+
+EXPERIMENTS = [load_experiment(name) for name in list_experiments()]
+
+
+def in_units(length, angle, ranges):
+    """Labels of 200 contacts sampled from ranges in mm and deg, as they are in other units."""
+    rng = np.random.default_rng(0)
+    scale = {name: length if name[-1] in "123" else angle for name in ranges}
+    return {name: scale[name] * rng.uniform(*ends, 200) for name, ends in ranges.items() if name.startswith(("pose_", "move_"))}
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS, ids=lambda experiment: experiment.name)
+def test_lengths_in_metres_are_named_and_the_right_units_are_not(experiment):
+    ranges = experiment.ranges()
+    assert unlikely_units(in_units(1.0, 1.0, ranges)) == []
+    (said,) = unlikely_units(in_units(1e-3, 1.0, ranges))
+    assert "in mm" in said and "in m," in said
+    (said,) = unlikely_units(in_units(1e3, 1.0, ranges))
+    assert "in um," in said
+
+
+@pytest.mark.parametrize("widest_deg", [10.0, 40.0, 60.0, 360.0])
+def test_angles_in_radians_are_named(widest_deg):
+    ranges = {"pose_3": (2.0, 5.0), "pose_6": (-widest_deg / 2, widest_deg / 2), "move_6": (-5.0, 5.0)}
+    assert unlikely_units(in_units(1.0, 1.0, ranges)) == []
+    (said,) = unlikely_units(in_units(1.0, np.radians(1.0), ranges))
+    assert "in deg, pose_6" in said and "in rad," in said
+
+
+def test_constant_missing_and_foreign_columns_tell_no_unit():
+    labels = {"pose_1": np.full(5, 0.35), "pose_2": np.full(5, np.nan), "move_6": np.array(["-"] * 5), "Fx": np.linspace(0, 1e-3, 5)}
+    assert unlikely_units(labels) == [] == unlikely_units({})

@@ -34,6 +34,20 @@ def frame(k: int, image=None) -> Frame:
     return Frame(np.full((8, 8), k, np.uint8) if image is None else image, Form.RECORDING, f"f{k}", 0.5 * k, k + 1)
 
 
+def test_pauses_unread_frames_and_frames_that_are_used_again_are_said(tmp_path):
+    """The camera's frames come every 0.5 s; 4 to 9 were not read, and the last one was used twice."""
+    with SessionWriter(tmp_path / "s", {}) as session:
+        for k in (0, 1, 2, 3, 10, 11, 11):
+            session.append(frame(k), {})
+    notes = "".join(open_records(tmp_path / "s").notes)
+    assert "1 pause, 3.5 s in all, the longest 3.5 s after frame 3; usually 0.5 s" in notes
+    assert "6 frames of the camera between the recorded ones" in notes and "1 of 7 steps use the frame of the step before" in notes
+    with SessionWriter(tmp_path / "even", {}) as session:
+        for k in range(4):
+            session.append(frame(k), {})
+    assert open_records(tmp_path / "even").notes == []
+
+
 @pytest.mark.parametrize("after_s", [0.21, *(pytest.param(more, marks=pytest.mark.slow) for more in (0.05, 0.43))])
 def test_killed_at_any_moment_it_is_whole_up_to_the_last_line(tmp_path, after_s):
     process = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path / "s")], stdout=subprocess.PIPE, env=os.environ)

@@ -120,6 +120,13 @@ def main() -> None:
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a letter that the encoding lacks is printed as its code, as on stderr
+    try:
+        os.getcwd()  # libraries fail without one, each in its own way
+        import_module("twin").require_own("training", "hardware")
+    except (OSError, ImportError) as error:
+        reason = error if isinstance(error, ImportError) else "the working folder was deleted; change into a folder that exists"
+        print(f"twin: error: {reason}", file=sys.stderr)
+        sys.exit(FAILED)
     warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {' '.join(str(message).split())}\n"
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # without a writable home directory it prints four lines of warnings
     try:

@@ -10,7 +10,7 @@ from twin.errors import FrameError
 from twin.types import Form
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
-VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".gif"})
 IMAGE_FOLDERS = ("frames_bw", "sensor_images", "images", "processed_images")
 # Names of no-contact frames in use, besides init_*.
 NO_CONTACT_NAME = re.compile(

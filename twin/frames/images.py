@@ -2,11 +2,14 @@
 
 The libraries that OpenCV uses print messages to the process's stderr, where Python code can't catch them. `quiet` redirects stderr
 during one decoder call.
+
+Pixels are taken as they are stored, because a sensor's calibration counts them so. An orientation flag (EXIF) is stated, never applied.
 """
 
 import contextlib
 import os
 import re
+import struct
 import threading
 import zlib
 from collections.abc import Iterator
@@ -25,8 +28,16 @@ PNG_CHUNK_FRAME = 12
 """Bytes of a PNG chunk without its data: length, kind and checksum, 4 bytes each."""
 LARGEST_BYTES = 500_000_000
 """Largest size of a picture's file, bytes: ten times an uncompressed 16-bit colour picture of an 8-megapixel camera."""
-SEVERAL_FROM_START = (b"II*\0", b"MM\0*", b"RIFF")
-"""First bytes of TIFF and WebP files, which can hold several pictures."""
+SEVERAL_FROM_START = (b"II*\0", b"MM\0*", b"RIFF", b"GIF8")
+"""First bytes of TIFF, WebP and GIF files, which can hold several pictures."""
+TIFF_STARTS = {b"II*\0": "<", b"MM\0*": ">"}
+"""First bytes of TIFF files, which are also those of EXIF data, and the order of bytes that each states."""
+EXIF_MARKS = {b"": 0, b"Exif\0\0": 6, b"eXIf": 4, b"EXIF": 8}
+"""Marks before EXIF data in TIFF, JPEG, PNG and WebP files, and the number of bytes from each mark to the data."""
+ORIENTATION, UPRIGHT = 0x0112, 1
+"""EXIF's tag of the orientation (CIPA DC-008), and its value for pictures that are shown as they are stored."""
+NOT_TURNED = "an orientation flag ({}) is not applied: pixels are taken as they are stored"
+"""Note on a picture or video that a player would show turned or mirrored."""
 ADDED_BYTES = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
 """The JPEG decoder's message about extra bytes after a complete picture. Some cameras add such bytes."""
 DAMAGE = re.compile(
@@ -45,8 +56,6 @@ _lock = threading.Lock()
 _hearing = threading.Lock()  # one decoder call at a time, so that the messages belong to this call
 _inside = 0  # number of calls that currently need stderr redirected
 _kept: int | None = None  # the original stderr while it is redirected
-
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET; OpenCV reads it when it opens its first video
 
 
 def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
@@ -126,6 +135,9 @@ def _decoded(data: bytes) -> tuple[np.ndarray, str]:
     """Levels as of ``decode`` from a picture's bytes, and a note on irregularities that its decoder reported ("" if there are none)."""
     if data.startswith(PNG_START) and (torn := _png_fault(data)):
         raise FrameError(f"{torn}; copy it again")
+    orientation, place = _orientation(data)
+    if place and data[:4] in TIFF_STARTS:  # OpenCV turns TIFF pictures, whatever it is told
+        data = data[:place] + struct.pack(f"{TIFF_STARTS[data[:4]]}H", UPRIGHT) + data[place + 2 :]
     try:
         with overheard() as said:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -137,9 +149,25 @@ def _decoded(data: bytes) -> tuple[np.ndarray, str]:
         raise FrameError(f"expected 8-bit levels, got {image.dtype}; convert it to 8 bits")
     if fault := DAMAGE.search(said[0]):
         raise FrameError(f"damaged ({fault[0]}); copy it again, or leave it out")
+    odd = [NOT_TURNED.format(f"EXIF {orientation}")] if orientation != UPRIGHT else []
     if extra := ADDED_BYTES.search(said[0]):
-        return image, f"holds {extra[1]} bytes that belong to no part of it: damaged, or of a camera that adds some; look at its pins"
-    return image, ""
+        odd.append(f"holds {extra[1]} bytes that belong to no part of it: damaged, or of a camera that adds some; look at its pins")
+    return image, "; ".join(odd)
+
+
+def _orientation(data: bytes) -> tuple[int, int]:
+    """EXIF's orientation that a picture's file states, and the place of its two bytes; ``UPRIGHT`` and 0 if it states none."""
+    for mark, skip in EXIF_MARKS.items():
+        start = data.find(mark) + skip
+        order = TIFF_STARTS.get(data[start : start + 4])
+        if order is None:
+            continue
+        with contextlib.suppress(struct.error):
+            place = start + int(struct.unpack_from(f"{order}I", data, start + 4)[0])
+            for entry in range(place + 2, place + 2 + 12 * struct.unpack_from(f"{order}H", data, place)[0], 12):
+                if struct.unpack_from(f"{order}H", data, entry)[0] == ORIENTATION:
+                    return struct.unpack_from(f"{order}H", data, entry + 8)[0] or UPRIGHT, entry + 8
+    return UPRIGHT, 0
 
 
 def _holds_several(path: Path, data: bytes) -> bool:

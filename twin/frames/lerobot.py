@@ -71,14 +71,19 @@ class LeRobotFrames:
             return
         for index in wanted:
             try:
-                yield index, self._as_first(picture_of(self._stored(*self._places[index]))[0])
+                image, note = picture_of(self._stored(*self._places[index]))
+                said = f"{self.path.name}: pictures of {self._feature}: {note}"
+                self.problems += [said] if note and said not in self.problems else []
+                yield index, self._as_first(image)
             except FrameError as error:
                 yield index, str(error)
 
     def _from_videos(self, wanted: list[int]) -> Iterator[tuple[int, np.ndarray | str]]:
         for path in dict.fromkeys(self._places[index][0] for index in wanted):
             number = {self._places[index][2]: index for index in wanted if self._places[index][0] == path}
-            for k, _, image in open_video(path).frames():
+            video = open_video(path)
+            self.problems += [problem for problem in video.problems if problem not in self.problems]
+            for k, _, image in video.frames():
                 if k in number:
                     yield number.pop(k), image if isinstance(image, str) else self._as_first(image)
                 if not number:

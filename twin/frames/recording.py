@@ -15,7 +15,7 @@ from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_
 from twin.frames.forms import FrameKind, KnownFrames, common_kind, form_named, form_of, known_frames, times
 from twin.frames.images import read_image
 from twin.frames.lerobot import INFO, RESTS, LeRobotFrames, is_lerobot, open_lerobot
-from twin.frames.tables import TABLES, order_by_table, read_metadata
+from twin.frames.tables import TABLES, counted, order_by_table, read_metadata, unlikely_units
 from twin.frames.videos import Video, open_video
 from twin.types import Form, Frame
 
@@ -129,7 +129,11 @@ class Recording:
 
     def notes(self) -> list[str]:
         """Irregularities of the recording, and the frames that could not be read so far, one line each."""
-        return [*self.problems, *(f"skipped {bad['image_name']}: {bad['reason']}" for bad in self.failed)]
+        alike: dict[str, list[str]] = {}
+        for bad in self.failed:
+            alike.setdefault(bad["reason"], []).append(bad["image_name"])
+        skipped = {said: names[0] if len(names) == 1 else counted(len(names), "frames", names) for said, names in alike.items()}
+        return [*self.problems, *(f"skipped {named}: {said}" for said, named in skipped.items())]
 
     def labels_found(self) -> str:
         """The available labels, in words for a message: the table's columns, or why no table can be used."""
@@ -316,6 +320,7 @@ def open_recording(
     recording = _opened(path, None if spec is None else known_frames(spec), form, table)
     if no_contact is not None:
         recording.must_take_reference(no_contact)
+    recording.problems += unlikely_units(recording.labels)
     return recording
 
 

@@ -27,6 +27,12 @@ CALLED_HERE = {
     **{f"observation.state.{axis}.pos": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
     **{axis: f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
 }
+# Ranges of poses and moves in mm, between which a sensor's contacts lie: below the first they are probably in m (contacts within 100 mm),
+# above the second, which no arm here reaches, in um.
+MM_RANGES = (0.1, 2000.0)
+# Range of poses and moves in deg below which they are probably in rad (within 34 deg), and the share by which a range may differ from a
+# quarter, a half or a whole turn in rad.
+RAD_RANGE, TURN_SHARE, TURNS_RAD = 1.2, 0.01, (np.pi / 2, np.pi, 2 * np.pi)
 # Characters that may separate the cells of a row. The most frequent one in the header is used.
 SEPARATORS = (",", ";", "\t")
 # Largest size of a table or of metadata, bytes: a million rows of a hundred characters.
@@ -228,6 +234,26 @@ def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -
 def called_here(labels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Columns (M,). Columns with names of other conventions are also given under the names used here."""
     return labels | {here: cells for name, cells in labels.items() if (here := CALLED_HERE.get(name.casefold())) and here not in labels}
+
+
+def unlikely_units(labels: dict[str, np.ndarray]) -> list[str]:
+    """Doubts about the unit of a table's poses and moves, one line each. Lengths are in mm, angles in deg.
+
+    A table has one unit for all lengths, and one for all angles, so the widest column of each decides. A column that is constant tells
+    nothing.
+    """
+    ranges = {"mm": [(0.0, "")], "deg": [(0.0, "")]}
+    for name, cells in labels.items():
+        if re.fullmatch("(pose|move)_[1-6]", name) and np.isfinite(values := numbers(cells)).any():
+            ranges["mm" if name[-1] in "123" else "deg"].append((float(np.nanmax(values) - np.nanmin(values)), name))
+    (length, _), (angle, _) = widest = [max(each) for each in ranges.values()]
+    others = ["m" if 0 < length < MM_RANGES[0] else "um" if length > MM_RANGES[1] else ""]
+    others += ["rad" if 0 < angle < RAD_RANGE or any(abs(angle / turn - 1) < TURN_SHARE for turn in TURNS_RAD) else ""]
+    return [
+        f"labels in another unit? Of the columns in {unit}, {name} has the widest range: {span:.3g}; if they are in {other}, convert them"
+        for unit, (span, name), other in zip(ranges, widest, others, strict=True)
+        if other
+    ]
 
 
 def _as_array(cells: list[str]) -> np.ndarray:

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scenes.sensor import SensorSpec, UsualCapsSpec
 from twin.camera.capture import expose
 from twin.frames import spread
-from twin.frames.forms import gray_levels
+from twin.frames.forms import blob_spec, gray_levels, known_frames
 from twin.optics.preview import Preview
 from twin.pins.caps import Caps, measure_caps
 from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
@@ -106,7 +106,11 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
     """
     form = frames[0].form
     detector = detector or shipped_detector(spec, form)
-    pipeline = Pipeline(with_detector(spec, detector), form)
+    tuned = with_detector(spec, detector)
+    pipeline = Pipeline(tuned, form)
+    if known_frames(tuned) != known_frames(spec):  # tuned for another size: the calibrated pins are those of the view scaled to it
+        blob = blob_spec(tuned.pipeline, form).model_copy(update={"rest_px": ()})
+        spec = tuned.model_copy(update={"pipeline": tuned.pipeline.model_copy(update={str(form): blob})})
     seen = []
     for k, frame in enumerate(frames):
         seen.append(pipeline(frame))

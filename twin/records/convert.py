@@ -10,7 +10,7 @@ import numpy as np
 
 from scenes import SensorSpec, SpecError, load_sensor
 from scenes.files import LONGEST_PATH, shown
-from twin.errors import FrameError
+from twin.errors import FrameError, warn_once
 from twin.frames.forms import frame_size, times
 from twin.frames.lerobot import RESTS
 from twin.pins.pipeline import Pipeline, measure_reference
@@ -240,7 +240,7 @@ def convert(
         before, total = len(writer.facts), sum(len(records.episodes) for records in opened)
         writer.write(_missing(opened, writer, lambda done: step(done, total)))
         facts = writer.facts
-    notes = list(dict.fromkeys(note for records in opened for note in records.notes))
+    notes = list(dict.fromkeys([*(note for records in opened for note in records.notes), *writer.notes()]))
     return Converted(out, to, len(facts), sum(int(each["length"]) for each in facts), before, notes)
 
 
@@ -310,3 +310,5 @@ class KeptAlso:
                 self._writers.append(self._open.enter_context(writer))
         for writer in self._writers:
             writer.write(_missing([records], writer, lambda done: None))
+            for note in writer.notes():
+                warn_once(note)

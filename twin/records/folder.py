@@ -93,6 +93,10 @@ class FolderWriter(ABC):
             self.keys |= {facts["key"] for facts in group}
         return len(self.facts) - before
 
+    def notes(self) -> list[str]:
+        """What the format could not hold of the episodes that were written, one line each."""
+        return []
+
     @abstractmethod
     def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
         """Write episodes, several together if this suits the format, and give the facts of each group as soon as the group is complete."""

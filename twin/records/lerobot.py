@@ -2,8 +2,8 @@
 
 Each file appears under its name only when it is complete, and ``meta/info.json`` counts an episode only after its files. Therefore the data
 set is readable after any interruption, up to its last finished episode. As LeRobot requires, ``timestamp`` is the frame's number divided by
-the whole number of frames per second. The true times are in ``observation.time_s``. In addition to LeRobot's columns, the table of episodes
-has ``tactip/facts``.
+the whole number of frames per second. The true times are in ``observation.time_s``; a note tells where the two differ by more than half a
+frame. In addition to LeRobot's columns, the table of episodes has ``tactip/facts``.
 """
 
 import json
@@ -19,8 +19,9 @@ import numpy as np
 
 from twin.errors import FrameError
 from twin.frames import open_recording
+from twin.frames.videos import describe_pauses
 from twin.records.folder import AGAIN, FolderWriter, image_of, png, read_json, read_sidecar, records_in
-from twin.records.record import CHANNELS, IMAGE, TIME, About, Episode, RecordError, Records, Step, library
+from twin.records.record import CHANNELS, IMAGE, TIME, About, Episode, RecordError, Records, Step, library, off_s
 from twin.store import write_json, write_text, write_with
 from twin.types import Form
 
@@ -72,6 +73,7 @@ class LeRobotWriter(FolderWriter):
         self.video, self.held_bytes = video, held_mb * 1e6
         self._file = self._frames = 0  # number of the next file, and number of frames so far
         self._tasks: list[str] = []
+        self._off: list[tuple[float, str, str]] = []  # largest error of a time (s), key and pauses of an episode
         self._stats: dict[str, dict[str, np.ndarray]] = {}
 
     def _said(self) -> dict[str, Any]:
@@ -152,12 +154,27 @@ class LeRobotWriter(FolderWriter):
                     table.write_table(pa.Table.from_pylist(rows, schema))
                 if not length:
                     continue
+                self._compare_times(np.array(gathered.times_s), episode.key)
                 stats = gathered.stats(self.rate_hz, number, frames, task)
                 row = self._episode_row(episode, number, frames, length, at)
                 group.append((row, self._facts(episode, length), stats))
                 frames += length
         if film is not None:
             film.close()
+
+    def notes(self) -> list[str]:
+        if not self._off:
+            return []
+        most_s, key, pauses = max(self._off)
+        where = f"{len(self._off)} episodes, by up to {most_s:.3g} s in {key}{f' ({pauses})' if pauses else ''}"
+        stamp = f"timestamp, as LeRobot wants it (frame number / {self.rate_hz} fps), is more than half a frame off the true times in"
+        return [f"{stamp} {where}; the true times are in {TIME}"]
+
+    def _compare_times(self, times_s: np.ndarray, key: str) -> None:
+        """Remember an episode in which ``timestamp`` is more than half a frame off the true times."""
+        most_s = float(off_s(times_s, self.rate_hz).max())
+        if most_s > 0.5 / self.rate_hz:
+            self._off.append((most_s, key, describe_pauses(times_s)))
 
     def _task(self, text: str) -> int:
         if text not in self._tasks:
@@ -292,7 +309,7 @@ class _Gathered:
 
     def __init__(self, about: About) -> None:
         self._values: dict[str, list[np.ndarray]] = {name: [] for name in about.numbers}
-        self._times: list[float] = []
+        self.times_s: list[float] = []
         self._pictures: list[np.ndarray] = []
         self._every = 1
 
@@ -300,7 +317,7 @@ class _Gathered:
         """Add a step. Of a long episode only every second picture is kept, then every fourth, and so on."""
         for name, values in self._values.items():
             values.append(np.asarray(step.values[name], np.float32))
-        self._times.append(step.time_s)
+        self.times_s.append(step.time_s)
         if number % self._every == 0:
             self._pictures.append(_colour(step.image)[::PIXEL_STEP, ::PIXEL_STEP])
         if len(self._pictures) > 2 * SAMPLED:
@@ -308,7 +325,7 @@ class _Gathered:
 
     def stats(self, rate_hz: int, number: int, start: int, task: int) -> dict[str, dict[str, np.ndarray]]:
         """Statistics of each column, in LeRobot's shapes: (3, 1, 1) for pictures, with values from 0 to 1, and (2,) for pins."""
-        length = len(self._times)
+        length = len(self.times_s)
         pixels = np.stack(self._pictures).reshape(-1, 3) / 255.0
         found = {IMAGE: {key: value.reshape(-1, 1, 1) for key, value in _spread(pixels).items()}}
         for name, values in self._values.items():
@@ -316,7 +333,7 @@ class _Gathered:
             found[CHANNELS[name].column] = _spread(stacked.reshape(-1, stacked.shape[-1]))
         frames = np.arange(length)
         counters = (frames, np.full(length, number), start + frames, np.full(length, task))
-        plain = {TIME: np.array(self._times), "timestamp": frames / rate_hz} | dict(zip(COUNTERS, counters, strict=True))
+        plain = {TIME: np.array(self.times_s), "timestamp": frames / rate_hz} | dict(zip(COUNTERS, counters, strict=True))
         found |= {name: _spread(np.asarray(values, float)[:, None]) for name, values in plain.items()}
         return {name: each | {"count": np.array([len(self._pictures) if name == IMAGE else length])} for name, each in found.items()}
 

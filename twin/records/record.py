@@ -260,13 +260,23 @@ class Records:
         return self if not task else replace(self, episodes=[replace(episode, task=task) for episode in self.episodes])
 
     def rate_hz(self) -> int:
-        """Whole number of frames per second, from the times of the first episode with several steps."""
+        """Whole number of frames per second, from the times of the first episode with several steps.
+
+        It is the usual rate, which a pause does not change, or the mean one: the one by which more frames have their true time.
+        """
         for episode in self.episodes:
             if episode.length > 1:
-                *_, last = episode.steps()
-                lasted_s = max(last.time_s, 1.0 / FASTEST_HZ)
-                return int(np.clip(round((episode.length - 1) / lasted_s), 1, FASTEST_HZ))
+                times_s = np.array([step.time_s for step in episode.steps()])
+                shortest_s = 1.0 / FASTEST_HZ
+                steps_s = [np.median(np.diff(times_s)), times_s[-1] / (len(times_s) - 1)] if len(times_s) > 1 else []
+                rates_hz = [max(1, round(1.0 / max(step_s, shortest_s))) for step_s in steps_s]
+                return max(rates_hz, key=lambda hz: int((off_s(times_s, hz) <= 0.5 / hz).sum()), default=round(NOMINAL_HZ))
         return round(NOMINAL_HZ)
+
+
+def off_s(times_s: np.ndarray, rate_hz: int) -> np.ndarray:
+    """Differences (n,), s, between the times (n,) of an episode's frames and those of as many frames at a rate."""
+    return np.abs(times_s - np.arange(len(times_s)) / rate_hz)
 
 
 def digest(*parts: object) -> str:

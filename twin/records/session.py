@@ -23,6 +23,7 @@ from scenes.files import read_regular, shown
 from twin.errors import FrameError, StoreError
 from twin.frames.forms import times
 from twin.frames.images import read_image, write_image
+from twin.frames.videos import describe_pauses
 from twin.records.record import CHANNELS, About, Episode, Records, Step, digest, float32, seconds
 from twin.rig.mounting import Mounting
 from twin.store import contents, unwritten, write_json
@@ -229,6 +230,16 @@ class Session:
         except FrameError as error:
             raise FrameError(f"{self.folder}: {error}") from error
 
+    def stills(self) -> list[str]:
+        """Pauses between frames, frames that the camera took and nobody read, and steps that use a frame again, one line each."""
+        used = {line.sequence: line.time_s for line in self._lines}
+        numbers, times_s = sorted(used), [used[number] for number in sorted(used)]
+        unread, again = numbers[-1] - numbers[0] + 1 - len(numbers), len(self._lines) - len(numbers)
+        found = [describe_pauses(times_s)]
+        found += [f"{unread} frames of the camera between the recorded ones are not in the session"] if unread > 0 else []
+        found += [f"{again} of {len(self._lines)} steps use the frame of the step before them"] if again else []
+        return [f"{self.folder.name}: {each}" for each in found if each]
+
     @property
     def rest(self) -> Frame | None:
         """The no-contact frame from which displacements were computed; None if they were computed from the nominal layout."""
@@ -282,7 +293,7 @@ def session_records(folder: Path) -> Records:
         started_s=_started_s(session),
         T_tool_sensor=_sensor_on_tool(session.about),
     )
-    return Records(about, [episode], list(session.notes))
+    return Records(about, [episode], [*session.notes, *session.stills()])
 
 
 # Keys of a step's line that hold the numbers of a channel.

@@ -13,7 +13,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from scenes.sensor import BlobSpec, PipelineSpec, RecordingSpec, SensorSpec
+from scenes.sensor import BlobSpec, PipelineSpec, Polarity, RecordingSpec, SensorSpec
 from twin.errors import FrameError
 from twin.frames.images import bits_used, decode, to_eight_bits
 from twin.types import Form
@@ -115,6 +115,25 @@ def gray_levels(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.shape[2] == 3 else image[..., 0]
 
 
+def pin_levels(image: np.ndarray, polarity: Polarity) -> np.ndarray:
+    """Gray levels (H, W) in which pins are brighter than the skin: those of `gray_levels`, inverted if the pins are dark."""
+    gray = gray_levels(image)
+    return cv2.bitwise_not(gray) if polarity == "dark" else gray
+
+
+def levels_at(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """Gray levels (...,) of the pixels nearest to places (..., 2)."""
+    column, row = np.moveaxis(np.clip(np.round(px), 0, np.array(gray.shape[::-1]) - 1).astype(int), -1, 0)
+    levels: np.ndarray = gray[row, column].astype(float)
+    return levels
+
+
+def polarity_of(pipeline: PipelineSpec, form: Form) -> Polarity:
+    """Whether pins are bright or dark in frames of a form; if the sensor has no such form, as in raw frames."""
+    blob = pipeline.recording if form == Form.RECORDING else None
+    return (blob or pipeline.raw).polarity
+
+
 @dataclass(frozen=True)
 class KnownFrames:
     """A sensor's name, and (width, height) in px of its frames of each form."""
@@ -158,7 +177,12 @@ def is_two_level(image: np.ndarray) -> bool:
     """Whether a picture was thresholded at capture: its pixels are black or white, apart from the edges that a resize leaves gray."""
     if image.ndim == 3 and float(np.mean(np.ptp(image, axis=2))) > COLOURLESS_BELOW:
         return False
-    image = gray_levels(image)
+    gray = gray_levels(image)
+    return _bright_on_black(gray) or _bright_on_black(cv2.bitwise_not(gray))
+
+
+def _bright_on_black(image: np.ndarray) -> bool:
+    """Whether a gray picture (H, W) uint8 was thresholded: by its share of black and white, or as mostly black with white pins."""
     black, white = image < BLACK_BELOW, image > WHITE_ABOVE
     low, high = float(np.mean(black)), float(np.mean(white))
     resized = low > MOSTLY_BLACK and high > WHITE_OF_REST * (1 - low)

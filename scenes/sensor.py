@@ -731,7 +731,7 @@ class SensorSpec(Section):
         if self.pipeline.raw.polarity == "dark" and not self.appearance.dark_caps:
             raise ValueError(
                 "pipeline.raw.polarity = 'dark' needs caps that are darker than the skin: give appearance.skin_albedo and "
-                "appearance.pin_albedo, [0.2, 0.2, 0.2] for example, and appearance.cap_albedo, [0.01, 0.01, 0.01] for example"
+                "appearance.pin_albedo, [0.4, 0.4, 0.4] for example, and appearance.cap_albedo, [0.03, 0.03, 0.03] for example"
             )
         if self.appearance.cap_levels and len(self.appearance.cap_levels) != pins.count:
             raise ValueError(f"appearance.cap_levels needs one number for each of the {pins.count} pins; {ELSEWHERE}")

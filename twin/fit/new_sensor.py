@@ -31,7 +31,7 @@ from twin.report.page import Page, Picture
 from twin.store import output, writes_file
 from twin.types import Form, Frame
 
-DARK_CAPS = AppearanceSpec(skin_albedo=(0.2, 0.2, 0.2), pin_albedo=(0.2, 0.2, 0.2), cap_albedo=(0.01, 0.01, 0.01))
+DARK_CAPS = AppearanceSpec(skin_albedo=(0.4, 0.4, 0.4), pin_albedo=(0.4, 0.4, 0.4), cap_albedo=(0.03, 0.03, 0.03))
 """Assumed reflectances of a sensor with dark caps. With the default LEDs and exposure the skin is bright, but not white."""
 LIMIT = 40
 """Number of frames, evenly spread, from which the specification is made: enough contacts to estimate the pins at rest."""
@@ -547,7 +547,7 @@ def _told(
         "Stiffness of skin and gel: Shore A 26 to 30 rubber and a soft gel.",
         "Light, colours, noise: those of another TacTip, until 'twin calibrate optics' has found this sensor's."
         if found.polarity == "bright"
-        else "Light, noise: those of another TacTip; a gray skin and black caps.",
+        else "Light, noise: those of another TacTip; a gray skin and black caps ([appearance]).",
         *camera.held.values(),
     ]
     steps = []
@@ -564,7 +564,7 @@ def _told(
         steps.append(f"fit the contact to the labels: twin calibrate contact {files}")
     else:
         steps.append("record labelled contacts (a table targets.csv beside the frames), then 'twin calibrate contact' and 'twin train'")
-    if sensor.camera.channels == "color" and recording.form is Form.RAW:
+    if sensor.camera.channels == "color" and recording.form is Form.RAW and found.polarity == "bright":
         steps.append(f"fit light and colours: twin calibrate optics {files}")
     return known, tuple(assumed), tuple(steps)
 

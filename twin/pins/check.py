@@ -225,7 +225,7 @@ def _pins(seen: list[Observation], pipeline: Pipeline) -> Finding:
 
 
 def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
-    """Finding about bright spots among the pins that are not pins and are at the same place in most frames."""
+    """Finding about spots among the pins that are not pins and are at the same place in most frames."""
     within = SAME_SPOT * float(np.mean(pipeline.reference.spacing_px))
     radius = np.linalg.norm(pipeline.reference.pins_px - pipeline.reference.pins_px[0], axis=1).max()
     places = [o.extra_px[np.linalg.norm(o.extra_px - pipeline.reference.pins_px[0], axis=1) < radius] for o in seen]
@@ -233,8 +233,9 @@ def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
     if len(places[0]):
         hits = np.array([[len(p) and cKDTree(p).query(spot)[0] < within for p in places] for spot in places[0]], float)
         steady = int((hits.mean(axis=1) >= STEADY).sum())
+    kind = pipeline.blob_spec.polarity
     remedy = "bubbles, dust or LED reflections: clean the window, turn the sensor's LEDs, or mask them"
-    return _finding("specks", steady / len(pipeline.reference.pins_px), (0.02, 0.2), f"{steady} steady bright spots among the pins", remedy)
+    return _finding("specks", steady / len(pipeline.reference.pins_px), (0.02, 0.2), f"{steady} steady {kind} spots among the pins", remedy)
 
 
 def _place(seen: list[Observation], nominal: Reference, bulge: float) -> list[Finding]:

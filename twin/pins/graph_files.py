@@ -128,9 +128,7 @@ def _graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Fo
     notes: list[str] = []
     reference, _ = recording_reference(spec, recording, notes)
     if legacy:
-        pipeline: LegacyPipeline | Pipeline = LegacyPipeline(
-            spec.pins, spec.recording, polarity=polarity_of(spec.pipeline, recording.form)
-        )
+        pipeline: LegacyPipeline | Pipeline = LegacyPipeline(spec.pins, spec.recording, polarity=polarity_of(spec.pipeline, recording.form))
     else:
         pipeline = Pipeline(spec, recording.form, reference, graph=kind)
     names: list[str] = []

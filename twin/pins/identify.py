@@ -5,8 +5,8 @@ the lattice that holds the spots is a candidate. A candidate is judged by what i
 seen, and pin-like spots that belong to none of its pins, also at its rim and just outside it. Therefore a layout with one ring too few or
 too many explains less than the right layout, and is not chosen.
 
-Pins may be brighter or darker than the skin. The gaps between dark pins are bright spots, too, and often form a lattice that explains all of
-them. But pins have skin on all sides, while gaps have skin on some sides and pins on others (`stand_out`).
+Pins may be brighter or darker than the skin. The gaps between dark pins are bright spots, too, and often form a lattice that explains all
+of them. But pins have skin on all sides, while gaps have skin on some sides and pins on others (`stand_out`).
 """
 
 from collections.abc import Callable, Sequence
@@ -343,6 +343,15 @@ def judge_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
     Its missing pins are not changed.
     """
     by = family_of_positions(pins) if pins.layout == "positions" or pins.missing else family(pins.layout)
+    layout = _judged(pins, by, images)
+    if by.name == "positions" and pins.layout != "positions" and (layout is None or layout.explained < SHOWN):
+        grown = _judged(pins, family(pins.layout), images)  # it follows a strongly curved view, but may be a row off
+        layout = max((one for one in (layout, grown) if one is not None), key=lambda one: one.explained, default=None)
+    return layout
+
+
+def _judged(pins: PinsSpec, by: Family, images: list[np.ndarray]) -> Candidate | None:
+    """How well a given layout explains frames whose spots are labelled by a family."""
     look = partial(_layout_look, pins, by)
     sizes = [size for k in spread(len(images), SIZED_ON) if (size := _best_size(images[k], [look]))]
     if not sizes:
@@ -442,13 +451,14 @@ def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> Se
     """A given layout of a family in a labelled frame, at the position with most labels; None if the lattice is too small for it."""
     if by.name == "positions":
         return _seen(spots, spot, by, np.arange(len(by.lattice)))
-    if by.name == "rings":
-        return _seen(spots, spot, by, _ring_nodes(by, 0, pins.rings or 0)) if (pins.rings or 0) <= by.ring.max() else None
-    if by.name == "hexagon":
-        middle = _best_middle(by, spot, pins.rings or 0)
-        return None if middle is None else _seen(spots, spot, by, _ring_nodes(by, middle, pins.rings or 0))
-    nodes = _best_rectangle(by, spot, pins.columns or 0, pins.rows or 0)
-    return None if nodes is None else _seen(spots, spot, by, nodes)
+    nodes: np.ndarray | None = None
+    if by.name == "rings" and (pins.rings or 0) <= by.ring.max():
+        nodes = _ring_nodes(by, 0, pins.rings or 0)
+    elif by.name == "hexagon" and (middle := _best_middle(by, spot, pins.rings or 0)) is not None:
+        nodes = _ring_nodes(by, middle, pins.rings or 0)
+    elif by.name == "grid":
+        nodes = _best_rectangle(by, spot, pins.columns or 0, pins.rows or 0)
+    return None if nodes is None else _seen(spots, spot, by, np.delete(nodes, list(pins.missing)))
 
 
 def _family_in_view(by: Family, spots: Bumps, spot: np.ndarray) -> np.ndarray:

@@ -88,7 +88,9 @@ def make_reference(pins_px: np.ndarray, pins: PinsSpec) -> Reference:
     distance, index = cKDTree(pins_px).query(pins_px, k=min(NEIGHBOURS + 1, n))
     if distance[:, 1].min() == 0:
         one, other = index[distance[:, 1].argmin(), :2]
-        raise FrameError(f"pins {one} and {other} are at the same place at rest; mend rest_px of the specification, or pins_px of the tuned file")
+        raise FrameError(
+            f"pins {one} and {other} are at the same place at rest; mend rest_px of the specification, or pins_px of the tuned file"
+        )
     triangles = Delaunay(pins_px).simplices.astype(np.int64)
     area = _double_areas(pins_px, triangles)
     triangles[area < 0] = triangles[area < 0][:, ::-1]

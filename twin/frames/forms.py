@@ -21,16 +21,16 @@ from twin.types import Form
 # Share of black and white pixels above which a frame counts as thresholded. It is below 1, because resizing leaves gray edges.
 TWO_LEVEL_SHARE = 0.9
 # A second criterion. A thresholded frame of small caps that was resized has many gray edges. It is mostly black (first share of all
-# pixels), and of its other pixels at least the second share is white. (Measured: 0.16 and more in resized thresholded frames of three
-# sensors, at most 0.04 in raw ones.)
+# pixels), and of its other pixels at least the second share is white; or mostly white and black, if its pins are dark. (Measured: 0.16 and
+# more in resized thresholded frames of three sensors, at most 0.04 in raw ones.)
 MOSTLY_BLACK, WHITE_OF_REST = 0.5, 0.1
 # Least share of black pixels, and least share of white pixels, in a thresholded frame.
 LEAST_OF_EACH_LEVEL = 0.005
-# Least share of the gray pixels of a thresholded frame that lie at most this far (px) from a white one, because resizing makes them of its
-# edges. (Measured: 0.72 and more in thresholded frames of three sensors, resized by 0.5 to 1.9; 0.04 for a gray picture of dark skin, gray
+# Least share of the gray pixels of a thresholded frame that lie at most this far (px) from a white and from a black one, because resizing
+# makes them of its edges. (Measured: 0.72 and more in thresholded frames of three sensors, resized by 0.5 to 1.9; 0.04 for a gray picture of dark skin, gray
 # caps and a white housing.)
 AT_EDGES, EDGE_PX = 0.4, 2
-# Share of a picture's pixels that are gray and away from white ones, below which it is thresholded nevertheless: a line of text, a broken
+# Share of a picture's pixels that are gray and away from edges, below which it is thresholded nevertheless: a line of text, a broken
 # row. The caps of a gray picture are 4 % of it or more.
 FEW_AWAY = 0.03
 # Gray levels below which a pixel counts as black, and above which it counts as white.
@@ -177,20 +177,16 @@ def is_two_level(image: np.ndarray) -> bool:
     """Whether a picture was thresholded at capture: its pixels are black or white, apart from the edges that a resize leaves gray."""
     if image.ndim == 3 and float(np.mean(np.ptp(image, axis=2))) > COLOURLESS_BELOW:
         return False
-    gray = gray_levels(image)
-    return _bright_on_black(gray) or _bright_on_black(cv2.bitwise_not(gray))
-
-
-def _bright_on_black(image: np.ndarray) -> bool:
-    """Whether a gray picture (H, W) uint8 was thresholded: by its share of black and white, or as mostly black with white pins."""
+    image = gray_levels(image)
     black, white = image < BLACK_BELOW, image > WHITE_ABOVE
     low, high = float(np.mean(black)), float(np.mean(white))
-    resized = low > MOSTLY_BLACK and high > WHITE_OF_REST * (1 - low)
-    if not (low + high > TWO_LEVEL_SHARE or resized) or min(low, high) <= LEAST_OF_EACH_LEVEL:
+    ground, pins = max(low, high), min(low, high)
+    resized = ground > MOSTLY_BLACK and pins > WHITE_OF_REST * (1 - ground)
+    if not (low + high > TWO_LEVEL_SHARE or resized) or pins <= LEAST_OF_EACH_LEVEL:
         return False
-    gray, width = ~(black | white), 2 * EDGE_PX + 1
-    beside_white = cv2.dilate(white.astype(np.uint8), np.ones((width, width), np.uint8)) > 0
-    away = float(np.mean(gray & ~beside_white))
+    gray, square = ~(black | white), np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1))
+    at_edge = np.logical_and(*(cv2.dilate(level.astype(np.uint8), square) > 0 for level in (black, white)))
+    away = float(np.mean(gray & ~at_edge))
     return away < FEW_AWAY or 1 - away / float(np.mean(gray)) > AT_EDGES
 
 

@@ -18,7 +18,7 @@ from twin.optics.preview import Preview
 from twin.optics.surfaces import cap_albedo
 from twin.pins import Grade, Pipeline, examine, tune
 from twin.pins.caps import measure_caps
-from twin.pins.identify import identify, judge_layout
+from twin.pins.identify import Seen, _at_likelier_spots, identify, judge_layout
 from twin.pins.legacy import LegacyPipeline
 from twin.pins.matching import match
 from twin.pins.reference import make_reference
@@ -106,10 +106,10 @@ def test_a_sensor_of_dark_pins_is_made_checked_and_tuned(made):
 
 def test_white_skin_around_dark_caps_is_saturated_and_black_caps_are_not(made):
     found, _, _ = made
-    images, _ = dots(level=(290, 0), light=0.0, corner=0.0)
+    images, _ = dots(1, level=(290, 0), light=0.0, corner=0.0)
     findings = {one.name: one for one in examine([Frame(image, Form.RAW) for image in images], found.sensor)}
     assert findings["saturation"].verdict is Grade.BAD and "skin" in findings["saturation"].text
-    images, _ = dots(level=(180, 0), light=0.0, corner=0.0)
+    images, _ = dots(1, level=(180, 0), light=0.0, corner=0.0)
     findings = {one.name: one for one in examine([Frame(image, Form.RAW) for image in images], found.sensor)}
     assert findings["saturation"].verdict is Grade.GOOD
 
@@ -189,3 +189,22 @@ def test_a_pin_out_of_view_is_not_put_on_another_one():
     spec = tune([Frame(images[0], Form.RAW)], sensor_of("bright", AppearanceSpec()).model_copy(update={"pins": found.pins})).detector
     places = np.array(_at_rest(spec, found.pins, Rest(rest, "found", "frame.png"), found).pins_px)
     assert make_reference(places, found.pins).spacing_px.min() > 5
+
+
+def test_a_pin_put_on_a_spot_beside_the_sensor_is_moved_to_the_spot_that_fits_the_others():
+    """A layout that is one spot off at a corner, as if that spot was a dark place of the housing, in most frames."""
+    rest = rest_of(GRID, size=SIZE, radius=76.0)
+    wrong = rest.copy()
+    wrong[0] += 0.8 * (rest[0] - rest[8])
+    seen = [Seen(wrong, wrong, 0, rest[:1] + 0.1)] * 3
+    np.testing.assert_allclose(_at_likelier_spots(GRID, wrong, seen)[0], rest[0] + 0.1)
+    assert np.array_equal(_at_likelier_spots(GRID, rest, [Seen(rest, rest, 0, wrong[:1])] * 3), rest)
+
+
+def test_a_layout_with_a_missing_pin_is_seen_in_a_curved_view():
+    """Laid over the spots as a whole, the lattice misses most of them."""
+    rest = rest_of(GRID, size=SIZE, radius=76.0, bulge=-0.45)
+    pins = GRID.model_copy(update={"missing": (10,)})
+    image = draw_discs(SIZE, np.delete(rest, 10, axis=0), 2.2, blur_px=0.8)
+    shown = judge_layout(pins, [image])
+    assert shown is not None and shown.explained > 0.9 and len(shown.rest_px) == 62

@@ -27,8 +27,8 @@ MOSTLY_BLACK, WHITE_OF_REST = 0.5, 0.1
 # Least share of black pixels, and least share of white pixels, in a thresholded frame.
 LEAST_OF_EACH_LEVEL = 0.005
 # Least share of the gray pixels of a thresholded frame that lie at most this far (px) from a white and from a black one, because resizing
-# makes them of its edges. (Measured: 0.72 and more in thresholded frames of three sensors, resized by 0.5 to 1.9; 0.04 for a gray picture of dark skin, gray
-# caps and a white housing.)
+# makes them of its edges. (Measured: 0.72 and more in thresholded frames of three sensors, resized by 0.5 to 1.9; 0.04 for a gray picture
+# of dark skin, gray caps and a white housing.)
 AT_EDGES, EDGE_PX = 0.4, 2
 # Share of a picture's pixels that are gray and away from edges, below which it is thresholded nevertheless: a line of text, a broken
 # row. The caps of a gray picture are 4 % of it or more.

@@ -67,9 +67,9 @@ FADED = 0.8
 """Least size of the outermost caps in thresholded frames, relative to the other caps. If they are smaller, the light fades at the rim, and
 caps farther out may be black. The ratio was measured as 0.96 to 1.7 in thresholded frames of three sensors, and as 0.3 and 0.6 in frames
 of a sensor with dark corners."""
-ODD, LIKELIER = 0.3, 0.5
-"""Distance of a pin at rest from the smooth view of the other pins, in spacings, above which an unnamed spot is looked for instead; and
-largest ratio of this spot's distance to the pin's."""
+SMOOTH, ODD, LIKELIER = 0.15, 0.3, 0.5
+"""Largest misfit of a layout to a smooth view at which single pins of it are corrected; distance of a pin at rest from the smooth view of
+the other pins, in spacings, above which an unnamed spot is looked for instead; and largest ratio of this spot's distance to the pin's."""
 LEAST_EXPLAINED = 0.6
 """Least share of the pins and pin-like spots that a candidate must explain."""
 ALIKE, MOST_GAPS = 0.5, 0.25
@@ -607,7 +607,7 @@ def _at_likelier_spots(pins: PinsSpec, rest_px: np.ndarray, seen: Sequence[Seen]
 
     Growth by local affine maps may take a spot beside the sensor for a corner pin, where the view is strongly curved.
     """
-    if len(rest_px) < 2 * FEWEST_VIEWED:
+    if len(rest_px) < 2 * FEWEST_VIEWED or unevenness(pin_lattice(pins).places, rest_px) > SMOOTH:
         return rest_px
     terms = _view_terms(pin_lattice(pins).places)
     solve = np.linalg.pinv(terms)

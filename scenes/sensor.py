@@ -15,6 +15,8 @@ from scenes.body import GelSpec, SkinSpec
 from scenes.pins import PinsSpec
 from scenes.rig import RigSpec
 
+Polarity = Literal["bright", "dark"]
+"""Whether caps are brighter or darker than the skin around them."""
 ELSEWHERE = "leave it out if it was measured on another layout"
 """Remedy in the error for measured values of caps that do not fit the layout."""
 
@@ -368,6 +370,11 @@ class AppearanceSpec(Section):
     specks: tuple[SpeckSpec, ...] = ()
     relief: ReliefSpec | None = None
 
+    @property
+    def dark_caps(self) -> bool:
+        """Whether the caps reflect less light than the skin."""
+        return sum(self.cap_albedo) < sum(self.skin_albedo)
+
 
 class ResidualSpec(Section):
     """A small network that corrects the discrepancy of the light and camera models in a colour frame, before the stream rounds the frame.
@@ -507,6 +514,9 @@ class BlobSpec(Section):
 
     Attributes
     ----------
+    polarity : {"bright", "dark"}
+        Whether the caps are brighter or darker than the skin around them. The gray levels of frames with dark caps are inverted before the
+        detection, so all other keys have the same meaning for both.
     threshold : float
         A fixed gray level (0 to 255) if ``threshold_block_px`` is 0, else the offset of an adaptive mean threshold with this block.
     threshold_block_px : int
@@ -527,6 +537,7 @@ class BlobSpec(Section):
         Whether ``rest_px`` was measured in a frame without contact, or estimated from contacts, which is less accurate.
     """
 
+    polarity: Polarity = "bright"
     threshold: float
     threshold_block_px: Annotated[int, Field(ge=0, le=8192)] = 0
     erosion_px: Annotated[int, Field(ge=1, le=100)] = 1
@@ -544,7 +555,7 @@ class UsualCapsSpec(Section):
     Attributes
     ----------
     contrast : float
-        Median difference between the caps and the skin around them, in gray levels.
+        Median difference between the caps and the skin around them, in gray levels. It is positive for dark caps, too.
     edge_px : float
         Median width of the caps' edges: the distance over which the level decreases from 90 to 10 % of the contrast.
     unevenness : float
@@ -717,6 +728,11 @@ class SensorSpec(Section):
         if shapes and ({len(c) % 2 for c in shapes} != {1} or len({len(c) for c in shapes}) > 1 or len(shapes) != pins.count):
             each = f"a_0 and the same number of pairs for each of the {pins.count} pins"
             raise ValueError(f"appearance.cap_shapes needs {each}; {ELSEWHERE}")
+        if self.pipeline.raw.polarity == "dark" and not self.appearance.dark_caps:
+            raise ValueError(
+                "pipeline.raw.polarity = 'dark' needs caps that are darker than the skin: give appearance.skin_albedo and "
+                "appearance.pin_albedo, [0.4, 0.4, 0.4] for example, and appearance.cap_albedo, [0.03, 0.03, 0.03] for example"
+            )
         if self.appearance.cap_levels and len(self.appearance.cap_levels) != pins.count:
             raise ValueError(f"appearance.cap_levels needs one number for each of the {pins.count} pins; {ELSEWHERE}")
         if self.appearance.cap_offsets and len(self.appearance.cap_offsets) != pins.count:

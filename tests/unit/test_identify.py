@@ -201,10 +201,9 @@ def test_a_reflection_of_an_led_beside_a_cap_does_not_draw_it_away():
     assert nearest(find_bumps(white, 3.7)).max() < 0.5
 
 
-def test_frames_of_inverted_contrast_are_refused_as_such():
-    images = [255 - image for image in frames_of(rest_of(PinsSpec(rings=4)), 3)]
-    with pytest.raises(FrameError, match="contrast is inverted"):
-        identify(images)
+def test_frames_of_inverted_contrast_show_the_same_layout_of_dark_pins():
+    found = identify([255 - image for image in frames_of(rest_of(PinsSpec(rings=4)), 3)])
+    assert (found.polarity, found.best.pins.layout, found.best.pins.rings) == ("dark", "rings", 4) and found.sure
 
 
 def test_thresholded_frames_of_fading_light_are_not_sure():

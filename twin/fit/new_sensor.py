@@ -7,13 +7,13 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from scenes.pins import PinsSpec
-from scenes.sensor import BlobSpec, CameraSpec, PipelineSpec, RecordingSpec, SensorSpec
+from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Polarity, RecordingSpec, SensorSpec
 from twin.errors import FrameError
 from twin.fit.camera_pose import LEAST_PINS, MODEL_PX, CameraReport, fit_camera
 from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.fit.size import of_radius, require_radius
 from twin.frames import Recording, evenly_read, frames_at, open_recording, spread
-from twin.frames.forms import gray_levels
+from twin.frames.forms import gray_levels, pin_levels
 from twin.frames.images import write_image
 from twin.geometry.pins import rest_pins, usual_spacing
 from twin.optics.relief import cap_planes
@@ -21,7 +21,7 @@ from twin.pins.batch import draw_overlay
 from twin.pins.caps import measure_caps
 from twin.pins.check import CAPS_MEASURED, lost_in_view, usual_caps
 from twin.pins.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, with_detector
-from twin.pins.identify import STEADY, Candidate, Identified, identify, judge_layout
+from twin.pins.identify import STEADY, Candidate, Identified, identify, judge_layout, unnamed_spots
 from twin.pins.pipeline import Pipeline
 from twin.pins.rest import Rest, rest_of, turn_of
 from twin.pins.tune import Tuned, tune
@@ -31,6 +31,8 @@ from twin.report.page import Page, Picture
 from twin.store import output, writes_file
 from twin.types import Form, Frame
 
+DARK_CAPS = AppearanceSpec(skin_albedo=(0.4, 0.4, 0.4), pin_albedo=(0.4, 0.4, 0.4), cap_albedo=(0.03, 0.03, 0.03))
+"""Assumed reflectances of a sensor with dark caps. With the default LEDs and exposure the skin is bright, but not white."""
 LIMIT = 40
 """Number of frames, evenly spread, from which the specification is made: enough contacts to estimate the pins at rest."""
 JUDGED = 40
@@ -210,14 +212,15 @@ def new_sensor(
         images = [gray_levels(frame.image) for frame in looked]
         with stage(progress, "layout") as step:
             found = identify(images, progress=step) if layout is None else _given(layout, images)
-        best = found.best
+        best, polarity = found.best, found.polarity
+        images = [pin_levels(image, polarity) for image in images]
         if (enough := int((best.there >= STEADY).sum())) < LEAST_PINS:
             raise FrameError(
                 f"{enough} pins are seen in most frames, as {best.pins.in_words()}: too few, a camera is fitted to {LEAST_PINS} or more; "
-                "give frames in which more pins are bright, not thresholded if the light fades towards the rim"
+                "give frames in which more pins stand out, not thresholded if the light fades towards the rim"
             )
         given, names = recording.reference, [frame.name for frame in looked]
-        known_name, known_gray = (given.name, gray_levels(given.image)) if given is not None else ("", None)
+        known_name, known_gray = (given.name, pin_levels(given.image, polarity)) if given is not None else ("", None)
         try:
             rest = rest_of(best, names, known_gray, known_name)
         except FrameError as error:
@@ -227,7 +230,7 @@ def new_sensor(
                 f"the layout is not recognised: the likeliest, {best.line()}, and {known_name} does not show it. If {known_name} shows no "
                 "contact, give the layout with --layout; one of no known kind as --layout positions:FILE.csv"
             ) from error
-        start = _started(out.stem, looked[0], best.pins, rest, frames.name)
+        start = _started(out.stem, looked[0], best.pins, rest, frames.name, polarity)
         start = start if radius_mm is None else of_radius(start, radius_mm)
         with stage(progress, "camera"):
             sizes_px = _sizes(best, images) if looked[0].form == Form.RAW else None
@@ -251,19 +254,6 @@ def _holds_its_axis(places: np.ndarray) -> bool:
     return bool(Delaunay(places).find_simplex(np.zeros(2)) >= 0)
 
 
-def _unnamed(layout: Candidate) -> list[np.ndarray]:
-    """Places (2,) px of spots near the pins of a layout, and as bright, that are none of them, in most frames."""
-    within, frames = usual_spacing(layout.rest_px) / 2, [one.left_over_px for one in layout.seen]
-    places: list[np.ndarray] = []
-    for spot in np.concatenate([np.zeros((0, 2)), *frames]):
-        if any(np.linalg.norm(spot - place) < within for place in places):
-            continue
-        seen_in = sum(bool((np.linalg.norm(spots - spot, axis=1) < within).any()) for spots in frames)
-        if seen_in >= STEADY * len(layout.seen):
-            places.append(spot)
-    return places
-
-
 def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
     """The user's layout, compared with the frames."""
     if layout.layout == "positions" and not _holds_its_axis(np.array(layout.positions)):
@@ -271,14 +261,19 @@ def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
             f"the sensor's axis, 0,0, lies outside of the {layout.in_words()} that were given; x,y count from the axis: "
             "subtract the place of the middle pin, or of the middle of all pins"
         )
+    polarity: Polarity = "bright"
     shown = judge_layout(layout, images)
+    if shown is None or shown.explained < GIVEN_SHOWN:
+        dark = judge_layout(layout, [pin_levels(image, "dark") for image in images])
+        if dark is not None and (shown is None or dark.explained > shown.explained):
+            shown, polarity = dark, "dark"
     if shown is not None and shown.explained >= GIVEN_SHOWN:
-        forgotten = _unnamed(shown) if layout.layout == "positions" else []
+        forgotten = unnamed_spots(shown.rest_px, shown.seen) if layout.layout == "positions" else []
         doubts = tuple(
             f"a pin-like spot at ({x:.0f}, {y:.0f}) px is none of the {layout.in_words()}: does the file lack its place?"
             for x, y in forgotten
         )
-        return Identified((shown,), not doubts, doubts, 0.0)
+        return Identified((shown,), not doubts, doubts, 0.0, polarity)
     try:
         other = identify(images).best
     except FrameError:
@@ -295,12 +290,12 @@ def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
         )
     doubt = f"{layout.in_words()} were given, and explain only {100 * shown.explained:.1f} % of what is there"
     if other is None or other.explained <= shown.explained:
-        return Identified((shown,), False, (f"{doubt}; look at the overlay: are these all pins?",), 0.0)
+        return Identified((shown,), False, (f"{doubt}; look at the overlay: are these all pins?",), 0.0, polarity)
     doubt += f"; {other.pins.in_words()} explain {100 * other.explained:.1f} %: leave --layout out, or correct it"
-    return Identified((shown, other), False, (doubt,), 0.0)
+    return Identified((shown, other), False, (doubt,), 0.0, polarity)
 
 
-def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str) -> SensorSpec:
+def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str, polarity: Polarity) -> SensorSpec:
     """A specification with the right layout and frame size, and with a camera that sees the pins at about the right places."""
     height, width = frame.image.shape[:2]
     color = frame.image.ndim == 3 and frame.image.shape[2] == 3 and bool(np.ptp(frame.image.astype(int), axis=2).max() > 0)
@@ -319,7 +314,13 @@ def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str) -
         cy_px=y,
         distance_mm=PINHOLE_MM,
     )
-    anywhere = BlobSpec(threshold=UNKNOWN_OFFSET, threshold_block_px=UNKNOWN_BLOCK_PX, mask_center_px=(x, y), mask_radius_px=1.1 * radius)
+    anywhere = BlobSpec(
+        polarity=polarity,
+        threshold=UNKNOWN_OFFSET,
+        threshold_block_px=UNKNOWN_BLOCK_PX,
+        mask_center_px=(x, y),
+        mask_radius_px=1.1 * radius,
+    )
     thresholded = frame.form == Form.RECORDING
     return SensorSpec(
         name=name,
@@ -327,19 +328,20 @@ def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str) -
         source="Layout, camera and pin detection: the frames. All else: the defaults of a printed TacTip",
         pins=turned,
         camera=camera,
-        recording=_whole(width, height) if thresholded else None,
+        appearance=DARK_CAPS if polarity == "dark" else AppearanceSpec(),
+        recording=_whole(width, height, polarity) if thresholded else None,
         pipeline=PipelineSpec(raw=anywhere, recording=anywhere if thresholded else None),
     )
 
 
-def _whole(width: int, height: int) -> RecordingSpec:
+def _whole(width: int, height: int, polarity: Polarity) -> RecordingSpec:
     """A recorder that keeps the whole frame. The frames do not show how they were thresholded."""
     return RecordingSpec(
         crop_px=(0, 0, width, height),
         width_px=width,
         height_px=height,
         threshold_block_px=UNKNOWN_BLOCK_PX,
-        threshold_offset=UNKNOWN_OFFSET,
+        threshold_offset=UNKNOWN_OFFSET if polarity == "bright" else -UNKNOWN_OFFSET,
     )
 
 
@@ -455,7 +457,8 @@ def _with_usual_caps(sensor: SensorSpec, frames: list[Frame]) -> SensorSpec:
         return sensor
     pipeline = Pipeline(sensor, form)
     seen = [(frame, pipeline(frame)) for frame in (frames[k] for k in spread(len(frames), CAPS_MEASURED))]
-    usual = usual_caps([measure_caps(gray_levels(frame.image), o.pins_px) for frame, o in seen if o.valid])
+    polarity = sensor.pipeline.raw.polarity
+    usual = usual_caps([measure_caps(gray_levels(frame.image), o.pins_px, polarity=polarity) for frame, o in seen if o.valid])
     return sensor.model_copy(update={"pipeline": sensor.pipeline.model_copy(update={"usual_caps": usual})})
 
 
@@ -526,6 +529,7 @@ def _told(
     known = (
         f"Layout: {found.best.line()}",
         rest.line(),
+        *([] if found.polarity == "bright" else ["polarity: the pins are darker than the skin"]),
         f"camera: {_camera_words(sensor)}, middle ({sensor.camera.cx_px:.0f}, {sensor.camera.cy_px:.0f}) px; "
         f"it sees the {camera.pins} pins at rest within {camera.rms_px:.2f} px (rms)"
         + (f"; about as well: {', or '.join(dict.fromkeys(other_cameras))}" if other_cameras else ""),
@@ -541,7 +545,9 @@ def _told(
         f"Outermost pins at {sensor.pins.max_polar_deg:g} deg from the axis, and the camera's distance {sensor.camera.distance_mm:.1f} mm: "
         "pins at rest fit many pairs of them.",
         "Stiffness of skin and gel: Shore A 26 to 30 rubber and a soft gel.",
-        "Light, colours, noise: those of another TacTip, until 'twin calibrate optics' has found this sensor's.",
+        "Light, colours, noise: those of another TacTip, until 'twin calibrate optics' has found this sensor's."
+        if found.polarity == "bright"
+        else "Light, noise: those of another TacTip; a gray skin and black caps ([appearance]).",
         *camera.held.values(),
     ]
     steps = []
@@ -558,7 +564,7 @@ def _told(
         steps.append(f"fit the contact to the labels: twin calibrate contact {files}")
     else:
         steps.append("record labelled contacts (a table targets.csv beside the frames), then 'twin calibrate contact' and 'twin train'")
-    if sensor.camera.channels == "color" and recording.form is Form.RAW:
+    if sensor.camera.channels == "color" and recording.form is Form.RAW and found.polarity == "bright":
         steps.append(f"fit light and colours: twin calibrate optics {files}")
     return known, tuple(assumed), tuple(steps)
 

@@ -210,10 +210,15 @@ def fit_optics(
     Raises
     ------
     FrameError
-        No frame can be used, or their sizes differ.
+        No frame can be used, their sizes differ, or the sensor's caps are dark.
     RenderError
         The renderer, or its differentiation, does not work on this machine.
     """
+    if spec.appearance.dark_caps:
+        raise FrameError(
+            f"light and colours are fitted to white caps, and those of {spec.name} are darker than the skin; set [appearance], [leds] and "
+            "[response] by hand, and compare with 'twin realism'"
+        )
     notes, bar = list(ALWAYS), partial(stage, progress)
     if no_contact is not None:
         spec, report = fit_camera(spec, _pins_at_rest(no_contact, spec))

@@ -13,7 +13,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from scenes.sensor import BlobSpec, PipelineSpec, RecordingSpec, SensorSpec
+from scenes.sensor import BlobSpec, PipelineSpec, Polarity, RecordingSpec, SensorSpec
 from twin.errors import FrameError
 from twin.frames.images import bits_used, decode, to_eight_bits
 from twin.types import Form
@@ -21,16 +21,16 @@ from twin.types import Form
 # Share of black and white pixels above which a frame counts as thresholded. It is below 1, because resizing leaves gray edges.
 TWO_LEVEL_SHARE = 0.9
 # A second criterion. A thresholded frame of small caps that was resized has many gray edges. It is mostly black (first share of all
-# pixels), and of its other pixels at least the second share is white. (Measured: 0.16 and more in resized thresholded frames of three
-# sensors, at most 0.04 in raw ones.)
+# pixels), and of its other pixels at least the second share is white; or mostly white and black, if its pins are dark. (Measured: 0.16 and
+# more in resized thresholded frames of three sensors, at most 0.04 in raw ones.)
 MOSTLY_BLACK, WHITE_OF_REST = 0.5, 0.1
 # Least share of black pixels, and least share of white pixels, in a thresholded frame.
 LEAST_OF_EACH_LEVEL = 0.005
-# Least share of the gray pixels of a thresholded frame that lie at most this far (px) from a white one, because resizing makes them of its
-# edges. (Measured: 0.72 and more in thresholded frames of three sensors, resized by 0.5 to 1.9; 0.04 for a gray picture of dark skin, gray
-# caps and a white housing.)
+# Least share of the gray pixels of a thresholded frame that lie at most this far (px) from a white and from a black one, because resizing
+# makes them of its edges. (Measured: 0.72 and more in thresholded frames of three sensors, resized by 0.5 to 1.9; 0.04 for a gray picture
+# of dark skin, gray caps and a white housing.)
 AT_EDGES, EDGE_PX = 0.4, 2
-# Share of a picture's pixels that are gray and away from white ones, below which it is thresholded nevertheless: a line of text, a broken
+# Share of a picture's pixels that are gray and away from edges, below which it is thresholded nevertheless: a line of text, a broken
 # row. The caps of a gray picture are 4 % of it or more.
 FEW_AWAY = 0.03
 # Gray levels below which a pixel counts as black, and above which it counts as white.
@@ -115,6 +115,25 @@ def gray_levels(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.shape[2] == 3 else image[..., 0]
 
 
+def pin_levels(image: np.ndarray, polarity: Polarity) -> np.ndarray:
+    """Gray levels (H, W) in which pins are brighter than the skin: those of `gray_levels`, inverted if the pins are dark."""
+    gray = gray_levels(image)
+    return cv2.bitwise_not(gray) if polarity == "dark" else gray
+
+
+def levels_at(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """Gray levels (...,) of the pixels nearest to places (..., 2)."""
+    column, row = np.moveaxis(np.clip(np.round(px), 0, np.array(gray.shape[::-1]) - 1).astype(int), -1, 0)
+    levels: np.ndarray = gray[row, column].astype(float)
+    return levels
+
+
+def polarity_of(pipeline: PipelineSpec, form: Form) -> Polarity:
+    """Whether pins are bright or dark in frames of a form; if the sensor has no such form, as in raw frames."""
+    blob = pipeline.recording if form == Form.RECORDING else None
+    return (blob or pipeline.raw).polarity
+
+
 @dataclass(frozen=True)
 class KnownFrames:
     """A sensor's name, and (width, height) in px of its frames of each form."""
@@ -161,12 +180,13 @@ def is_two_level(image: np.ndarray) -> bool:
     image = gray_levels(image)
     black, white = image < BLACK_BELOW, image > WHITE_ABOVE
     low, high = float(np.mean(black)), float(np.mean(white))
-    resized = low > MOSTLY_BLACK and high > WHITE_OF_REST * (1 - low)
-    if not (low + high > TWO_LEVEL_SHARE or resized) or min(low, high) <= LEAST_OF_EACH_LEVEL:
+    ground, pins = max(low, high), min(low, high)
+    resized = ground > MOSTLY_BLACK and pins > WHITE_OF_REST * (1 - ground)
+    if not (low + high > TWO_LEVEL_SHARE or resized) or pins <= LEAST_OF_EACH_LEVEL:
         return False
-    gray, width = ~(black | white), 2 * EDGE_PX + 1
-    beside_white = cv2.dilate(white.astype(np.uint8), np.ones((width, width), np.uint8)) > 0
-    away = float(np.mean(gray & ~beside_white))
+    gray, square = ~(black | white), np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1))
+    at_edge = np.logical_and(*(cv2.dilate(level.astype(np.uint8), square) > 0 for level in (black, white)))
+    away = float(np.mean(gray & ~at_edge))
     return away < FEW_AWAY or 1 - away / float(np.mean(gray)) > AT_EDGES
 
 

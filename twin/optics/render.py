@@ -37,6 +37,8 @@ SHADING_QUALITY: Quality = "standard"
 """Quality of the path-traced frame to which a stored shading is fitted."""
 BOUNCES = 2
 """Number of scatterings of a light path after the first. Because the skin is dark, a third one changes no gray level."""
+BRIGHT_SKIN_BOUNCES = 6
+"""The same for a sensor with dark caps on a bright skin, which scatters most of the light again."""
 PASS_SEED = 0x10000
 """Increment of the seed from one pass of a picture to the next. It is larger than the seeds that callers give to different pictures."""
 MOST_SAMPLES_AT_ONCE = 6_000_000
@@ -61,8 +63,8 @@ class Renderer:
     spp : int, optional
         Number of samples of a pixel that shows a pin. It replaces the quality's number. Pixels of bare skin get a quarter of it
         (`twin.optics.sampling`).
-    bounces : int
-        Number of scatterings of a light path after the first.
+    bounces : int, optional
+        Number of scatterings of a light path after the first. Default: 2, or 6 if the skin is brighter than the caps.
     shading : Shading, optional
         Shading of drawn pictures. Default: the shading of the frame at rest (`traced_shading`).
 
@@ -81,7 +83,7 @@ class Renderer:
         mesh: SensorMesh | None = None,
         window_px: tuple[int, int, int, int] | None = None,
         spp: int | None = None,
-        bounces: int = BOUNCES,
+        bounces: int | None = None,
         shading: Shading | None = None,
     ) -> None:
         if quality not in SAMPLES:
@@ -100,7 +102,8 @@ class Renderer:
         self.spp = 0 if self.drawn else spp or (SCALAR_SAMPLES if self.choice.backend == "scalar" else SAMPLES)[quality]
         self._rest = rest_pins(spec.geometry)
         self._mesh, self._inner = mesh, None if mesh is None else np.unique(mesh.inner_quads)
-        self._bounces = bounces
+        usual = BRIGHT_SKIN_BOUNCES if spec.appearance.dark_caps else BOUNCES
+        self._bounces = usual if bounces is None else bounces
         self._view: GelView | ScalarView | None = None
 
     @cached_property
@@ -267,7 +270,7 @@ class GelView:
         """Mean light (n, 3) or (n, 1) of pixels (n,) of the window, numbered row by row. Bare skin gets fewer samples."""
         mi = self._mi
         pins = near_pins(self._spec.view, self._spec.pins, self._spec.appearance, state, self._window_px).ravel()[pixels]
-        passes, each, few = 1, spp, -(-spp // SKIN_SAVING)
+        passes, each, few = 1, spp, -(-spp // (1 if self._spec.appearance.dark_caps else SKIN_SAVING))
         while each > 1 and each * len(pixels) > MOST_SAMPLES_AT_ONCE:
             passes, each, few = 2 * passes, -(-each // 2), -(-few // 2)  # half as many samples: a net with a power of two is most uniform
         first = np.argsort(~pins, kind="stable")  # those near pins come first: each part has one number of samples, and sums by blocks

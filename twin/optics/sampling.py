@@ -1,6 +1,7 @@
 """Sampling of pixels: which pixels need many samples, and well-distributed random numbers in Dr.Jit.
 
-Pixels that show pins need many samples, because edges are noisy. Dark bare skin is free of noise after few samples.
+Pixels that show pins need many samples, because edges are noisy. Dark bare skin is free of noise after few samples; bright skin is not,
+because pins shadow it.
 """
 
 from types import ModuleType

@@ -4,11 +4,14 @@ A cap's outline is where the gray level is half way between the cap's plateau an
 a patch interpolated four times as fine, within the cap's Voronoi cell.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
+
+from scenes.sensor import Polarity
+from twin.frames.forms import pin_levels
 
 # Number of interpolated pixels for one pixel, in each direction.
 FINE = 4
@@ -35,7 +38,8 @@ class Caps:
     Attributes
     ----------
     level, contrast, skin : (N,) float
-        Gray levels: of the plateau, of the plateau minus the skin around it, and of that skin.
+        Gray levels: of the plateau, the difference between the plateau and the skin around it, and of that skin. The contrast of a dark cap
+        is positive, too.
     diameter_px : float
         Diameter of the disc whose area is that above half level.
     eccentricity : float
@@ -56,8 +60,9 @@ class Caps:
 MEASURES = tuple(field.name for field in fields(Caps))
 
 
-def measure_caps(gray: np.ndarray, pins_px: np.ndarray) -> Caps:
-    """Measure the caps at pins (N, 2) px in a gray frame (H, W) uint8; NaN pins stay NaN."""
+def measure_caps(gray: np.ndarray, pins_px: np.ndarray, *, polarity: Polarity = "bright") -> Caps:
+    """Measure the bright or dark caps at pins (N, 2) px in a gray frame (H, W) uint8; NaN pins stay NaN."""
+    gray = pin_levels(gray, polarity)
     values = np.full((len(pins_px), len(MEASURES)), np.nan)
     seen = np.flatnonzero(np.isfinite(pins_px).all(axis=1))
     distance, nearest = cKDTree(pins_px[seen]).query(pins_px[seen], k=min(NEIGHBOURS, len(seen)))
@@ -67,7 +72,8 @@ def measure_caps(gray: np.ndarray, pins_px: np.ndarray) -> Caps:
         found = _measure(gray, pins_px[k], others, half)
         if found is not None:
             values[k] = found
-    return Caps(*values.T)
+    caps = Caps(*values.T)
+    return caps if polarity == "bright" else replace(caps, level=255 - caps.level, skin=255 - caps.skin)
 
 
 def _measure(gray: np.ndarray, pin_px: np.ndarray, others: np.ndarray, half: int) -> tuple[float, ...] | None:

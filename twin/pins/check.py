@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scenes.sensor import SensorSpec, UsualCapsSpec
+from scenes.sensor import Polarity, SensorSpec, UsualCapsSpec
 from twin.camera.capture import expose
 from twin.frames import spread
-from twin.frames.forms import blob_spec, gray_levels, known_frames
+from twin.frames.forms import blob_spec, known_frames, pin_levels
 from twin.optics.preview import Preview
 from twin.pins.caps import Caps, measure_caps
 from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
@@ -118,7 +118,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
             progress(k + 1, len(frames))
     nominal = nominal_reference(spec, form)
     findings = [
-        _layout(frames, spec),
+        _layout(frames, spec, pipeline.blob_spec.polarity),
         _pins(seen, pipeline),
         _spots(seen, pipeline),
         *_place(seen, nominal, BULGE if spec.skin.shape == "cap" else 0.0),
@@ -190,9 +190,9 @@ def _finding(name: str, value: float, limits: tuple[float, float], text: str, re
     return Finding(name, verdict, float(value), text, "" if verdict is Grade.GOOD else remedy)
 
 
-def _layout(frames: list[Frame], spec: SensorSpec) -> Finding:
+def _layout(frames: list[Frame], spec: SensorSpec, polarity: Polarity) -> Finding:
     """Finding about the layout: whether the frames show the specification's layout, independent of the camera's place."""
-    images = [gray_levels(frames[k].image) for k in spread(len(frames), LAYOUT_JUDGED)]
+    images = [pin_levels(frames[k].image, polarity) for k in spread(len(frames), LAYOUT_JUDGED)]
     layout = judge_layout(spec.pins, images)
     share = 0.0 if layout is None else layout.explained
     doubts = [f"the frames do not show {spec.pins.in_words()}"] if layout is None else other_layout(layout, images)
@@ -229,7 +229,7 @@ def _pins(seen: list[Observation], pipeline: Pipeline) -> Finding:
 
 
 def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
-    """Finding about bright spots among the pins that are not pins and are at the same place in most frames."""
+    """Finding about spots among the pins that are not pins and are at the same place in most frames."""
     within = SAME_SPOT * float(np.mean(pipeline.reference.spacing_px))
     radius = np.linalg.norm(pipeline.reference.pins_px - pipeline.reference.pins_px[0], axis=1).max()
     places = [o.extra_px[np.linalg.norm(o.extra_px - pipeline.reference.pins_px[0], axis=1) < radius] for o in seen]
@@ -237,8 +237,9 @@ def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
     if len(places[0]):
         hits = np.array([[len(p) and cKDTree(p).query(spot)[0] < within for p in places] for spot in places[0]], float)
         steady = int((hits.mean(axis=1) >= STEADY).sum())
+    kind = pipeline.blob_spec.polarity
     remedy = "bubbles, dust or LED reflections: clean the window, turn the sensor's LEDs, or mask them"
-    return _finding("specks", steady / len(pipeline.reference.pins_px), (0.02, 0.2), f"{steady} steady bright spots among the pins", remedy)
+    return _finding("specks", steady / len(pipeline.reference.pins_px), (0.02, 0.2), f"{steady} steady {kind} spots among the pins", remedy)
 
 
 def _place(seen: list[Observation], nominal: Reference, bulge: float) -> list[Finding]:
@@ -294,7 +295,8 @@ def _around_pins(pipeline: Pipeline) -> np.ndarray:
 def _light(frames: list[Frame], seen: list[Observation], expected: UsualCapsSpec | None, pipeline: Pipeline) -> list[Finding]:
     """Findings about brightness, saturation, focus and glare of raw frames around the pins, compared with the ``expected`` caps."""
     looked = list(zip(frames, seen, strict=True))[:: -(-len(frames) // CAPS_MEASURED)]
-    caps = [measure_caps(gray_levels(f.image), o.pins_px) for f, o in looked if np.isfinite(o.pins_px).any()]
+    polarity = pipeline.blob_spec.polarity
+    caps = [measure_caps(gray_levels(f.image), o.pins_px, polarity=polarity) for f, o in looked if np.isfinite(o.pins_px).any()]
     windows, disc = [gray_levels(np.ascontiguousarray(f.image[pipeline.mask.window])) for f in frames], _around_pins(pipeline)
     brightest = float(np.median([np.percentile(w[disc > 0], BRIGHT_PERCENTILE) for w in windows]))
     level, contrast, edge, diameter = (
@@ -306,14 +308,15 @@ def _light(frames: list[Frame], seen: list[Observation], expected: UsualCapsSpec
     stray, where = _stray(caps, [o for _, o in looked if np.isfinite(o.pins_px).any()], contrast)
     usual = uneven / promised
     glare = float(np.median([_glare(w, disc, cap_px2) for w in windows]))
+    white, part = _white(caps, polarity), "caps" if polarity == "bright" else "skin around the caps"
     dark = (
-        f"caps {level:.0f} gray levels, {contrast:.0f} above the skin ({promised:.0f} expected)"
+        f"caps {level:.0f} gray levels, {contrast:.0f} {'above' if polarity == 'bright' else 'below'} the skin ({promised:.0f} expected)"
         if caps
         else f"brightest percent at {brightest:.0f} gray levels"
     )
     return [
         _finding("brightness", contrast / promised, (0.6, 0.3), dark, "raise exposure or gain; look for dead LEDs, dirt, a foggy window"),
-        _finding("saturation", _white(caps), (0.02, 0.2), f"{100 * _white(caps):.1f} % of the caps white", "lower exposure or gain"),
+        _finding("saturation", white, (0.02, 0.2), f"{100 * white:.1f} % of the {part} white", "lower exposure or gain"),
         _finding(
             "focus",
             edge / sharp,
@@ -352,12 +355,14 @@ def usual_caps(caps: list[Caps]) -> UsualCapsSpec | None:
 def drawn_caps(spec: SensorSpec) -> UsualCapsSpec | None:
     """The caps measured in the twin's frame at rest; None if that frame shows none."""
     twin = expose(Preview(spec).render(), spec.capture)
-    return usual_caps([measure_caps(gray_levels(twin), Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px)])
+    pins_px = Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px
+    return usual_caps([measure_caps(gray_levels(twin), pins_px, polarity=spec.pipeline.raw.polarity)])
 
 
-def _white(caps: list[Caps]) -> float:
-    """Share of the caps that are saturated."""
-    return float(np.mean(np.concatenate([c.level for c in caps]) >= SATURATED_LEVEL)) if caps else 0.0
+def _white(caps: list[Caps], polarity: Polarity) -> float:
+    """Share of the caps that are saturated; of dark caps, of those with saturated skin around them."""
+    levels = [c.level if polarity == "bright" else c.skin for c in caps]
+    return float(np.mean(np.concatenate(levels) >= SATURATED_LEVEL)) if caps else 0.0
 
 
 def _unevenness(caps: Caps) -> float:

@@ -18,7 +18,7 @@ from scenes.pins import PinsSpec
 from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
 from twin.camera.capture import record
 from twin.errors import FrameError
-from twin.frames.forms import frame_size, from_raw, gray_levels, recording_to_raw
+from twin.frames.forms import frame_size, from_raw, pin_levels, recording_to_raw
 from twin.pins.blobs import Mask, circular_mask, threshold
 from twin.pins.detector_spec import OWN, DetectorSpec, with_detector
 from twin.pins.graph import make_graph
@@ -180,7 +180,7 @@ class LegacyDetector:
                 " run 'twin tune --method legacy'"
             )
         self.spec, self._recording = spec, recording
-        self._pipeline = LegacyPipeline(pins, recording)
+        self._pipeline = LegacyPipeline(pins, recording, polarity=spec.blob.polarity)
 
     def __call__(self, frame: Frame) -> Found:
         raw = frame.form == Form.RAW
@@ -202,7 +202,8 @@ class LegacyDetector:
 
 def _masked(detector: DetectorSpec, mask: Mask, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Places and areas of the blobs in a frame's mask."""
-    return find(np.ascontiguousarray(gray_levels(np.ascontiguousarray(frame.image[mask.window]))), mask, detector)
+    window = pin_levels(np.ascontiguousarray(frame.image[mask.window]), detector.blob.polarity)
+    return find(np.ascontiguousarray(window), mask, detector)
 
 
 def _own(detector: DetectorSpec, frame: Frame) -> tuple[np.ndarray, np.ndarray]:

@@ -159,7 +159,11 @@ def with_detector(spec: SensorSpec, detector: DetectorSpec) -> SensorSpec:
         else:
             whole = (0, 0, spec.camera.width_px, spec.camera.height_px)
             changed["recording"] = RecordingSpec(
-                crop_px=whole, width_px=width, height_px=height, threshold_block_px=UNKNOWN_BLOCK_PX, threshold_offset=UNKNOWN_OFFSET
+                crop_px=whole,
+                width_px=width,
+                height_px=height,
+                threshold_block_px=UNKNOWN_BLOCK_PX,
+                threshold_offset=UNKNOWN_OFFSET if blob.polarity == "bright" else -UNKNOWN_OFFSET,
             )
     return spec.model_copy(update=changed)
 

@@ -11,7 +11,7 @@ from scenes.files import require_regular
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, OptionError
 from twin.frames import open_recording
-from twin.frames.forms import frame_size
+from twin.frames.forms import frame_size, polarity_of
 from twin.pins.batch import recording_reference
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.legacy import LegacyPipeline
@@ -127,7 +127,10 @@ def _graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Fo
     left_out: list[str] = []
     notes: list[str] = []
     reference, _ = recording_reference(spec, recording, notes)
-    pipeline = LegacyPipeline(spec.pins, spec.recording) if legacy else Pipeline(spec, recording.form, reference, graph=kind)
+    if legacy:
+        pipeline: LegacyPipeline | Pipeline = LegacyPipeline(spec.pins, spec.recording, polarity=polarity_of(spec.pipeline, recording.form))
+    else:
+        pipeline = Pipeline(spec, recording.form, reference, graph=kind)
     names: list[str] = []
     graphs: list[PinGraph] = []
     first_image: np.ndarray | None = None

@@ -4,26 +4,31 @@ Each family of layouts (rings, hexagon, grid) labels the pin-like spots of each 
 the lattice that holds the spots is a candidate. A candidate is judged by what it does not explain: pins that should be in view but are not
 seen, and pin-like spots that belong to none of its pins, also at its rim and just outside it. Therefore a layout with one ring too few or
 too many explains less than the right layout, and is not chosen.
+
+Pins may be brighter or darker than the skin. The gaps between dark pins are bright spots, too, and often form a lattice that explains all
+of them. But pins have skin on all sides, while gaps have skin on some sides and pins on others (`stand_out`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from scenes.pins import PinsSpec
+from scenes.sensor import Polarity
 from twin.errors import FrameError
 from twin.frames import spread
-from twin.frames.forms import is_two_level
+from twin.frames.forms import is_two_level, levels_at, pin_levels
 from twin.geometry.pins import pin_lattice, usual_spacing
 from twin.pins.bumps import Bumps, find_bumps
 from twin.pins.extent import filled_area, in_view, open_sides, seen_beyond, with_view
 from twin.pins.families import Family, family, family_of_positions, label_spots
 from twin.pins.growth import seen_places
 from twin.pins.matching import match
-from twin.pins.reference import make_reference
+from twin.pins.reference import make_reference, spread_out, together
 from twin.progress import Step
 
 SIZES = tuple(0.003 * 1.4**k for k in range(8))
@@ -46,8 +51,6 @@ MOST_MISSING = 0.05
 """Largest share of missing pins that a layout may have."""
 SHOWN = 0.9
 """Least share of a frame's pins and pin-like spots that a layout must explain, for the frame to show this layout."""
-FOLDED = 0.02
-"""Least distance between two pins at rest, in median spacings. If two pins are nearer to each other, the frames do not show this layout."""
 AROUND = 6
 """Number of nearest pins with which a spot is compared."""
 MOST_GUESSES = 3
@@ -64,8 +67,17 @@ FADED = 0.8
 """Least size of the outermost caps in thresholded frames, relative to the other caps. If they are smaller, the light fades at the rim, and
 caps farther out may be black. The ratio was measured as 0.96 to 1.7 in thresholded frames of three sensors, and as 0.3 and 0.6 in frames
 of a sensor with dark corners."""
+SMOOTH, ODD, LIKELIER = 0.15, 0.3, 0.5
+"""Largest misfit of a layout to a smooth view at which single pins of it are corrected; distance of a pin at rest from the smooth view of
+the other pins, in spacings, above which an unnamed spot is looked for instead; and largest ratio of this spot's distance to the pin's."""
 LEAST_EXPLAINED = 0.6
 """Least share of the pins and pin-like spots that a candidate must explain."""
+ALIKE, MOST_GAPS = 0.5, 0.25
+"""Test of whether spots are pins (`stand_out`): least ratio of the two heights of three neighbours above the places between them, which is
+about 1 for pins and about 0 for gaps; and largest share of threes with a smaller ratio. The share was measured as at most 0.02 in frames of
+seven sensors with bright and of one with dark pins, and as at least 0.44 for gaps of drawn layouts."""
+SMOOTHED = 0.5
+"""Standard deviation of the smoothing before these heights are measured, in standard deviations of a spot."""
 FEWEST_VIEWED = 12
 """Least number of pins to which a smooth view is fitted. The view has ten terms."""
 
@@ -153,12 +165,15 @@ class Identified:
         Reasons why the best candidate is not sure, and the data that would decide.
     sigma_px : float
         Size of the spots: standard deviation of the Gaussian that fits them best, px of the frame.
+    polarity : {"bright", "dark"}
+        Whether the pins are brighter or darker than the skin.
     """
 
     candidates: tuple[Candidate, ...]
     sure: bool
     doubts: tuple[str, ...]
     sigma_px: float
+    polarity: Polarity = "bright"
 
     @property
     def best(self) -> Candidate:
@@ -171,41 +186,82 @@ Look = Callable[[Bumps], Seen | None]
 
 
 def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Identified:
-    """Identify the layout in gray frames (H, W) uint8 of one sensor, with or without contact.
+    """Identify the layout in gray frames (H, W) uint8 of one sensor, with or without contact, with bright or dark pins.
 
     First each frame is labelled by itself. The layouts that are found in most frames are then matched to all frames, starting from the
-    median positions of their pins. In this way a frame in which a contact hides the middle of the layout can be used, too.
+    median positions of their pins. In this way a frame in which a contact hides the middle of the layout can be used, too. Unless bright
+    pins are sure, some frames are searched for dark pins, and all of them if these explain more.
 
     Raises
     ------
     FrameError
-        No frame shows a layout, or the frames' contrast is inverted.
+        No frame shows a layout.
     """
-    found, refused = None, None
-    try:
-        found = _identified(images, progress)
-    except FrameError as error:
-        refused = error
-    if found is not None and (found.sure or found.best.explained >= SHOWN):
+    found, refused = _attempt(images, progress)
+    if found is not None and found.sure and found.best.pins.count >= FEWEST_VIEWED:
         return found
-    few = [255 - images[k] for k in spread(len(images), SIZED_ON)]
-    try:
-        inverted = _identified(few, None)
-    except FrameError:
-        inverted = None
-    if inverted is not None and (found is None or (inverted.best.explained >= SHOWN and inverted.best.pins.count > found.best.pins.count)):
-        raise FrameError(
-            f"the {len(images)} frames show pins that are darker than the skin: their contrast is inverted; give them as the camera takes "
-            "them, or turn bright and dark around first"
-        ) from refused
+    inverted = [pin_levels(image, "dark") for image in images]
+    dark, _ = _attempt([inverted[k] for k in spread(len(images), SIZED_ON)], None)
+    if dark is not None and len(images) > SIZED_ON and _better(dark, found):
+        dark, _ = _attempt(inverted, progress)
+    if dark is not None and _better(dark, found):
+        return replace(dark, polarity="dark")
     if found is None:
-        assert refused is not None
-        raise refused
+        raise refused or FrameError(NO_LAYOUT)
     return found
 
 
+def _attempt(images: list[np.ndarray], progress: Step | None) -> tuple[Identified | None, FrameError | None]:
+    """The layout of bright pins in gray frames, or the reason why there is none."""
+    try:
+        return _identified(images, progress), None
+    except FrameError as error:
+        return None, error
+
+
+def _better(dark: Identified, bright: Identified | None) -> bool:
+    """Whether the best candidate of dark pins is better than that of bright ones, if there is one."""
+    return bright is None or _merit(dark.best) > _merit(bright.best)
+
+
+def stand_out(images: list[np.ndarray], seen: Sequence[Seen], sigma_px: float) -> bool:
+    """Whether spots of the size ``sigma_px`` in gray frames (H, W) uint8 are bright pins, not the gaps between dark ones.
+
+    The level of three neighbours is compared with that midway between them, and with that in the middle of the gap between them (the centre
+    of the circle through them). Both are the skin's level between pins. Between gaps one is the skin's and one a pin's.
+    """
+    odd: list[np.ndarray] = []
+    for k in spread(len(seen), SIZED_ON):
+        px = seen[k].pins_px[np.isfinite(seen[k].pins_px[:, 0])]
+        try:
+            corners = px[Delaunay(px).simplices]
+        except (QhullError, ValueError):  # too few pins, or pins on a line
+            continue
+        smooth = cv2.GaussianBlur(images[k].astype(np.float32), (0, 0), SMOOTHED * sigma_px)
+        u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        u2, v2, area = (u * u).sum(axis=1), (v * v).sum(axis=1), u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+        to_middle = np.column_stack([v[:, 1] * u2 - u[:, 1] * v2, u[:, 0] * v2 - v[:, 0] * u2]) / (2 * area[:, None])
+        before = np.roll(corners, 1, axis=1)
+        sides = np.linalg.norm(corners - before, axis=2)
+        level = levels_at(smooth, corners)
+        rise = (level + np.roll(level, 1, axis=1)) / 2 - levels_at(smooth, (corners + before) / 2)
+        row, longest = np.arange(len(corners)), sides.argmax(axis=1)  # the longest side of a grid's triangle crosses the gap
+        midway = (rise.sum(axis=1) - rise[row, longest]) / 2
+        in_gap = np.maximum(level.mean(axis=1) - levels_at(smooth, corners[:, 0] + to_middle), rise[row, longest])
+        whole = np.linalg.norm(to_middle, axis=1) < sides.min(axis=1)  # not the flat triangles along the rim
+        odd.append((np.minimum(midway, in_gap) < ALIKE * np.maximum(midway, in_gap))[whole])
+    all_odd = np.concatenate([np.zeros(0), *odd])
+    return not len(all_odd) or float(all_odd.mean()) <= MOST_GAPS
+
+
 def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
-    """Identify the layout in frames whose caps are brighter than the skin."""
+    """Identify the layout in frames whose caps are brighter than the skin.
+
+    Raises
+    ------
+    FrameError
+        No frame shows a layout.
+    """
     looks: list[Look] = [partial(_family_look, family(name)) for name in FAMILIES]
     sizes = [_best_size(images[k], looks) for k in spread(len(images), SIZED_ON)]
     if not any(sizes):
@@ -224,7 +280,8 @@ def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
         candidates.append(_candidate(pins, seen, spots))
         if progress:
             progress(MOST_GUESSES + k, 2 * MOST_GUESSES)
-    candidates = sorted((c for c in candidates if c.explained >= LEAST_EXPLAINED), key=lambda c: -_merit(c))
+    candidates = [c for c in candidates if c.explained >= LEAST_EXPLAINED and stand_out(images, c.seen, sigma)]
+    candidates.sort(key=lambda c: -_merit(c))
     if not candidates:
         raise FrameError(f"none of {len(images)} frames shows a whole layout of pins; {NO_LAYOUT}")
     doubts = _doubts(candidates)
@@ -281,15 +338,29 @@ def _with_larger(candidates: list[Candidate], spots: list[Bumps]) -> list[Candid
 
 
 def judge_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
-    """How well a given layout explains gray frames (H, W) uint8; None if no frame shows it. Its missing pins are not changed."""
+    """How well a given layout of bright pins explains gray frames (H, W) uint8; None if no frame shows it, or only gaps between pins do.
+
+    Its missing pins are not changed.
+    """
     by = family_of_positions(pins) if pins.layout == "positions" or pins.missing else family(pins.layout)
+    layout = _judged(pins, by, images)
+    if by.name == "positions" and pins.layout != "positions" and (layout is None or layout.explained < SHOWN):
+        grown = _judged(pins, family(pins.layout), images)  # it follows a strongly curved view, but may be a row off
+        layout = max((one for one in (layout, grown) if one is not None), key=lambda one: one.explained, default=None)
+    return layout
+
+
+def _judged(pins: PinsSpec, by: Family, images: list[np.ndarray]) -> Candidate | None:
+    """How well a given layout explains frames whose spots are labelled by a family."""
     look = partial(_layout_look, pins, by)
     sizes = [size for k in spread(len(images), SIZED_ON) if (size := _best_size(images[k], [look]))]
     if not sizes:
         return None
-    spots = _spots(images, float(np.median(sizes)))
+    sigma = float(np.median(sizes))
+    spots = _spots(images, sigma)
     seen = [shown for one in spots if (shown := look(one)) is not None]
-    return _candidate(pins, seen, spots, may_miss=False) if seen else None
+    layout = _candidate(pins, seen, spots, may_miss=False) if seen else None
+    return layout if layout is not None and stand_out(images, layout.seen, sigma) else None
 
 
 def _spots(images: list[np.ndarray], sigma_px: float) -> list[Bumps]:
@@ -380,13 +451,14 @@ def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> Se
     """A given layout of a family in a labelled frame, at the position with most labels; None if the lattice is too small for it."""
     if by.name == "positions":
         return _seen(spots, spot, by, np.arange(len(by.lattice)))
-    if by.name == "rings":
-        return _seen(spots, spot, by, _ring_nodes(by, 0, pins.rings or 0)) if (pins.rings or 0) <= by.ring.max() else None
-    if by.name == "hexagon":
-        middle = _best_middle(by, spot, pins.rings or 0)
-        return None if middle is None else _seen(spots, spot, by, _ring_nodes(by, middle, pins.rings or 0))
-    nodes = _best_rectangle(by, spot, pins.columns or 0, pins.rows or 0)
-    return None if nodes is None else _seen(spots, spot, by, nodes)
+    nodes: np.ndarray | None = None
+    if by.name == "rings" and (pins.rings or 0) <= by.ring.max():
+        nodes = _ring_nodes(by, 0, pins.rings or 0)
+    elif by.name == "hexagon" and (middle := _best_middle(by, spot, pins.rings or 0)) is not None:
+        nodes = _ring_nodes(by, middle, pins.rings or 0)
+    elif by.name == "grid":
+        nodes = _best_rectangle(by, spot, pins.columns or 0, pins.rows or 0)
+    return None if nodes is None else _seen(spots, spot, by, np.delete(nodes, list(pins.missing)))
 
 
 def _family_in_view(by: Family, spots: Bumps, spot: np.ndarray) -> np.ndarray:
@@ -497,7 +569,7 @@ def _candidate(pins: PinsSpec, seen: list[Seen], spots: list[Bumps], *, may_miss
     again = [_matched(pins, rest, one) for one in spots]
     good = [k for k, one in enumerate(again) if one.explained > LEAST_EXPLAINED]
     if good:
-        rest = _rest(pins, [again[k] for k in good])
+        rest = _at_likelier_spots(pins, _rest(pins, [again[k] for k in good]), [again[k] for k in good])
         again = [_matched(pins, rest, one) for one in spots]
     there = np.mean([np.isfinite(one.pins_px[:, 0]) for one in again], axis=0)
     shown = np.mean([in_view(one.places_px, a) for one, a in zip(again, spots, strict=True)], axis=0) > STEADY
@@ -530,12 +602,48 @@ def _rest(pins: PinsSpec, seen: list[Seen]) -> np.ndarray:
     return np.where(np.isfinite(rest), rest, smooth_view(pin_lattice(pins).places, rest))
 
 
+def _at_likelier_spots(pins: PinsSpec, rest_px: np.ndarray, seen: Sequence[Seen]) -> np.ndarray:
+    """Pins at rest (N, 2), px, in which one that is far from a smooth view of the others is at an unnamed spot that fits this view.
+
+    Growth by local affine maps may take a spot beside the sensor for a corner pin, where the view is strongly curved.
+    """
+    if len(rest_px) < 2 * FEWEST_VIEWED or unevenness(pin_lattice(pins).places, rest_px) > SMOOTH:
+        return rest_px
+    terms = _view_terms(pin_lattice(pins).places)
+    solve = np.linalg.pinv(terms)
+    leverage = np.minimum(np.einsum("nt,tn->n", terms, solve), 1 - 1e-6)
+    without_it = rest_px - (rest_px - terms @ (solve @ rest_px)) / (1 - leverage)[:, None]  # the view of all other pins, by least squares
+    spacing, off_px = usual_spacing(rest_px), np.linalg.norm(rest_px - without_it, axis=1)
+    odd = np.flatnonzero(off_px > ODD * spacing)
+    spots = np.array(unnamed_spots(rest_px, seen) if len(odd) else []).reshape(-1, 2)
+    if not len(spots):
+        return rest_px
+    moved = rest_px.copy()
+    for pin in odd:
+        away = np.linalg.norm(spots - without_it[pin], axis=1)
+        if away.min() < min(ODD * spacing, LIKELIER * off_px[pin]):
+            moved[pin] = spots[away.argmin()]
+    return moved
+
+
+def unnamed_spots(rest_px: np.ndarray, seen: Sequence[Seen]) -> list[np.ndarray]:
+    """Places (2,) px of spots near pins at rest (N, 2), and as bright, that are none of them, in most frames."""
+    within, frames = usual_spacing(rest_px) / 2, [one.left_over_px for one in seen]
+    places: list[np.ndarray] = []
+    for spot in np.concatenate([np.zeros((0, 2)), *frames]):
+        if any(np.linalg.norm(spot - place) < within for place in places):
+            continue
+        seen_in = sum(bool((np.linalg.norm(spots - spot, axis=1) < within).any()) for spots in frames)
+        if seen_in >= STEADY * len(seen):
+            places.append(spot)
+    return places
+
+
 def _matched(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps) -> Seen:
     """Match a layout with known pins at rest (N, 2), px, to a frame's spots."""
-    reference = make_reference(rest_px, pins)
-    if reference.spacing_px.min() < FOLDED * np.median(reference.spacing_px):
+    if not spread_out(rest_px) or together(rest_px).any():
         return _told(spots, np.full(pins.count, -1), rest_px)
-    found = match(reference, spots.px, np.ones(len(spots.px)))
+    found = match(make_reference(rest_px, pins), spots.px, np.ones(len(spots.px)))
     places = np.where((found.blob >= 0)[:, None], spots.px[found.blob] if len(spots.px) else np.nan, found.predicted_px)
     return _told(spots, found.blob, np.where(np.isfinite(places), places, rest_px))
 
@@ -584,13 +692,16 @@ def smooth_view(places: np.ndarray, px: np.ndarray) -> np.ndarray:
     px : (N, 2) float
         Pins, px; NaN where unknown.
     """
-    known = np.isfinite(px[:, 0])
-    x, y = places.T
-    r2 = x * x + y * y
-    one = np.ones_like(x)
-    terms = np.column_stack([one, x, y, x * x, x * y, y * y, x * r2, y * r2, x * r2 * r2, y * r2 * r2])
+    known, terms = np.isfinite(px[:, 0]), _view_terms(places)
     solved = np.linalg.lstsq(terms[known], px[known], rcond=None)[0]
     return terms @ solved
+
+
+def _view_terms(places: np.ndarray) -> np.ndarray:
+    """The terms (N, 10) of a smooth view at places (N, 2)."""
+    x, y = places.T
+    r2 = x * x + y * y
+    return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y, x * r2, y * r2, x * r2 * r2, y * r2 * r2])
 
 
 def unevenness(places: np.ndarray, pins_px: np.ndarray) -> float:

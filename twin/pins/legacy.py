@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError, Voronoi
 
 from scenes.pins import Layout, PinsSpec
-from scenes.sensor import RecordingSpec
+from scenes.sensor import Polarity, RecordingSpec
 from twin.errors import FrameError
 from twin.frames.forms import gray_levels
 from twin.pins.voronoi import directed_edges
@@ -162,7 +162,9 @@ class LegacyPipeline:
         The sensor has no recording form.
     """
 
-    def __init__(self, pins: PinsSpec, recording: RecordingSpec | None) -> None:
+    def __init__(self, pins: PinsSpec, recording: RecordingSpec | None, *, polarity: Polarity = "bright") -> None:
+        if polarity == "dark":
+            raise FrameError("the published method finds bright pins only, and the sensor's are dark (polarity); use another method")
         if recording is None:
             raise FrameError("the published method takes recordings, and the sensor has no recording form ([recording])")
         self.count = pins.count

@@ -12,7 +12,7 @@ import numpy as np
 
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
-from twin.frames.forms import blob_spec, form_named, frame_size, gray_levels
+from twin.frames.forms import blob_spec, form_named, frame_size, levels_at, pin_levels
 from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.matching import Match, match, predict_all, rematch
@@ -200,13 +200,17 @@ class Pipeline:
 
     def _window(self, frame: Frame, mask: Mask) -> np.ndarray:
         """Gray levels (h, w) of the mask's window. For an adaptive threshold hot and dead pixels are removed."""
-        window = gray_levels(np.ascontiguousarray(frame.image[mask.window]))
+        window = self._levels(frame.image[mask.window])
         return despeckled(window) if self.blob_spec.threshold_block_px else window
+
+    def _levels(self, image: np.ndarray) -> np.ndarray:
+        """Gray levels (h, w) of an image or a part of it, in which the pins are bright."""
+        return pin_levels(np.ascontiguousarray(image), self.blob_spec.polarity)
 
     def _detect(self, frame: Frame, mask: Mask, blob: BlobSpec) -> Blobs:
         """Blobs in the mask's window, with chains of several caps split; or spots, if the parameters ask for spots."""
         if blob.spot_sigma_px:
-            return find_spots(gray_levels(np.ascontiguousarray(frame.image[mask.window])), mask, blob)
+            return find_spots(self._levels(frame.image[mask.window]), mask, blob)
         return split_chains(find_blobs(self._window(frame, mask), mask, blob, max_area_px2=self._max_area_px2))
 
     def _plausible(self, found: Match) -> bool:
@@ -285,16 +289,16 @@ class Pipeline:
         )
 
     def _between_caps(self, frame: Frame, pins_px: np.ndarray) -> float:
-        """Share of the found pins (N, 2), NaN where lost, that are hardly brighter than the midpoints between them and their neighbours."""
+        """Share of the found pins (N, 2), NaN where lost, that do not stand out from the midpoints between them and their neighbours."""
         found = np.flatnonzero(np.isfinite(pins_px[:, 0]))
         if len(found) < LEAST_COMPARED:
             return 0.0
-        gray = cv2.blur(gray_levels(np.ascontiguousarray(frame.image)), (3, 3))
+        gray = cv2.blur(self._levels(frame.image), (3, 3))
         near = self.reference.neighbours[found, :NEAREST]
         middle = (pins_px[found, None] + pins_px[near]) / 2
         known = np.isfinite(middle[..., 0])
-        between = np.where(known, _levels(gray, np.where(known[..., None], middle, 0.0)), np.nan)[known.any(axis=1)]
-        above = _levels(gray, pins_px[found])[known.any(axis=1)] - lower_levels(between, DARKER)
+        between = np.where(known, levels_at(gray, np.where(known[..., None], middle, 0.0)), np.nan)[known.any(axis=1)]
+        above = levels_at(gray, pins_px[found])[known.any(axis=1)] - lower_levels(between, DARKER)
         return float(np.mean(above <= LEAST_ABOVE * np.percentile(above, BRIGHT))) if len(above) else 0.0
 
     def _reason(self, blobs: Blobs, found: int, n: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
@@ -319,13 +323,6 @@ class Pipeline:
         if extra > n or (extra > MAX_EXTRA * n and found < NEARLY_ALL * n):
             return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
         return ""
-
-
-def _levels(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """Gray levels (...,) of the pixels nearest to places (..., 2)."""
-    column, row = np.moveaxis(np.clip(np.round(px), 0, np.array(gray.shape[::-1]) - 1).astype(int), -1, 0)
-    levels: np.ndarray = gray[row, column].astype(float)
-    return levels
 
 
 def lower_levels(levels: np.ndarray, percent: float) -> np.ndarray:

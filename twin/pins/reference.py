@@ -18,6 +18,8 @@ from twin.types import Form
 NEIGHBOURS = 18
 # Least spread of the pins in every direction (smallest singular value of their places), px. The shipped sensors have 460 to 1600 px.
 LEAST_SPREAD_PX = 1.0
+# Least distance between two pins at rest, in median spacings. If two pins are nearer to each other, no frame shows them apart.
+FOLDED = 0.02
 # Largest distance of a pin from the frame's origin, px. It is larger than any camera's frame.
 FARTHEST_PX = 1e6
 
@@ -60,13 +62,20 @@ def spread_out(pins_px: np.ndarray) -> bool:
     return bool(np.linalg.svd(pins_px - pins_px.mean(axis=0), compute_uv=False)[-1] > LEAST_SPREAD_PX)
 
 
+def together(pins_px: np.ndarray) -> np.ndarray:
+    """Pins (N,) bool of pins (N, 2) that are at the place of another one: nearer to it than ``FOLDED`` median spacings."""
+    spacing = cKDTree(pins_px).query(pins_px, k=2)[0][:, 1]
+    at_another: np.ndarray = spacing <= FOLDED * np.median(spacing)
+    return at_another
+
+
 def make_reference(pins_px: np.ndarray, pins: PinsSpec) -> Reference:
     """Reference from rest positions (N, 2) of the pins of a layout.
 
     Raises
     ------
     FrameError
-        The pins lie at one place, on a line, or farther away than in any camera's frame.
+        The pins lie at one place, on a line, or farther away than in any camera's frame, or two of them at the same place.
     """
     lattice = pin_lattice(pins)
     pins_px = np.ascontiguousarray(pins_px, float)
@@ -77,6 +86,11 @@ def make_reference(pins_px: np.ndarray, pins: PinsSpec) -> Reference:
         )
     n = len(pins_px)
     distance, index = cKDTree(pins_px).query(pins_px, k=min(NEIGHBOURS + 1, n))
+    if distance[:, 1].min() == 0:
+        one, other = index[distance[:, 1].argmin(), :2]
+        raise FrameError(
+            f"pins {one} and {other} are at the same place at rest; mend rest_px of the specification, or pins_px of the tuned file"
+        )
     triangles = Delaunay(pins_px).simplices.astype(np.int64)
     area = _double_areas(pins_px, triangles)
     triangles[area < 0] = triangles[area < 0][:, ::-1]

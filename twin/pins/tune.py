@@ -7,16 +7,16 @@ from typing import Any, Literal, TypedDict
 import numpy as np
 
 from scenes.pins import Layout, PinsSpec
-from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
+from scenes.sensor import BlobSpec, Polarity, RecordingSpec, SensorSpec
 from twin.errors import FrameError
 from twin.frames import spread
-from twin.frames.forms import gray_levels
+from twin.frames.forms import pin_levels, polarity_of
 from twin.geometry.pins import pin_lattice
 from twin.pins.detector import Found, make_detector
 from twin.pins.detector_spec import DetectorSpec, Evidence, Method, with_detector
-from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, identify, judge_layout, symmetries
+from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, Identified, identify, judge_layout, smooth_view, symmetries
 from twin.pins.legacy import legacy_parameters
-from twin.pins.reference import Reference, make_reference
+from twin.pins.reference import Reference, make_reference, together
 from twin.pins.rest import Rest, rest_of
 from twin.progress import Step
 from twin.types import Form, Frame
@@ -107,7 +107,7 @@ def tune(
 ) -> Tuned:
     """Find mask, threshold and blob parameters from frames of one size and form.
 
-    Only the layout of the sensor's pins is used. The frames may show any contact, and be of any size.
+    Only the layout and the polarity of the sensor's pins are used. The frames may show any contact, and be of any size.
 
     Parameters
     ----------
@@ -127,7 +127,8 @@ def tune(
     chosen = spread(len(frames), TUNED_ON)
     frames = [frames[k] for k in chosen]
     form = frames[0].form
-    images = [gray_levels(frame.image) for frame in frames]
+    polarity = polarity_of(sensor.pipeline, form)
+    images = [pin_levels(frame.image, polarity) for frame in frames]
     doubts: list[str] = []
     layout = judge_layout(sensor.pins, images) if known is None else replace(known, seen=tuple(known.seen[k] for k in chosen))
     if layout is None or layout.explained < LEAST_SHOWN:
@@ -140,11 +141,12 @@ def tune(
     shape = frames[0].image.shape
     size_px = (shape[1], shape[0])
     if rest is None:
-        rest = rest_of(layout, [f.name for f in frames], None if given is None else gray_levels(given.image), given.name if given else "")
+        given_levels = None if given is None else pin_levels(given.image, polarity)
+        rest = rest_of(layout, [f.name for f in frames], given_levels, given.name if given else "")
     reference = make_reference(turned_as(sensor.pins, layout.rest_px), sensor.pins)
     caps = [caps_in(image, seen.pins_px, reference.spacing_px) for image, seen in zip(images, layout.seen, strict=True)]
     area, contrast = (float(np.nanmedian(values)) for values in zip(*caps, strict=True))
-    start = _start(size_px, reference, layout, area, method, form, sensor.pins.layout)
+    start = _start(size_px, reference, layout, area, method, form, sensor.pins.layout, polarity)
     sensor = with_detector(sensor, start)
     tried, judged = list(_settings(start, reference, contrast, form == Form.RECORDING)), frames
     if method in SLOW:
@@ -170,9 +172,12 @@ def tune(
 
 
 def _at_rest(detector: DetectorSpec, pins: PinsSpec, rest: Rest, layout: Candidate) -> DetectorSpec:
-    """The detector with the pins at rest. A pin out of view gets its median place over the frames."""
+    """The detector with the pins at rest. A pin out of view gets its median place over the frames; if another pin is there, as if frames
+    were labelled differently, its place in a smooth view of the pins in view."""
     unseen = ~np.isfinite(rest.pins_px[:, 0])
-    places = turned_as(pins, np.where(unseen[:, None], layout.rest_px, rest.pins_px))
+    places = np.where(unseen[:, None], layout.rest_px, rest.pins_px)
+    smooth = smooth_view(pin_lattice(pins).places, rest.pins_px)
+    places = turned_as(pins, np.where((unseen & together(places.round(2)))[:, None], smooth, places))
     blob = detector.blob.model_copy(update={"rest_origin": "contacts" if rest.source == "made" else "measured"})
     return detector.model_copy(update={"pins_px": tuple(map(tuple, places.round(2).tolist())), "blob": blob})
 
@@ -180,23 +185,30 @@ def _at_rest(detector: DetectorSpec, pins: PinsSpec, rest: Rest, layout: Candida
 def _shown_instead(images: list[np.ndarray]) -> str:
     """What the frames show instead of the expected layout, for an error message; "" if nothing is recognised."""
     try:
-        return f"; they show {identify(images).best.pins.in_words()}"
+        return f"; they show {_in_words(identify(images))}"
     except FrameError:
         return ""
+
+
+def _in_words(found: Identified) -> str:
+    """An identified layout in words, with the remedy if its polarity is not the expected one."""
+    other = "" if found.polarity == "bright" else " of the other polarity (bright or dark, 'polarity' in the specification)"
+    return found.best.pins.in_words() + other
 
 
 def other_layout(layout: Candidate, images: list[np.ndarray]) -> list[str]:
     """Reasons to doubt a given layout: what it leaves unexplained, and which other layout explains more."""
     try:
-        other = identify(images).best
+        found = identify(images)
     except FrameError:
         return []
+    other = found.best
     same = (other.pins.layout, other.pins.complete_count) == (layout.pins.layout, layout.pins.complete_count)
     more = other.explained > layout.explained + MORE_EXPLAINED
     smoother = other.explained > layout.explained - MORE_EXPLAINED and other.misfit < SAME_SHAPE * layout.misfit
     if not same and (more or smoother):
         return [
-            f"these frames show {other.pins.in_words()} rather than {layout.pins.in_words()}: {layout.left_over:g} pin-like spots of a "
+            f"these frames show {_in_words(found)} rather than {layout.pins.in_words()}: {layout.left_over:g} pin-like spots of a "
             f"frame are none of these pins, and {layout.not_seen:g} of the pins are not seen; give the right --sensor, or make one with "
             "'twin new'"
         ]
@@ -237,7 +249,14 @@ def caps_in(gray: np.ndarray, pins_px: np.ndarray, spacing_px: np.ndarray) -> tu
 
 
 def _start(
-    size_px: tuple[int, int], reference: Reference, layout: Candidate, area: float, method: Method, form: Form, kind: Layout
+    size_px: tuple[int, int],
+    reference: Reference,
+    layout: Candidate,
+    area: float,
+    method: Method,
+    form: Form,
+    kind: Layout,
+    polarity: Polarity,
 ) -> DetectorSpec:
     """A detector with the mask and the caps' size, before a threshold is chosen."""
     rim = reference.pins_px[reference.outmost]
@@ -246,6 +265,7 @@ def _start(
     radius = reach + MASK_SPACINGS * np.median(reference.spacing_px[reference.outmost])
     smallest, largest = (round(float(max(share * np.sqrt(area / np.pi), 1.0)), 2) for share in CAP_RADII)
     blob = BlobSpec(
+        polarity=polarity,
         threshold=0.0,
         mask_center_px=tuple(center.round(1).tolist()),
         mask_radius_px=round(float(radius), 1),

@@ -79,7 +79,7 @@ def tune_on_frames(
     path : Path
         Path as for ``open_recording``. If it has a frame without contact, this frame gives the pins at rest.
     sensor : SensorSpec
-        Only the layout of its pins is used.
+        Only the layout and the polarity of its pins are used.
     out : Path, optional
         The ``.toml`` file to write.
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from scenes import load_experiment
 from scenes.rig import RigSpec
-from scenes.sensor import SensorSpec
+from scenes.sensor import Polarity, SensorSpec
 from twin.camera.capture import expose
 from twin.camera.projection import Disc, project
 from twin.frames.forms import gray_levels
@@ -124,12 +124,12 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
     return PoseAligned(rig, fitted, contacts_of(rig, experiment, labels, apex_mm), pairs)
 
 
-def statistics(pairs: list[Pair], disc: Disc, *, progress: Step) -> Statistics:
+def statistics(pairs: list[Pair], disc: Disc, polarity: Polarity, *, progress: Step) -> Statistics:
     """Compare real frames with pin-aligned renders: caps, skin, noise, spectrum, spots."""
     sets: tuple[list[FrameStatistics], list[FrameStatistics]] = ([], [])
     for number, pair in enumerate(pairs):
         for measured, image in zip(sets, (pair.real.frame.image, pair.image), strict=True):
-            measured.append(measure_frame(gray_levels(image), pair.real.pins_px, disc))
+            measured.append(measure_frame(gray_levels(image), pair.real.pins_px, disc, polarity=polarity))
         progress(number + 1, len(pairs))
     return compare_statistics(*sets)
 

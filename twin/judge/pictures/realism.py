@@ -101,7 +101,7 @@ def run_realism(
         pairs = pin_aligned(spec, real.frames, disc, quality=quality, progress=step)
     poses = pose_aligned(spec, real.frames, disc, quality=quality, bar=bar) if with_poses else None
     with bar("measure caps, skin, noise, spectra") as step:
-        found = statistics(pairs, disc, progress=step)
+        found = statistics(pairs, disc, spec.pipeline.raw.polarity, progress=step)
     outcome: Mapping[str, TwoSample] = {}
     if test is not None and len(pairs) > 1:
         with bar("train the two-sample test") as step:

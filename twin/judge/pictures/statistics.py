@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scenes.sensor import Polarity
 from twin.camera.projection import Disc
 from twin.geometry.pins import usual_spacing
 from twin.judge.pictures.spectra import RadialRow, equal_count_edges, log_distance_db, noise_sd, radial_rows, radial_spectrum
@@ -79,12 +80,12 @@ class Statistics:
         return float(np.nanmax([abs(row.difference) for row in self.radial if row.measure == measure]))
 
 
-def measure_frame(gray: np.ndarray, pins_px: np.ndarray, disc: Disc) -> FrameStatistics:
-    """Measure a gray frame (H, W) uint8 with pins at (N, 2) px."""
+def measure_frame(gray: np.ndarray, pins_px: np.ndarray, disc: Disc, *, polarity: Polarity = "bright") -> FrameStatistics:
+    """Measure a gray frame (H, W) uint8 with bright or dark pins at (N, 2) px."""
     bare = bare_skin(gray.shape, pins_px, disc)
     frequency, power = radial_spectrum(gray, disc.center_px, disc.radius_px)
     return FrameStatistics(
-        caps=measure_caps(gray, pins_px),
+        caps=measure_caps(gray, pins_px, polarity=polarity),
         distance_px=disc.distance_px(pins_px),
         skin_level=float(np.median(gray[bare])) if bare.any() else np.nan,
         noise_sd=noise_sd(gray, bare) if bare.any() else np.nan,

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 
+from scenes.base import Rgb
 from scenes.body import SkinSpec
 from scenes.sensor import AppearanceSpec, SensorSpec
 from twin.geometry.pins import rest_pins
@@ -37,7 +38,9 @@ def missing(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorS
     """Caps that have come off."""
     if not value:
         return spec
-    levels = np.where(chosen(spec.pins.count, value, rng), GONE, cap_levels(spec.appearance, spec.pins.count))
+    look = spec.appearance
+    gone = sum(look.skin_albedo) / max(sum(look.cap_albedo), GONE) if look.dark_caps else GONE
+    levels = np.where(chosen(spec.pins.count, value, rng), gone, cap_levels(look, spec.pins.count))
     return altered(spec, appearance={"cap_levels": tuple(levels.tolist())})
 
 
@@ -62,8 +65,15 @@ def broken(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSp
 
 
 def faded(appearance: AppearanceSpec, value: float, rng: np.random.Generator) -> AppearanceSpec:
-    """Caps that have darkened."""
+    """Caps that have darkened; dark caps have become as bright as the skin."""
+    if appearance.dark_caps:
+        return appearance.model_copy(update={"cap_albedo": _towards(appearance.cap_albedo, appearance.skin_albedo, value)})
     return appearance.model_copy(update={"cap_albedo": tuple(a * (1 - value) for a in appearance.cap_albedo)}) if value else appearance
+
+
+def _towards(albedo: Rgb, other: Rgb, value: float) -> tuple[float, ...]:
+    """A reflectance between two."""
+    return tuple(a + value * (b - a) for a, b in zip(albedo, other, strict=True))
 
 
 def uneven(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
@@ -75,7 +85,9 @@ def uneven(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSp
 
 
 def pale(appearance: AppearanceSpec, value: float, rng: np.random.Generator) -> AppearanceSpec:
-    """A skin that has lost its black."""
+    """A skin that has lost its black; a bright skin has become as dark as the caps."""
+    if appearance.dark_caps:
+        return appearance.model_copy(update={"skin_albedo": _towards(appearance.skin_albedo, appearance.cap_albedo, value)})
     old = appearance.skin_albedo
     return appearance.model_copy(update={"skin_albedo": tuple(a + value * (1 - a) for a in old)}) if value else appearance
 

@@ -182,10 +182,15 @@ there in half of the frames, so give frames of several contacts.
 
 The exit code is 3 if something is bad, else 0.
 
+On a symmetric layout a turn by its symmetry and a mirror can't be seen in pins of an unknown unit. Contacts that push the pins to known
+sides decide: with --push and --no-contact, turn, mirror, size and place of the picture and the pins at rest are found, written to --out as
+a copy of the specification, and the frames are checked against that copy.
+
 \b
 Example:
   twin check recordings/today --sensor ur5-331
   twin check 0 --sensor mine.toml
+  twin check recordings/today --sensor mine.toml --no-contact rest.png --push x:right.png --push y:down.png --out turned.toml
 """
 
 
@@ -198,13 +203,33 @@ def check(
     form: FormOrAuto = None,
     pipeline: Annotated[Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="what 'twin tune' wrote")] = None,
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="look at no more than N frames, evenly spread")] = 20,
+    no_contact: Annotated[Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, for --push")] = None,
+    push: Annotated[
+        list[str] | None,
+        typer.Option("--push", metavar="SIDE:FRAME", help="contact whose object was moved to the sensor's x, y, -x or -y; repeat it"),
+    ] = None,
+    twist: Annotated[
+        Path | None, typer.Option("--twist", metavar="FRAME", help="contact whose object was turned from x to y, instead of a second push")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE.toml", help="copy of the specification with the view of --push")
+    ] = None,
 ) -> None:
     from hardware.examining import examine_sensor
     from scenes import load_sensor
     from twin.cli.progress import shown
+    from twin.errors import OptionError
+    from twin.fit.camera_view import register_files
     from twin.pins import load_detector
 
     spec, detector = load_sensor(sensor), if_given(load_detector, pipeline)
+    if no_contact is not None and (push or twist is not None):
+        spec, view = register_files(spec, no_contact, push or [], twist=twist, form=form, out=out)
+        say(
+            [f"the picture is {'mirrored and ' if view.mirrored else ''}turned by {view.turn_deg:.1f} deg, {view.scale:.3f} times its size"]
+        )
+    elif no_contact is not None or push or twist is not None or out is not None:
+        raise OptionError("--no-contact, --push and --out belong together: give a frame without contact, and pushes to known sides")
     with shown() as progress:
         found = examine_sensor(source, spec, form=form, detector=detector, limit=limit, progress=progress)
     say(found.lines())

@@ -16,8 +16,9 @@ from twin.pins.detector import Found, make_detector
 from twin.pins.detector_spec import DetectorSpec, Evidence, Method, with_detector
 from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, identify, judge_layout, symmetries
 from twin.pins.legacy import legacy_parameters
-from twin.pins.reference import Reference, make_reference
+from twin.pins.reference import Reference, make_reference, nominal_reference
 from twin.pins.rest import Rest, rest_of
+from twin.pins.view import camera_modes, view_of
 from twin.progress import Step
 from twin.types import Form, Frame
 
@@ -141,6 +142,9 @@ def tune(
     size_px = (shape[1], shape[0])
     if rest is None:
         rest = rest_of(layout, [f.name for f in frames], None if given is None else gray_levels(given.image), given.name if given else "")
+        if given is not None:
+            view = view_of(rest.pins_px, nominal_reference(sensor, form), sensor.pins, camera_modes(sensor, form))
+            view.require_unpressed(given.name, sensor)
     reference = make_reference(turned_as(sensor.pins, layout.rest_px), sensor.pins)
     caps = [caps_in(image, seen.pins_px, reference.spacing_px) for image, seen in zip(images, layout.seen, strict=True)]
     area, contrast = (float(np.nanmedian(values)) for values in zip(*caps, strict=True))

@@ -168,8 +168,8 @@ def test_a_pressed_or_foreign_frame_at_rest_is_an_error_of_every_reader(tmp_path
     away = (known - known.mean(axis=0)) / np.abs(known - known.mean(axis=0)).max()
     cv2.imwrite(str(tmp_path / "frame_1_0.png"), drawn(model, known).image)
     pressed = known + 15.0 * away * np.exp(-4 * (away**2).sum(axis=1))[:, None]
-    for px, words in ((pressed, "seems pressed"), (known[:60], "no use as no-contact frame")):
-        cv2.imwrite(str(tmp_path / "init_0.png"), drawn(model, px).image)
+    for image, words in ((drawn(model, pressed).image, "seems pressed"), (np.zeros((256, 256), np.uint8), "no use as no-contact frame")):
+        cv2.imwrite(str(tmp_path / "init_0.png"), image)
         with pytest.raises(FrameError, match=f"init_0.png: .*{words}.*--no-contact FRAME"):
             predict_frames("mg400-127", tmp_path)
 

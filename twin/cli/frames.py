@@ -190,7 +190,8 @@ a copy of the specification, and the frames are checked against that copy.
 Example:
   twin check recordings/today --sensor ur5-331
   twin check 0 --sensor mine.toml
-  twin check recordings/today --sensor mine.toml --no-contact rest.png --push x:right.png --push y:down.png --out turned.toml
+  twin check today --sensor mine.toml --no-contact rest.png \\
+      --push x:right.png --push y:down.png --out turned.toml
 """
 
 
@@ -214,24 +215,27 @@ def check(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.toml", help="copy of the specification with the view of --push")
     ] = None,
+    force: Force = False,
 ) -> None:
     from hardware.examining import examine_sensor
     from scenes import load_sensor
     from twin.cli.progress import shown
-    from twin.errors import OptionError
-    from twin.fit.camera_view import register_files
     from twin.pins import load_detector
+    from twin.store import overwriting
 
-    spec, detector = load_sensor(sensor), if_given(load_detector, pipeline)
-    if no_contact is not None and (push or twist is not None):
-        spec, view = register_files(spec, no_contact, push or [], twist=twist, form=form, out=out)
-        say(
-            [f"the picture is {'mirrored and ' if view.mirrored else ''}turned by {view.turn_deg:.1f} deg, {view.scale:.3f} times its size"]
+    with overwriting(force), shown() as progress:
+        found = examine_sensor(
+            source,
+            load_sensor(sensor),
+            form=form,
+            detector=if_given(load_detector, pipeline),
+            limit=limit,
+            no_contact=no_contact,
+            pushes=push or (),
+            twist=twist,
+            out=out,
+            progress=progress,
         )
-    elif no_contact is not None or push or twist is not None or out is not None:
-        raise OptionError("--no-contact, --push and --out belong together: give a frame without contact, and pushes to known sides")
-    with shown() as progress:
-        found = examine_sensor(source, spec, form=form, detector=detector, limit=limit, progress=progress)
     say(found.lines())
     if found.bad:
         raise SystemExit(BAD)

@@ -30,7 +30,7 @@ sure. Two units of one drawing differ by 0.017 or more."""
 MOST_DENT, MOST_FLAT = (0.02, 0.045), (0.08, 0.09)
 """Largest dent without contact, in spacings, on the unit of the known places and on others: if the camera's distance and lens may differ,
 and if only its tilt may (``flat``, because a plate from the front is much like another lens). Measured at rest: 0.022 to 0.031 and 0.024 to
-0.060 on other units. Contacts: ``docs/recordings.md``."""
+0.060 on other units. Contacts: ``docs/your-own-sensor.md``."""
 NOISE = 0.6
 """Largest dent relative to what is left of each pin alone: in coarse pictures the noise of the pins is larger than the limits above."""
 MOST_UNEVEN = 0.06
@@ -39,7 +39,7 @@ sensors, 0.053 with a camera tilted by 7 deg."""
 AROUND, ALONE = 18, 6
 """Number of nearest pins with which a pin's motion is averaged in a dent, and from which its motion alone is counted."""
 MOST_TURN_DEG, MOST_STRETCH, MOST_ZOOM, MOST_SHIFT = 5.0, 0.03, 0.05, 1.0
-"""Largest turn, stretch, zoom, and shift (spacings) of the picture with which estimates were measured to hold (``docs/recordings.md``)."""
+"""Largest turn, stretch, zoom, and shift (spacings) of the picture with which estimates were measured to hold (``docs/your-own-sensor.md``)."""
 MOST_ZOOM_PRESSED = 0.12
 """Largest zoom if the pins are those of contacts, which bulge the rim by 0.03 in the median and 0.1 at most."""
 TILTED = 8

@@ -208,6 +208,16 @@ class PoseEstimator:
         known = self._known_rest_px
         return self._trained.reference if known is None else make_reference(known, self.sensor.pins)
 
+    def require_view_of_contacts(self, nodes_px: np.ndarray, rest: Reference | None, name: str) -> None:
+        """As ``require_view``, from the pins (M, N, 2) of contacts, and from the places at ``rest`` that were estimated from them."""
+        if len(nodes_px) >= FEWEST_VIEWED:
+            self.require_view(np.median(nodes_px, axis=0), name, contacts=True)
+        if rest is not None and self.require_view(rest.pins_px, name).pressed:
+            raise FrameError(
+                f"{name}: no pins at rest of {self.sensor.name} explain them: the camera's picture may be turned or mirrored, or they are "
+                "of a kind that the weights do not know; give a frame without contact (init_0.png beside the frames, --no-contact FRAME)"
+            )
+
     def require_view(self, pins_px: np.ndarray, name: str, *, contacts: bool = False) -> View:
         """The camera's view of pins at rest (N, 2), or of the median of ``contacts``, against the unit of the weights.
 
@@ -272,9 +282,9 @@ class PoseEstimator:
         pipeline = self.at_known_rest().pipeline
         graphs = [seen.graph for frame in frames if (seen := pipeline(frame)).valid]
         nodes_px = np.array([graph.nodes_px for graph in graphs if graph is not None]).reshape(-1, self.sensor.pins.count, 2)
-        if len(nodes_px) >= FEWEST_VIEWED:
-            self.require_view(np.median(nodes_px, axis=0), "these contacts", contacts=True)
-        return self.told_rest(nodes_px)
+        found, other = self.told_rest(nodes_px)
+        self.require_view_of_contacts(nodes_px, found.pipeline.reference if other else None, "these contacts")
+        return found, other
 
     def told_rest(self, nodes_px: np.ndarray) -> tuple["PoseEstimator", bool]:
         """As ``at_rest_of``, from the pins (M, N, 2), px, of contacts."""

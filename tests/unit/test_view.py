@@ -15,6 +15,7 @@ from training.studies.prediction import predict_frames
 from twin.camera.projection import pixel_rays, project
 from twin.errors import FrameError
 from twin.fit.camera_view import register_files, registered_view
+from twin.frames import open_recording
 from twin.frames.forms import from_raw
 from twin.geometry.pins import namings, pin_lattice, rest_pins
 from twin.geometry.solid import Resolution
@@ -23,6 +24,7 @@ from twin.mechanics.solver import SkinSolver
 from twin.pins import Grade, Pipeline, examine, make_reference, measure_reference, nominal_reference, view_of
 from twin.pins.identify import symmetries
 from twin.pins.view import MOST_TURN_DEG
+from twin.rig.labels import read_arm_labels
 from twin.types import Form, Frame
 
 WEIGHTS = ("mg400-127", "mg400-331")
@@ -270,3 +272,28 @@ def test_a_dark_frame_is_no_frame_at_rest():
     spec = load_sensor("mg400-127")
     with pytest.raises(FrameError, match="no use as no-contact frame, no pins"):
         measure_reference(spec, Form.RECORDING, Frame(np.zeros((256, 256), np.uint8), Form.RECORDING, "init_0.png"))
+
+
+def warped(frame, centre_px, *, turn_deg=0.0, scale=1.0):
+    matrix = cv2.getRotationMatrix2D(tuple(centre_px), -turn_deg, scale)
+    return Frame(cv2.warpAffine(frame.image, matrix, frame.image.shape[::-1], borderMode=cv2.BORDER_REPLICATE), frame.form, frame.name)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("folder", "name"), [("tac-vgnn-331", "mg400-331"), ("tac-vgnn-127", "mg400-127")])
+def test_real_frames_of_a_displaced_camera_keep_their_estimates(real_dir, folder, name):
+    recording, model, centre = open_recording(real_dir / folder, load_sensor(name)), model_of(name), known_of(name).mean(axis=0)
+    frames = [recording.read(k) for k in range(50, len(recording), 600)]
+    straight = [model.at_rest(recording.reference)(frame) for frame in frames]
+    for change in ({"turn_deg": 4.5}, {"scale": 1.04}, {"scale": 0.96, "turn_deg": -3.0}):
+        at_rest = model.at_rest(warped(recording.reference, centre, **change))
+        for frame, before in zip(frames, straight, strict=True):
+            made = at_rest(warped(frame, centre, **change))
+            assert made.valid and np.all(np.abs(made.value - before.value) < [0.02, 0.06]), change
+    with pytest.raises(FrameError, match="turned by -?180"):
+        model.at_rest(warped(recording.reference, centre, turn_deg=180.0))
+    shallow = [k for k, label in enumerate(read_arm_labels(recording)) if 1.5 < label.pose[1] + 5.0 < 1.8][::60]
+    for k in shallow:
+        with pytest.raises(FrameError, match="seems pressed"):
+            model.at_rest(recording.read(k))
+    assert len(shallow) > 2

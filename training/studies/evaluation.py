@@ -72,9 +72,8 @@ def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
         return data
     if open_recording(data.folder, estimator.sensor, estimator.form).reference is not None:
         return data
-    if len(nodes_px := data.pins.nodes_px[data.pins.valid]):
-        estimator.require_view(np.median(nodes_px, axis=0), f"the contacts of {data.folder.name}", contacts=True)
     other = estimator.other_rest(data.pins.reference, data.pins.nodes_px)
+    estimator.require_view_of_contacts(data.pins.nodes_px[data.pins.valid], other, f"the contacts of {data.folder.name}")
     if other is None:
         return data
     return replace(data, pins=replace(data.pins, reference=other, measured=True), problems=[*data.problems, OTHER_UNIT])

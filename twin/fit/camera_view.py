@@ -103,7 +103,7 @@ def register_files(
 ) -> tuple[SensorSpec, View]:
     """As ``registered_view``, from pictures; ``pushes`` are texts such as ``x:FRAME``."""
     form = form or open_recording(rest, spec).form
-    sides = dict(text.split(":", 1) if ":" in text else (text, "") for text in pushes)
+    sides = {side: path for side, _, path in (text.partition(":") for text in pushes)}
 
     def frame(path: str | Path) -> Frame:
         return open_recording(path, spec, form).read(0)

@@ -250,7 +250,7 @@ def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> lis
     found = [d for d, _ in drifts]
     with np.errstate(invalid="ignore"):
         pins_px = np.stack([o.pins_px for _, o in drifts])
-        known = np.isfinite(pins_px).any(axis=(0, 2))
+        known = np.asarray(np.isfinite(pins_px).any(axis=(0, 2)))
         pins_px = np.where(known[:, None], np.nanmedian(np.where(known[:, None], pins_px, 0.0), axis=0), np.nan)
     view = view_of(pins_px, nominal, spec.pins)
     shift = np.median(np.stack([d.shift_px for d in found]), axis=0)

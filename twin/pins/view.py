@@ -39,7 +39,8 @@ sensors, 0.053 with a camera tilted by 7 deg."""
 AROUND, ALONE = 18, 6
 """Number of nearest pins with which a pin's motion is averaged in a dent, and from which its motion alone is counted."""
 MOST_TURN_DEG, MOST_STRETCH, MOST_ZOOM, MOST_SHIFT = 5.0, 0.03, 0.05, 1.0
-"""Largest turn, stretch, zoom, and shift (spacings) of the picture with which estimates were measured to hold (``docs/your-own-sensor.md``)."""
+"""Largest turn, stretch, zoom, and shift (spacings) of the picture with which estimates were measured to hold
+(``docs/your-own-sensor.md``)."""
 MOST_ZOOM_PRESSED = 0.12
 """Largest zoom if the pins are those of contacts, which bulge the rim by 0.03 in the median and 0.1 at most."""
 TILTED = 8
@@ -214,8 +215,8 @@ def views_of(pins_px: np.ndarray, known: Reference, pins: PinsSpec, modes: np.nd
         )
         alone = (away - _mean(away[nearest[:, 1 : ALONE + 1]]))[seen]
         left = float(np.sqrt(np.mean(np.sum(alone**2, axis=1)) * ALONE / (ALONE + 1)))
-        dents = (float(np.linalg.norm(_mean(each[nearest]), axis=1).max()) for each in (away, still))
-        found.append(View(carry[0] - middle, carry[1:].T / spacing, left, *dents, spacing, order))
+        dent, unlike = (float(np.linalg.norm(_mean(each[nearest]), axis=1).max()) for each in (away, still))
+        found.append(View(carry[0] - middle, carry[1:].T / spacing, left, dent, unlike, spacing, order))
     return found
 
 

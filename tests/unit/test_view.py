@@ -29,6 +29,7 @@ from twin.types import Form, Frame
 
 WEIGHTS = ("mg400-127", "mg400-331")
 PRINT_PITCHES = 0.03  # sd of a print's tolerances
+LIKE_STRAIGHT = 0.2  # of half an interval: resampling the picture moves a real estimate by 0.14 of it where it loses a pin
 
 
 def carried(px, *, turn_deg=0.0, scale=(1.0, 1.0), mirrored=False, shift_px=(0.0, 0.0)):
@@ -289,7 +290,7 @@ def test_real_frames_of_a_displaced_camera_keep_their_estimates(real_dir, folder
         at_rest = model.at_rest(warped(recording.reference, centre, **change))
         for frame, before in zip(frames, straight, strict=True):
             made = at_rest(warped(frame, centre, **change))
-            assert made.valid and np.all(np.abs(made.value - before.value) < [0.02, 0.06]), change
+            assert made.valid and np.all(np.abs(made.value - before.value) < LIKE_STRAIGHT * (before.high - before.low) / 2), change
     with pytest.raises(FrameError, match="turned by -?180"):
         model.at_rest(warped(recording.reference, centre, turn_deg=180.0))
     shallow = [k for k, label in enumerate(read_arm_labels(recording)) if 1.5 < label.pose[1] + 5.0 < 1.8][::60]

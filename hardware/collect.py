@@ -30,9 +30,10 @@ from hardware.watch import ArmWatch
 from scenes import ObjectSpec, SensorSpec, ServoSpec
 from scenes.experiment import LABELS, ExperimentSpec
 from scenes.files import shown
+from twin.errors import FrameError
 from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
-from twin.pins import require_untouched
+from twin.pins import measure_reference
 from twin.progress import Progress, Step, silent, stage
 from twin.records import KeptAlso
 from twin.store import contents, made_by, output, write_json, write_text, writes
@@ -532,7 +533,7 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
     DeviceError
         The folder holds something else, or one of the reasons of ``collect``.
     FrameError
-        The sensor seems to be pressed in the frame without contact.
+        The frame without contact shows a contact, or not this sensor.
     """
     kept = KeptAlso(out, plan.also, plan.sensor)
     rig = build_rig(
@@ -552,11 +553,10 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
     before = collection.count
 
     def require_rest(frame: Frame) -> None:
-        remedy = (
-            f"look for what touches it, remove {collection.rest} and give the same command again, which takes it anew; "
-            "or give the same command without removing it, to use it as it is"
-        )
-        require_untouched(plan.sensor, rig.source.form, frame, remedy)
+        try:
+            measure_reference(plan.sensor, rig.source.form, frame)
+        except FrameError as error:
+            raise FrameError(f"{error}; remove {collection.rest} and give the same command again, which takes it anew") from error
 
     with kept:
         if before < plan.count:

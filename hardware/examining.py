@@ -1,15 +1,18 @@
 """Check of a sensor's condition from frames of a camera or of a recording."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import await_frame
 from scenes import SensorSpec
-from twin.errors import FrameError
+from twin.errors import FrameError, OptionError
+from twin.fit.camera_view import register_files
 from twin.frames import evenly_read, open_recording
 from twin.pins import DetectorSpec, Finding, Grade, examine, with_detector
 from twin.progress import Progress, silent, stage
+from twin.store import writes_file
 from twin.types import Form, Frame
 
 LIMIT = 20  # most frames that are used
@@ -38,6 +41,7 @@ class Examination:
         return lines
 
 
+@writes_file()
 def examine_sensor(
     source: str,
     sensor: SensorSpec,
@@ -45,6 +49,10 @@ def examine_sensor(
     form: Form | None = None,
     detector: DetectorSpec | None = None,
     limit: int = LIMIT,
+    no_contact: Path | None = None,
+    pushes: Sequence[str] = (),
+    twist: Path | None = None,
+    out: Path | None = None,
     progress: Progress = silent,
 ) -> Examination:
     """Examine at most ``limit`` frames of a camera or a recording.
@@ -57,11 +65,16 @@ def examine_sensor(
         Form of the frames; recognised by size and content by default.
     detector : DetectorSpec, optional
         Result of 'twin tune'; by default the specification's own detector.
+    no_contact, pushes, twist, out : optional
+        As ``rest``, ``pushes``, ``twist`` and ``out`` of ``twin.fit.camera_view.register_files``: the camera's turn and mirror are found,
+        and the frames are compared with the corrected copy of the specification.
 
     Raises
     ------
     FrameError
-        The detector is not of method ``twin``, or there are no frames.
+        The detector is not of method ``twin``, there are no frames, or the pushes do not tell the camera's view.
+    OptionError
+        Pushes without a frame without contact, or the other way round.
     DeviceError
         There is no such camera, or it delivers no frame.
     """
@@ -69,10 +82,17 @@ def examine_sensor(
         raise FrameError(
             f"{detector.name}: tuned for method '{detector.method}', --pipeline takes method 'twin'; run 'twin tune' without --method"
         )
+    views = []
+    if no_contact is not None and (pushes or twist is not None):
+        sensor, view = register_files(sensor, no_contact, pushes, twist=twist, form=form, out=out)
+        mirrored = "mirrored and " if view.mirrored else ""
+        views.append(f"the camera's picture is {mirrored}turned by {view.turn_deg:.1f} deg against the given specification")
+    elif no_contact is not None or pushes or twist is not None or out is not None:
+        raise OptionError("--no-contact, --push and --out belong together: give a frame without contact, and pushes to known sides")
     seeing = sensor if detector is None else with_detector(sensor, detector)  # frames have the size for which the detector was tuned
     frames, notes = frames_of(source, seeing, form, limit)
     with stage(progress, "frames") as step:
-        return Examination(examine(frames, sensor, detector, progress=step), notes)
+        return Examination(examine(frames, sensor, detector, progress=step), views + notes)
 
 
 def frames_of(source: str, sensor: SensorSpec | None, form: Form | None, limit: int) -> tuple[list[Frame], list[str]]:

@@ -14,7 +14,7 @@ from hardware.errors import DeviceError
 from hardware.last_axis import LastAxis, turns_back_mm
 from hardware.loop import ServoLoop
 from hardware.policy_law import policy_law
-from hardware.rig import TWIN, Rig, build_rig, counting_from_first, given_frame, servo_loop, steps_round
+from hardware.rig import TWIN, Rig, build_rig, given_frame, servo_loop, steps_round
 from hardware.step import LoopSettings, StepRecord
 from hardware.timing import Timing
 from hardware.trajectory import Measures, Trajectory, measure, trajectory_figure, trajectory_of, write_csv
@@ -255,7 +255,7 @@ def _take_rest(session: SessionWriter | None, model: SensorModel, frame: Frame) 
     """Store the frame that was taken clear of the object, and use its pins as the pins at rest."""
     if session is not None:
         session.keep_rest(frame)
-    return counting_from_first(model, frame)
+    return model.at_rest(frame)
 
 
 def _results(plan: FollowPlan, rig: Rig, loop: ServoLoop, wanted_mm: float, failure: str) -> Followed:

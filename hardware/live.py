@@ -17,7 +17,7 @@ from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.rerun_view import RerunView
-from hardware.rig import counting_from_first, given_frame
+from hardware.rig import given_frame
 from hardware.session import SessionSource
 from hardware.timing import Spread, Timing
 from twin.errors import FrameError, OptionError, TwinError
@@ -394,7 +394,7 @@ def _at_rest(plan: WatchPlan, model: SensorModel, source: FrameSource, rest: Fra
     """The model with the pins at rest from the frame without contact, or from the contacts, and that frame."""
     if plan.at_rest == FIRST:
         rest = await_frame(source)
-        return counting_from_first(model, rest), rest
+        return model.at_rest(rest), rest
     # A session may be replayed with another model, which may not use displacements from rest.
     if rest is not None and (model.counts_from_rest or plan.replay is None):
         return model.at_rest(rest), rest

@@ -1,8 +1,7 @@
 """The composition root of live work: the only module that decides whether a device is simulated, recorded or real.
 
-``build_rig`` builds a camera and an arm in front of an object from the user's options. ``given_frame`` and ``counting_from_first`` select
-the no-contact frame relative to which a model measures the pins' displacements. ``signals_as_ctrl_c`` makes signals end work that moves an
-arm as Ctrl-C does.
+``build_rig`` builds a camera and an arm in front of an object from the user's options. ``given_frame`` selects the no-contact frame from
+which a model measures the pins' displacements. ``signals_as_ctrl_c`` makes signals end work that moves an arm as Ctrl-C does.
 """
 
 import signal
@@ -34,7 +33,6 @@ from twin.estimate import Estimate, Estimator, SensorModel
 from twin.frames import open_recording
 from twin.optics.preview import Preview
 from twin.optics.render import traced_shading
-from twin.pins import require_untouched
 from twin.rig.mounting import Mounting
 from twin.types import FIRST, NONE, Form, Frame
 
@@ -82,20 +80,6 @@ def given_frame(at_rest: str, model: SensorModel) -> Frame | None:
         raise FrameError(f"--at-rest {at_rest}: no such file; expected a frame without contact, '{FIRST}' or '{NONE}'")
     recording = open_recording(at_rest, model.sensor, model.form)
     return recording.reference if recording.reference is not None else recording.read(0)
-
-
-def counting_from_first(model: SensorModel, frame: Frame) -> SensorModel:
-    """The model that uses the first frame as its no-contact frame.
-
-    Raises
-    ------
-    FrameError
-        The sensor seems to be in contact in this frame, or the model can't use it.
-    """
-    found = model.at_rest(frame)
-    remedy = "move it clear of everything and begin again, or give a frame that was taken without contact: --at-rest FRAME"
-    require_untouched(model.sensor, model.form, frame, remedy)
-    return found
 
 
 @dataclass

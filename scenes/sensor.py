@@ -67,6 +67,9 @@ class CameraSpec(Section):
     tilt_x_deg, tilt_y_deg : float
         Rotation of the camera about its pupil. A positive ``tilt_x_deg`` turns the optical axis towards -y of the sensor frame, a
         positive ``tilt_y_deg`` towards -x.
+    turn_deg, mirrored : float, bool
+        Turn of the picture from x towards y, and whether it is mirrored left to right before the turn: of a camera that is mounted turned,
+        or that looks over a mirror. ``twin check --push`` finds them.
     k1, k2, p1, p2 : float
         Coefficients of the radial (k) and tangential (p) distortion of the ``projection``.
     aperture_mm : float
@@ -92,6 +95,8 @@ class CameraSpec(Section):
     distance_mm: float
     tilt_x_deg: Annotated[float, Field(ge=-30, le=30)] = 0.0
     tilt_y_deg: Annotated[float, Field(ge=-30, le=30)] = 0.0
+    turn_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    mirrored: bool = False
     k1: float = 0.0
     k2: float = 0.0
     p1: float = 0.0

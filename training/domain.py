@@ -233,9 +233,7 @@ class Domain:
         if found.unknown > 0:
             notes.append("no training frame of known label is near")
         factor = (1 + GROWS * max(strange - 1, 0)) * (1 + (OFF_PLACE - 1) * share)
-        return Verdict(
-            "", factor, self.rate * found.unknown, tuple(f"{note}: intervals are wider" for note in notes), share * found.camera
-        )
+        return Verdict("", factor, self.rate * found.unknown, tuple(f"{note}: intervals are wider" for note in notes), share * found.camera)
 
     def without_camera(self, nodes_px: FloatArray, area_px2: FloatArray, camera: FloatArray, spacing_px: float) -> tuple:
         """Pins (N, 2) and areas (N,) without motions (4,) of the camera."""

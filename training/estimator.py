@@ -32,7 +32,8 @@ from twin.errors import FrameError
 from twin.estimate import SensorModel
 from twin.frames.forms import blob_spec, form_named
 from twin.mechanics.skin_map import ContactMaps
-from twin.pins import Pipeline, Reference, make_reference, measure_reference, nominal_reference
+from twin.pins import Pipeline, Reference, View, make_reference, measure_reference, nominal_reference, view_of
+from twin.pins.view import camera_modes
 from twin.store import fingerprint
 from twin.types import Form, Frame, Observation
 
@@ -43,6 +44,8 @@ LOST_WIDENS = 2.0
 factor of 1.2 or 1.6."""
 USUAL_FRAME = Verdict("")
 """Verdict on a frame about which nothing strange is known."""
+FEWEST_VIEWED = 8
+"""Least number of contacts whose median pins show the camera's view."""
 SIMULATED_FORCES = ("force_x", "force_y", "force_z", "torque_z")
 """Labels that are proportional to the stiffness of the simulated sensor."""
 
@@ -138,6 +141,7 @@ class PoseEstimator:
         self.displacements: Displacements | None = None
         self.domain: Domain | None = None
         self._tracker: SlipTracker | None = None
+        self._undecided = ""
 
     @classmethod
     def load(cls, run: str | Path) -> "PoseEstimator":
@@ -188,7 +192,8 @@ class PoseEstimator:
         Raises
         ------
         FrameError
-            The layout can't be found in the frame, or the model does not count pins from rest.
+            The frame shows a contact, or not this sensor, or the camera's picture is displaced so far that estimates would be wrong
+            (``twin.pins.view``); or the model does not count pins from rest.
 
         Notes
         -----
@@ -196,10 +201,40 @@ class PoseEstimator:
         """
         if not self.counts_from_rest:
             raise FrameError(f"a no-contact frame serves only a model that counts pins from rest, {self.model} does not; leave it out")
-        reference = measure_reference(self.sensor, self.form, frame)
+        reference = measure_reference(self.sensor, self.form, frame, known=self._known_rest)
+        view = self.require_view(reference.pins_px, frame.name or "frame")
         found = self._counted_from(reference)
         found._trained = replace(found._trained, touched=TouchAnswer(reference))
+        found._undecided = view.undecided()
         return found
+
+    @property
+    def _known_rest(self) -> Reference:
+        """The pins at rest of the unit from which the weights were learnt."""
+        known = self._known_rest_px
+        return self._trained.reference if known is None else make_reference(known, self.sensor.pins)
+
+    def require_view_of_contacts(self, nodes_px: np.ndarray, rest: Reference | None, name: str) -> None:
+        """As ``require_view``, from the pins (M, N, 2) of contacts, and from the places at ``rest`` that were estimated from them."""
+        if len(nodes_px) >= FEWEST_VIEWED:
+            self.require_view(np.median(nodes_px, axis=0), name, contacts=True)
+        if rest is not None and self.require_view(rest.pins_px, name).pressed:
+            raise FrameError(
+                f"{name}: no pins at rest of {self.sensor.name} explain them: the camera's picture may be turned or mirrored, or they are "
+                "of a kind that the weights do not know; give a frame without contact (init_0.png beside the frames, --no-contact FRAME)"
+            )
+
+    def require_view(self, pins_px: np.ndarray, name: str, *, contacts: bool = False) -> View:
+        """The camera's view of pins at rest (N, 2), or of the median of ``contacts``, against the unit of the weights.
+
+        Raises
+        ------
+        FrameError
+            The picture ``name`` is displaced so far that estimates would be wrong.
+        """
+        view = view_of(pins_px, self._known_rest, self.sensor.pins, camera_modes(self.sensor, self.form))
+        view.require_small(name, f"the unit that the weights of {self.sensor.name} are for", contacts=contacts)
+        return view
 
     def remembering(self) -> "PoseEstimator":
         """The model for consecutive frames, which remembers earlier frames; the model itself if the run did not learn slip.
@@ -248,10 +283,18 @@ class PoseEstimator:
         """The model for the sensor that took ``frames`` of contacts, none of them without contact, and whether the sensor is another unit.
 
         The rest places are those measured on the unit of the weights, unless the contacts show others: see ``other_rest``.
+
+        Raises
+        ------
+        FrameError
+            The camera's picture is displaced so far that estimates would be wrong.
         """
         pipeline = self.at_known_rest().pipeline
         graphs = [seen.graph for frame in frames if (seen := pipeline(frame)).valid]
-        return self.told_rest(np.array([graph.nodes_px for graph in graphs if graph is not None]).reshape(-1, self.sensor.pins.count, 2))
+        nodes_px = np.array([graph.nodes_px for graph in graphs if graph is not None]).reshape(-1, self.sensor.pins.count, 2)
+        found, other = self.told_rest(nodes_px)
+        self.require_view_of_contacts(nodes_px, found.pipeline.reference if other else None, "these contacts")
+        return found, other
 
     def told_rest(self, nodes_px: np.ndarray) -> tuple["PoseEstimator", bool]:
         """As ``at_rest_of``, from the pins (M, N, 2), px, of contacts."""
@@ -312,7 +355,7 @@ class PoseEstimator:
     @property
     def caveats(self) -> list[str]:
         """Reasons why the intervals of all frames are wider than the model's own, one line each."""
-        found = []
+        found = [self._undecided] if self._undecided else []
         if self.domain is None:
             found.append(
                 "the run does not hold the patterns of pins that it learnt from (an earlier version, or fewer frames than "

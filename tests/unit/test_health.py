@@ -38,10 +38,13 @@ def verdicts(shown):
     return {found.name: found for found in examine(shown, sensor())}
 
 
+PLACE = ("shift", "turn", "scale", "stretch", "mirror")
+
+
 def test_an_undamaged_sensor_has_no_bad_finding():
     found = verdicts(frames("noise", 0.0))
     assert {f.verdict for f in found.values()} == {Grade.GOOD}, found
-    assert set(found) == {"brightness", "saturation", "focus", "glare", "stray light", "layout", "pins", "specks", "shift", "turn", "scale"}
+    assert set(found) == {"brightness", "saturation", "focus", "glare", "stray light", "layout", "pins", "specks", *PLACE}
 
 
 @pytest.mark.parametrize(

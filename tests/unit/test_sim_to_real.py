@@ -23,7 +23,7 @@ from training.studies.sim_to_real.steps import choose_frames, put_beside, quadra
 from twin.pins import make_reference
 from twin.rig.labels import ArmLabel
 
-SAME = 1e-6  # mm or deg: rounding of the areas' logarithms
+LIKE_A_UNIT = 1e-3  # mm or deg: the tolerances of a unit's pins turn and scale its layout by some 0.01 deg and 0.01 %
 HALF = 0.02  # of a label's spread: what half precision may change
 
 
@@ -43,9 +43,9 @@ def other_camera(pins):
 def test_pins_are_counted_from_the_no_contact_frame_in_hand(data, run):
     estimator, pins = PoseEstimator.load(run), replace(data.pins, measured=True)
     here, there = estimator.predict_table(pins), estimator.predict_table(other_camera(pins))
-    assert np.abs(here.mean - there.mean).max() < SAME
+    assert np.abs(here.mean - there.mean).max() < LIKE_A_UNIT
     unknown = estimator.predict_table(replace(other_camera(pins), measured=False))
-    assert np.abs(here.mean - unknown.mean).max() > 100 * SAME
+    assert np.abs(here.mean - unknown.mean).max() > 2 * LIKE_A_UNIT
 
 
 def test_the_discrepancy_is_learnt_from_few_frames_and_its_uncertainty_is_right():

@@ -61,12 +61,19 @@ def _slip_errors(estimator: PoseEstimator, parts: Sequence[Dataset], chosen: set
 
 
 def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
-    """A recording without a no-contact frame, relative to the pins at rest estimated from its contacts; other recordings unchanged."""
+    """A recording without a no-contact frame, relative to the pins at rest estimated from its contacts; other recordings unchanged.
+
+    Raises
+    ------
+    FrameError
+        The camera's picture is displaced so far that estimates would be wrong.
+    """
     if not estimator.counts_from_rest or is_simulated(data.folder):
         return data
     if open_recording(data.folder, estimator.sensor, estimator.form).reference is not None:
         return data
     other = estimator.other_rest(data.pins.reference, data.pins.nodes_px)
+    estimator.require_view_of_contacts(data.pins.nodes_px[data.pins.valid], other, f"the contacts of {data.folder.name}")
     if other is None:
         return data
     return replace(data, pins=replace(data.pins, reference=other, measured=True), problems=[*data.problems, OTHER_UNIT])
@@ -190,6 +197,8 @@ def evaluate_run(
     for folder in recordings:
         with stage(progress, f"frames of {folder.name}") as step:
             part = load_dataset(folder, estimator.recorded_sensor, estimator.names, form=estimator.form, progress=step)
+            if estimator.counts_from_rest and part.pins.measured:
+                estimator.require_view(part.pins.reference.pins_px, folder.name)
             parts.append(at_own_rest(estimator, part))
     found = joined(parts)
     chosen = rows_to_judge(estimator, found, rows)

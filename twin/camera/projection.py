@@ -42,14 +42,19 @@ def sensor_to_camera(camera: CameraSpec) -> FloatArray:
 
     The entrance pupil is at (0, 0, -distance) of the sensor frame; the camera is turned about it
     by tilt_x (about x), then tilt_y (about y). A positive tilt_x turns the optical axis towards -y of the sensor frame, a positive tilt_y
-    towards -x.
+    towards -x. Then the picture is mirrored left to right, if it is, and turned by ``turn_deg`` from x towards y: of a mirrored picture the
+    determinant is negative.
     """
-    ax, ay = np.radians([camera.tilt_x_deg, camera.tilt_y_deg])
+    ax, ay, turn = np.radians([camera.tilt_x_deg, camera.tilt_y_deg, camera.turn_deg])
     rot_x = np.array([[1, 0, 0], [0, np.cos(ax), np.sin(ax)], [0, -np.sin(ax), np.cos(ax)]])
     rot_y = np.array([[np.cos(ay), 0, np.sin(ay)], [0, 1, 0], [-np.sin(ay), 0, np.cos(ay)]])
+    rotation = rot_y @ rot_x
+    if camera.turn_deg or camera.mirrored:
+        rot_z = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+        rotation = rot_z @ np.diag([-1.0 if camera.mirrored else 1.0, 1.0, 1.0]) @ rotation
     T_camera_sensor = np.eye(4)
-    T_camera_sensor[:3, :3] = rot_y @ rot_x
-    T_camera_sensor[:3, 3] = rot_y @ rot_x @ [0, 0, camera.distance_mm]
+    T_camera_sensor[:3, :3] = rotation
+    T_camera_sensor[:3, 3] = rotation @ [0, 0, camera.distance_mm]
     return T_camera_sensor
 
 

@@ -182,10 +182,16 @@ there in half of the frames, so give frames of several contacts.
 
 The exit code is 3 if something is bad, else 0.
 
+On a symmetric layout a turn by its symmetry and a mirror can't be seen in pins of an unknown unit. Contacts that push the pins to known
+sides decide: with --push and --no-contact, turn, mirror, size and place of the picture and the pins at rest are found, written to --out as
+a copy of the specification, and the frames are checked against that copy.
+
 \b
 Example:
   twin check recordings/today --sensor ur5-331
   twin check 0 --sensor mine.toml
+  twin check today --sensor mine.toml --no-contact rest.png \\
+      --push x:right.png --push y:down.png --out turned.toml
 """
 
 
@@ -198,15 +204,38 @@ def check(
     form: FormOrAuto = None,
     pipeline: Annotated[Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="what 'twin tune' wrote")] = None,
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="look at no more than N frames, evenly spread")] = 20,
+    no_contact: Annotated[Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, for --push")] = None,
+    push: Annotated[
+        list[str] | None,
+        typer.Option("--push", metavar="SIDE:FRAME", help="contact whose object was moved to the sensor's x, y, -x or -y; repeat it"),
+    ] = None,
+    twist: Annotated[
+        Path | None, typer.Option("--twist", metavar="FRAME", help="contact whose object was turned from x to y, instead of a second push")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE.toml", help="copy of the specification with the view of --push")
+    ] = None,
+    force: Force = False,
 ) -> None:
     from hardware.examining import examine_sensor
     from scenes import load_sensor
     from twin.cli.progress import shown
     from twin.pins import load_detector
+    from twin.store import overwriting
 
-    spec, detector = load_sensor(sensor), if_given(load_detector, pipeline)
-    with shown() as progress:
-        found = examine_sensor(source, spec, form=form, detector=detector, limit=limit, progress=progress)
+    with overwriting(force), shown() as progress:
+        found = examine_sensor(
+            source,
+            load_sensor(sensor),
+            form=form,
+            detector=if_given(load_detector, pipeline),
+            limit=limit,
+            no_contact=no_contact,
+            pushes=push or (),
+            twist=twist,
+            out=out,
+            progress=progress,
+        )
     say(found.lines())
     if found.bad:
         raise SystemExit(BAD)

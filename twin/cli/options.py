@@ -103,7 +103,7 @@ AtRest = Annotated[
     typer.Option(
         "--at-rest",
         metavar="FRAME|first|none",
-        help="frame without contact that pins are counted from: a file, the first frame (an error if the sensor seems pressed in it), "
+        help="frame without contact that pins are counted from: a file, the first frame (an error if the sensor is pressed in it), "
         "or none (the places that the model knows, or that some forty contacts tell)",
     ),
 ]

@@ -33,6 +33,7 @@ from twin.mechanics.skin_fit import FittedPins, SkinFit
 from twin.optics.relief import DETAILS, without
 from twin.optics.render import Renderer
 from twin.pins.pipeline import Pipeline
+from twin.pins.rest import require_even
 from twin.progress import Bar, Progress, Step, silent, stage
 from twin.report.page import Page, Picture, code
 from twin.report.table import Column
@@ -308,6 +309,7 @@ def _pins_at_rest(path: Path, spec: SensorSpec) -> np.ndarray:
     observation = Pipeline(spec, Form.RAW)(Frame(image, Form.RAW, path.name))
     if not observation.valid:
         raise FrameError(f"{path.name}: {observation.reason}; give a raw frame without contact that shows every pin")
+    require_even(spec.pins, observation.pins_px, path.name)  # the camera is not yet that of the specification
     return observation.pins_px
 
 

@@ -21,6 +21,9 @@ LONGEST_LINK = 1.8
 """Largest length of a side of a computed border, relative to the usual distance of neighbouring pins. The diagonal of a square grid is
 1.41."""
 
+SAME_PLACE = 0.05
+"""Largest distance of two places that count as one when a layout is turned onto itself, relative to the usual spacing."""
+
 
 @dataclass(frozen=True)
 class PinRest:
@@ -121,6 +124,28 @@ _COMPLETE: dict[str, Callable[[PinsSpec], tuple[FloatArray, IntArray | None, Int
     "grid": _grid,
     "positions": _given,
 }
+
+
+@lru_cache(maxsize=32)
+def namings(pins: PinsSpec) -> tuple[IntArray, ...]:
+    """Orders (N,) of the pins for all turns that map the layout onto itself, then for all turns of its mirror image; the identity is first.
+
+    A pin whose place is taken by a missing pin is -1.
+    """
+    places = pin_lattice(pins).places
+    z, near = places @ [1, 1j], SAME_PLACE * usual_spacing(places)
+    outer = z[np.abs(np.abs(z) - np.abs(z).max()) < near]
+    found: list[IntArray] = []
+    for whole in (z, z.conj()):
+        start = outer if whole is z else outer.conj()
+        turns = np.angle(outer[:, None] / start).round(4).ravel()
+        for turn in sorted(set(turns.tolist()), key=lambda turn: (abs(turn), -turn)):
+            turned = whole * np.exp(1j * turn)
+            distance, order = cKDTree(np.column_stack([turned.real, turned.imag])).query(places)
+            order = np.where(distance < near, order, -1)
+            if (order < 0).sum() <= len(pins.missing) and not any(np.array_equal(order, other) for other in found):
+                found.append(order)
+    return tuple(found)
 
 
 def usual_spacing(places: FloatArray) -> float:

@@ -8,9 +8,10 @@ from twin.pins.check import Finding, Grade, examine
 from twin.pins.detector import Detector, Found, make_detector
 from twin.pins.detector_spec import METHODS, DetectorSpec, load_detector, shipped_detector, with_detector, write_detector
 from twin.pins.graph import features, make_graph
-from twin.pins.pipeline import Pipeline, measure_reference, require_untouched
+from twin.pins.pipeline import Pipeline, measure_reference
 from twin.pins.reference import Reference, make_reference, nominal_reference
 from twin.pins.tune import Tuned, tune
+from twin.pins.view import View, view_of
 
 __all__ = [
     "Detector",
@@ -22,6 +23,7 @@ __all__ = [
     "Pipeline",
     "Reference",
     "Tuned",
+    "View",
     "examine",
     "features",
     "load_detector",
@@ -30,9 +32,9 @@ __all__ = [
     "make_reference",
     "measure_reference",
     "nominal_reference",
-    "require_untouched",
     "shipped_detector",
     "tune",
+    "view_of",
     "with_detector",
     "write_detector",
 ]

@@ -16,6 +16,7 @@ from twin.frames.images import write_image
 from twin.frames.recording import BadFrame
 from twin.pins.pipeline import Pipeline, measure_reference
 from twin.pins.reference import Reference, nominal_reference
+from twin.pins.view import view_of
 from twin.store import made_by, write_json, write_npz, writes
 from twin.types import Form, Frame, Observation
 
@@ -91,7 +92,8 @@ def preprocess_recording(
     Raises
     ------
     FrameError
-        No frame was readable, or none was valid. In the second case the files are written nevertheless.
+        The frame without contact shows a contact, no frame was readable, or none was valid. In the last case the files are written
+        nevertheless.
     StoreError
         The folder can't be written to, another run is at work in it, or it holds files of these names that this program did not write.
     """
@@ -171,15 +173,23 @@ def _observed(
 
 
 def recording_reference(spec: SensorSpec, recording: Recording, problems: list[str]) -> tuple[Reference, str]:
-    """The layout in the recording's no-contact frame and this frame's name; without a usable frame the specification's layout.
+    """The layout in the recording's no-contact frame and this frame's name; without such a frame the specification's layout.
 
-    The reason why a no-contact frame cannot be used is added to ``problems``.
+    What is worth knowing about the reference is added to ``problems``.
+
+    Raises
+    ------
+    FrameError
+        The no-contact frame shows a contact, or not this sensor.
     """
     if recording.reference is not None:
-        try:
-            return measure_reference(spec, recording.form, recording.reference), recording.reference.name
-        except FrameError as error:
-            problems.append(str(error))
+        found = measure_reference(spec, recording.form, recording.reference)
+        if displaced := view_of(found.pins_px, nominal_reference(spec, recording.form), spec.pins).displacements():
+            problems.append(
+                f"{recording.reference.name}: the camera's picture is {' and '.join(displaced)} against {spec.name}: the specification's "
+                "camera and light, and weights for it, do not hold for these frames; 'twin check' says more"
+            )
+        return found, recording.reference.name
     blob = blob_spec(spec.pipeline, recording.form)
     if blob.rest_px:
         made = blob.rest_origin == "contacts"

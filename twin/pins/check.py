@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scenes.sensor import Polarity, SensorSpec, UsualCapsSpec
 from twin.camera.capture import expose
 from twin.frames import spread
-from twin.frames.forms import blob_spec, known_frames, pin_levels
+from twin.frames.forms import blob_spec, gray_levels, known_frames, pin_levels
 from twin.optics.preview import Preview
 from twin.pins.caps import Caps, measure_caps
 from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
@@ -23,6 +23,7 @@ from twin.pins.identify import judge_layout
 from twin.pins.pipeline import Pipeline
 from twin.pins.reference import Reference, nominal_reference, seen_at_rest
 from twin.pins.tune import other_layout
+from twin.pins.view import MOST_STRETCH, view_of
 from twin.progress import Step
 from twin.types import Form, Frame, Observation
 
@@ -121,7 +122,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
         _layout(frames, spec, pipeline.blob_spec.polarity),
         _pins(seen, pipeline),
         _spots(seen, pipeline),
-        *_place(seen, nominal, BULGE if spec.skin.shape == "cap" else 0.0),
+        *_place(seen, nominal, spec),
         *_twin(spec, form, nominal),
     ]
     return (
@@ -242,24 +243,40 @@ def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
     return _finding("specks", steady / len(pipeline.reference.pins_px), (0.02, 0.2), f"{steady} steady {kind} spots among the pins", remedy)
 
 
-def _place(seen: list[Observation], nominal: Reference, bulge: float) -> list[Finding]:
-    """Findings about the camera's place: in the frames with the least contact, the rim of pins is compared with the ``nominal`` one."""
-    pitch = float(np.mean(nominal.spacing_px))
-    found = [d for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost, bulge=bulge))]
-    if not found:
+def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> list[Finding]:
+    """Findings about the camera's place: in the frames with the least contact, the pins are compared with the ``nominal`` ones."""
+    pitch, bulge = float(np.mean(nominal.spacing_px)), BULGE if spec.skin.shape == "cap" else 0.0
+    drifts = [(d, o) for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost, bulge=bulge))]
+    if not drifts:
         return [
             Finding("place", Grade.BAD, np.nan, "the camera's place can't be told: too few pins at the rim", "see the other findings first")
         ]
-    found = sorted(found, key=lambda d: d.contact)[: max(round(LEAST_DEFORMED * len(found)), 1)]
+    drifts = sorted(drifts, key=lambda each: each[0].contact)[: max(round(LEAST_DEFORMED * len(drifts)), 1)]
+    found = [d for d, _ in drifts]
+    with np.errstate(invalid="ignore"):
+        pins_px = np.stack([o.pins_px for _, o in drifts])
+        known = np.asarray(np.isfinite(pins_px).any(axis=(0, 2)))
+        pins_px = np.where(known[:, None], np.nanmedian(np.where(known[:, None], pins_px, 0.0), axis=0), np.nan)
+    view = view_of(pins_px, nominal, spec.pins)
     shift = np.median(np.stack([d.shift_px for d in found]), axis=0)
     turn, scale, seen_scale = (float(np.median([getattr(d, name) for d in found])) for name in ("turn_deg", "scale_at_rest", "scale"))
+    turn = view.turn_deg if view.sure else turn
     grown = f" ({seen_scale:.3f} with the bulge of the contact)" if seen_scale - scale > TOLD_BULGE else ""
     away = float(np.linalg.norm(shift))
     again = "fix the camera, or calibrate again ('twin calibrate optics'); 'twin tune' moves the mask"
+    mirror = "the picture is mirrored" if view.mirrored else "the picture is not mirrored" if view.sure else view.undecided()
     return [
         _finding("shift", away / pitch, (0.2, 1.0), f"displaced by ({shift[0]:.1f}, {shift[1]:.1f}) px, {away / pitch:.2f} pitches", again),
         _finding("turn", abs(turn), (1.5, 6.0), f"turned by {turn:.2f} deg", again),
         _finding("scale", abs(scale - 1), (0.02, 0.1), f"{scale:.3f} times its calibrated size{grown}", again),
+        _finding(
+            "stretch",
+            view.stretch,
+            (MOST_STRETCH, 2 * MOST_STRETCH),
+            f"stretched by {view.stretch:.1%}",
+            "give frames as the camera took them",
+        ),
+        _finding("mirror", float(view.mirrored), (0.0, 0.5), mirror, "turn mirroring off where the frames are taken, or see --push"),
     ]
 
 

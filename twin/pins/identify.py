@@ -22,7 +22,7 @@ from scenes.sensor import Polarity
 from twin.errors import FrameError
 from twin.frames import spread
 from twin.frames.forms import is_two_level, levels_at, pin_levels
-from twin.geometry.pins import pin_lattice, usual_spacing
+from twin.geometry.pins import namings, pin_lattice, usual_spacing
 from twin.pins.bumps import Bumps, find_bumps
 from twin.pins.extent import filled_area, in_view, open_sides, seen_beyond, with_view
 from twin.pins.families import Family, family, family_of_positions, label_spots
@@ -650,19 +650,14 @@ def _matched(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps) -> Seen:
 
 def symmetries(pins: PinsSpec) -> list[np.ndarray]:
     """Orders (N,) of the pins for all turns that map a layout onto itself; the identity comes first."""
+    return [order for order in namings(pins) if (order >= 0).all() and np.linalg.det(_map(pins, order)) > 0]
+
+
+def _map(pins: PinsSpec, order: np.ndarray) -> np.ndarray:
+    """Linear map (2, 2) from the places of a layout to those of its pins in another order."""
     places = pin_lattice(pins).places
-    if pins.layout == "grid" and pins.row_distance == 1 and pins.columns == pins.rows:
-        turns = 4
-    else:
-        turns = {"rings": 6, "hexagon": 6, "grid": 2}.get(pins.layout, 1)
-    orders = []
-    for k in range(turns):
-        turn = np.exp(2j * np.pi * k / turns)
-        turned = places @ np.array([[turn.real, turn.imag], [-turn.imag, turn.real]])
-        distance, order = cKDTree(turned).query(places)
-        if distance.max() < 1e-6:
-            orders.append(order)
-    return orders
+    found: np.ndarray = np.linalg.lstsq(places, places[order], rcond=None)[0]
+    return found
 
 
 def _turned_alike(pins: PinsSpec, seen: list[Seen]) -> list[Seen]:

@@ -1,7 +1,7 @@
 """The pipeline: observation of the pins in a frame, the same for rendered, recorded and live frames.
 
 The limits of an observation were chosen, not derived. A frame that is meant to show no contact is refused if its pins are displaced in a
-way that no displacement of the camera explains (`require_untouched`).
+way that no displacement of the camera explains (`measure_reference`, `twin.pins.view`).
 """
 
 from dataclasses import replace
@@ -15,9 +15,12 @@ from twin.errors import FrameError
 from twin.frames.forms import blob_spec, form_named, frame_size, levels_at, pin_levels
 from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
+from twin.pins.identify import SHOWN, judge_layout
 from twin.pins.matching import Match, match, predict_all, rematch
 from twin.pins.reference import Reference, folded_fraction, make_reference, nominal_reference
+from twin.pins.rest import require_even
 from twin.pins.split import split_chains, split_merged
+from twin.pins.view import NO_CONTACT_REMEDY, camera_modes, view_of
 from twin.types import Form, Frame, Observation
 
 MOST_RIM_LOST = 0.75
@@ -71,10 +74,6 @@ is seen, a labelling that is a row apart lacks a row. If a row is lost, or light
 well."""
 PREDICTED_WEIGHT = 0.1
 """Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
-MOST_DENT = 0.008
-"""Largest dent of a sensor at rest, relative to the rim's mean radius. Measured at rest: 0.0026 to 0.0041 in three real sensors, 0.005
-with a camera tilted by 2 deg. Measured in real contacts: at least 0.003 from about 1 mm on, 0.009 from 2 mm, 0.012 from 3 mm. A contact
-of less than about 2 mm is not noticed, because it moves the pins less than the differences between cameras do."""
 
 
 class Pipeline:
@@ -351,62 +350,35 @@ def _since(start: float) -> tuple[float, float]:
     return 1e3 * (now - start), now
 
 
-def measure_reference(spec: SensorSpec, form: Form, frame: Frame) -> Reference:
+def measure_reference(spec: SensorSpec, form: Form, frame: Frame, *, known: Reference | None = None) -> Reference:
     """The reference from a no-contact frame. Lost pins are predicted from their neighbours.
-
-    Raises
-    ------
-    FrameError
-        The layout can't be found in the frame.
-    """
-    observation = Pipeline(spec, form, graph="delaunay")(frame)
-    if observation.graph is None:
-        raise FrameError(
-            f"{frame.name or 'frame'}: no use as no-contact reference, {observation.reason}; leave it out to use the specification's layout"
-        )
-    return make_reference(observation.graph.nodes_px, spec.pins)
-
-
-def dent_of(pins_px: np.ndarray, reference: Reference) -> float:
-    """Largest motion of neighbouring pins that no change of the camera explains, relative to the rim's mean radius.
-
-    To first order, another place, tilt, focal length or radial distortion of the camera moves the reference by
-    ``u = t + G x + (h . x) x + k |x|^2 x``. This motion is fitted by least squares and subtracted. The rest is averaged over each pin and
-    its neighbours, because tolerances of the print, which are independent from pin to pin, must not count as a dent.
 
     Parameters
     ----------
-    pins_px : (N, 2) float
-        NaN where lost.
-    reference : Reference
-    """
-    rim = reference.pins_px[reference.outmost]
-    middle = rim.mean(axis=0)
-    radius_px = float(np.linalg.norm(rim - middle, axis=1).mean())
-    place, moved = (reference.pins_px - middle) / radius_px, (pins_px - reference.pins_px) / radius_px
-    seen = np.isfinite(moved[:, 0])
-    x, y = place.T
-    one, none, square = np.ones_like(x), np.zeros_like(x), x * x + y * y
-    along_x = np.column_stack([one, none, x, y, none, none, x * x, x * y, square * x])
-    along_y = np.column_stack([none, one, none, none, x, y, x * y, y * y, square * y])
-    camera = np.linalg.lstsq(np.concatenate([along_x[seen], along_y[seen]]), moved[seen].T.ravel(), rcond=None)[0]
-    left = moved - np.column_stack([along_x @ camera, along_y @ camera])
-    around = np.column_stack([np.arange(len(left)), reference.neighbours])[seen]
-    return float(np.linalg.norm(np.nanmean(left[around], axis=1), axis=1).max())
-
-
-def require_untouched(spec: SensorSpec, form: Form, frame: Frame, remedy: str) -> None:
-    """Refuse a frame that is meant to show no contact if its pins show one. A frame whose pins are not found is accepted.
+    known : Reference, optional
+        Known places at rest, of this unit or of another; by default those of the specification.
 
     Raises
     ------
     FrameError
-        The pins are dented. The message ends with ``remedy``: what to do.
+        The layout can't be found in the frame, or the sensor is pressed in it, or the picture is turned so far that the pins' names are
+        not sure. The message says what to do.
     """
-    pipeline = Pipeline(spec, form, graph="delaunay")
-    seen = pipeline(frame)
-    if seen.valid and (dent := dent_of(seen.pins_px, pipeline.reference)) > MOST_DENT:
-        raise FrameError(
-            f"{frame.name or 'frame'}: the sensor seems pressed: its pins are dented by {dent:.1%} of their rim's radius from where "
-            f"{spec.name} has them without contact (allowed {MOST_DENT:.1%}); {remedy}"
-        )
+    name, expected, modes = frame.name or "frame", known or nominal_reference(spec, form), camera_modes(spec, form)
+    seen = Pipeline(spec, form, expected, graph="delaunay")(frame)
+    refused = FrameError(f"{name}: no use as no-contact frame, {seen.reason}; {NO_CONTACT_REMEDY}")
+    if seen.graph is not None:
+        try:
+            if known is None and blob_spec(spec.pipeline, form).rest_origin == "contacts":  # such places are dented themselves
+                require_even(spec.pins, seen.pins_px, name)
+            else:
+                view_of(seen.pins_px, expected, spec.pins, modes).require_unpressed(name, spec)
+            return make_reference(seen.graph.nodes_px, spec.pins)
+        except FrameError as error:
+            refused = error
+    shown = judge_layout(spec.pins, [gray_levels(frame.image)])  # it names the pins without known places
+    if shown is not None and shown.explained >= SHOWN:
+        other = view_of(shown.seen[0].pins_px, expected, spec.pins, modes)
+        if not other.pressed:
+            other.require_small(name, f"the pins at rest of {spec.name}")
+    raise refused

@@ -9,6 +9,7 @@ from scenes.pins import PinsSpec
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
 from twin.pins.identify import SHOWN, Candidate, judge_layout, symmetries, unevenness
+from twin.pins.view import MOST_UNEVEN, uneven_dent
 
 STILL = 0.035
 """Largest rms distance of pins without contact from the smooth view of their layout, in spacings. It was measured as 0.028 in no-contact
@@ -56,7 +57,7 @@ def rest_of(layout: Candidate, names: list[str], given: np.ndarray | None = None
     Raises
     ------
     FrameError
-        The given frame does not show the layout.
+        The given frame does not show the layout, or shows a contact.
     """
     if given is not None:
         shown = judge_layout(layout.pins, [given])
@@ -65,6 +66,7 @@ def rest_of(layout: Candidate, names: list[str], given: np.ndarray | None = None
                 f"{given_name}: no use as no-contact frame, it does not show {layout.pins.in_words()} as the other frames do; "
                 "give another one"
             )
+        require_even(layout.pins, shown.seen[0].pins_px, given_name)
         return Rest(_alike(layout, shown.seen[0].pins_px), "given", given_name)
     places = pin_lattice(layout.pins).places
     good = [k for k, seen in enumerate(layout.seen) if seen.explained >= SHOWN]
@@ -73,6 +75,20 @@ def rest_of(layout: Candidate, names: list[str], given: np.ndarray | None = None
         if unevenness(places, layout.seen[still].pins_px) < STILL:
             return Rest(layout.seen[still].pins_px, "found", names[still])
     return Rest(rest_from_contacts(layout), "made")
+
+
+def require_even(pins: PinsSpec, pins_px: np.ndarray, name: str) -> None:
+    """Refuse pins (N, 2), NaN where lost, of a no-contact frame ``name`` if they are dented from every smooth view of their layout.
+
+    Raises
+    ------
+    FrameError
+    """
+    if (dent := uneven_dent(pins, pins_px)) > MOST_UNEVEN:
+        raise FrameError(
+            f"{name}: the sensor seems pressed: neighbouring pins are dented by {dent:.2f} of their spacing from a smooth view of "
+            f"{pins.in_words()} (allowed {MOST_UNEVEN:.2f}); give a frame that was taken without contact, or none"
+        )
 
 
 def rest_from_contacts(layout: Candidate) -> np.ndarray:

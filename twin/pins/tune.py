@@ -16,8 +16,9 @@ from twin.pins.detector import Found, make_detector
 from twin.pins.detector_spec import DetectorSpec, Evidence, Method, with_detector
 from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, Identified, identify, judge_layout, smooth_view, symmetries
 from twin.pins.legacy import legacy_parameters
-from twin.pins.reference import Reference, make_reference, together
+from twin.pins.reference import Reference, make_reference, nominal_reference, together
 from twin.pins.rest import Rest, rest_of
+from twin.pins.view import camera_modes, view_of
 from twin.progress import Step
 from twin.types import Form, Frame
 
@@ -143,6 +144,9 @@ def tune(
     if rest is None:
         given_levels = None if given is None else pin_levels(given.image, polarity)
         rest = rest_of(layout, [f.name for f in frames], given_levels, given.name if given else "")
+        if given is not None:
+            view = view_of(rest.pins_px, nominal_reference(sensor, form), sensor.pins, camera_modes(sensor, form))
+            view.require_unpressed(given.name, sensor)
     reference = make_reference(turned_as(sensor.pins, layout.rest_px), sensor.pins)
     caps = [caps_in(image, seen.pins_px, reference.spacing_px) for image, seen in zip(images, layout.seen, strict=True)]
     area, contrast = (float(np.nanmedian(values)) for values in zip(*caps, strict=True))

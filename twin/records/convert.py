@@ -97,7 +97,7 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
         raise FrameError(f"{got}, those of {spec.name} are {times(expected)}; give the matching --sensor, or another recording or session")
     numbers = {"pins": 2 * spec.pins.count, **records.about.numbers}
     about = replace(records.about, sensor=spec.name, numbers=numbers)
-    found = [replace(episode, steps=partial(_seen, episode, about, spec, records.notes)) for episode in records.episodes]
+    found = [replace(episode, steps=partial(_seen, episode, about, spec)) for episode in records.episodes]
     return Records(about, found, records.notes)
 
 
@@ -112,14 +112,10 @@ def _require_pins_of(spec: SensorSpec, about: About) -> None:
     raise FrameError(f"{told}; leave --sensor out, or give the matching one")
 
 
-def _seen(episode: Episode, about: About, spec: SensorSpec, notes: list[str]) -> Iterator[Step]:
+def _seen(episode: Episode, about: About, spec: SensorSpec) -> Iterator[Step]:
     reference = None
     if episode.rest is not None:
-        try:
-            reference = measure_reference(spec, about.form, Frame(episode.rest, about.form, "the picture without contact"))
-        except FrameError as error:
-            if (note := str(error)) not in notes:
-                notes.append(note)
+        reference = measure_reference(spec, about.form, Frame(episode.rest, about.form, "the picture without contact"))
     pipeline = Pipeline(spec, about.form, reference)
     for step in episode.steps():
         pins_px = pipeline(Frame(step.image, about.form)).pins_px.astype(np.float32)

@@ -100,7 +100,8 @@ class RecordingView:
             try:
                 return model.at_rest(self.recording.reference)
             except FrameError as error:
-                self.notes.append(str(error))
+                self.notes.append(f"no estimates: {error}")
+                return None
         return model
 
     def look(self, index: int) -> Looked:

@@ -15,7 +15,7 @@ from twin.errors import FrameError
 from twin.frames.forms import blob_spec, form_named, frame_size, gray_levels
 from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
-from twin.pins.matching import Match, match, predict_all, rematch
+from twin.pins.matching import Match, complete, confirm, match, rematch
 from twin.pins.reference import Reference, folded_fraction, make_reference, nominal_reference
 from twin.pins.split import split_chains, split_merged
 from twin.types import Form, Frame, Observation
@@ -69,8 +69,6 @@ LEAST_LEAD = 0.35
 """Least lead of the labelling over the next, quite different one, in rows of pins (the square root of their number). If the whole layout
 is seen, a labelling that is a row apart lacks a row. If a row is lost, or lights beside the pins look like one, it explains the frame as
 well."""
-PREDICTED_WEIGHT = 0.1
-"""Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
 MOST_DENT = 0.008
 """Largest dent of a sensor at rest, relative to the rim's mean radius. Measured at rest: 0.0026 to 0.0041 in three real sensors, 0.005
 with a camera tilted by 2 deg. Measured in real contacts: at least 0.003 from about 1 mm on, 0.009 from 2 mm, 0.012 from 3 mm. A contact
@@ -132,7 +130,7 @@ class Pipeline:
         paired = found.blob >= 0
         pins_px = np.full_like(self.reference.pins_px, np.nan)
         pins_px[paired] = blobs.px[found.blob[paired]]
-        nodes_px = self._complete(pins_px)
+        nodes_px = complete(self.reference, pins_px)
         predicted_px = np.where(paired[:, None], np.nan, nodes_px)
         extra_px = np.delete(blobs.px, found.blob[paired], axis=0)
         between = self._between_caps(frame, pins_px)
@@ -179,6 +177,8 @@ class Pipeline:
             blobs, found = self._with_displaced_mask(frame, blob, blobs, found)
         if (found.blob < 0).any() and self._plausible(found):
             blobs, found = self._with_split_caps(blobs, found)
+            if (found.blob < 0).any():
+                found = confirm(self.reference, blobs.px, blobs.area_px2, found)
         ms["match"], _ = _since(now)
         return blobs, found
 
@@ -241,23 +241,6 @@ class Pipeline:
                 break
             blobs, found = parts, replace(again, lead=found.lead)
         return blobs, found
-
-    def _complete(self, pins_px: np.ndarray) -> np.ndarray:
-        """Pins (N, 2) in which lost pins are at the places that their neighbours' motion predicts."""
-        reference = self.reference
-        found = np.isfinite(pins_px[:, 0])
-        if found.all():
-            return pins_px
-        nodes_px = np.where(found[:, None], pins_px, reference.pins_px)
-        known = found.astype(float)
-        while known.any() and not known.all():  # from the edge of a gap inwards
-            predicted = predict_all(reference.pins_px, reference.neighbours, reference.spacing_px, nodes_px, known)
-            new = (known == 0) & np.isfinite(predicted[:, 0])
-            if not new.any():
-                break
-            nodes_px[new] = predicted[new]
-            known[new] = PREDICTED_WEIGHT
-        return nodes_px
 
     def _inside_px(self, px: np.ndarray) -> np.ndarray:
         """Distance (n,) of places (n, 2) from the frame's border, px; negative outside the frame."""

@@ -13,6 +13,8 @@ from twin.pins.reference import Reference
 REACH = 0.4
 # Least area of a component that is split, relative to the sum of the areas expected of all pins that claim it. A smaller one is one cap.
 MIN_AREA_SHARE = 0.65
+# Largest such area. A larger component is glare, or a hole in the threshold, and its shape states no pins' places.
+MAX_AREA_SHARE = 1.5
 # Least distance of two parts, in cap diameters.
 MIN_SEPARATION = 0.6
 # Least weight of the smallest part, relative to the mean weight of the parts.
@@ -177,7 +179,7 @@ def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
             continue
         expected = float(np.nanmedian(around))
         whole = blobs.label_area_px2[label]
-        if whole < MIN_AREA_SHARE * expected * len(pins):
+        if not MIN_AREA_SHARE < whole / (expected * len(pins)) < MAX_AREA_SHARE:
             continue
         centers, share = _parts(blobs, label, found.predicted_px[pins])
         apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.diag(np.full(len(pins), np.inf))

@@ -237,13 +237,8 @@ def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: M
             if np.median(away[pins[np.argsort(gap[pins])[:NEAR]]]) < FINAL_GATE:
                 start[pins] = blob[pins]
         again = _refine(layout, px, area_px2, start, buckets, cell)
-    if DEBUG is not None:
-        DEBUG.append((found, again, part))
     renamed = (again.blob != blob) & (again.blob >= 0) & (blob >= 0)
     return replace(again, lead=0.0 if renamed.any() and again.score <= found.score else found.lead)
-
-
-DEBUG = None
 
 
 def _parts(reference: Reference, px: np.ndarray, blob: np.ndarray) -> np.ndarray:

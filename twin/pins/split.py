@@ -9,10 +9,10 @@ from twin.pins.matching import Match
 from twin.pins.reference import Reference
 
 # All limits were chosen, not derived.
-# Largest distance from a pin's predicted place to a component that the pin may claim, in spacings.
+# Largest distance from a pin's predicted place to a component that the pin may claim, and from there to the part that the pin gets, in spacings.
 REACH = 0.4
 # Least area of a component that is split, relative to the sum of the areas expected of all pins that claim it. A smaller one is one cap.
-MIN_AREA_SHARE = 0.8
+MIN_AREA_SHARE = 0.65
 # Largest such area. A larger component is glare, or a hole in the threshold, and its shape states no pins' places.
 MAX_AREA_SHARE = 1.5
 # Number of neighbours of a pin towards which the surroundings of its part are compared. A part is in a bright area if it is not brighter
@@ -199,9 +199,10 @@ def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
         if not MIN_AREA_SHARE < whole / (expected * len(pins)) < MAX_AREA_SHARE:
             continue
         centers, share = _parts(blobs, label, found.predicted_px[pins])
+        away = np.linalg.norm(centers - found.predicted_px[pins], axis=1) / reference.spacing_px[pins]
         apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.diag(np.full(len(pins), np.inf))
         separate = apart.min() > MIN_SEPARATION * 2 * np.sqrt(expected / np.pi) and share.min() > MIN_PART / len(pins)
-        if separate and not _bright_around(reference, blobs, found, pins, centers):
+        if separate and away.max() < REACH and not _bright_around(reference, blobs, found, pins, centers):
             split.append(label)
             px += list(centers)
             part_area += list(share * whole)

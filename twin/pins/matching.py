@@ -31,7 +31,7 @@ GROW_GATES = (0.30, 0.45)
 """Largest distance from a prediction to its blob while a labelling grows: in the first pass, and in the second."""
 FINAL_GATE = 0.40
 """Largest distance from a prediction to its blob in the final assignment."""
-ADOPT_GATE = 0.7
+ADOPT_GATE = 0.55
 """Largest distance from the prediction of a lost pin to a free blob that it gets, if each is the other's nearest."""
 ADOPT_AREA_RATIO = 2.0
 """Largest ratio of the area of a blob that is given to a lost pin to the area of the pin's neighbours, and of the second to the first."""

@@ -9,6 +9,7 @@ from time import perf_counter
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
@@ -69,6 +70,13 @@ LEAST_LEAD = 0.35
 """Least lead of the labelling over the next, quite different one, in rows of pins (the square root of their number). If the whole layout
 is seen, a labelling that is a row apart lacks a row. If a row is lost, or lights beside the pins look like one, it explains the frame as
 well."""
+ONWARD = 0.4
+"""Largest distance of a blob that is no pin, in spacings, from a place where a row of pins would go on. It is farther from all pins."""
+UNNAMED_AREA_RATIO = 2.0
+"""Largest ratio of this blob's area to the median of the pins', and of the second to the first."""
+LEAST_UNNAMED = 3
+"""Least number of such blobs, and of lost pins, with which part of the layout may be named a row apart: the blobs at one end, the lost
+pins at the other."""
 MOST_DENT = 0.008
 """Largest dent of a sensor at rest, relative to the rim's mean radius. Measured at rest: 0.0026 to 0.0041 in three real sensors, 0.005
 with a camera tilted by 2 deg. Measured in real contacts: at least 0.003 from about 1 mm on, 0.009 from 2 mm, 0.012 from 3 mm. A contact
@@ -135,12 +143,17 @@ class Pipeline:
         extra_px = np.delete(blobs.px, found.blob[paired], axis=0)
         between = self._between_caps(frame, pins_px)
         ms["complete"], now = _since(now)
-        expected = int((paired | ~self._cut_off(nodes_px)).sum())
+        expected, lost = int((paired | ~self._cut_off(nodes_px)).sum()), int((~paired).sum())
         reason = self._reason(blobs, int(paired.sum()), expected, nodes_px, extra_px) or self._rim_lost(paired, nodes_px)
         if not reason and found.lead < LEAST_LEAD * np.sqrt(len(paired)):
             reason = (
-                "ambiguous pins: two ways to name them, a row apart, explain the frame nearly alike; press or shear less, and hide what "
-                "looks like pins beside them"
+                "ambiguous pins: two ways to name them, a row apart, explain the frame nearly alike; press or shear less, uncover "
+                "hidden pins, and hide what looks like pins beside them"
+            )
+        if not reason and (unnamed := self._unnamed(blobs, found, nodes_px)) >= LEAST_UNNAMED <= lost:
+            reason = (
+                f"ambiguous pins: {unnamed} blobs continue the rows of pins, and {lost} pins are lost: the picture is torn, or part of it is "
+                "named a row apart; grab the frame again, or hide what looks like pins"
             )
         if not reason and between > MOST_BETWEEN:
             reason = f"wrong pins: {between:.0%} of them stand between caps; stray light, a wrong threshold, or another sensor's frame"
@@ -266,6 +279,23 @@ class Pipeline:
             f"the rim is not seen: {lost} of the {len(rim)} outermost pins are lost; light that fades, too high a threshold, or a sensor "
             "of fewer pins: run 'twin tune' on these frames, or 'twin new'"
         )
+
+    def _unnamed(self, blobs: Blobs, found: Match, nodes_px: np.ndarray) -> int:
+        """Number of blobs of a cap's size that are no pins, but stand where the rows of pins go on, if pins are lost.
+
+        ``nodes_px`` (N, 2) are the pins. A row goes on as far from a pin as one of its neighbours is, on the other side.
+        """
+        paired = found.blob >= 0
+        extra = np.setdiff1d(np.arange(len(blobs.px)), found.blob)
+        if paired.all() or not len(extra):
+            return 0
+        ratio = blobs.area_px2[extra] / np.median(blobs.area_px2[found.blob[paired]])
+        px = blobs.px[extra[(ratio > 1 / UNNAMED_AREA_RATIO) & (ratio < UNNAMED_AREA_RATIO)]]
+        pins_px = nodes_px[paired]
+        onward = (2 * pins_px[:, None] - nodes_px[self.reference.neighbours[paired, :NEAREST]]).reshape(-1, 2)
+        (away, _), (_, pin) = cKDTree(onward).query(px), cKDTree(pins_px).query(px)
+        reach = ONWARD * self.reference.spacing_px[paired][pin]
+        return int(((away < reach) & (np.linalg.norm(px - pins_px[pin], axis=1) > reach)).sum())
 
     def _between_caps(self, frame: Frame, pins_px: np.ndarray) -> float:
         """Share of the found pins (N, 2), NaN where lost, that are hardly brighter than the midpoints between them and their neighbours."""

@@ -9,7 +9,7 @@ from twin.pins.matching import Match
 from twin.pins.reference import Reference
 
 # All limits were chosen, not derived.
-# Largest distance from a pin's predicted place to a component that the pin may claim, and from there to the part that the pin gets, in spacings.
+# Largest distance, in spacings, from a pin's predicted place to a component that the pin may claim, and to the part that it gets.
 REACH = 0.4
 # Least area of a component that is split, relative to the sum of the areas expected of all pins that claim it. A smaller one is one cap.
 MIN_AREA_SHARE = 0.65

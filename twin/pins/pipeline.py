@@ -152,7 +152,7 @@ class Pipeline:
             )
         if not reason and (unnamed := self._unnamed(blobs, found, nodes_px)) >= LEAST_UNNAMED <= lost:
             reason = (
-                f"ambiguous pins: {unnamed} blobs continue the rows of pins, and {lost} pins are lost: the picture is torn, or part of it is "
+                f"ambiguous pins: {unnamed} blobs continue the rows of pins, and {lost} pins are lost: the picture is torn, or part is "
                 "named a row apart; grab the frame again, or hide what looks like pins"
             )
         if not reason and between > MOST_BETWEEN:

@@ -19,6 +19,8 @@ from scenes.tables import fill_in_tables
 
 SHIPPED = Path(__file__).parent
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
+UNLISTED = ("servos",)
+"""Kinds of specifications that no command lists. Errors name them all."""
 # Largest number of problems that a message names. For further problems it states only their number.
 MOST_PROBLEMS = 5
 Spec = TypeVar("Spec", bound=BaseModel)
@@ -141,24 +143,22 @@ def _list(kind: str) -> dict[str, Path]:
 
 
 def _find(name_or_path: str | Path, kind: str) -> Path:
-    path = Path(name_or_path)
+    path, known = Path(name_or_path), _list(kind)
+    listed = f"known: {', '.join(known)}" if kind in UNLISTED else f"'twin {kind}' lists them"
     if path.suffix != ".toml" and os.path.isfile(path):
         suffixes = ", ".join((".toml", *MESH_SUFFIXES) if kind == "objects" else (".toml",))
         raise SpecError(f"{path}: files ending in '{path.suffix}' are not understood here; give one of {suffixes}")
     if path.suffix == ".toml":
         if not os.path.isfile(path):
             raise SpecError(
-                f"{shown(path, LONGEST_PATH)}: no such file; give the path of an existing TOML specification, or a name from 'twin {kind}'"
+                f"{shown(path, LONGEST_PATH)}: no such file; give the path of an existing TOML specification, or a name ({listed})"
             )
         return path
-    known = _list(kind)
     if str(name_or_path) in known:
         return known[str(name_or_path)]
     near = difflib.get_close_matches(str(name_or_path), known, n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
-    raise SpecError(
-        f"no {kind[:-1]} named '{shown(name_or_path)}': {hint} ('twin {kind}' lists them; own files go to {user_spec_dir() / kind})"
-    )
+    raise SpecError(f"no {kind[:-1]} named '{shown(name_or_path)}': {hint} ({listed}; own files go to {user_spec_dir() / kind})")
 
 
 def read_section(path: Path, model: type[Spec]) -> Spec:

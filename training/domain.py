@@ -11,10 +11,10 @@ left out of the fit:
 - beyond: distance of the leading components from the nearest training frame (a contact deeper, or of another kind, than any);
 - camera: difference between the camera's motions and those that the contact itself causes, by the same polynomial.
 
-The lightest contacts of a training set may be far from the frame at rest. So that lighter ones are no strangers, each training frame is
-also used with its displacement reduced at random. They count as known patterns, but not as known labels: the intervals grow with the
-difference from the nearest frame whose label is known, by the rate at which labels change between training frames. Lost pins are placed where
-the others make them most probable, and what is not known of them counts as such a difference, too.
+The lightest contacts of a training set may be far from the frame at rest. So that lighter ones are no strangers, training frames are also
+used with their displacements reduced at random. They count as known patterns, but not as known labels: the intervals grow with the
+difference from the nearest frame whose label is known, by the rate at which labels change between training frames. Lost pins are placed
+where the others make them most probable, and what is not known of them counts as such a difference, too.
 """
 
 from collections.abc import Sequence
@@ -72,8 +72,7 @@ SURE_RATE = 0.9
 PARTS = ("outside", "misfit", "beyond", "camera")
 """Names of the four distances."""
 REFUSED = 2.0
-"""Distance, in limits, above which a frame gets no estimate. Between 1 and this the intervals grow, if the camera sits at its place: a frame
-that is strange in both ways is refused."""
+"""Distance, in limits, above which a frame gets no estimate. Between 1 and this the intervals grow, if the camera sits at its place."""
 GROWS = 2.0
 """Growth of the intervals for each limit of distance beyond the first."""
 CORRECTED = np.array([0.6, 0.6, np.radians(3.0), 0.05])
@@ -268,15 +267,17 @@ class Domain:
         if share > EXPLAINS and share > smooth + TORN_MORE * (1 - smooth):
             side = ("right of x" if axis == 0 else "below y") + f" = {place:.0f} px"
             step = step * reference.spacing_px.mean()
-            return f"torn frame: {side} the picture is displaced by ({step[0]:.1f}, {step[1]:.1f}) px; check the camera's cable and rate"
+            by = f"({step[0]:.1f}, {step[1]:.1f}) px"
+            return f"torn frame: {side} the picture is displaced by {by}; check the camera's cable and rate"
         if smooth > EXPLAINS:
             return (
                 f"displaced camera: the view is stretched by {200 * np.hypot(*stretch):.1f} %, or seen through another lens or at another "
                 "angle than at rest; check the picture's size and the camera's seat, then " + again
             )
+        far = f"{found.parts[:3].max():.1f} times as far from the training frames as they are from each other"
         return (
-            f"not a contact that the model knows: the pins' pattern is {found.parts[:3].max():.1f} times as far from the training frames as "
-            "they are from each other; another object or another sensor's frame, a turned or mirrored picture, or pins with wrong names"
+            f"not a contact that the model knows: the pins' pattern is {far}; another object or another sensor's frame, a turned or mirrored "
+            "picture, or pins with wrong names"
         )
 
     def _explained(self, moved: FloatArray, lost: BoolArray, columns: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -17,6 +17,9 @@ from command import run_twin
 from typer.testing import CliRunner
 
 from hardware.errors import DeviceNotConnectedError
+from scenes import load_experiment, load_object, load_randomisation, load_sensor
+from scenes.base import SpecError
+from scenes.load import load_servo
 from twin.cli import command_line, main
 
 ROOT = Path(__file__).parents[2]
@@ -25,6 +28,7 @@ OURS = ("scenes", "twin", "training", "hardware")
 FEW = 8  # statements of a command beside its imports: specifications loaded, a plan, a call, what is printed, an exit code
 ENTRY = {"main", "command_line"}  # what others may take from the command line
 NO_LOGIC = (ast.For, ast.While, ast.AsyncFor, ast.Try, ast.Lambda, ast.FunctionDef, ast.ClassDef, ast.ListComp, ast.DictComp, ast.SetComp)
+NOT_COMMANDS = {"twin alone", "twin and labelled frames", "twin read", "twin read, no label", "twin read, evenly chosen frames", "twin of "}
 HEAVY = {"numpy", "scipy", "torch", "cv2", "mitsuba", "drjit", "numba", "pyvista", "matplotlib"}
 
 
@@ -168,6 +172,47 @@ def test_nothing_takes_the_command_line_for_a_library():
 def test_a_command_that_a_group_does_not_have_is_told_with_those_it_has():
     told = CliRunner().invoke(command_line(), ["emulate", "ur5"])
     assert told.exit_code == 2 and "There are mg400, magician, camera." in told.output
+
+
+def commands_below(command, words=()):
+    """By its words, every command and group."""
+    yield words, command
+    for name, below in getattr(command, "commands", {}).items():
+        yield from commands_below(below, (*words, name))
+
+
+TREE = dict(commands_below(typer.main.get_command(command_line())))
+OPTIONS = {name for command in TREE.values() for option in command.params for name in (*option.opts, *option.secondary_opts)} | {"--help"}
+HINTED = re.compile(r"(?:^|(?<=['`$(]))(?:\$ )?twin ([a-z][a-z-]+)(?: ([a-z][a-z0-9-]+))?(?=[ '`])")  # at a text's beginning or quoted
+
+
+def wrong_hints(text: str) -> list[str]:
+    """Commands and options named in a text that do not exist."""
+    commands = [found for found in HINTED.finditer(text) if (found[1],) not in TREE]
+    groups = [found for found in HINTED.finditer(text) if hasattr(TREE.get((found[1],)), "commands") and found[2]]
+    wrong = [*commands, *(found for found in groups if found.group(1, 2) not in TREE)]
+    return [found[0] for found in wrong] + [name for name in re.findall(r"(?<![\w-])--[a-z][a-z0-9-]+", text) if name not in OPTIONS]
+
+
+@pytest.mark.parametrize("package", OURS)
+def test_every_command_and_option_that_a_text_names_exists(package):
+    wrong = [
+        f"{path.relative_to(ROOT)}:{node.lineno}: {hint}"
+        for path in sorted((ROOT / package).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value not in NOT_COMMANDS
+        for hint in wrong_hints(node.value)
+    ]
+    assert not wrong
+    assert wrong_hints("run 'twin tun' or 'twin emulate ur5 --port 1 --no-such'") == ["twin tun", "twin emulate ur5", "--no-such"]
+
+
+@pytest.mark.parametrize("name", ["nope", "nope.toml"])
+@pytest.mark.parametrize("load", [load_sensor, load_object, load_experiment, load_randomisation, load_servo])
+def test_a_name_that_is_not_known_names_commands_that_exist(load, name):
+    with pytest.raises(SpecError) as error:
+        load(name)
+    assert not wrong_hints(str(error.value)) and ("lists them" in str(error.value) or "known: surface" in str(error.value))
 
 
 def test_what_could_not_be_let_go_of_is_printed_after_ctrl_c(monkeypatch, tmp_path):

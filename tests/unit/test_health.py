@@ -86,6 +86,16 @@ def test_a_black_frame_is_bad_and_nothing_crashes():
     assert found["pins"].verdict is Grade.BAD and found["brightness"].verdict is Grade.BAD and "place" in found
 
 
+def test_frames_that_cannot_be_used_are_named():
+    spec = load_sensor("mg400-127")
+    rest = nominal_reference(spec, Form.RECORDING).pins_px
+    shown = [drawn_frame(spec, Form.RECORDING, rest, name=f"frame_{k}.png") for k in range(4)]
+    shown[2] = replace(shown[2], image=np.zeros_like(shown[2].image))
+    found = {each.name: each for each in examine(shown, spec)}["pins"]
+    assert "3 of 4 frames can be used; not frame_2.png" in found.text and "no pins" in found.remedy
+    assert "frame_" not in {each.name: each for each in examine(shown[:2], spec)}["pins"].text
+
+
 def test_drift_is_the_planted_similarity():
     reference = nominal_reference(sensor(), Form.RAW)
     rest, rim = reference.pins_px, reference.outmost

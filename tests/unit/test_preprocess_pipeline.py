@@ -1,5 +1,7 @@
 """The pipeline on drawn frames with known truth, and on recordings where they are."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from twin.frames.forms import raw_to_recording
 from twin.pins import Pipeline, measure_reference, nominal_reference
 from twin.pins.blobs import SPECK_LEVELS, circular_mask, despeckled, find_blobs
 from twin.pins.legacy import LegacyPipeline
-from twin.pins.matching import match, rematch
+from twin.pins.matching import confirm, match, rematch
 from twin.pins.pipeline import lower_levels
 from twin.pins.reference import folded_fraction
 from twin.pins.split import split_chains
@@ -271,6 +273,69 @@ def test_a_layout_that_lost_a_column_is_named_right_or_not_at_all(lights):
         assert not observation.valid or np.nanmax(errors_px(observation, truth)) < SAME_PIN_PX, displaced
         assert observation.valid or "ambiguous" in observation.reason, displaced
         assert observation.valid or displaced > 1 / 3, "near its place at rest a layout is never taken for one that is a column apart"
+
+
+def misnamed(observation, truth_px, spacing_px):
+    """Pins that were found nearer to another pin's true place than to their own, and off their own."""
+    pins = np.flatnonzero(np.isfinite(observation.pins_px[:, 0]))
+    away = np.linalg.norm(observation.pins_px[pins, None] - truth_px, axis=2)
+    return pins[(away.argmin(axis=1) != pins) & (away[np.arange(len(pins)), pins] > 0.5 * spacing_px[pins])].tolist()
+
+
+@pytest.mark.parametrize("level", [0, 255])
+@pytest.mark.parametrize(
+    "name, form, pins", [("mg400-331", Form.RECORDING, (171, 180, 183, 234)), ("ur5-331", Form.RAW, (168, 180, 228, 288))]
+)
+def test_pins_behind_a_hole_are_named_right_or_the_frame_is_not_valid(name, form, pins, level):
+    """A dark or bright disc over a sixth of the pins. Behind it a sector fits as well if its names are shifted by a pin along the rings."""
+    pipeline = Pipeline(load_sensor(name), form)
+    truth, valid = pipeline.reference.pins_px, 0
+    for pin in pins:
+        frame = draw(pipeline, truth)
+        radius_px = np.sort(np.linalg.norm(truth - truth[pin], axis=1))[len(truth) // 6]
+        cv2.circle(frame.image, np.round(truth[pin]).astype(int).tolist(), int(radius_px), (level,) * 3, -1)
+        observation = pipeline(frame)
+        assert not observation.valid or not misnamed(observation, truth, pipeline.reference.spacing_px), pin
+        valid += observation.valid
+    assert valid >= len(pins) / 2, "most of these frames can be used"
+
+
+@pytest.mark.parametrize("width", [1.2, 2.2, 3.2])
+def test_a_part_across_a_gap_loses_wrong_names_and_keeps_right_ones(width):
+    """Beyond a dark bar, each ring's names are shifted along the ring by a pin, as if the labelling had begun there."""
+    rest = nominal_reference(load_sensor("mg400-331"), Form.RECORDING)
+    spacing = float(np.median(rest.spacing_px))
+    beyond = (rest.pins_px - rest.pins_px[0])[:, 0] / spacing - 5
+    seen = np.flatnonzero(np.abs(beyond) > width / 2)
+    true = np.full(len(beyond), -1)
+    true[seen] = np.arange(len(seen))
+    shifted = np.full(len(beyond), -1)
+    for first, last in zip(rest.ring_ends[:-1], rest.ring_ends[1:], strict=True):
+        ring = rest.slots[first:last]
+        shifted[ring] = true[np.roll(ring, 1)]
+    wrong = np.where(beyond > 0, np.where(np.isin(shifted, true[beyond > 0]), shifted, -1), true)
+    px, area = rest.pins_px[seen], np.full(len(seen), 50.0)
+    for labels in (true, wrong):
+        found = confirm(rest, px, area, replace(rematch(rest, px, area, true), blob=labels, score=0.0))
+        named = found.blob >= 0
+        np.testing.assert_array_equal(found.blob[named], true[named])
+        assert (named[beyond < 0] == (true[beyond < 0] >= 0)).all()
+        assert found.lead > 0 and (labels is wrong or named.sum() == len(seen))
+
+
+@pytest.mark.parametrize("torn", [-25, -13, 12, 22])
+@pytest.mark.parametrize("name", ["mg400-331", "mg400-127"])
+def test_a_torn_picture_is_named_right_or_not_valid(name, torn):
+    """The lower half is displaced by one to two pins, so that most of its pins lie where pins of other names should be."""
+    pipeline = Pipeline(load_sensor(name), Form.RECORDING)
+    truth = pipeline.reference.pins_px + 0.0
+    frame = draw(pipeline, truth)
+    half = len(frame.image) // 2
+    frame.image[half:] = np.roll(frame.image[half:], torn, axis=1)
+    truth[truth[:, 1] >= half - 0.5, 0] += torn
+    observation = pipeline(frame)
+    assert not observation.valid or not misnamed(observation, truth, pipeline.reference.spacing_px)
+    assert observation.valid or "pins" in observation.reason
 
 
 def test_a_rim_of_another_size_is_not_valid(pipeline):

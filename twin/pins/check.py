@@ -120,7 +120,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
     nominal = nominal_reference(spec, form)
     findings = [
         _layout(frames, spec, pipeline.blob_spec.polarity),
-        _pins(seen, pipeline),
+        _pins(frames, seen, pipeline),
         _spots(seen, pipeline),
         *_place(seen, nominal, spec),
         *_twin(spec, form, nominal),
@@ -209,13 +209,19 @@ def lost_in_view(seen: list[Observation], pipeline: Pipeline) -> tuple[np.ndarra
     return np.isnan(np.stack([o.pins_px[:, 0] for o in seen])) & in_view, in_view
 
 
-def _pins(seen: list[Observation], pipeline: Pipeline) -> Finding:
-    """Finding about lost pins, and about pins that are lost in most frames. Pins that the frame's border cuts off do not count as lost."""
+def _pins(frames: list[Frame], seen: list[Observation], pipeline: Pipeline) -> Finding:
+    """Finding about lost pins, with the frames that can't be used and the pins that are lost in most frames.
+
+    Pins that the frame's border cuts off do not count as lost.
+    """
     lost, in_view = lost_in_view(seen, pipeline)
     share = float(lost.sum() / max(in_view.sum(), 1))
     steady = np.flatnonzero(lost.mean(axis=0) >= STEADY)
     outside = int(np.median((~in_view).sum(axis=1)))
     text = f"{100 * share:.2f} % of the pins in view lost; {sum(o.valid for o in seen)} of {len(seen)} frames can be used"
+    bad = [f.name or f"number {k}" for k, (f, o) in enumerate(zip(frames, seen, strict=True), 1) if not o.valid]
+    if 0 < len(bad) < len(seen):
+        text += f"; not {', '.join(bad[:LISTED])}{', ...' if len(bad) > LISTED else ''}"
     if 0 < len(steady) < lost.shape[1] / 2:
         text += f"; steadily lost: pin {', '.join(map(str, steady[:LISTED]))}{', ...' if len(steady) > LISTED else ''}"
     if outside:

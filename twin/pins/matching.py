@@ -18,6 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from twin.compiled import compiled
 from twin.pins.reference import Reference
@@ -28,7 +31,7 @@ GROW_GATES = (0.30, 0.45)
 """Largest distance from a prediction to its blob while a labelling grows: in the first pass, and in the second."""
 FINAL_GATE = 0.40
 """Largest distance from a prediction to its blob in the final assignment."""
-ADOPT_GATE = 0.7
+ADOPT_GATE = 0.55
 """Largest distance from the prediction of a lost pin to a free blob that it gets, if each is the other's nearest."""
 ADOPT_AREA_RATIO = 2.0
 """Largest ratio of the area of a blob that is given to a lost pin to the area of the pin's neighbours, and of the second to the first."""
@@ -80,6 +83,11 @@ LEAST_KEPT = 0.5
 """Least share of the pins that must stay labelled for labels to be grown anew."""
 MOST_REGROWN = 0.3
 """Share of lost pins above which labels are not grown anew."""
+SEAM = 0.7
+"""Least difference between the motions of neighbouring pins, in spacings, at which a seam may separate them. It is 1 where names are
+shifted by a pin; in contacts with true names at most some 0.6, and 0.9 where the skin slips."""
+PREDICTED_WEIGHT = 0.1
+"""Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
 Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
 """Blobs by square cell: first blob of each cell, next blob in the same cell, x0, y0, columns, rows (see ``_buckets``)."""
 
@@ -201,6 +209,66 @@ def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np
     cell = float(np.median(reference.spacing_px))
     layout = _layout(reference)
     return _refine(layout, px, area_px2, blob, _buckets(px, cell), cell)
+
+
+def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: Match) -> Match:
+    """Name the pins that a hole or a seam separates from the others again, from the largest part of a labelling with lost pins.
+
+    Parts are separated by lost pins, or by neighbours whose motions differ by nearly a spacing. A part across a gap keeps its names if
+    its nearest pins are where the motion of the largest part predicts them; else it loses them. If the two labellings give a blob two
+    names, and the new one is not better, the result has no lead.
+    """
+    part, blob = _parts(reference, px, found.blob), found.blob
+    main = part == np.bincount(part[part >= 0]).argmax()
+    if main[blob >= 0].all():
+        return found
+    px = np.ascontiguousarray(px)
+    cell = float(np.median(reference.spacing_px))
+    layout, buckets = _layout(reference), _buckets(px, cell)
+    again = _refine(layout, px, area_px2, _grow(*layout[:3], px, np.where(main, blob, -1), buckets, cell), buckets, cell)
+    across = (blob >= 0) & (again.blob < 0) & ~np.isin(blob, again.blob)
+    if across.any():
+        nodes_px = complete(reference, np.where(again.blob[:, None] >= 0, px[again.blob], np.nan))
+        away = np.linalg.norm(px[blob] - nodes_px, axis=1) / reference.spacing_px
+        gap, _ = cKDTree(reference.pins_px[again.blob >= 0]).query(reference.pins_px)
+        start = again.blob.copy()
+        for one in np.unique(part[across]):
+            pins = np.flatnonzero(across & (part == one))
+            if np.median(away[pins[np.argsort(gap[pins])[:NEAR]]]) < FINAL_GATE:
+                start[pins] = blob[pins]
+        again = _refine(layout, px, area_px2, start, buckets, cell)
+    renamed = (again.blob != blob) & (again.blob >= 0) & (blob >= 0)
+    return replace(again, lead=0.0 if renamed.any() and again.score <= found.score else found.lead)
+
+
+def _parts(reference: Reference, px: np.ndarray, blob: np.ndarray) -> np.ndarray:
+    """Part (N,) of a labelling (N,) that each pin belongs to, -1 if it is lost. Pins are linked to neighbours that move alike."""
+    n, found = len(blob), blob >= 0
+    plane = np.column_stack([np.ones(n), reference.pins_px])
+    fit = np.linalg.lstsq(plane[found], px[blob[found]], rcond=None)[0]
+    moved = (px[blob] - plane @ fit) @ np.linalg.pinv(fit[1:]) / reference.spacing_px[:, None]
+    near = reference.neighbours[:, :NEAR]
+    alike = np.linalg.norm(moved[near] - moved[:, None], axis=2) < SEAM
+    pin, column = np.nonzero(alike & found[:, None] & found[near])
+    links = coo_array((np.ones(len(pin)), (pin, near[pin, column])), shape=(n, n))
+    return np.where(found, connected_components(links, directed=False)[1], -1)
+
+
+def complete(reference: Reference, pins_px: np.ndarray) -> np.ndarray:
+    """Pins (N, 2) in which lost pins (NaN) are at the places that their neighbours' motion predicts."""
+    found = np.isfinite(pins_px[:, 0])
+    if found.all():
+        return pins_px
+    nodes_px = np.where(found[:, None], pins_px, reference.pins_px)
+    known = found.astype(float)
+    while known.any() and not known.all():  # from the edge of a gap inwards
+        predicted = predict_all(reference.pins_px, reference.neighbours, reference.spacing_px, nodes_px, known)
+        new = (known == 0) & np.isfinite(predicted[:, 0])
+        if not new.any():
+            break
+        nodes_px[new] = predicted[new]
+        known[new] = PREDICTED_WEIGHT
+    return nodes_px
 
 
 @compiled()

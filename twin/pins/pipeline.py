@@ -9,6 +9,7 @@ from time import perf_counter
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
@@ -16,7 +17,7 @@ from twin.frames.forms import blob_spec, form_named, frame_size, levels_at, pin_
 from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.identify import SHOWN, judge_layout
-from twin.pins.matching import Match, match, predict_all, rematch
+from twin.pins.matching import Match, complete, confirm, match, rematch
 from twin.pins.reference import Reference, folded_fraction, make_reference, nominal_reference
 from twin.pins.rest import require_even
 from twin.pins.split import split_chains, split_merged
@@ -72,8 +73,13 @@ LEAST_LEAD = 0.35
 """Least lead of the labelling over the next, quite different one, in rows of pins (the square root of their number). If the whole layout
 is seen, a labelling that is a row apart lacks a row. If a row is lost, or lights beside the pins look like one, it explains the frame as
 well."""
-PREDICTED_WEIGHT = 0.1
-"""Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
+ONWARD = 0.4
+"""Largest distance of a blob that is no pin, in spacings, from a place where a row of pins would go on. It is farther from all pins."""
+UNNAMED_AREA_RATIO = 2.0
+"""Largest ratio of this blob's area to the median of the pins', and of the second to the first."""
+LEAST_UNNAMED = 3
+"""Least number of such blobs, and of lost pins, with which part of the layout may be named a row apart: the blobs at one end, the lost
+pins at the other."""
 
 
 class Pipeline:
@@ -131,17 +137,22 @@ class Pipeline:
         paired = found.blob >= 0
         pins_px = np.full_like(self.reference.pins_px, np.nan)
         pins_px[paired] = blobs.px[found.blob[paired]]
-        nodes_px = self._complete(pins_px)
+        nodes_px = complete(self.reference, pins_px)
         predicted_px = np.where(paired[:, None], np.nan, nodes_px)
         extra_px = np.delete(blobs.px, found.blob[paired], axis=0)
         between = self._between_caps(frame, pins_px)
         ms["complete"], now = _since(now)
-        expected = int((paired | ~self._cut_off(nodes_px)).sum())
+        expected, lost = int((paired | ~self._cut_off(nodes_px)).sum()), int((~paired).sum())
         reason = self._reason(blobs, int(paired.sum()), expected, nodes_px, extra_px) or self._rim_lost(paired, nodes_px)
         if not reason and found.lead < LEAST_LEAD * np.sqrt(len(paired)):
             reason = (
-                "ambiguous pins: two ways to name them, a row apart, explain the frame nearly alike; press or shear less, and hide what "
-                "looks like pins beside them"
+                "ambiguous pins: two ways to name them, a row apart, explain the frame nearly alike; press or shear less, uncover "
+                "hidden pins, and hide what looks like pins beside them"
+            )
+        if not reason and (unnamed := self._unnamed(blobs, found, nodes_px)) >= LEAST_UNNAMED <= lost:
+            reason = (
+                f"ambiguous pins: {unnamed} blobs continue the rows of pins, and {lost} pins are lost: the picture is torn, or part is "
+                "named a row apart; grab the frame again, or hide what looks like pins"
             )
         if not reason and between > MOST_BETWEEN:
             reason = f"wrong pins: {between:.0%} of them stand between caps; stray light, a wrong threshold, or another sensor's frame"
@@ -178,6 +189,8 @@ class Pipeline:
             blobs, found = self._with_displaced_mask(frame, blob, blobs, found)
         if (found.blob < 0).any() and self._plausible(found):
             blobs, found = self._with_split_caps(blobs, found)
+            if (found.blob < 0).any():
+                found = confirm(self.reference, blobs.px, blobs.area_px2, found)
         ms["match"], _ = _since(now)
         return blobs, found
 
@@ -245,23 +258,6 @@ class Pipeline:
             blobs, found = parts, replace(again, lead=found.lead)
         return blobs, found
 
-    def _complete(self, pins_px: np.ndarray) -> np.ndarray:
-        """Pins (N, 2) in which lost pins are at the places that their neighbours' motion predicts."""
-        reference = self.reference
-        found = np.isfinite(pins_px[:, 0])
-        if found.all():
-            return pins_px
-        nodes_px = np.where(found[:, None], pins_px, reference.pins_px)
-        known = found.astype(float)
-        while known.any() and not known.all():  # from the edge of a gap inwards
-            predicted = predict_all(reference.pins_px, reference.neighbours, reference.spacing_px, nodes_px, known)
-            new = (known == 0) & np.isfinite(predicted[:, 0])
-            if not new.any():
-                break
-            nodes_px[new] = predicted[new]
-            known[new] = PREDICTED_WEIGHT
-        return nodes_px
-
     def _inside_px(self, px: np.ndarray) -> np.ndarray:
         """Distance (n,) of places (n, 2) from the frame's border, px; negative outside the frame."""
         return np.minimum(px, np.array(self.size_px) - 1 - px).min(axis=1)
@@ -286,6 +282,23 @@ class Pipeline:
             f"the rim is not seen: {lost} of the {len(rim)} outermost pins are lost; light that fades, too high a threshold, or a sensor "
             "of fewer pins: run 'twin tune' on these frames, or 'twin new'"
         )
+
+    def _unnamed(self, blobs: Blobs, found: Match, nodes_px: np.ndarray) -> int:
+        """Number of blobs of a cap's size that are no pins, but stand where the rows of pins go on, if pins are lost.
+
+        ``nodes_px`` (N, 2) are the pins. A row goes on as far from a pin as one of its neighbours is, on the other side.
+        """
+        paired = found.blob >= 0
+        extra = np.setdiff1d(np.arange(len(blobs.px)), found.blob)
+        if paired.all() or not len(extra):
+            return 0
+        ratio = blobs.area_px2[extra] / np.median(blobs.area_px2[found.blob[paired]])
+        px = blobs.px[extra[(ratio > 1 / UNNAMED_AREA_RATIO) & (ratio < UNNAMED_AREA_RATIO)]]
+        pins_px = nodes_px[paired]
+        onward = (2 * pins_px[:, None] - nodes_px[self.reference.neighbours[paired, :NEAREST]]).reshape(-1, 2)
+        (away, _), (_, pin) = cKDTree(onward).query(px), cKDTree(pins_px).query(px)
+        reach = ONWARD * self.reference.spacing_px[paired][pin]
+        return int(((away < reach) & (np.linalg.norm(px - pins_px[pin], axis=1) > reach)).sum())
 
     def _between_caps(self, frame: Frame, pins_px: np.ndarray) -> float:
         """Share of the found pins (N, 2), NaN where lost, that do not stand out from the midpoints between them and their neighbours."""
@@ -376,7 +389,8 @@ def measure_reference(spec: SensorSpec, form: Form, frame: Frame, *, known: Refe
             return make_reference(seen.graph.nodes_px, spec.pins)
         except FrameError as error:
             refused = error
-    shown = judge_layout(spec.pins, [gray_levels(frame.image)])  # it names the pins without known places
+    levels = pin_levels(frame.image, blob_spec(spec.pipeline, form).polarity)
+    shown = judge_layout(spec.pins, [levels])  # it names the pins without known places
     if shown is not None and shown.explained >= SHOWN:
         other = view_of(shown.seen[0].pins_px, expected, spec.pins, modes)
         if not other.pressed:

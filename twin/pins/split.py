@@ -9,10 +9,15 @@ from twin.pins.matching import Match
 from twin.pins.reference import Reference
 
 # All limits were chosen, not derived.
-# Largest distance from a pin's predicted place to a component that the pin may claim, in spacings.
+# Largest distance, in spacings, from a pin's predicted place to a component that the pin may claim, and to the part that it gets.
 REACH = 0.4
 # Least area of a component that is split, relative to the sum of the areas expected of all pins that claim it. A smaller one is one cap.
 MIN_AREA_SHARE = 0.65
+# Largest such area. A larger component is glare, or a hole in the threshold, and its shape states no pins' places.
+MAX_AREA_SHARE = 1.5
+# Number of neighbours of a pin towards which the surroundings of its part are compared. A part is in a bright area if it is not brighter
+# than at least half of these places by a share of the component's height above the darkest, and largest share of such parts.
+AROUND_PART, LEAST_ABOVE, MOST_BRIGHT = 6, 0.15, 0.25
 # Least distance of two parts, in cap diameters.
 MIN_SEPARATION = 0.6
 # Least weight of the smallest part, relative to the mean weight of the parts.
@@ -149,6 +154,20 @@ def split_chains(blobs: Blobs) -> Blobs:
     return _with_parts(blobs, split, px, part_area, part_label) if split else blobs
 
 
+def _bright_around(reference: Reference, blobs: Blobs, found: Match, pins: list[int], centers: np.ndarray) -> bool:
+    """Whether the parts of a component at ``centers`` (n, 2), for ``pins`` (n,), lie in or along a bright area: glare, which hides pins.
+
+    Touching caps form a chain or a small clump. Half of the way to most of its neighbours, a cap's surroundings are dark.
+    """
+    middle = (centers[:, None] + found.predicted_px[reference.neighbours[pins, :AROUND_PART]]) / 2
+    last = np.array(blobs.gray.shape[::-1]) - 1
+    column, row = np.moveaxis(np.clip(np.round(np.nan_to_num(middle - blobs.corner_px)), 0, last).astype(int), -1, 0)
+    between = blobs.gray[row, column].astype(float)
+    column, row = np.clip(np.round(centers - blobs.corner_px), 0, last).astype(int).T
+    height = blobs.gray[row, column, None] - np.sort(between, axis=1)
+    return bool(np.mean(height[:, AROUND_PART // 2] <= LEAST_ABOVE * height[:, 0].max()) > MOST_BRIGHT)
+
+
 def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
     """Split each component that several pins claim into as many parts. Returns the new blobs.
 
@@ -177,11 +196,13 @@ def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
             continue
         expected = float(np.nanmedian(around))
         whole = blobs.label_area_px2[label]
-        if whole < MIN_AREA_SHARE * expected * len(pins):
+        if not MIN_AREA_SHARE < whole / (expected * len(pins)) < MAX_AREA_SHARE:
             continue
         centers, share = _parts(blobs, label, found.predicted_px[pins])
+        away = np.linalg.norm(centers - found.predicted_px[pins], axis=1) / reference.spacing_px[pins]
         apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.diag(np.full(len(pins), np.inf))
-        if apart.min() > MIN_SEPARATION * 2 * np.sqrt(expected / np.pi) and share.min() > MIN_PART / len(pins):
+        separate = apart.min() > MIN_SEPARATION * 2 * np.sqrt(expected / np.pi) and share.min() > MIN_PART / len(pins)
+        if separate and away.max() < REACH and not _bright_around(reference, blobs, found, pins, centers):
             split.append(label)
             px += list(centers)
             part_area += list(share * whole)

@@ -143,6 +143,8 @@ class ContactEstimator:
         if isinstance(seen, Unseen):
             return self._any.unseen(seen, started)
         kind = str(self.contacts.likeliest(seen.pins, tuple(self.parts))[0])
+        if self.parts[kind].domain is None and not str(self.contacts.tell(seen.pins)[0]):
+            return self._any.unseen(Unseen(f"no contact that the weights know ({', '.join(self.parts)})", seen.touched), started)
         return self.parts[kind].estimate_one(seen, started, kind)
 
     def taken_for(self, pins: PinTable) -> dict[str, float]:

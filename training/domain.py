@@ -255,12 +255,12 @@ class Domain:
     def _why(self, found: Strangeness, moved: FloatArray, lost: BoolArray, reference: Reference) -> str:
         """The most probable cause of a strange frame, in words."""
         straight = self(_aligned(moved, reference), lost)  # exactly, because the motions are those of small turns
-        again = "record a new frame without contact with the present view (init_0.png beside the frames, --no-contact, --at-rest)"
+        again = "take a new frame without contact with the present view (init_0.png beside the frames, --no-contact, --at-rest)"
         if min(found.parts[:3].max(), straight.parts[:3].max()) <= REFUSED:
             scale, turn, *shift = align(reference.pins_px[None] + moved * reference.spacing_px.mean(), reference.pins_px)[1][0]
             return (
-                f"displaced camera: the view is shifted by ({shift[0]:.1f}, {shift[1]:.1f}) px, turned by {np.degrees(turn):.1f} deg and {np.exp(scale):.3f} "
-                f"times as large as at rest, more than a contact does; {again}"
+                f"displaced camera: the view is shifted by ({shift[0]:.1f}, {shift[1]:.1f}) px, turned by {np.degrees(turn):.1f} deg "
+                f"and {np.exp(scale):.3f} times as large as at rest, more than a contact does; {again}"
             )
         share, place, axis, step = self._torn(moved, lost, reference)
         smooth, stretch = self._smooth(moved, lost, reference)
@@ -276,8 +276,8 @@ class Domain:
             )
         far = f"{found.parts[:3].max():.1f} times as far from the training frames as they are from each other"
         return (
-            f"not a contact that the model knows: the pins' pattern is {far}; another object or another sensor's frame, a turned or mirrored "
-            "picture, or pins with wrong names"
+            f"not a contact that the model knows: the pins' pattern is {far}; another object or another sensor's frame, a turned or "
+            "mirrored picture, or pins with wrong names"
         )
 
     def _explained(self, moved: FloatArray, lost: BoolArray, columns: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -458,7 +458,7 @@ class PoseEstimator:
         if isinstance(made, Prediction) and self.domain is not None:
             reason = verdict.reason
             if not reason:
-                reason, excess = self.domain.outside_range(made.mean[0], self.names, self.units)
+                reason, excess = self.domain.outside_range(made.mean[0], self.config["columns"], self.config["units"])
             made = Unseen(reason, made.touched, made.seen) if reason else made
         if isinstance(made, Unseen):
             if self._tracker is not None:
@@ -490,21 +490,23 @@ class PoseEstimator:
         contact : str
             Kind of the frame's contact.
         """
+        known = self._trained.reference
+        seen = replace(seen, pins=seen.pins.seen_from(known)) if seen.pins.measured else seen
         verdict = self._verdict(seen.pins.nodes_px[0], seen.pins.lost[0])
         if verdict.reason:
             return self.unseen(Unseen(verdict.reason, seen.touched, seen.seen), started)
         if self.domain is not None and verdict.camera.any():
             pins = seen.pins
-            places = self.domain.without_camera(pins.nodes_px[0], pins.area_px2[0], verdict.camera, pins.reference.spacing_px.mean())
+            places = self.domain.without_camera(pins.nodes_px[0], pins.area_px2[0], verdict.camera, known.spacing_px.mean())
             seen = replace(seen, pins=replace(pins, nodes_px=places[0][None], area_px2=places[1][None]))
         slip = None if self._tracker is None else self._tracker(self.modes_of(seen.pins)[0])
         return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip, seen.lost_share, verdict)
 
     def _verdict(self, nodes_px: np.ndarray, lost: np.ndarray) -> Verdict:
-        """Whether pins (N, 2), some of them ``lost`` (N,), are a pattern that the model was trained on."""
+        """Whether pins (N, 2), as seen by the camera of the training, some of them ``lost`` (N,), are a pattern that was trained on."""
         if self.domain is None:
             return USUAL_FRAME
-        reference = self.pipeline.reference
+        reference = self._trained.reference
         moved = (nodes_px - reference.pins_px) / reference.spacing_px.mean()
         return self.domain.judge(moved, lost, reference, corrects=isinstance(self.part, PinModel))
 
@@ -613,7 +615,7 @@ def models_by_sensor(run: str | Path | None = None, first: str = "") -> Callable
 def digest_of(run: str | Path) -> str:
     """Digest of everything that affects a model's estimates: its weights, its configuration, and the code that runs it."""
     folder, digest = folder_of(run), hashlib.sha256(fingerprint(PoseEstimator).encode())
-    for name in (CONFIG, WEIGHTS, TENSORS):
+    for name in (CONFIG, WEIGHTS, TENSORS, DOMAIN):
         if (folder / name).is_file():
             digest.update(name.encode() + hashlib.sha256((folder / name).read_bytes()).digest())
     return digest.hexdigest()

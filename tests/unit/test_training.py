@@ -316,7 +316,7 @@ def test_a_runs_digest_is_that_of_its_weights_and_configuration(tmp_path, monkey
         found.append(digest_of(copy))
     monkeypatch.setattr("training.estimator.fingerprint", lambda *makers: "of another version")
     found.append(digest_of(copy))
-    assert len(set(found)) == 4
+    assert len(set(found)) == 5  # its displacements alone change no estimate with known rest places
 
 
 def test_the_time_of_an_estimate_is_without_that_of_compiling():

@@ -146,7 +146,8 @@ def tune(
         rest = rest_of(layout, [f.name for f in frames], given_levels, given.name if given else "")
         if given is not None:
             view = view_of(rest.pins_px, nominal_reference(sensor, form), sensor.pins, camera_modes(sensor, form))
-            view.require_unpressed(given.name, sensor)
+            if not view.displacements():  # else the specification is of another camera, and its places tell nothing
+                view.require_unpressed(given.name, sensor)
     reference = make_reference(turned_as(sensor.pins, layout.rest_px), sensor.pins)
     caps = [caps_in(image, seen.pins_px, reference.spacing_px) for image, seen in zip(images, layout.seen, strict=True)]
     area, contrast = (float(np.nanmedian(values)) for values in zip(*caps, strict=True))

@@ -1,0 +1,118 @@
+"""The domain of a model, on made-up contacts whose displacements follow from three numbers."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from scenes import load_sensor
+from training.domain import FEWEST, REFUSED, learn_domain, read_domain, write_domain
+from training.recipes import TrainingError
+from twin.pins import nominal_reference
+from twin.types import Form
+
+UNITS = ("mm", "deg")
+REFERENCE = nominal_reference(load_sensor("mg400-127"), Form.RECORDING)
+SPACING_PX = float(REFERENCE.spacing_px.mean())
+PLACES = (REFERENCE.pins_px - REFERENCE.pins_px.mean(axis=0)) / SPACING_PX
+NONE_LOST = np.zeros(len(PLACES), bool)
+
+
+def contacts(count, seed, depth=(1.0, 3.0)):
+    """Displacements (M, N, 2) in spacings of contacts of a depth, a tilt and a shear, with noise of the pins, and the labels depth, tilt."""
+    rng = np.random.default_rng(seed)
+    deep, tilt, shear = rng.uniform(*depth, count), rng.uniform(-15, 15, count), rng.uniform(-1, 1, count)
+    off = PLACES[None] - np.stack([0.15 * tilt, np.zeros(count)], axis=-1)[:, None]
+    bump = np.exp(-0.06 * (off**2).sum(axis=2))[..., None]
+    moved = deep[:, None, None] * bump * (0.05 * off + np.stack([0.1 * shear, 0 * shear], axis=-1)[:, None])
+    return moved + rng.normal(0, 0.005, moved.shape), np.column_stack([deep, tilt])
+
+
+@lru_cache(maxsize=1)
+def domain():
+    moved, labels = contacts(600, 0)
+    return learn_domain(moved, labels, REFERENCE, UNITS, least=np.array([0.05, 0.5]))
+
+
+def judged(moved, lost=NONE_LOST, **options):
+    return domain().judge(moved, lost, REFERENCE, **options)
+
+
+def test_contacts_like_those_of_the_training_are_usual():
+    verdicts = [judged(each) for each in contacts(200, 1)[0]]
+    assert np.mean([not each.reason for each in verdicts]) >= 0.99
+    assert np.mean([not each.notes for each in verdicts]) >= 0.9
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda u: u + np.where(PLACES[:, 1:] > 0.5, [0.5, 0.0], 0.0), "torn frame: below y"),
+        (lambda u: u + np.where(PLACES[:, :1] > 0.5, [0.0, 0.5], 0.0), "torn frame: right of x"),
+        (lambda u: u + [1.2, 0.0], "displaced camera: the view is shifted by"),
+        (lambda u: u + 0.08 * PLACES * [1, 0], "displaced camera: the view is stretched by"),
+        (lambda u: u + 0.3 * np.random.default_rng(2).normal(size=u.shape), "not a contact that the model knows"),
+        (lambda u: PLACES @ [[0.8, 0.6], [-0.6, 0.8]] - PLACES + u @ [[0.8, 0.6], [-0.6, 0.8]], "turned by 36.9 deg"),
+    ],
+)
+def test_a_strange_frame_gets_no_estimate_and_its_cause_is_named(change, words):
+    for each in contacts(5, 3)[0]:
+        assert words in judged(change(each)).reason
+
+
+def test_a_small_displacement_of_the_camera_is_removed_as_far_as_models_can():
+    straight = contacts(1, 4)[0][0]
+    verdict = judged(straight + [0.2, -0.1])
+    assert not verdict.reason and verdict.camera[:2] == pytest.approx([0.2, -0.1], abs=0.02) and verdict.factor > 1
+    nodes_px, area_px2 = domain().without_camera(
+        REFERENCE.pins_px + SPACING_PX * (straight + [0.2, -0.1]), REFERENCE.area_px2, verdict.camera, SPACING_PX
+    )
+    assert np.abs((nodes_px - REFERENCE.pins_px) / SPACING_PX - straight).max() < 0.03
+    assert area_px2 == pytest.approx(REFERENCE.area_px2, rel=0.02)
+    assert judged(straight + [0.2, -0.1], corrects=False).reason.startswith("displaced camera")
+
+
+def test_intervals_grow_with_the_distance_and_never_shrink_until_there_is_no_estimate():
+    straight, strange = contacts(1, 5)[0][0], np.random.default_rng(6).normal(size=(len(PLACES), 2))
+    verdicts = [judged(straight + size * strange) for size in np.linspace(0, 0.2, 41)]
+    first = next(k for k, each in enumerate(verdicts) if each.reason)
+    factors = [each.factor for each in verdicts[:first]]
+    assert factors == sorted(factors) and factors[-1] > 1.2 and all(each.reason for each in verdicts[first:])
+
+
+def test_lighter_contacts_are_no_strangers_and_their_intervals_reach_no_contact():
+    deep, labels = contacts(600, 7, depth=(1.0, 3.0))
+    light = contacts(50, 8, depth=(0.0, 0.9))[0]
+    assert not any(judged(each).reason for each in [*light, np.zeros_like(light[0])])
+    added = judged(np.zeros_like(light[0])).added
+    assert added[0] > 0 and added[0] >= judged(0.5 * deep[0]).added[0]
+
+
+def test_lost_pins_are_filled_in_and_what_is_not_known_of_them_widens():
+    moved = contacts(1, 9)[0][0]
+    few, half = NONE_LOST.copy(), np.hypot(*(PLACES - [0.5, 0.0]).T) < 3.0
+    few[::25] = True
+    filled, unsure = domain().filled(np.where(few[:, None], 9.0, moved), few)
+    assert np.abs(filled - moved)[few].max() < 0.05 and np.array_equal(filled[~few], moved[~few])
+    assert domain().filled(moved, half)[1] > unsure > 0 and not judged(np.where(few[:, None], 9.0, moved), few).reason
+
+
+def test_an_estimate_far_outside_the_trained_range_is_named():
+    reason, _ = domain().outside_range(np.array([16.2, 0.0]), ("pose_2", "pose_6"), UNITS)
+    assert "pose_2 comes out as 16.2 mm, trained from 1.0" in reason
+    reason, excess = domain().outside_range(np.array([3.2, 0.0]), ("pose_2", "pose_6"), UNITS)
+    assert not reason and 0.15 < excess[0] < 0.25 and excess[1] == 0
+
+
+def test_a_written_domain_judges_alike_and_one_of_other_pins_is_refused(tmp_path):
+    write_domain(tmp_path / "domain.safetensors", domain())
+    again = read_domain(tmp_path / "domain.safetensors", len(PLACES), 2)
+    for each in contacts(20, 10)[0]:
+        assert again(each).parts == pytest.approx(domain()(each).parts, abs=0.05 * REFUSED)
+    with pytest.raises(TrainingError, match="domain"):
+        read_domain(tmp_path / "domain.safetensors", 331, 2)
+
+
+def test_too_few_frames_make_no_domain():
+    moved, labels = contacts(FEWEST - 1, 11)
+    assert learn_domain(moved, labels, REFERENCE, UNITS, least=np.ones(2)) is None

@@ -109,14 +109,19 @@ class Strangeness:
     unknown : float
         Rms difference of a coordinate, in spacings, from the nearest frame with a known label, less the usual one; 0 for usual frames. What
         is not known of lost pins is added.
-    size : float
-        Rms displacement of a coordinate, in spacings.
+    ample : float
+        Rms size of the leading components, in standard deviations, at least 1. What no model of contacts explains grows with it.
     """
 
     parts: np.ndarray
     camera: np.ndarray
     unknown: float
-    size: float
+    ample: float
+
+    @property
+    def usual_camera(self) -> np.ndarray:
+        """Sizes (4,) of the camera's motions relative to ``ample``."""
+        return np.abs(self.camera) / self.ample
 
 
 @dataclass(frozen=True)
@@ -342,21 +347,21 @@ class Domain:
         seen = away @ self._project
         camera, a = seen[:, :4], seen[:, 4:]
         left = away - camera @ self.motions - (a * self.deviation) @ self.components
-        outside = np.sqrt(np.einsum("mi,mi->m", left, left) / flat.shape[1])
         a = np.clip(a, -FARTHEST, FARTHEST)
         first = a[:, : self.known.shape[1]]
+        ample = np.maximum(np.sqrt(np.einsum("mi,mi->m", first, first) / first.shape[1]), 1.0)  # what is left grows with the contact
+        outside = np.sqrt(np.einsum("mi,mi->m", left, left) / flat.shape[1]) / ample
         expected = _terms(first) @ self.weight
         camera = camera - expected[:, -4:]
         wrong = (a[:, first.shape[1] :] - expected[:, :-4]) / self.usual
-        misfit = np.sqrt(np.einsum("mi,mi->m", wrong, wrong) / max(wrong.shape[1], 1))
+        misfit = np.sqrt(np.einsum("mi,mi->m", wrong, wrong) / max(wrong.shape[1], 1)) / ample
         beyond = np.sqrt(_least_distance2(first, self.known))
         lead, labelled = self.deviation[: first.shape[1]], len(self.known) - self.lighter
         nearest = np.sqrt(_least_distance2(first * lead, self.known[:labelled] * lead) / flat.shape[1])
-        moved_by = (np.abs(camera) / self.limits[3:]).max(axis=1)
+        moved_by = (np.abs(camera) / self.limits[3:]).max(axis=1) / ample
         parts = np.column_stack([np.column_stack([outside, misfit, beyond]) / self.limits[:3], moved_by])
-        size = np.sqrt(np.einsum("mi,mi->m", flat, flat) / flat.shape[1])
         unknown = np.maximum(nearest - self.near, 0)
-        return [Strangeness(*each) for each in zip(parts, camera, unknown.tolist(), size.tolist(), strict=True)]
+        return [Strangeness(*each) for each in zip(parts, camera, unknown.tolist(), ample.tolist(), strict=True)]
 
     def filled(self, moved: FloatArray, lost: BoolArray) -> tuple[FloatArray, float]:
         """Displacements (N, 2) in which ``lost`` pins are the most probable ones, and the rms of what is not known of all coordinates."""
@@ -437,7 +442,7 @@ def learn_domain(
     for fold in range(FOLDS):
         here = part == fold
         one = _fit(flat[~here], labelled[~here], motions, rng)
-        measures[here] = [[*found.parts[:3], *np.abs(found.camera), found.unknown] for found in one.of(moved[here])]
+        measures[here] = [[*found.parts[:3], *found.usual_camera, found.unknown] for found in one.of(moved[here])]
     fitted = _fit(flat, labelled, motions, rng)
     limits = np.quantile(measures[:, :7], 1 - ALLOWED, axis=0)
     floors = np.array([OUTSIDE, 1.0, 1.0, SHIFT, SHIFT, np.radians(TURN_DEG), SCALE])

@@ -454,7 +454,7 @@ class PoseEstimator:
         lost: float = 0.0,
         verdict: Verdict = USUAL_FRAME,
     ) -> PoseEstimate:
-        excess = np.zeros(len(self._bounds[0]))
+        excess: np.ndarray = np.zeros(len(self._bounds[0]))
         if isinstance(made, Prediction) and self.domain is not None:
             reason = verdict.reason
             if not reason:

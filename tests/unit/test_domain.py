@@ -19,7 +19,7 @@ NONE_LOST = np.zeros(len(PLACES), bool)
 
 
 def contacts(count, seed, depth=(1.0, 3.0)):
-    """Displacements (M, N, 2) in spacings of contacts of a depth, a tilt and a shear, with noise of the pins, and the labels depth, tilt."""
+    """Displacements (M, N, 2), spacings, of contacts of a depth, a tilt and a shear, with the pins' noise, and the labels depth, tilt."""
     rng = np.random.default_rng(seed)
     deep, tilt, shear = rng.uniform(*depth, count), rng.uniform(-15, 15, count), rng.uniform(-1, 1, count)
     off = PLACES[None] - np.stack([0.15 * tilt, np.zeros(count)], axis=-1)[:, None]

@@ -69,8 +69,6 @@ NEIGHBOURS = 10
 """Number of nearest known frames between which the rate of a label is measured."""
 SURE_RATE = 0.9
 """Share of pairs of neighbouring frames whose labels differ by at most the rate."""
-PARTS = ("outside", "misfit", "beyond", "camera")
-"""Names of the four distances."""
 REFUSED = 2.0
 """Distance, in limits, above which a frame gets no estimate. Between 1 and this the intervals grow, if the camera sits at its place."""
 GROWS = 2.0
@@ -103,7 +101,7 @@ class Strangeness:
     Attributes
     ----------
     parts : (4,) float
-        The distances ``NAMES``, each divided by its limit.
+        The distances outside, misfit, beyond and camera (see the module), each divided by its limit.
     camera : (4,) float
         Difference of the camera: shift in x and y (spacings), turn (rad, from x towards y), relative change of scale.
     unknown : float
@@ -300,8 +298,7 @@ class Domain:
         (S,) float, (S, k) float
         """
         known = np.repeat(~lost, 2)
-        modes = np.concatenate([self.motions, self.components * self.deviation[:, None]])[:, known]
-        inner = modes @ modes.T + NOISE**2 * np.diag(np.concatenate([np.full(4, 1e-9), np.ones(len(self.deviation))]))
+        modes, inner = self._seen_modes(known)
         away = (moved.ravel() - self.mean)[known]
 
         def probable(x: FloatArray) -> FloatArray:
@@ -331,8 +328,8 @@ class Domain:
 
     def _smooth(self, moved: FloatArray, lost: BoolArray, reference: Reference) -> tuple[float, FloatArray]:
         """Share that a stretch, tilt or distortion of the view explains, and the stretch (2,)."""
-        q = reference.pins_px - reference.pins_px.mean(axis=0)
-        (x, y), size = (q / reference.spacing_px.mean()).T, float(np.abs(q).max() / reference.spacing_px.mean())
+        x, y = _places(reference).T
+        size = float(np.abs(_places(reference)).max())
         fields_xy = [(x, -y), (y, x), (x * x / size, x * y / size), (x * y / size, y * y / size)]
         fields_xy.append((x * (x * x + y * y) / size**2, y * (x * x + y * y) / size**2))
         share, step = self._explained(moved, lost, np.array([[np.column_stack(each).ravel() for each in fields_xy]]))
@@ -355,9 +352,9 @@ class Domain:
         camera = camera - expected[:, -4:]
         wrong = (a[:, first.shape[1] :] - expected[:, :-4]) / self.usual
         misfit = np.sqrt(np.einsum("mi,mi->m", wrong, wrong) / max(wrong.shape[1], 1)) / ample
-        beyond = np.sqrt(_least_distance2(first, self.known))
+        beyond = np.sqrt(_distances2(first, self.known).min(axis=1))
         lead, labelled = self.deviation[: first.shape[1]], len(self.known) - self.lighter
-        nearest = np.sqrt(_least_distance2(first * lead, self.known[:labelled] * lead) / flat.shape[1])
+        nearest = np.sqrt(_distances2(first * lead, self.known[:labelled] * lead).min(axis=1) / flat.shape[1])
         moved_by = (np.abs(camera) / self.limits[3:]).max(axis=1) / ample
         parts = np.column_stack([np.column_stack([outside, misfit, beyond]) / self.limits[:3], moved_by])
         unknown = np.maximum(nearest - self.near, 0)
@@ -366,20 +363,28 @@ class Domain:
     def filled(self, moved: FloatArray, lost: BoolArray) -> tuple[FloatArray, float]:
         """Displacements (N, 2) in which ``lost`` pins are the most probable ones, and the rms of what is not known of all coordinates."""
         known = np.repeat(~lost, 2)
-        modes = np.concatenate([self.motions, self.components * self.deviation[:, None]])
-        part = modes[:, known]
-        inner = part @ part.T + NOISE**2 * np.diag(np.concatenate([np.full(4, 1e-9), np.ones(len(self.components))]))
+        part, inner = self._seen_modes(known)
         found = np.linalg.solve(inner, part @ (moved.ravel() - self.mean)[known])
-        spread_out = np.linalg.cholesky(np.linalg.inv(inner) * NOISE**2).T @ modes[:, ~known]
-        whole = np.where(known, moved.ravel(), self.mean + found @ modes).reshape(moved.shape)
+        spread_out = np.linalg.cholesky(np.linalg.inv(inner) * NOISE**2).T @ self._modes[:, ~known]
+        whole = np.where(known, moved.ravel(), self.mean + found @ self._modes).reshape(moved.shape)
         return whole, float(np.sqrt((spread_out**2).sum() / len(known)))
 
+    @property
+    def _modes(self) -> FloatArray:
+        """The camera's motions, and the components in standard deviations (D + 4, 2N)."""
+        return np.concatenate([self.motions, self.components * self.deviation[:, None]])
 
-def _least_distance2(points: FloatArray, known: FloatArray) -> FloatArray:
-    """Squared distance (M,) of points (M, L) from the nearest of known ones (n, L)."""
+    def _seen_modes(self, known: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """The modes in the ``known`` coordinates (2N,), and NOISE^2 times the precision of their amplitudes given these coordinates."""
+        modes = self._modes[:, known]
+        return modes, modes @ modes.T + NOISE**2 * np.diag(np.concatenate([np.full(4, 1e-9), np.ones(len(self.deviation))]))
+
+
+def _distances2(points: FloatArray, known: FloatArray) -> FloatArray:
+    """Squared distances (M, n) of points (M, L) from known ones (n, L)."""
     square = (points**2).sum(axis=1)[:, None] + (known**2).sum(axis=1) - 2 * points @ known.T
-    least: FloatArray = np.maximum(square.min(axis=1), 0)
-    return least
+    found: FloatArray = np.maximum(square, 0)
+    return found
 
 
 def _terms(a: np.ndarray) -> np.ndarray:
@@ -493,9 +498,15 @@ def _fit(flat: np.ndarray, labelled: np.ndarray, motions: np.ndarray, rng: np.ra
     return Domain(motions, mean, components, deviation, weight, usual, known, np.ones(7), none, none, none, none, len(dim) + 1, 0.0, 0.0)
 
 
+def _places(reference: Reference) -> FloatArray:
+    """Places (N, 2) of the pins at rest about their middle, in mean spacings."""
+    found: FloatArray = (reference.pins_px - reference.pins_px.mean(axis=0)) / reference.spacing_px.mean()
+    return found
+
+
 def _motions(reference: Reference) -> np.ndarray:
     """Displacements (4, 2N), spacings, by the camera: see ``Domain``. A turn and a scale act about the middle of the pins."""
-    x, y = ((reference.pins_px - reference.pins_px.mean(axis=0)) / reference.spacing_px.mean()).T
+    x, y = _places(reference).T
     one, none = np.ones_like(x), np.zeros_like(x)
     return np.stack([np.column_stack(pair).ravel() for pair in ((one, none), (none, one), (-y, x), (x, y))])
 
@@ -512,7 +523,7 @@ def _rates(found: Domain, flat: np.ndarray, labels: np.ndarray, units: Sequence[
     rows = np.sort(rng.permutation(len(flat))[:KNOWN])
     lead = found.known.shape[1]
     a = ((flat[rows] - found.mean) @ found._project)[:, 4 : 4 + lead] * found.deviation[:lead] / np.sqrt(flat.shape[1])
-    apart = np.sqrt(np.maximum((a**2).sum(axis=1)[:, None] + (a**2).sum(axis=1) - 2 * a @ a.T, 0))
+    apart = np.sqrt(_distances2(a, a))
     i, j = np.nonzero((apart > 0) & (np.argsort(np.argsort(apart, axis=1), axis=1) <= NEIGHBOURS))
     change = np.abs(label_error(labels[rows][i], labels[rows][j], units))
     return np.quantile(change / np.maximum(apart[i, j], 1e-9)[:, None], SURE_RATE, axis=0)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 
@@ -32,7 +33,7 @@ from twin.errors import FrameError
 from twin.estimate import SensorModel
 from twin.frames.forms import blob_spec, form_named
 from twin.mechanics.skin_map import ContactMaps
-from twin.pins import Pipeline, Reference, View, make_reference, measure_reference, nominal_reference, view_of
+from twin.pins import Pipeline, Reference, View, make_reference, measure_reference, view_of
 from twin.pins.view import camera_modes
 from twin.store import fingerprint
 from twin.types import Form, Frame, Observation
@@ -208,7 +209,7 @@ class PoseEstimator:
         found._undecided = view.undecided()
         return found
 
-    @property
+    @cached_property
     def _known_rest(self) -> Reference:
         """The pins at rest of the unit from which the weights were learnt."""
         known = self._known_rest_px
@@ -266,7 +267,7 @@ class PoseEstimator:
         """The same model for frames without a no-contact frame, taken by the unit from which its weights were learnt."""
         if self._known_rest_px is None:
             return self
-        found = self._counted_from(nominal_reference(self.recorded_sensor, self.form))
+        found = self._counted_from(self._known_rest)
         found._trained = replace(found._trained, touched=TouchAnswer(found.pipeline.reference))
         return found
 

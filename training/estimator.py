@@ -419,7 +419,7 @@ class PoseEstimator:
         if isinstance(seen, Unseen):
             return self.unseen(seen, started), None
         made = self.estimate_one(seen, started, "")
-        return made, self.maps_of(seen.pins, made.value[None])[0]
+        return made, self.maps_of(seen.pins, made.value[None])[0] if made.valid else None
 
     def maps_of(self, pins: PinTable, values: np.ndarray) -> list[ContactMaps]:
         """Contact maps of many frames, from their pins and the model's estimates for them (M, K).

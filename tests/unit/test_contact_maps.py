@@ -114,6 +114,16 @@ def test_maps_overwrite_nothing_foreign(contacts, tmp_path):
         list(made)
 
 
+def test_a_frame_unlike_any_of_the_training_has_no_maps(contacts, monkeypatch):
+    folder, run, sensor = contacts
+    estimator = PoseEstimator.load(run)
+    pins = load_dataset(folder, sensor, estimator.names).pins.rows(np.array([0]))
+    strange = replace(pins, nodes_px=pins.nodes_px + np.random.default_rng(0).normal(0, 5, pins.nodes_px.shape))
+    monkeypatch.setattr(estimator, "pins_in", lambda frame: OneFrame(strange))
+    made, maps = estimator.contact_maps(Frame(np.zeros((300, 300), np.uint8), Form.RECORDING))
+    assert not made.valid and maps is None
+
+
 def test_a_model_of_recordings_says_that_it_makes_no_maps(trained):
     with pytest.raises(TrainingError, match="makes no contact maps.*train touch on simulated contacts"):
         PoseEstimator.load(trained).require_maps()

@@ -117,9 +117,13 @@ class ContactEstimator:
 
     def at_rest_of(self, frames: Iterable[Frame]) -> tuple["ContactEstimator", bool]:
         """As for ``PoseEstimator``."""
-        looked = list(frames)
-        told = {name: part.at_rest_of(looked) for name, part in self.parts.items()}
-        return self._with({name: part for name, (part, _) in told.items()}), any(other for _, other in told.values())
+        nodes_px = self._any.at_known_rest().nodes_in(frames)
+        best = max(self.parts.values(), key=lambda part: part.usual_share(nodes_px))
+        found, other = best.told_rest(nodes_px)
+        rest = found.pipeline.reference if other else None
+        best.require_view_of_contacts(nodes_px, rest, "these contacts")
+        parts = {name: part.at_known_rest() if rest is None else part.counted_from(rest) for name, part in self.parts.items()}
+        return self._with(parts), other
 
     def _with(self, parts: dict[str, PoseEstimator]) -> "ContactEstimator":
         found = copy(self)

@@ -81,9 +81,10 @@ IN_RANGE = 0.995
 """Quantile of the training labels that is taken as an end of their range. A few states of contacts lie far outside of an experiment."""
 BEYOND_RANGE = 0.25
 """Share of a label's trained range by which an estimate may leave it."""
-IN_PLACE = 0.9
-"""Distance, in limits, above which a frame gets no estimate if a displacement of the camera was removed from it: two ways of being strange
-are one too many (a mirrored picture)."""
+IN_PLACE = np.array([1.1, 0.9, 0.9])
+"""Distances outside, misfit and beyond, in limits, above which a frame gets no estimate if a displacement of the camera was removed from
+it: two ways of being strange
+are one too many (a mirrored picture). A picture that was turned or enlarged adds a little noise, which is outside."""
 OFF_PLACE = 1.5
 """Growth of the intervals where motions of the camera were removed."""
 SPLITS = 24
@@ -198,17 +199,25 @@ class Domain:
     near: float
     blind: float
     _project: np.ndarray = field(init=False, repr=False, compare=False)
+    _modes: np.ndarray = field(init=False, repr=False, compare=False)
+    _near: "tuple[_Nearest, _Nearest]" = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         camera = np.linalg.pinv(self.motions).T
-        object.__setattr__(self, "_project", np.concatenate([camera, self.components / self.deviation[:, None]]).T.copy())
+        lead, labelled = self.deviation[: self.known.shape[1]], len(self.known) - self.lighter
+        for name, value in (
+            ("_project", np.concatenate([camera, self.components / self.deviation[:, None]]).T.copy()),
+            ("_modes", np.concatenate([self.motions, self.components * self.deviation[:, None]])),
+            ("_near", (_Nearest(self.known), _Nearest(self.known[:labelled] * lead))),
+        ):
+            object.__setattr__(self, name, value)
 
     def __call__(self, moved: FloatArray, lost: BoolArray | None = None) -> Strangeness:
         """The strangeness of one frame, from its pins' displacements (N, 2) in mean rest spacings; ``lost`` (N,) pins are not used."""
         if lost is None or not lost.any():
-            return self._measured(moved.reshape(1, -1))[0]
+            return self._measure(moved.ravel())
         filled, unsure = self.filled(moved, lost)
-        found = self._measured(filled.reshape(1, -1))[0]
+        found = self._measure(filled.ravel())
         return replace(found, unknown=found.unknown + max(unsure - self.blind, 0.0))
 
     def judge(self, moved: FloatArray, lost: BoolArray, reference: Reference, *, corrects: bool = True) -> Verdict:
@@ -223,9 +232,11 @@ class Domain:
             Whether motions of the camera can be removed from what the model sees.
         """
         found = self(moved, lost)
-        share = float(np.clip((found.parts[3] - REMOVED[0]) / (REMOVED[1] - REMOVED[0]), 0, 1))
-        strange, displaced = float(found.parts[:3].max()), (np.abs(found.camera) > CORRECTED).any() or not corrects
-        if strange > REFUSED - share * (REFUSED - IN_PLACE) or (share == 1 and displaced):
+        *others, displaced = found.parts.tolist()
+        share = min(max((displaced - REMOVED[0]) / (REMOVED[1] - REMOVED[0]), 0.0), 1.0)
+        strange = max(others)
+        removable = share < 1 or (corrects and bool((np.abs(found.camera) <= CORRECTED).all()))
+        if not removable or (found.parts[:3] > REFUSED - share * (REFUSED - IN_PLACE)).any():
             return Verdict(self._why(found, moved, lost, reference))
         notes = []
         if strange > 1:
@@ -236,6 +247,21 @@ class Domain:
             notes.append("no training frame of known label is near")
         factor = (1 + GROWS * max(strange - 1, 0)) * (1 + (OFF_PLACE - 1) * share)
         return Verdict("", factor, self.rate * found.unknown, tuple(f"{note}: intervals are wider" for note in notes), share * found.camera)
+
+    def common_camera(self, moved: FloatArray) -> tuple[FloatArray, float]:
+        """What contacts (M, N, 2), in mean rest spacings, say about the camera that took all of them.
+
+        Returns
+        -------
+        motions : (4,) float
+            Their median motion of the camera, see ``Strangeness``; zero within the limits.
+        usual : float
+            Share of the contacts that are usual but for the camera's motion.
+        """
+        found = [self(each) for each in moved]
+        motions = np.median([each.camera for each in found], axis=0)
+        usual = float(np.mean([(each.parts[:3] <= IN_PLACE).all() for each in found]))
+        return np.where((np.abs(motions) > self.limits[3:]).any(), motions, 0.0), usual
 
     def without_camera(self, nodes_px: FloatArray, area_px2: FloatArray, camera: FloatArray, spacing_px: float) -> tuple:
         """Pins (N, 2) and areas (N,) without motions (4,) of the camera."""
@@ -335,30 +361,24 @@ class Domain:
         share, step = self._explained(moved, lost, np.array([[np.column_stack(each).ravel() for each in fields_xy]]))
         return float(share[0]), step[0, :2]
 
-    def of(self, moved: FloatArray) -> list[Strangeness]:
-        """The strangeness of many frames (M, N, 2) without lost pins."""
-        return self._measured(moved.reshape(len(moved), -1))
-
-    def _measured(self, flat: FloatArray) -> list[Strangeness]:
+    def _measure(self, flat: FloatArray) -> Strangeness:
         away = flat - self.mean
         seen = away @ self._project
-        camera, a = seen[:, :4], seen[:, 4:]
-        left = away - camera @ self.motions - (a * self.deviation) @ self.components
-        a = np.clip(a, -FARTHEST, FARTHEST)
-        first = a[:, : self.known.shape[1]]
-        ample = np.maximum(np.sqrt(np.einsum("mi,mi->m", first, first) / first.shape[1]), 1.0)  # what is left grows with the contact
-        outside = np.sqrt(np.einsum("mi,mi->m", left, left) / flat.shape[1]) / ample
+        left = away - seen @ self._modes
+        camera, a = seen[:4], np.minimum(np.maximum(seen[4:], -FARTHEST), FARTHEST)
+        lead = self.known.shape[1]
+        first = a[:lead]
+        ample = max(float(first @ first / lead) ** 0.5, 1.0)  # what is left grows with the contact
         expected = _terms(first) @ self.weight
-        camera = camera - expected[:, -4:]
-        wrong = (a[:, first.shape[1] :] - expected[:, :-4]) / self.usual
-        misfit = np.sqrt(np.einsum("mi,mi->m", wrong, wrong) / max(wrong.shape[1], 1)) / ample
-        beyond = np.sqrt(_distances2(first, self.known).min(axis=1))
-        lead, labelled = self.deviation[: first.shape[1]], len(self.known) - self.lighter
-        nearest = np.sqrt(_distances2(first * lead, self.known[:labelled] * lead).min(axis=1) / flat.shape[1])
-        moved_by = (np.abs(camera) / self.limits[3:]).max(axis=1) / ample
-        parts = np.column_stack([np.column_stack([outside, misfit, beyond]) / self.limits[:3], moved_by])
-        unknown = np.maximum(nearest - self.near, 0)
-        return [Strangeness(*each) for each in zip(parts, camera, unknown.tolist(), ample.tolist(), strict=True)]
+        camera = camera - expected[-4:]
+        wrong = (a[lead:] - expected[:-4]) / self.usual
+        misfit = float(wrong @ wrong / max(len(wrong), 1)) ** 0.5 / ample
+        outside = float(left @ left / len(flat)) ** 0.5 / ample
+        moved_by = float((np.abs(camera) / self.limits[3:]).max()) / ample
+        parts = np.array([outside, misfit, self._near[0](first), moved_by])
+        parts[:3] /= self.limits[:3]
+        unknown = self._near[1](first * self.deviation[:lead]) / len(flat) ** 0.5 - self.near
+        return Strangeness(parts, camera, max(unknown, 0.0), ample)
 
     def filled(self, moved: FloatArray, lost: BoolArray) -> tuple[FloatArray, float]:
         """Displacements (N, 2) in which ``lost`` pins are the most probable ones, and the rms of what is not known of all coordinates."""
@@ -369,28 +389,29 @@ class Domain:
         whole = np.where(known, moved.ravel(), self.mean + found @ self._modes).reshape(moved.shape)
         return whole, float(np.sqrt((spread_out**2).sum() / len(known)))
 
-    @property
-    def _modes(self) -> FloatArray:
-        """The camera's motions, and the components in standard deviations (D + 4, 2N)."""
-        return np.concatenate([self.motions, self.components * self.deviation[:, None]])
-
     def _seen_modes(self, known: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """The modes in the ``known`` coordinates (2N,), and NOISE^2 times the precision of their amplitudes given these coordinates."""
+        """The modes in the ``known`` coordinates (2N,), and NOISE^2 times the precision of their amplitudes given these coordinates.
+
+        Modes are the camera's motions, then the components in standard deviations.
+        """
         modes = self._modes[:, known]
         return modes, modes @ modes.T + NOISE**2 * np.diag(np.concatenate([np.full(4, 1e-9), np.ones(len(self.deviation))]))
 
 
-def _distances2(points: FloatArray, known: FloatArray) -> FloatArray:
-    """Squared distances (M, n) of points (M, L) from known ones (n, L)."""
-    square = (points**2).sum(axis=1)[:, None] + (known**2).sum(axis=1) - 2 * points @ known.T
-    found: FloatArray = np.maximum(square, 0)
-    return found
+class _Nearest:
+    """Measure the distance of a point (L,) from the nearest of known ones (n, L)."""
+
+    def __init__(self, known: FloatArray) -> None:
+        self._square, self._twice = (known**2).sum(axis=1), np.ascontiguousarray(-2 * known.T)
+
+    def __call__(self, point: FloatArray) -> float:
+        return max(float((point @ self._twice + self._square).min() + point @ point), 0.0) ** 0.5
 
 
 def _terms(a: np.ndarray) -> np.ndarray:
-    """Terms (M, T) of the polynomial in the leading components (M, L): 1, each, products of two, and of three of the first few."""
-    two, three = _products(a.shape[1])
-    return np.concatenate([np.ones((len(a), 1)), a, a[:, two[0]] * a[:, two[1]], a[:, three[0]] * a[:, three[1]] * a[:, three[2]]], axis=1)
+    """Terms (..., T) of the polynomial in the leading components (..., L): 1, each, products of two, and of three of the first few."""
+    (i, j), (k, m, n) = _products(a.shape[-1])
+    return np.concatenate([np.ones((*a.shape[:-1], 1)), a, a[..., i] * a[..., j], a[..., k] * a[..., m] * a[..., n]], axis=-1)
 
 
 _PRODUCTS: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -447,7 +468,7 @@ def learn_domain(
     for fold in range(FOLDS):
         here = part == fold
         one = _fit(flat[~here], labelled[~here], motions, rng)
-        measures[here] = [[*found.parts[:3], *found.usual_camera, found.unknown] for found in one.of(moved[here])]
+        measures[here] = [[*found.parts[:3], *found.usual_camera, found.unknown] for found in map(one, moved[here])]
     fitted = _fit(flat, labelled, motions, rng)
     limits = np.quantile(measures[:, :7], 1 - ALLOWED, axis=0)
     floors = np.array([OUTSIDE, 1.0, 1.0, SHIFT, SHIFT, np.radians(TURN_DEG), SCALE])
@@ -523,7 +544,7 @@ def _rates(found: Domain, flat: np.ndarray, labels: np.ndarray, units: Sequence[
     rows = np.sort(rng.permutation(len(flat))[:KNOWN])
     lead = found.known.shape[1]
     a = ((flat[rows] - found.mean) @ found._project)[:, 4 : 4 + lead] * found.deviation[:lead] / np.sqrt(flat.shape[1])
-    apart = np.sqrt(_distances2(a, a))
+    apart = np.linalg.norm(a[:, None] - a, axis=2)
     i, j = np.nonzero((apart > 0) & (np.argsort(np.argsort(apart, axis=1), axis=1) <= NEIGHBOURS))
     change = np.abs(label_error(labels[rows][i], labels[rows][j], units))
     return np.quantile(change / np.maximum(apart[i, j], 1e-9)[:, None], SURE_RATE, axis=0)

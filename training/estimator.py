@@ -16,7 +16,7 @@ from scenes.sensor import SensorSpec
 from training.assemble import Ensemble
 from training.contact_maps import MAPS, MapModel, read_maps
 from training.dataset import Dataset
-from training.displacements import DISPLACEMENTS, Displacements, other_rest, read_displacements
+from training.displacements import DISPLACEMENTS, MOST_CONTACTS, Displacements, other_rest, read_displacements
 from training.domain import DOMAIN, FEWEST, Domain, Verdict, read_domain
 from training.models import model_named
 from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen
@@ -31,6 +31,7 @@ from training.targets import limits_of
 from training.touched import TouchAnswer
 from twin.errors import FrameError
 from twin.estimate import SensorModel
+from twin.frames import spread
 from twin.frames.forms import blob_spec, form_named
 from twin.mechanics.skin_map import ContactMaps
 from twin.pins import Pipeline, Reference, View, make_reference, measure_reference, view_of
@@ -46,6 +47,8 @@ factor of 1.2 or 1.6."""
 USUAL_FRAME = Verdict("")
 """Verdict on a frame about which nothing strange is known."""
 FEWEST_VIEWED = 8
+MOST_USUAL = 0.6
+"""Least share of contacts that must be usual but for a motion of the camera, for this motion to be estimated from them."""
 """Least number of contacts whose median pins show the camera's view."""
 SIMULATED_FORCES = ("force_x", "force_y", "force_z", "torque_z")
 """Labels that are proportional to the stiffness of the simulated sensor."""
@@ -204,7 +207,7 @@ class PoseEstimator:
             raise FrameError(f"a no-contact frame serves only a model that counts pins from rest, {self.model} does not; leave it out")
         reference = measure_reference(self.sensor, self.form, frame, known=self._known_rest)
         view = self.require_view(reference.pins_px, frame.name or "frame")
-        found = self._counted_from(reference)
+        found = self.counted_from(reference)
         found._trained = replace(found._trained, touched=TouchAnswer(reference))
         found._undecided = view.undecided()
         return found
@@ -219,6 +222,13 @@ class PoseEstimator:
         """As ``require_view``, from the pins (M, N, 2) of contacts, and from the places at ``rest`` that were estimated from them."""
         if len(nodes_px) >= FEWEST_VIEWED:
             self.require_view(np.median(nodes_px, axis=0), name, contacts=True)
+            motions, usual = self._common_camera(self._known_rest, nodes_px)
+            if rest is None and motions.any() and usual < MOST_USUAL:
+                raise FrameError(
+                    f"{name}: {1 - usual:.0%} of them are no contacts that the weights of {self.sensor.name} know, and the camera is "
+                    "displaced: its picture may be turned, mirrored or stretched; give a frame without contact (init_0.png beside the "
+                    "frames, --no-contact FRAME)"
+                )
         if rest is not None and self.require_view(rest.pins_px, name).pressed:
             raise FrameError(
                 f"{name}: no pins at rest of {self.sensor.name} explain them: the camera's picture may be turned or mirrored, or they are "
@@ -267,18 +277,32 @@ class PoseEstimator:
         """The same model for frames without a no-contact frame, taken by the unit from which its weights were learnt."""
         if self._known_rest_px is None:
             return self
-        found = self._counted_from(self._known_rest)
+        found = self.counted_from(self._known_rest)
         found._trained = replace(found._trained, touched=TouchAnswer(found.pipeline.reference))
         return found
 
     def other_rest(self, start: Reference, nodes_px: np.ndarray) -> Reference | None:
         """The rest layout estimated from contacts with pins (M, N, 2), if it differs from ``start``, the assumed one.
 
-        None if the difference is not significant, if there are fewer contacts than ``training.displacements.FEWEST_CONTACTS``, or if the
-        run did not learn how contacts displace the pins.
+        None if the difference is not significant, if there are fewer contacts than ``training.displacements.FEWEST_CONTACTS`` (8 for the
+        place of the camera alone), or if the run did not learn how contacts displace the pins.
         """
-        found = other_rest(self.displacements, start, nodes_px) if self.counts_from_rest else None
+        if not self.counts_from_rest:
+            return None
+        found = other_rest(self.displacements, start, nodes_px)
+        if found is None and self.domain is not None:
+            motions, usual = self._common_camera(start, nodes_px)
+            if motions.any() and usual >= MOST_USUAL:
+                found = start.pins_px + start.spacing_px.mean() * (motions @ self.domain.motions).reshape(-1, 2)
         return None if found is None else make_reference(found, self.sensor.pins)
+
+    def _common_camera(self, start: Reference, nodes_px: np.ndarray) -> tuple[np.ndarray, float]:
+        """``Domain.common_camera`` of contacts (M, N, 2), px, with the pins at rest ``start``; no motion for few contacts or no domain."""
+        whole = nodes_px[np.isfinite(nodes_px).all(axis=(1, 2))]
+        if self.domain is None or len(whole) < FEWEST_VIEWED:
+            return np.zeros(4), 1.0
+        whole = whole[spread(len(whole), MOST_CONTACTS)]
+        return self.domain.common_camera((whole - start.pins_px) / start.spacing_px.mean())
 
     def at_rest_of(self, frames: Iterable[Frame]) -> tuple["PoseEstimator", bool]:
         """The model for the sensor that took ``frames`` of contacts, none of them without contact, and whether the sensor is another unit.
@@ -290,18 +314,25 @@ class PoseEstimator:
         FrameError
             The camera's picture is displaced so far that estimates would be wrong.
         """
-        pipeline = self.at_known_rest().pipeline
-        graphs = [seen.graph for frame in frames if (seen := pipeline(frame)).valid]
-        nodes_px = np.array([graph.nodes_px for graph in graphs if graph is not None]).reshape(-1, self.sensor.pins.count, 2)
+        nodes_px = self.at_known_rest().nodes_in(frames)
         found, other = self.told_rest(nodes_px)
         self.require_view_of_contacts(nodes_px, found.pipeline.reference if other else None, "these contacts")
         return found, other
+
+    def nodes_in(self, frames: Iterable[Frame]) -> np.ndarray:
+        """The pins (M, N, 2), px, in the valid ones of some frames."""
+        graphs = [seen.graph for frame in frames if (seen := self.pipeline(frame)).valid]
+        return np.array([graph.nodes_px for graph in graphs if graph is not None]).reshape(-1, self.sensor.pins.count, 2)
+
+    def usual_share(self, nodes_px: np.ndarray) -> float:
+        """Share of contacts with pins (M, N, 2), px, that the model knows, wherever the camera sits; 0 if the run holds no domain."""
+        return 0.0 if self.domain is None else self._common_camera(self._known_rest, nodes_px)[1]
 
     def told_rest(self, nodes_px: np.ndarray) -> tuple["PoseEstimator", bool]:
         """As ``at_rest_of``, from the pins (M, N, 2), px, of contacts."""
         estimator = self.at_known_rest()
         other = estimator.other_rest(estimator.pipeline.reference, nodes_px)
-        return (estimator, False) if other is None else (estimator._counted_from(other), True)
+        return (estimator, False) if other is None else (estimator.counted_from(other), True)
 
     def seeking_rest(self) -> SensorModel:
         """The model for a camera's frames if no frame shows its sensor without contact. It works as ``at_rest_of``, while frames arrive.
@@ -319,7 +350,8 @@ class PoseEstimator:
         found._trained = replace(self._trained, ensemble=found.ensemble)
         return found
 
-    def _counted_from(self, reference: Reference) -> "PoseEstimator":
+    def counted_from(self, reference: Reference) -> "PoseEstimator":
+        """The same model; it measures the pins' displacements from other pins at rest."""
         found = copy(self)
         found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
         found._trained = replace(self._trained, pipeline=found.pipeline)

@@ -2,13 +2,15 @@
 
 A few numbers (depth, tilt, shear, place) determine nearly the whole displacement of the pins by a contact. The displacement u (2N,) of a
 frame is split into the four small motions of a camera (shift, turn and scale) and the rest. The rest is written in the principal components
-of the training frames. Four distances follow; each is divided by its limit, which all but one in ``ALLOWED`` training frames keep that were
+of the training frames. Five distances follow; each is divided by its limit, which all but one in ``ALLOWED`` training frames keep that were
 left out of the fit:
 
 - outside: rms of what is outside of the components (a torn frame, pins with wrong names, a lens of another kind);
 - misfit: rms difference between the further components and those that a polynomial of the leading ones predicts (a pattern that is
   possible, but that no contact makes);
 - beyond: distance of the leading components from the nearest training frame (a contact deeper, or of another kind, than any);
+- halves: difference between the components that follow from the upper and from the lower half of the pins (a torn frame, or two frames
+  in one picture), less what a polynomial of the leading components predicts;
 - camera: difference between the camera's motions and those that the contact itself causes, by the same polynomial.
 
 The lightest contacts of a training set may be far from the frame at rest. So that lighter ones are no strangers, training frames are also
@@ -35,7 +37,7 @@ from twin.types import BoolArray, FloatArray
 
 DOMAIN = "domain.safetensors"
 """File of a run with its domain."""
-FILE = ArrayFile("file of a domain", "twin train", version=1, error=TrainingError, again=AGAIN)
+FILE = ArrayFile("file of a domain", "twin train", version=2, error=TrainingError, again=AGAIN)
 MODES, LEADING, CUBED = 60, 12, 6
 """Number of principal components, of leading ones, and of those whose products of three are terms of the polynomial."""
 FEWEST = 60
@@ -52,6 +54,8 @@ FOLDS = 5
 """Number of parts of the training frames; each part is measured by a fit to the others."""
 ALLOWED = 0.005
 """Share of left-out training frames beyond each limit."""
+WHITE = 1e-3
+"""Share of the variance of the halves' differences that counts as noise."""
 RIDGE = 1e-3
 """Penalty of the polynomial's coefficients, per frame, for components of standard deviation 1."""
 LEAST_DEVIATION = 1e-4
@@ -69,8 +73,8 @@ NEIGHBOURS = 10
 """Number of nearest known frames between which the rate of a label is measured."""
 SURE_RATE = 0.9
 """Share of pairs of neighbouring frames whose labels differ by at most the rate."""
-REFUSED = 2.0
-"""Distance, in limits, above which a frame gets no estimate. Between 1 and this the intervals grow, if the camera sits at its place."""
+REFUSED = np.array([2.0, 2.0, 2.0, 1.4])
+"""Distances outside, misfit, beyond and halves, in limits, above which a frame gets no estimate. Between 1 and this the intervals grow."""
 GROWS = 2.0
 """Growth of the intervals for each limit of distance beyond the first."""
 CORRECTED = np.array([0.6, 0.6, np.radians(3.0), 0.05])
@@ -81,10 +85,12 @@ IN_RANGE = 0.995
 """Quantile of the training labels that is taken as an end of their range. A few states of contacts lie far outside of an experiment."""
 BEYOND_RANGE = 0.25
 """Share of a label's trained range by which an estimate may leave it."""
-IN_PLACE = np.array([1.1, 0.9, 0.9])
-"""Distances outside, misfit and beyond, in limits, above which a frame gets no estimate if a displacement of the camera was removed from
+IN_PLACE = np.array([0.95, 0.9, 0.9, 1.0])
+"""As ``REFUSED``: distances above which a frame gets no estimate if a displacement of the camera was removed from
 it: two ways of being strange
 are one too many (a mirrored picture). A picture that was turned or enlarged adds a little noise, which is outside."""
+USUAL = np.array([1.25, 1.0, 1.0, 1.2])
+"""As ``REFUSED``: distances up to which a contact is usual, wherever the camera sits."""
 OFF_PLACE = 1.5
 """Growth of the intervals where motions of the camera were removed."""
 SPLITS = 24
@@ -101,8 +107,8 @@ class Strangeness:
 
     Attributes
     ----------
-    parts : (4,) float
-        The distances outside, misfit, beyond and camera (see the module), each divided by its limit.
+    parts : (5,) float
+        The distances outside, misfit, beyond, halves and camera (see the module), each divided by its limit.
     camera : (4,) float
         Difference of the camera: shift in x and y (spacings), turn (rad, from x towards y), relative change of scale.
     unknown : float
@@ -161,14 +167,17 @@ class Domain:
         Orthonormal, and orthogonal to the motions.
     deviation : (D,) float
         Standard deviations of the components.
-    weight : (T, D - L + 4) float
-        Coefficients from the polynomial's terms in the L leading components to the further ones and to the camera's motions.
+    weight : (T, D - L + 4 + D) float
+        Coefficients from the polynomial's terms in the L leading components to the further ones, to the camera's motions, and to the
+        differences of the halves.
+    whiten : (D, D) float
+        Inverse square root of the covariance of the differences of the halves.
     usual : (D - L,) float
         Root mean square of the polynomial's residual in the further components.
     known : (n, L) float
         Leading components of training frames with labels, then ``lighter`` ones.
-    limits : (7,) float
-        Limits of outside, misfit and beyond, and of the camera's motions.
+    limits : (8,) float
+        Limits of outside, misfit, beyond and halves, and of the camera's motions.
     rate : (K,) float
         Rate of each label: change for each spacing of rms difference between frames.
     least : (K,) float
@@ -188,6 +197,7 @@ class Domain:
     components: np.ndarray
     deviation: np.ndarray
     weight: np.ndarray
+    whiten: np.ndarray
     usual: np.ndarray
     known: np.ndarray
     limits: np.ndarray
@@ -200,6 +210,7 @@ class Domain:
     blind: float
     _project: np.ndarray = field(init=False, repr=False, compare=False)
     _modes: np.ndarray = field(init=False, repr=False, compare=False)
+    _halves: np.ndarray = field(init=False, repr=False, compare=False)
     _near: "tuple[_Nearest, _Nearest]" = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -208,6 +219,7 @@ class Domain:
         for name, value in (
             ("_project", np.concatenate([camera, self.components / self.deviation[:, None]]).T.copy()),
             ("_modes", np.concatenate([self.motions, self.components * self.deviation[:, None]])),
+            ("_halves", _halves(self.motions, self.components * self.deviation[:, None])),
             ("_near", (_Nearest(self.known), _Nearest(self.known[:labelled] * lead))),
         ):
             object.__setattr__(self, name, value)
@@ -236,7 +248,7 @@ class Domain:
         share = min(max((displaced - REMOVED[0]) / (REMOVED[1] - REMOVED[0]), 0.0), 1.0)
         strange = max(others)
         removable = share < 1 or (corrects and bool((np.abs(found.camera) <= CORRECTED).all()))
-        if not removable or (found.parts[:3] > REFUSED - share * (REFUSED - IN_PLACE)).any():
+        if not removable or (found.parts[:4] > REFUSED - share * (REFUSED - IN_PLACE)).any():
             return Verdict(self._why(found, moved, lost, reference))
         notes = []
         if strange > 1:
@@ -260,8 +272,8 @@ class Domain:
         """
         found = [self(each) for each in moved]
         motions = np.median([each.camera for each in found], axis=0)
-        usual = float(np.mean([(each.parts[:3] <= IN_PLACE).all() for each in found]))
-        return np.where((np.abs(motions) > self.limits[3:]).any(), motions, 0.0), usual
+        usual = float(np.mean([(each.parts[:4] <= USUAL).all() for each in found]))
+        return np.where((np.abs(motions) > self.limits[4:]).any(), motions, 0.0), usual
 
     def without_camera(self, nodes_px: FloatArray, area_px2: FloatArray, camera: FloatArray, spacing_px: float) -> tuple:
         """Pins (N, 2) and areas (N,) without motions (4,) of the camera."""
@@ -285,7 +297,7 @@ class Domain:
         """The most probable cause of a strange frame, in words."""
         straight = self(_aligned(moved, reference), lost)  # exactly, because the motions are those of small turns
         again = "take a new frame without contact with the present view (init_0.png beside the frames, --no-contact, --at-rest)"
-        if min(found.parts[:3].max(), straight.parts[:3].max()) <= REFUSED:
+        if any((each.parts[:4] <= REFUSED).all() for each in (found, straight)):
             scale, turn, *shift = align(reference.pins_px[None] + moved * reference.spacing_px.mean(), reference.pins_px)[1][0]
             return (
                 f"displaced camera: the view is shifted by ({shift[0]:.1f}, {shift[1]:.1f}) px, turned by {np.degrees(turn):.1f} deg "
@@ -303,7 +315,7 @@ class Domain:
                 f"displaced camera: the view is stretched by {200 * np.hypot(*stretch):.1f} %, or seen through another lens or at another "
                 "angle than at rest; check the picture's size and the camera's seat, then " + again
             )
-        far = f"{found.parts[:3].max():.1f} times as far from the training frames as they are from each other"
+        far = f"{found.parts[:4].max():.1f} times as far from the training frames as they are from each other"
         return (
             f"not a contact that the model knows: the pins' pattern is {far}; another object or another sensor's frame, a turned or "
             "mirrored picture, or pins with wrong names"
@@ -370,13 +382,17 @@ class Domain:
         first = a[:lead]
         ample = max(float(first @ first / lead) ** 0.5, 1.0)  # what is left grows with the contact
         expected = _terms(first) @ self.weight
-        camera = camera - expected[-4:]
-        wrong = (a[lead:] - expected[:-4]) / self.usual
+        ends = len(a) - lead, len(a) - lead + 4
+        further, of_camera, of_halves = expected[: ends[0]], expected[ends[0] : ends[1]], expected[ends[1] :]
+        camera = camera - of_camera
+        wrong = (a[lead:] - further) / self.usual
+        apart = self.whiten @ ((away - seen[:4] @ self.motions) @ self._halves - of_halves)
+        halves = float(apart @ apart / len(apart)) ** 0.5 / ample
         misfit = float(wrong @ wrong / max(len(wrong), 1)) ** 0.5 / ample
         outside = float(left @ left / len(flat)) ** 0.5 / ample
-        moved_by = float((np.abs(camera) / self.limits[3:]).max()) / ample
-        parts = np.array([outside, misfit, self._near[0](first), moved_by])
-        parts[:3] /= self.limits[:3]
+        moved_by = float((np.abs(camera) / self.limits[4:]).max()) / ample
+        parts = np.array([outside, misfit, self._near[0](first), halves, moved_by])
+        parts[:4] /= self.limits[:4]
         unknown = self._near[1](first * self.deviation[:lead]) / len(flat) ** 0.5 - self.near
         return Strangeness(parts, camera, max(unknown, 0.0), ample)
 
@@ -464,14 +480,14 @@ def learn_domain(
     names, of_row = np.unique(np.arange(len(flat)) if group is None else group, return_inverse=True)
     part = rng.permutation(np.arange(len(names)) % FOLDS)[of_row.ravel()]
     motions = _motions(reference)
-    measures = np.full((len(flat), 8), np.nan)
+    measures = np.full((len(flat), 9), np.nan)
     for fold in range(FOLDS):
         here = part == fold
         one = _fit(flat[~here], labelled[~here], motions, rng)
-        measures[here] = [[*found.parts[:3], *found.usual_camera, found.unknown] for found in map(one, moved[here])]
+        measures[here] = [[*found.parts[:4], *found.usual_camera, found.unknown] for found in map(one, moved[here])]
     fitted = _fit(flat, labelled, motions, rng)
-    limits = np.quantile(measures[:, :7], 1 - ALLOWED, axis=0)
-    floors = np.array([OUTSIDE, 1.0, 1.0, SHIFT, SHIFT, np.radians(TURN_DEG), SCALE])
+    limits = np.quantile(measures[:, :8], 1 - ALLOWED, axis=0)
+    floors = np.array([OUTSIDE, 1.0, 1.0, 1.0, SHIFT, SHIFT, np.radians(TURN_DEG), SCALE])
     blind = [0.0]
     if lost is not None:
         rows = spread(len(moved), LOST_FRAMES)
@@ -480,7 +496,7 @@ def learn_domain(
     return replace(
         fitted,
         limits=np.maximum(limits, floors),
-        near=float(np.quantile(measures[labelled, 7], USUAL_DISTANCE)),
+        near=float(np.quantile(measures[labelled, 8], USUAL_DISTANCE)),
         rate=_rates(fitted, flat[labelled], labels[labelled], units, rng),
         least=least,
         low=low,
@@ -507,16 +523,22 @@ def _fit(flat: np.ndarray, labelled: np.ndarray, motions: np.ndarray, rng: np.ra
     a = (rest @ components.T) / deviation
     lead = next((n for n in range(min(LEADING, len(deviation)), 1, -1) if _terms(np.zeros((1, n))).shape[1] * PER_TERM <= len(every)), 1)
     terms = _terms(a[:, :lead])
-    wanted = np.concatenate([a[:, lead:], (every - mean) @ camera], axis=1)
+    halves = rest @ _halves(motions, components * deviation[:, None])
+    wanted = np.concatenate([a[:, lead:], (every - mean) @ camera, halves], axis=1)
     weight = np.linalg.solve(terms.T @ terms + RIDGE * len(terms) * np.eye(terms.shape[1]), terms.T @ wanted)
-    usual = np.maximum(np.sqrt(((wanted - terms @ weight)[:, :-4] ** 2).mean(axis=0)), 1e-6)
-    usual = np.maximum(usual, NOISE / deviation[lead:])
+    left = wanted - terms @ weight
+    further = len(deviation) - lead
+    usual = np.maximum(np.sqrt((left[:, :further] ** 2).mean(axis=0)), NOISE / deviation[lead:])
+    square = np.atleast_2d(np.cov(left[:, further + 4 :].T))
+    whiten = np.linalg.inv(np.linalg.cholesky(square + WHITE * np.diag(np.diag(square)) + 1e-12 * np.eye(len(square))))
     rows = np.flatnonzero(labelled)
     rows = np.sort(rng.permutation(rows)[:KNOWN])
     dim = np.sort(rng.permutation(np.concatenate([np.flatnonzero(~labelled), np.arange(len(flat), len(every))]))[: KNOWN // 2])
     known = np.concatenate([a[rows, :lead], a[dim, :lead], (-mean @ components.T / deviation)[None, :lead]])
     none = np.zeros(0)
-    return Domain(motions, mean, components, deviation, weight, usual, known, np.ones(7), none, none, none, none, len(dim) + 1, 0.0, 0.0)
+    return Domain(
+        motions, mean, components, deviation, weight, whiten, usual, known, np.ones(8), none, none, none, none, len(dim) + 1, 0.0, 0.0
+    )
 
 
 def _places(reference: Reference) -> FloatArray:
@@ -530,6 +552,20 @@ def _motions(reference: Reference) -> np.ndarray:
     x, y = _places(reference).T
     one, none = np.ones_like(x), np.zeros_like(x)
     return np.stack([np.column_stack(pair).ravel() for pair in ((one, none), (none, one), (-y, x), (x, y))])
+
+
+def _halves(motions: np.ndarray, modes: np.ndarray) -> np.ndarray:
+    """Map (2N, D) from displacements to the difference of the D components, in standard deviations, by the upper and by the lower pins.
+
+    The halves are those of the pins at rest; by each, the components are the most probable ones with the noise ``NOISE``.
+    """
+    y = motions[2, 0::2]  # a turn moves a pin along x by -y
+    upper = np.repeat(y >= np.median(y), 2)
+    found = np.zeros((len(upper), len(modes)))
+    for half, sign in ((upper, 1.0), (~upper, -1.0)):
+        part = modes[:, half]
+        found[half] = sign * np.linalg.solve(part @ part.T + NOISE**2 * np.eye(len(part)), part).T
+    return found
 
 
 def _aligned(moved: FloatArray, reference: Reference) -> FloatArray:
@@ -554,7 +590,7 @@ def write_domain(path: Path, domain: Domain) -> None:
     """Write a domain in the form that ``read_domain`` reads; components and known frames in half precision."""
     arrays = {each.name: getattr(domain, each.name) for each in fields(Domain) if each.init}
     about = {name: arrays.pop(name) for name in ("lighter", "near", "blind")}
-    half = ("components", "known")
+    half = ("components", "known", "weight", "whiten")
     FILE.write(path, {key: array.astype(np.float16 if key in half else np.float32) for key, array in arrays.items()}, about)
 
 

@@ -408,6 +408,11 @@ class PoseEstimator:
         return found
 
     @property
+    def label_range(self) -> np.ndarray:
+        """Extent (K,) of the labels that the model was trained on; infinite if the run holds no domain."""
+        return np.full(len(self.units), np.inf) if self.domain is None else self.domain.high - self.domain.low
+
+    @property
     def _unmeasured(self) -> float:
         """Factor on all intervals for a camera that may have moved."""
         alone = self.pipeline.reference is self._trained.reference

@@ -22,7 +22,7 @@ from twin.judge.degradation.plan import ConditionPlan, SweepPlan, load_plan
 from twin.judge.degradation.report import _share_row, compare
 from twin.judge.degradation.shots import DegradedShot, RealSource
 from twin.judge.degradation.study import check_pipelines, consensus, study
-from twin.judge.degradation.sweep import Plan, cells_of, run_sweep
+from twin.judge.degradation.sweep import Answer, Plan, cells_of, run_sweep
 from twin.pins import Found, make_detector, shipped_detector
 from twin.pins.reference import nominal_reference
 from twin.types import Form, Frame
@@ -112,6 +112,30 @@ def test_curves_envelopes_and_their_comparison():
     assert (band.low <= band.mean + 1e-12).all() and (band.mean <= band.high + 1e-12).all()
 
 
+def answer(value, half=0.1, valid=True):
+    low, high = ([v + sign * half for v in value] for sign in (-1, 1))
+    return {"value": value, "low": low, "high": high, "range": [5.0, 60.0], "units": ["mm", "deg"], "valid": valid}
+
+
+@pytest.mark.parametrize(
+    ("now", "wrong"),
+    [
+        (answer([1.25, 5.0]), 0),  # off by more than the interval, by less than its width
+        (answer([1.35, 5.0]), 1),
+        (answer([1.0, -5.0]), 1),
+        (answer([1.35, 5.0], valid=False), 0),
+        (answer([9.0, 5.0], half=0.84), 0),  # an interval wider than a third of the trained range says nothing
+        (answer([9.0, 5.0], half=0.82), 1),
+    ],
+)
+def test_a_confidently_wrong_pose_is_narrow_and_far_off(now, wrong):
+    case = Case((CONDITIONS["noise"],))
+    poses = {0.0: answer([1.0, 5.0]) | {"touched": True}, 1.0: now | {"touched": True}}
+    rows = [{"case": "noise", "severity": s, "pipeline": "run", "frame": "x", "pose": pose} for s, pose in poses.items()]
+    curve = next(c for c in curves_of(rows, (case,), pitch_px=10.0) if c.measure.name == "pose_wrong")
+    assert curve.mean.tolist() == [0, wrong]
+
+
 def test_poses_are_judged_against_the_undegraded_frame():
     case = Case((CONDITIONS["noise"],))
     rows = [
@@ -120,7 +144,7 @@ def test_poses_are_judged_against_the_undegraded_frame():
             "severity": s,
             "pipeline": "run",
             "frame": frame,
-            "pose": {"values": [v, 5.0], "units": ["mm", "deg"], "valid": s < 1, "touched": frame == "x"},
+            "pose": answer([v, 5.0], valid=s < 1) | {"touched": frame == "x"},
         }
         for s, v in ((0.0, 1.0), (0.5, 1.3), (1.0, np.nan))
         for frame in ("x", "no contact")
@@ -178,7 +202,12 @@ def test_two_processes_find_what_one_does(spec, frames, tmp_path):
 
 def levels_of_light():
     """A model in a sweep's hands: says how bright the frame is."""
-    return {"meter": lambda frame: (np.array([frame.image.mean()]), ("mm",), True)}
+    return {"meter": measured_light}
+
+
+def measured_light(frame):
+    light = np.array([frame.image.mean()])
+    return Answer(light, light - 1, light + 1, ("mm",), np.array([255.0]), True)
 
 
 def test_models_are_asked_about_every_frame(spec, frames, tmp_path):

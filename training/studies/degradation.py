@@ -6,8 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from scenes import SensorSpec
 from scenes.sensor import RecordingSpec
 from training.estimator import PoseEstimator, digest_of
@@ -16,6 +14,7 @@ from twin.judge.degradation.envelope import Envelope
 from twin.judge.degradation.plan import SweepPlan
 from twin.judge.degradation.report import REPORT_FILES
 from twin.judge.degradation.study import check_pipelines, real_study, rendered_study
+from twin.judge.degradation.sweep import Answer
 from twin.progress import Progress, silent
 from twin.store import writes
 from twin.types import Form, Frame
@@ -24,7 +23,6 @@ from twin.types import Form, Frame
 PIPELINES = ("twin", "legacy")
 # Most real frames that are judged if no other number is given.
 LIMIT = 12
-Estimates = tuple[np.ndarray, tuple[str, ...], bool]  # values, their units, whether they are valid
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     return Result(*real_study(plan.sensor, plan.frames, plan.limit, pipelines, cases, severities, out, beside=plan.rendered, **options))
 
 
-def load_models(runs: tuple[Path, ...], sensor: SensorSpec) -> dict[str, Callable[[Frame], Estimates]]:
+def load_models(runs: tuple[Path, ...], sensor: SensorSpec) -> dict[str, Callable[[Frame], Answer]]:
     """Models by name, as a sweep calls them. If a model was trained on recordings, raw frames are converted to that form first."""
     return {each.name: partial(_estimates, _checked(each, sensor), sensor.recording) for each in runs}
 
@@ -108,8 +106,8 @@ def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
     return estimator
 
 
-def _estimates(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Estimates:
+def _estimates(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Answer:
     if frame.form == Form.RAW and estimator.form == Form.RECORDING and recording is not None:
         frame = replace(frame, image=record(frame.image, recording), form=Form.RECORDING)
     found = estimator(frame)
-    return found.value, found.units, found.valid
+    return Answer(found.value, found.low, found.high, found.units, estimator.label_range, found.valid)

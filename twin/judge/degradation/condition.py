@@ -34,6 +34,8 @@ class View:
         Scale at the caps at rest.
     caps_px : (N, 2) float
         Places of the caps in this frame.
+    size_px : (int, int)
+        Width and height of the frame.
     """
 
     spec: SensorSpec
@@ -41,6 +43,7 @@ class View:
     radius_px: float
     px_per_mm: float
     caps_px: np.ndarray
+    size_px: tuple[int, int]
 
     @classmethod
     def of(cls, spec: SensorSpec, caps_px: np.ndarray) -> "View":
@@ -48,7 +51,8 @@ class View:
         disc = lens_disc(spec.view, spec.housing)
         caps_mm = rest_pins(spec.geometry).caps_mm
         apart = [cKDTree(points).query(points, k=2)[0][:, 1] for points in (project(spec.view, caps_mm), caps_mm)]
-        return cls(spec, disc.center_px, disc.radius_px, float(np.median(apart[0] / apart[1])), caps_px)
+        size_px = spec.camera.width_px, spec.camera.height_px
+        return cls(spec, disc.center_px, disc.radius_px, float(np.median(apart[0] / apart[1])), caps_px, size_px)
 
     @property
     def cap_radius_px(self) -> float:

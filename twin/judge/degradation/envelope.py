@@ -15,6 +15,8 @@ DRAWS = 400
 """Number of bootstrap samples of the frames."""
 BAND = (5, 95)
 """Percentiles of these samples at the ends of the band: a 90 % interval."""
+WIDEST = 1 / 3
+"""Width of an interval, relative to the trained range, from which on it says nothing."""
 SHORT = 0.75
 """Share of the margin of rendered frames below which a real sensor counts as having lost margin. Chosen."""
 
@@ -195,17 +197,23 @@ def _curve(case: str, pipeline: str, measure: Measure, limit: float, rows: list[
 
 
 def _poses_against_nominal(rows: list[dict]) -> list[dict]:
-    """Rows of models with the mean absolute change of their lengths and angles from those of the undegraded frame.
+    """Rows of models with their poses' errors, and whether the pose is confidently wrong.
 
-    Frames without contact have no pose, so their change is NaN.
+    The error is the mean absolute difference of lengths and angles from those of the undegraded frame. A valid pose is confidently wrong if
+    one of them differs by more than the interval and its width together, and no interval is wider than ``WIDEST`` of the trained range.
+    Frames without contact have no pose, so both are NaN.
     """
     nominal = {(r["case"], r["pipeline"], r["frame"]): r["pose"] for r in rows if "pose" in r and r["severity"] == 0}
     table = []
     for row in rows:
         if "pose" in row:
             first, now = nominal[row["case"], row["pipeline"], row["frame"]], row["pose"]
-            change = np.abs(np.array(now["values"]) - np.array(first["values"]))
-            row = row | {"pose_valid": float(now["valid"])}
+            truth, value, low, high = (np.array(each, float) for each in (first["value"], now["value"], now["low"], now["high"]))
+            change, width = np.abs(value - truth), high - low
+            narrow = now["valid"] and bool((width <= WIDEST * np.array(now["range"])).all())
+            far = bool((np.maximum(low - truth, truth - high) > width).any())
+            wrong = float(narrow and far) if now["touched"] and first["valid"] else np.nan
+            row = row | {"pose_valid": float(now["valid"]), "pose_wrong": wrong}
             for unit in ("mm", "deg"):
                 of_unit = [c for c, u in zip(change, now["units"], strict=True) if u == unit and now["touched"]]
                 row[f"pose_{unit}"] = float(np.mean(of_unit)) if of_unit else np.nan

@@ -55,6 +55,7 @@ MEASURES = (
 )
 POSE_MEASURES = (
     Measure("pose_valid", "frames with a pose", "", 0.95, True),
+    Measure("pose_wrong", "confidently wrong poses", "", 1 / 30, False),
     Measure("pose_mm", "pose error, lengths", "mm", 0.2, False),
     Measure("pose_deg", "pose error, angles", "deg", 2.0, False),
 )

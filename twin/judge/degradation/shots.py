@@ -153,7 +153,7 @@ class RealSource:
         view = View.of(neutral, self.caps_px[0])
         shots = []
         for draw, (frame, caps_px) in enumerate(zip(self.frames, self.caps_px, strict=True)):
-            view, image = replace(view, caps_px=caps_px), frame.image
+            view, image = replace(view, caps_px=caps_px, size_px=frame.image.shape[1::-1]), frame.image
             if in_light:
                 light = to_light(image, neutral.response).astype(np.float32)
                 image = expose(case.on_light(light, severity, view, draw), spec.capture, np.random.default_rng(draw))

@@ -20,9 +20,32 @@ from twin.workers import in_processes
 SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 CELLS = "cells"
 """Name of the folder with the finished cells."""
-Estimate = Callable[[Frame], tuple[np.ndarray, tuple[str, ...], bool]]
-"""A model's estimate for a frame: the pose's values, their units ("mm" or "deg"), and whether the estimate is valid."""
-Models = Callable[[], dict[str, Estimate]]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A model's answer for a frame.
+
+    Attributes
+    ----------
+    value, low, high : (K,) float
+        The pose, and the ends of its 90 % intervals.
+    units : tuple of str
+        "mm" or "deg".
+    range : (K,) float
+        Extent of the labels that the model was trained on. An interval wider than a third of it says nothing.
+    valid : bool
+    """
+
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    units: tuple[str, ...]
+    range: np.ndarray
+    valid: bool
+
+
+Models = Callable[[], dict[str, Callable[[Frame], Answer]]]
 """Function that returns models by their names; each process calls it once."""
 
 
@@ -104,7 +127,7 @@ def _begin(plan: Plan, folder: Path) -> Callable[[Cell], None]:
     return partial(_run, plan, folder, plan.models() if plan.models else {})
 
 
-def _run(plan: Plan, folder: Path, models: dict[str, Estimate], cell: Cell) -> None:
+def _run(plan: Plan, folder: Path, models: dict[str, Callable[[Frame], Answer]], cell: Cell) -> None:
     rows: list[dict] = []
     worst: tuple[float, DegradedShot, Found] | None = None
     detectors = [make_detector(plan.source.spec, cell.case.on_setting(spec, cell.severity)) for spec in plan.detectors]
@@ -128,9 +151,10 @@ def _plain_number(value: object) -> float:
     raise TypeError(f"expected a number, got {type(value).__name__}")
 
 
-def _pose(estimate: Estimate, shot: DegradedShot) -> dict:
-    values, units, valid = estimate(shot.frame)
-    return {"values": [float(v) for v in values], "units": list(units), "valid": bool(valid), "touched": shot.touched}
+def _pose(estimate: Callable[[Frame], Answer], shot: DegradedShot) -> dict:
+    answer = estimate(shot.frame)
+    numbers = {name: np.asarray(getattr(answer, name), float).tolist() for name in ("value", "low", "high", "range")}
+    return {**numbers, "units": list(answer.units), "valid": bool(answer.valid), "touched": shot.touched}
 
 
 def overlay(shot: DegradedShot, found: Found) -> np.ndarray:

@@ -5,9 +5,9 @@ import difflib
 from scenes.files import shown
 from twin.errors import TwinError
 from twin.judge.degradation.condition import Condition
-from twin.judge.degradation.conditions import electronics, gel, lighting, optics, placement, settings, skin
+from twin.judge.degradation.conditions import electronics, gel, lighting, optics, picture, placement, settings, skin
 
-FAMILIES = (lighting, optics, gel, skin, placement, electronics, settings)
+FAMILIES = (lighting, optics, gel, skin, placement, picture, electronics, settings)
 CONDITIONS: dict[str, Condition] = {c.name: c for family in FAMILIES for c in family.CONDITIONS}
 
 

@@ -73,7 +73,7 @@ NEIGHBOURS = 10
 """Number of nearest known frames between which the rate of a label is measured."""
 SURE_RATE = 0.9
 """Share of pairs of neighbouring frames whose labels differ by at most the rate."""
-REFUSED = np.array([2.0, 2.0, 2.0, 1.4])
+REFUSED = np.array([2.0, 2.0, 2.0, 1.1])
 """Distances outside, misfit, beyond and halves, in limits, above which a frame gets no estimate. Between 1 and this the intervals grow."""
 GROWS = 2.0
 """Growth of the intervals for each limit of distance beyond the first."""
@@ -89,6 +89,8 @@ IN_PLACE = np.array([0.95, 0.9, 0.9, 1.0])
 """As ``REFUSED``: distances above which a frame gets no estimate if a displacement of the camera was removed from
 it: two ways of being strange
 are one too many (a mirrored picture). A picture that was turned or enlarged adds a little noise, which is outside."""
+DOUBT = np.array([0.05, 0.05, 0.25, 0.25])
+"""Share of each removed motion of the camera that may be something else: another lens looks like another scale."""
 USUAL = np.array([1.25, 1.0, 1.0, 1.2])
 """As ``REFUSED``: distances up to which a contact is usual, wherever the camera sits."""
 OFF_PLACE = 1.5
@@ -253,12 +255,15 @@ class Domain:
         notes = []
         if strange > 1:
             notes.append(f"the pins' pattern is {strange:.1f} times as far from the training frames as they are from each other")
+        unknown = found.unknown
         if share > 0:
             notes.append("the camera sits a little off its place at rest, which was taken out of the pins")
+            unknown += float(share * DOUBT * np.abs(found.camera) @ np.sqrt((self.motions**2).mean(axis=1)))
         if found.unknown > 0:
             notes.append("no training frame of known label is near")
         factor = (1 + GROWS * max(strange - 1, 0)) * (1 + (OFF_PLACE - 1) * share)
-        return Verdict("", factor, self.rate * found.unknown, tuple(f"{note}: intervals are wider" for note in notes), share * found.camera)
+        wider = tuple(f"{note}: intervals are wider" for note in notes)
+        return Verdict("", factor, self.rate * unknown, wider, share * found.camera)
 
     def common_camera(self, moved: FloatArray) -> tuple[FloatArray, float]:
         """What contacts (M, N, 2), in mean rest spacings, say about the camera that took all of them.

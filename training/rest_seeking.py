@@ -1,14 +1,17 @@
 """A model for a camera whose sensor was never shown without contact. It collects contacts until these determine the pins at rest."""
 
 import logging
+from time import perf_counter
 from typing import Protocol
 
 import numpy as np
 
 from scenes.sensor import SensorSpec
 from training.displacements import FEWEST_CONTACTS, MOST_CONTACTS, OTHER_UNIT
+from training.models.part import Unseen
+from twin.errors import FrameError
 from twin.estimate import Estimate, SensorModel
-from twin.pins import Pipeline
+from twin.pins import Pipeline, Reference
 from twin.types import Form, Frame, Observation
 
 LOG = logging.getLogger(__name__)
@@ -26,13 +29,18 @@ class RestingModel(SensorModel, Protocol):
 
     def told_rest(self, nodes_px: np.ndarray) -> tuple["RestingModel", bool]: ...
 
+    def require_view_of_contacts(self, nodes_px: np.ndarray, rest: Reference | None, name: str) -> None: ...
+
+    def unseen(self, seen: Unseen, started: float) -> Estimate: ...
+
 
 class RestSeeker:
     """A model on a stream of frames. It starts with the known rest places, and changes to those estimated from the contacts as soon as
     possible.
 
     The rest places are estimated after ``FEWEST_CONTACTS`` different contacts, and once more after ``MOST_CONTACTS``. The frame at which
-    this happens takes up to a second longer.
+    this happens takes up to a second longer. If the contacts then show that the camera's picture is turned, mirrored or displaced, no frame
+    gets an estimate any more; the reason says so.
 
     Parameters
     ----------
@@ -55,6 +63,7 @@ class RestSeeker:
         self._given, self._model, self.other = model, model.at_known_rest(), False
         self.sensor, self.form, self.pipeline = model.sensor, model.form, self._model.pipeline
         self._contacts_px: list[np.ndarray] = []
+        self._refused = ""
         self._unlike_px = UNLIKE * float(np.median(self.pipeline.reference.spacing_px))
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
@@ -71,9 +80,18 @@ class RestSeeker:
 
     def __call__(self, frame: Frame) -> Estimate:
         """The estimate of one frame, with the rest places that are known by then; raises as the model does."""
+        if self._refused:
+            return self._model.unseen(Unseen(self._refused), perf_counter())
         made = self._model(frame)
         if self._gathered(made.seen) and len(self._contacts_px) in (FEWEST_CONTACTS, MOST_CONTACTS):
-            told, other = self._given.told_rest(np.array(self._contacts_px))
+            contacts_px = np.array(self._contacts_px)
+            told, other = self._given.told_rest(contacts_px)
+            try:
+                self._given.require_view_of_contacts(contacts_px, told.pipeline.reference if other else None, "the contacts so far")
+            except FrameError as error:
+                self._refused = str(error)
+                LOG.warning("%s", error)
+                return self._model.unseen(Unseen(self._refused), perf_counter())
             if other or self.other:  # otherwise the present model continues, because it remembers the frames so far
                 self._model, self.other, self.pipeline = told, other, told.pipeline
                 made = self._model(frame)

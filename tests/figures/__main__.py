@@ -17,6 +17,7 @@ from figures import (  # noqa: F401  (each registers its jobs)
     robustness,
     servo,
     studio,
+    sure,
 )
 from figures.jobs import FIGURES, JOBS, FiguresError, Job, is_kept, lacking, run, values
 from figures.tables import documents, fill_documents, named_in_templates, used_in

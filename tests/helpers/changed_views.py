@@ -1,11 +1,39 @@
-"""Changes of pictures as cameras, cables and hands make them: what each does to the frames of a recording, and to its frame at rest."""
+"""Real frames changed as cameras, cables and hands change them, given to the shipped weights.
 
-from collections.abc import Callable
+Confidently wrong is a valid estimate of which a label lies farther outside its 90 % interval than the interval is wide. An interval wider
+than a third of the labels' range counts as refused.
+"""
+
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 
+from training.contact_estimator import ContactEstimator, contacts_folder
+from training.displacements import MOST_CONTACTS
+from training.estimator import PoseEstimator
+from training.label_code import label_error
+from training.targets import choose_targets
+from twin.errors import TwinError
+from twin.frames import evenly_read, open_recording
+from twin.rig.labels import label_slope
+from twin.types import Frame
+
+FRAMES, SEED = 30, 3
+GIVEN, CONTACTS = "a frame at rest", "contacts"
+CASES = {  # weights, recording, kind of contact, where the pins at rest are known from
+    "331": ("mg400-331", "tac-vgnn-331", "", GIVEN),
+    "331, no frame at rest": ("mg400-331", "tac-vgnn-331", "", CONTACTS),
+    "127": ("mg400-127", "tac-vgnn-127", "", GIVEN),
+    "127, no frame at rest": ("mg400-127", "tac-vgnn-127", "", CONTACTS),
+    "raw": ("ur5-331", "ur5-331-raw", "", CONTACTS),
+    "plate": ("ur5-331", "ur5-331-surface-3d-tap", "plate", CONTACTS),
+    "plate, shear": ("ur5-331", "ur5-331-surface-3d-shear", "plate-sheared", CONTACTS),
+    "edge": ("ur5-331", "ur5-331-edge-2d-tap", "edge", CONTACTS),
+    "edge, shear": ("ur5-331", "ur5-331-edge-2d-shear", "edge-sheared", CONTACTS),
+}
 Change = Callable[[np.ndarray], np.ndarray]
 
 
@@ -144,3 +172,59 @@ def changes(other: np.ndarray) -> dict[str, Changed]:
         "hole rim": Changed(hole(0.25, 0.4, 0.1)),
         "large hole": Changed(hole(0.6, 0.45, 0.16)),
     }
+
+
+@dataclass
+class Counts:
+    """Frames of one change that were estimated, refused, and estimated confidently wrong."""
+
+    valid: int = 0
+    refused: int = 0
+    wrong: int = 0
+
+    @property
+    def right(self) -> int:
+        return self.valid - self.wrong
+
+
+def count(estimate, frames, truth, span, change) -> Counts:
+    found = Counts()
+    for frame, labels in zip(frames, truth, strict=True):
+        made = estimate(altered(frame, change))
+        width = made.high - made.low
+        if not made.valid or (width > span / 3).any():
+            found.refused += 1
+            continue
+        outside = np.abs(label_error((made.low + made.high) / 2, labels, made.units)) - width / 2
+        found.valid += 1
+        found.wrong += bool((outside > width).any())
+    return found
+
+
+def altered(frame: Frame, change: Change | None) -> Frame:
+    return frame if change is None else Frame(np.ascontiguousarray(change(frame.image)), frame.form, name=frame.name)
+
+
+def count_changes(case: str, real: Path) -> Iterator[tuple[str, Changed, Counts]]:
+    """Each change of a case in turn, and what came of its frames; ``real`` is the folder of the recordings."""
+    weights, folder, kind, rest = CASES[case]
+    models = ContactEstimator.load(contacts_folder(weights)) if kind else PoseEstimator.load(weights)
+    part = models.parts[kind] if isinstance(models, ContactEstimator) else models
+    recording = open_recording(real / folder, models.sensor, models.form)
+    rows = np.sort(np.random.default_rng(SEED).choice(len(recording), min(FRAMES, len(recording)), replace=False))
+    slope = label_slope(models.sensor.rig) if folder.startswith("tac-vgnn") else 0.0
+    labels = choose_targets(recording, part.names, np.arange(len(recording)), slope, []).corrected
+    frames = [recording.read(int(row)) for row in rows]
+    contacts = evenly_read(recording, MOST_CONTACTS) if rest == CONTACTS else []
+    for name, change in changes(recording.read(len(recording) // 2 + 3).image).items():
+        try:
+            if rest == GIVEN:
+                estimate = models.at_rest(altered(recording.reference, change.rest))
+            else:
+                estimate, _ = models.at_rest_of([altered(frame, change.rest) for frame in contacts])
+            found = count(estimate, frames, labels[rows], np.ptp(labels, axis=0), change.frames)
+        except TwinError as error:
+            found = Counts(refused=len(rows))
+            print(f"{case}: {name}: the pins at rest are refused: {error}")
+        print(f"{case}: {name}: {found.valid} valid, {found.refused} refused, {found.wrong} confidently wrong of {len(rows)}")
+        yield name, change, found

@@ -22,6 +22,7 @@ from training.estimator import PoseEstimator
 from training.recipes import TrainingError
 from training.rest_seeking import RestSeeker
 from training.studies.evaluation import at_own_rest
+from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
 from twin.pins import make_reference, nominal_reference
 
@@ -118,7 +119,8 @@ def test_a_recording_without_a_no_contact_frame_is_counted_from_where_its_contac
 class PinsSeen:
     """A model whose frames are pins; it tells how far they are, on average, from the rest places that it counts from."""
 
-    def __init__(self, known, reference=START):
+    def __init__(self, known, reference=START, turned=False):
+        self.turned = turned
         self.known, self.pipeline, self.sensor, self.form = known, SimpleNamespace(reference=reference), None, None
 
     def at_known_rest(self):
@@ -127,6 +129,13 @@ class PinsSeen:
     def told_rest(self, nodes_px):
         other = other_rest(self.known, START, nodes_px)
         return (self.at_known_rest(), False) if other is None else (PinsSeen(self.known, make_reference(other, PINS)), True)
+
+    def require_view_of_contacts(self, nodes_px, rest, name):
+        if self.turned:
+            raise FrameError(f"{name}: the camera's picture is turned")
+
+    def unseen(self, seen, started):
+        return SimpleNamespace(valid=False, reason=seen.reason, seen=seen.seen)
 
     def __call__(self, pins_px):
         seen = SimpleNamespace(graph=SimpleNamespace(nodes_px=pins_px))
@@ -160,3 +169,10 @@ def test_a_stream_of_the_known_unit_keeps_its_model(known):
     for frame in START.pins_px + contacts(2 * FEWEST_CONTACTS, 3):
         seeker(frame)
     assert not seeker.other and seeker._model is model
+
+
+def test_a_stream_of_a_turned_camera_gets_no_estimate_any_more(known):
+    seeker = RestSeeker(PinsSeen(known, turned=True))
+    answers = [seeker(frame) for frame in START.pins_px + contacts(2 * FEWEST_CONTACTS, 3)]
+    refused = [getattr(answer, "reason", "") for answer in answers]
+    assert not any(refused[: FEWEST_CONTACTS - 1]) and all("picture is turned" in reason for reason in refused[-5:])

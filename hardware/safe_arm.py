@@ -65,6 +65,10 @@ class RefusedMoveError(DeviceError):
         self.decision = decision
 
 
+class NoWayBackError(DeviceError):
+    """The limits allow no straight way back from an object."""
+
+
 @dataclass(frozen=True)
 class LoggedDecision:
     """A decision, the call that it belongs to, and its time (``time.monotonic()``)."""

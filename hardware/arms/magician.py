@@ -15,6 +15,7 @@ from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm
 from hardware.arms.dobot_alarms import explain
 from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
+from hardware.arms.supervisor import Supervisor
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 # Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take as long as feedback may be old.
@@ -27,6 +28,8 @@ HOME_TIMEOUT_S = 60.0
 PORT_ERRORS = (serial.SerialException, OSError, termios.error, TypeError, ValueError)
 # Bytes of the replies to commands that read.
 REPLY_BYTES = {Id.GET_POSE: 32, Id.ALARMS: 16, Id.QUEUE_INDEX: 8}
+# Messages that stop the arm and empty its queue if this program dies.
+LAST_WORDS = tuple(Message(id, WRITE).to_bytes() for id in (Id.QUEUE_FORCE_STOP, Id.QUEUE_CLEAR))
 # Bytes of a queue index.
 INDEX_BYTES = 8
 # Acceleration in mm/s2 (deg/s2) for each mm/s (deg/s) of speed, in 1/s: full speed is reached within a quarter of a second.
@@ -44,11 +47,15 @@ class Magician(BaseArm):
         For example ``/dev/ttyUSB0``.
     tool_x_mm : float
         Reach of the tool beyond the wrist.
+    supervised : bool
+        Whether a further process stops the arm if this program dies while the arm is enabled.
     """
 
     axes = 4
 
-    def __init__(self, port: str, *, tool_x_mm: float = 0.0) -> None:
+    def __init__(self, port: str, *, tool_x_mm: float = 0.0, supervised: bool = True) -> None:
+        self._supervised = supervised
+        self._supervisor: Supervisor | None = None
         self.name, self._port_name = f"Magician at {port}", port
         self.kinematics = replace(MAGICIAN, r0_mm=tool_x_mm)
         self._serial: serial.Serial | None = None
@@ -90,11 +97,19 @@ class Magician(BaseArm):
         self._request(Id.PTP_COMMON_PARAMS, struct.pack("<2f", 100.0, 100.0), ctrl=WRITE)
         self._forget_queue()
         self._request(Id.QUEUE_START, ctrl=WRITE)
+        if self._supervised and self._supervisor is None:
+            self._supervisor = Supervisor(self._port().fileno(), LAST_WORDS)
         self._enabled = True
 
     def disable(self) -> None:
         self.stop()
         self._enabled = False
+        self._unsupervise()
+
+    def _unsupervise(self) -> None:
+        supervisor, self._supervisor = self._supervisor, None
+        if supervisor is not None:
+            supervisor.end()
 
     def clear_error(self) -> None:
         self._forget_queue()
@@ -261,6 +276,7 @@ class Magician(BaseArm):
         return None
 
     def _close(self) -> None:
+        self._unsupervise()
         if self._serial is not None:
             with contextlib.suppress(*PORT_ERRORS):
                 self._serial.close()

@@ -10,6 +10,7 @@ import numpy as np
 
 from hardware.arms.arm import FEEDBACK_AGE_S
 from hardware.arms.mg400_wire import PACKET_BYTES, Reply, newest_packet, take_reply, told_apart, why_no_packet
+from hardware.arms.supervisor import Supervisor
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 # Longest wait for a connection, in s.
@@ -36,6 +37,8 @@ class CommandPort:
         self._socket: socket.socket | None = None
         self._lock, self._buffer = RLock(), ""
         self._heard = False  # whether anything came over this connection
+        self._last_words: tuple[bytes, ...] = ()
+        self._supervisor: Supervisor | None = None
 
     @property
     def is_open(self) -> bool:
@@ -55,9 +58,24 @@ class CommandPort:
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._heard = False
+        self.supervise(*self._last_words)
+
+    def supervise(self, *last_words: bytes) -> None:
+        """Have a further process send these requests if this program dies, over this connection or one that is opened after it.
+
+        Without requests there is no such process.
+        """
+        with self._lock:
+            self._last_words = last_words
+            if self._supervisor is not None:
+                self._supervisor.end()
+            self._supervisor = Supervisor(self._socket.fileno(), last_words) if self._socket is not None and last_words else None
 
     def close(self) -> None:
         with self._lock:
+            if self._supervisor is not None:
+                self._supervisor.end()
+                self._supervisor = None
             if self._socket is not None:
                 self._socket.close()
             self._socket, self._buffer = None, ""

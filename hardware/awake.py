@@ -9,7 +9,7 @@ import threading
 import time
 
 # Interval, s, of the ticks, and longest time between two ticks that counts.
-TICK_S, LONGEST_S = 0.02, 0.06
+TICK_S, LONGEST_S = 0.02, 0.1
 
 
 class AwakeClock:

@@ -16,6 +16,7 @@ from hardware.arms.dobot_alarms import explain
 from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
 from hardware.arms.supervisor import Supervisor
+from hardware.awake import awake_s
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 # Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take as long as feedback may be old.
@@ -135,9 +136,9 @@ class Magician(BaseArm):
 
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         self._require_connected()
-        begun_s = time.monotonic()
+        begun_s, awake_from_s = time.monotonic(), awake_s()
         try:
-            until_s = begun_s + max_age_s
+            until_s = awake_from_s + max_age_s
             last = self._last_index
             moving = last is not None and self._index_of(self._request(Id.QUEUE_INDEX, until_s=until_s)) < last
             values = np.array(struct.unpack("<8f", self._request(Id.GET_POSE, until_s=until_s)))
@@ -146,10 +147,8 @@ class Magician(BaseArm):
             raise
         except DeviceError as error:
             raise StaleDataError(f"{error}. Don't trust the last pose") from error
-        if time.monotonic() - begun_s > max_age_s:
-            raise StaleDataError(
-                f"{self.name}: the arm took {time.monotonic() - begun_s:.2f} s to tell its state (allowed {max_age_s:g} s)"
-            )
+        if (took_s := awake_s() - awake_from_s) > max_age_s:
+            raise StaleDataError(f"{self.name}: the arm took {took_s:.2f} s to tell its state (allowed {max_age_s:g} s)")
         pose = np.array([*values[:3], 0.0, 0.0, values[3]])
         self._require_possible(pose)
         return ArmState(pose, values[4:], begun_s, self._enabled, moving, explain(alarms) if alarms else "")
@@ -220,12 +219,12 @@ class Magician(BaseArm):
     def _request(self, id: Id, params: bytes = b"", *, ctrl: int = 0, until_s: float = np.inf) -> bytes:
         """Send a command and wait for the reply with the same id and ctrl.
 
-        The command is sent again if the reply is missing or damaged, but not after ``until_s`` of ``time.monotonic``.
+        The command is sent again if the reply is missing or damaged, but not after ``until_s`` of ``awake_s``.
         """
         sent = Message(id, ctrl, params).to_bytes()
         with self._lock:
             tries = 0
-            while tries < TRIES and time.monotonic() < until_s:
+            while tries < TRIES and awake_s() < until_s:
                 tries += 1
                 port = self._port()
                 try:
@@ -234,6 +233,8 @@ class Magician(BaseArm):
                     port.write(sent)
                     if (reply := self._reply(port, id, ctrl)) is not None:
                         return reply.params
+                except serial.SerialTimeoutException:  # the arm takes nothing, or this process was stalled
+                    continue
                 except PORT_ERRORS as error:
                     self._close()
                     raise DeviceNotConnectedError(
@@ -260,8 +261,8 @@ class Magician(BaseArm):
             A reply of another length came, so the attached device is not a Magician.
         """
         wanted = REPLY_BYTES.get(id) if ctrl == 0 else None
-        deadline = time.monotonic() + REPLY_TIMEOUT_S
-        while time.monotonic() < deadline:
+        deadline = awake_s() + REPLY_TIMEOUT_S
+        while awake_s() < deadline:
             self._buffer += port.read(max(1, port.in_waiting))
             message, self._buffer = take_message(self._buffer)
             while message is not None:

@@ -52,8 +52,8 @@ def signals_as_ctrl_c() -> Iterator[None]:
     before (``nohup``) stays ignored. The former handlers are restored at the end.
     """
 
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
+    def interrupt(number: int, _: object) -> None:
+        raise KeyboardInterrupt(number)
 
     before = {ended: signal.getsignal(ended) for ended in (signal.SIGTERM, signal.SIGHUP)}
     for ended, handler in before.items():

@@ -62,6 +62,7 @@ class Magician(BaseArm):
         self._serial: serial.Serial | None = None
         self._lock, self._buffer = RLock(), b""
         self._enabled = False
+        self._lost = ""  # how the connection was lost
         self._last_index: int | None = None  # queue index of the newest move; None if no move is pending
 
     @property
@@ -70,6 +71,7 @@ class Magician(BaseArm):
 
     def connect(self) -> None:
         self._require_disconnected()
+        self._lost = ""
         try:
             self._serial = serial.Serial(self._port_name, BAUD, timeout=0.05, write_timeout=REPLY_TIMEOUT_S, exclusive=True)
         except PORT_ERRORS as error:
@@ -237,10 +239,11 @@ class Magician(BaseArm):
                     continue
                 except PORT_ERRORS as error:
                     self._close()
-                    raise DeviceNotConnectedError(
+                    self._lost = (
                         f"{self.name}: the port vanished ({error}). The arm goes on with what is queued: switch it off if it moves! "
                         "Plug the cable in, then connect() again"
-                    ) from error
+                    )
+                    raise DeviceNotConnectedError(self._lost) from error
         raise DeviceError(
             f"{self.name}: no valid reply to command {int(id)} in {tries} tries of {REPLY_TIMEOUT_S:g} s; switch the arm on, "
             "check that the port is a Magician's and the cable is sound"
@@ -249,8 +252,11 @@ class Magician(BaseArm):
     def _port(self) -> serial.Serial:
         """The open port; ``DeviceNotConnectedError`` where there is none."""
         if self._serial is None:
-            raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
+            raise DeviceNotConnectedError(self._lost or f"{self.name}: not connected; call connect() first")
         return self._serial
+
+    def _require_connected(self) -> None:
+        self._port()
 
     def _reply(self, port: serial.Serial, id: Id, ctrl: int) -> Message | None:
         """The reply to a command, if it comes in time.

@@ -39,7 +39,7 @@ class CommandPort:
         self._name, self._address = name, (host, port)
         self._socket: socket.socket | None = None
         self._lock, self._buffer = RLock(), ""
-        self._heard = False  # whether anything came over this connection
+        self._heard = False  # whether anything came from this address
         self._last_words: tuple[bytes, ...] = ()
         self._supervisor: Supervisor | None = None
 
@@ -60,7 +60,6 @@ class CommandPort:
                 "'twin emulate mg400' and mg400:127.0.0.1"
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._heard = False
         self.supervise(*self._last_words)
 
     def supervise(self, *last_words: bytes) -> None:

@@ -383,5 +383,5 @@ def test_sigterm_makes_a_command_let_go_of_its_arm(tmp_path):
             while not arm.arm.busy() and process.poll() is None:
                 time.sleep(0.01)
             process.send_signal(signal.SIGTERM)
-            assert process.wait(timeout=60) == 130
+            assert process.wait(timeout=60) == 143
         assert not arm.arm.enabled and not arm.arm.busy()

@@ -8,6 +8,7 @@ it stands at the commanded pose. The table holds the reported pose.
 
 import csv
 import json
+import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError
 from hardware.eyes import Eyes
+from hardware.plan import check_plan
 from hardware.rig import Rig, build_rig
 from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
 from hardware.safe_arm import try_each
@@ -41,6 +43,7 @@ from twin.records import KeptAlso
 from twin.store import contents, made_by, output, write_json, write_text, writes
 from twin.types import Form, Frame
 
+LOGGER = logging.getLogger(__name__)
 # Distance from the object at the start and at the end, in mm.
 CLEAR_MM = 50.0
 # Distance from the object between two contacts, in mm.
@@ -53,6 +56,8 @@ MOVE_TIMEOUT_S = 30.0
 SPARE = 2.0
 # Longest wait in s for a frame while the arm stands still.
 FRAME_TIMEOUT_S = 5.0
+# Largest number of contacts that are checked before anything moves, and the usual time of a contact in s.
+CHECKED_CONTACTS, CONTACT_S = 100, 4.0
 # Most contacts of a collection. At a few seconds each, they take an arm months.
 MOST_CONTACTS = 1_000_000
 # Files of a collection, as in the published recordings: labels, description, times, and the frame without contact.
@@ -490,6 +495,8 @@ class CollectPlan:
         Draw the twin's frames without path tracing; see ``build_rig``.
     also : tuple of str
         Further formats in which each contact is kept as soon as it is made, each in a subfolder.
+    dry_run : bool
+        End after the check of the plan, before anything moves.
     """
 
     sensor: SensorSpec
@@ -506,6 +513,7 @@ class CollectPlan:
     limits: str | None = None
     plain_light: bool = False
     also: tuple[str, ...] = ()
+    dry_run: bool = False
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= MOST_CONTACTS:
@@ -585,7 +593,9 @@ def _collect_on_rig(
             kept.catch_up()
             step(done, total, note)
 
-        rig.await_frame()
+        _say_plan(plan, rig, collection.count)
+        if plan.dry_run:
+            return
         collect(
             rig.source,
             rig.arm,
@@ -601,6 +611,19 @@ def _collect_on_rig(
             on_rest=require_rest,
             progress=made,
         )
+
+
+def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
+    """Check the plan and report it. Of the contacts the next ``CHECKED_CONTACTS`` are checked."""
+    work, near = WorkFrame(plan.experiment, rig.placed), rig.arm.state().pose
+    design = "random" if plan.design == "random" else "even"
+    pressed = np.array(plan.experiment.clear) + np.array(plan.experiment.tap)
+    asked = [draw_contact(plan.experiment, plan.drawn_with, n, design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))]
+    planned = [work.base_pose(one.pose + pressed, near) for one in asked]
+    clear = work.base_pose(np.zeros(6), near, away_mm=CLEAR_MM)
+    spent_s = (plan.count - made) * CONTACT_S
+    for line in check_plan(rig, clear, planned, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s):
+        LOGGER.warning("%s", line)
 
 
 def _about(plan: CollectPlan, rig: Rig) -> dict[str, Any]:

@@ -3,12 +3,14 @@
 import os
 import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from threading import Timer
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from arms import bench
 from blind_runs import CAMERA_FAULTS, COMMANDS, FAULTS, HEALTHY, PHASES, draw, measure, table
 from noisy_camera import NoisyCamera
 from true_estimator import TrueEstimate, TrueEstimator
@@ -21,10 +23,11 @@ from hardware.errors import DeviceError
 from hardware.eyes import NEAR_MM, PIECE_MM, BlindError, Eyes, pieces_to
 from hardware.live_feed import CameraFeed
 from hardware.loop import ServoLoop
+from hardware.plan import check_plan
 from hardware.rig import Rig, servo_loop
-from hardware.rig_geometry import PlacedObject
+from hardware.rig_geometry import PlacedObject, moved
 from hardware.safe_arm import SafeArm
-from hardware.safety import SafetyLimits
+from hardware.safety import SafetyLimits, load_limits
 from hardware.step import LoopSettings
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
@@ -228,3 +231,22 @@ def test_the_studio_moves_an_arm_only_with_frames_and_back_without(monkeypatch):
     finally:
         source.off = False
         feed.stop()
+
+
+@pytest.mark.parametrize(
+    ("kind", "servo", "refused"), [("mg400", "surface", ""), ("magician", "surface", "--servo magician"), ("magician", "magician", "")]
+)
+def test_the_plan_is_checked_before_anything_moves(kind, servo, refused):
+    spec = load_servo(servo)
+    placed = PlacedObject(load_object("can"), spec.placement, Mounting.of(load_sensor("mg400-331"), load_experiment(spec.experiment)))
+    with bench(kind) as at, NoisyCamera(fps=60) as source, SafeArm(at.arm, load_limits(kind)) as arm:
+        rig, start, before = Rig(source, arm, placed, False), placed.start_pose(spec.indent_mm), at.reads()
+        clear = moved(start, -spec.clear_mm * placed.mounting.axis)
+        check = partial(check_plan, rig, clear, [start], linear_mm_s=spec.linear_mm_s, spent_s=1.0)
+        if refused:
+            with pytest.raises(DeviceError, match=refused):
+                check()
+        else:
+            lines = check()
+            assert [line.split(":")[0] for line in lines] == ["camera", "way", "limits", "time"] and "frames/s" in lines[0]
+        np.testing.assert_array_equal(at.reads(), before)

@@ -61,6 +61,7 @@ class TwinCamera(LiveSource):
     notices_still = False  # the twin's pictures may repeat without a fault
     notices_late = False  # a contact takes as long to compute as the machine needs
     first_frame_s = FIRST_FRAME_S
+    _spec: SensorSpec
 
     def __init__(
         self,

@@ -8,9 +8,11 @@ it stands at the commanded pose. The table holds the reported pose.
 
 import csv
 import json
+import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,8 @@ from hardware.approach import way_around
 from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError
+from hardware.eyes import Eyes
+from hardware.plan import check_plan
 from hardware.rig import Rig, build_rig
 from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
 from hardware.safe_arm import try_each
@@ -39,6 +43,7 @@ from twin.records import KeptAlso
 from twin.store import contents, made_by, output, write_json, write_text, writes
 from twin.types import Form, Frame
 
+LOGGER = logging.getLogger(__name__)
 # Distance from the object at the start and at the end, in mm.
 CLEAR_MM = 50.0
 # Distance from the object between two contacts, in mm.
@@ -51,6 +56,8 @@ MOVE_TIMEOUT_S = 30.0
 SPARE = 2.0
 # Longest wait in s for a frame while the arm stands still.
 FRAME_TIMEOUT_S = 5.0
+# Largest number of contacts that are checked before anything moves, and the usual time of a contact in s.
+CHECKED_CONTACTS, CONTACT_S = 100, 4.0
 # Most contacts of a collection. At a few seconds each, they take an arm months.
 MOST_CONTACTS = 1_000_000
 # Files of a collection, as in the published recordings: labels, description, times, and the frame without contact.
@@ -319,7 +326,7 @@ def collect(
     if not source.is_live:
         raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
     rig = _Stops(source, arm, placed, WorkFrame(experiment, placed), speed, guards, frame_timeout_s, ArmWatch(arm))
-    with output(collection.folder), rig.watch.watched():
+    with output(collection.folder), rig.watch.watched(), rig.eyes.watched():
         ask = _Asked(experiment, seed, design, collection.folder, chooser)
         failed = _collect_all(rig, experiment, collection, ask=ask, count=count, progress=progress, on_rest=on_rest, speed=speed)
     if failed:
@@ -341,6 +348,7 @@ def _collect_all(
     """Go to the object, make the missing contacts, and release the arm. Returns the failures of the release."""
     try:
         with rig.watch.alert():
+            rig.eyes.await_sight(timeout_s=rig.source.first_frame_s)
             rig.arm.enable()
             rig.arm.set_speed(*speed)
             state = rig.go_around(rig.label, CLEAR_MM)
@@ -411,6 +419,9 @@ class _Stops:
     label: np.ndarray = field(default_factory=lambda: np.zeros(6))
     at_object: bool = False
 
+    def __post_init__(self) -> None:
+        self.eyes = Eyes(self.arm, self.source, self.watch.pose_at, lambda pose: float(self.placed.touch(pose).indent_mm))
+
     def go(self, label: np.ndarray, away_mm: float = 0.0) -> ArmState:
         """Move straight to work coordinates (6,), ``away_mm`` back along the approach. Returns the state there."""
         return self._go_to(self.work.base_pose(label, self.arm.state().pose, away_mm=away_mm))
@@ -423,8 +434,8 @@ class _Stops:
         return state
 
     def withdraw(self) -> ArmState:
-        """Move clear of the object."""
-        return self.go(self.label, CLEAR_MM)
+        """Move clear of the object. This needs no frames."""
+        return self._go_to(self.work.base_pose(self.label, self.arm.state().pose, away_mm=CLEAR_MM), sees=False)
 
     def frame_after(self, state: ArmState) -> Frame:
         """The first frame exposed after a state."""
@@ -433,20 +444,24 @@ class _Stops:
         except TimeoutError as error:
             raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
 
-    def _go_to(self, target: np.ndarray) -> ArmState:
-        """Move straight to a pose (6,). Returns the state that confirms it."""
+    def _go_to(self, target: np.ndarray, *, sees: bool = True) -> ArmState:
+        """Move straight to a pose (6,), if the camera ``sees`` only while its frames are fresh. Returns the state that confirms it."""
         self.watch.require()
+        if sees:
+            self.eyes.await_sight(timeout_s=self.frame_timeout_s)
         state = self.arm.state()
         for guard in self.guards:
             target = guard(state, target)
         timeout_s = MOVE_TIMEOUT_S + SPARE * float(np.linalg.norm(target[:3] - state.pose[:3])) / self.speed[0]
-        sent = self.arm.move_linear(target, wait=False, timeout_s=timeout_s)
+        move = partial(self.arm.move_linear, target, wait=False, timeout_s=timeout_s)
+        sent = self.eyes.move(move, ends=False) if sees else move()
         if (short_mm := float(np.linalg.norm(sent[:3] - target[:3]))) > NEAR_MM:
             raise DeviceError(
                 f"{self.arm.name}: a move ends {short_mm:.1f} mm from where it should; give --limits without step_mm and step_deg"
             )
+        settle = partial(self.arm.wait_settled, sent, timeout_s=timeout_s)
         with self.watch.doing("moving"):
-            return self.arm.wait_settled(sent, timeout_s=timeout_s)
+            return self.eyes.move(settle) if sees else settle()
 
 
 @dataclass(frozen=True)
@@ -480,6 +495,8 @@ class CollectPlan:
         Draw the twin's frames without path tracing; see ``build_rig``.
     also : tuple of str
         Further formats in which each contact is kept as soon as it is made, each in a subfolder.
+    dry_run : bool
+        End after the check of the plan, before anything moves.
     """
 
     sensor: SensorSpec
@@ -496,6 +513,7 @@ class CollectPlan:
     limits: str | None = None
     plain_light: bool = False
     also: tuple[str, ...] = ()
+    dry_run: bool = False
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= MOST_CONTACTS:
@@ -575,7 +593,9 @@ def _collect_on_rig(
             kept.catch_up()
             step(done, total, note)
 
-        rig.await_frame()
+        _say_plan(plan, rig, collection.count)
+        if plan.dry_run:
+            return
         collect(
             rig.source,
             rig.arm,
@@ -591,6 +611,19 @@ def _collect_on_rig(
             on_rest=require_rest,
             progress=made,
         )
+
+
+def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
+    """Check the plan and report it. Of the contacts the next ``CHECKED_CONTACTS`` are checked."""
+    work, near = WorkFrame(plan.experiment, rig.placed), rig.arm.state().pose
+    design = "random" if plan.design == "random" else "even"
+    pressed = np.array(plan.experiment.clear) + np.array(plan.experiment.tap)
+    asked = [draw_contact(plan.experiment, plan.drawn_with, n, design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))]
+    planned = [work.base_pose(one.pose + pressed, near) for one in asked]
+    clear = work.base_pose(np.zeros(6), near, away_mm=CLEAR_MM)
+    spent_s = (plan.count - made) * CONTACT_S
+    for line in check_plan(rig, clear, planned, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s):
+        LOGGER.warning("%s", line)
 
 
 def _about(plan: CollectPlan, rig: Rig) -> dict[str, Any]:

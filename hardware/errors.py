@@ -5,6 +5,7 @@ device.
 """
 
 import errno
+import re
 import socket
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -72,3 +73,20 @@ def also(error: BaseException, what: str) -> None:
         error.args = (f"{error.args[0]}; {what}", *error.args[1:])
     else:
         error.add_note(what)
+
+
+# Words by which a message says that an arm may still move, and what a line says instead of all such words.
+_MOVES = {"switch it off": "the arm may still move: SWITCH IT OFF", "may move": "the arm may still move: PRESS ITS EMERGENCY STOP"}
+# Advice to a Python program, which is no help to the user of a command.
+_PYTHON = re.compile(r"[;,.]? *(?:then |or )?(?:call |\b)(?:(?:disconnect|connect|enable|stop|clear_error)\(\)[^;.]*)")
+
+
+def in_short(text: str, most: int) -> str:
+    """A device's error in one line of at most ``most`` characters: its cause, and whether the arm may still move."""
+    lower = text.lower()
+    end = next((told for word, told in _MOVES.items() if word in lower), "")
+    cause = _PYTHON.sub("", text.split("\n")[0]).strip()
+    left = most - len(end) - 2 * bool(end)
+    if len(cause) > left:
+        cause = cause[: left - 3].rstrip(" ;,.") + "..."
+    return f"{cause}; {end}" if end else cause

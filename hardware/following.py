@@ -11,10 +11,12 @@ import numpy as np
 
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.errors import DeviceError
-from hardware.last_axis import LastAxis, turns_back_mm
+from hardware.last_axis import LastAxis, poses_along, turns_back_mm
 from hardware.loop import ServoLoop
+from hardware.plan import check_plan
 from hardware.policy_law import policy_law
 from hardware.rig import TWIN, Rig, build_rig, given_frame, servo_loop, steps_round
+from hardware.rig_geometry import moved
 from hardware.step import LoopSettings, StepRecord
 from hardware.timing import Timing
 from hardware.trajectory import Measures, Trajectory, measure, trajectory_figure, trajectory_of, write_csv
@@ -40,6 +42,8 @@ GIVE_UP_S = 5.0
 STREAM_HZ = 10.0
 # Range of the rate, decisions per second. No camera is faster than the second, and an arm waits too long with a rate below the first.
 SLOWEST_HZ, FASTEST_HZ = 0.1, 1000.0
+# Distance, mm, between the poses along the outline that are checked before anything moves.
+CHECK_MM = 10.0
 # Most steps of a run. They take an arm days.
 MOST_STEPS = 1_000_000
 
@@ -77,6 +81,8 @@ class FollowPlan:
         from the contacts), or a file.
     also : tuple of str
         Further formats in which the session is kept at its end, each in a subfolder of it.
+    dry_run : bool
+        End after the check of the plan, before anything moves.
     """
 
     stimulus: ObjectSpec
@@ -92,6 +98,7 @@ class FollowPlan:
     known_place: bool = False
     at_rest: str = FIRST
     also: tuple[str, ...] = ()
+    dry_run: bool = False
 
     def __post_init__(self) -> None:
         if self.also and not self.record:
@@ -108,6 +115,10 @@ class FollowPlan:
                     "frames for the pose that the arm reports, and such a loop does not feel what it touches"
                 )
             object.__setattr__(self, "camera", TWIN)
+
+
+class PlannedOnly(Exception):  # noqa: N818  (no error)
+    """The plan was checked, and a dry run ends there."""
 
 
 @dataclass(frozen=True)
@@ -161,6 +172,8 @@ def follow(
     ------
     TwinError
         The run could not begin, or it ended before its first step.
+    PlannedOnly
+        The plan is a dry run, and its check is done.
     """
     kept = KeptAlso(out / SESSION, plan.also, model.sensor)
     rest = given_frame(plan.at_rest, model)
@@ -176,19 +189,22 @@ def follow(
     told = _told(plan, model) | (about or {})
     failure, followed = "", None
     with rig, stage(progress, f"following the {plan.stimulus.name}") as step, ExitStack() as stack:
+        _say_plan(plan, rig, wanted_mm, steps)
         first = rig.await_frame()
         loop = servo_loop(rig, plan.servo, model, _settings(plan, rig, steps))
         if isinstance(model, PolicyModel):
             loop.law = policy_law(model.policy, rig.mounting)
         else:
             loop.require_labels(model(first).names)
+        _say_turns(rig, plan.servo, wanted_mm)
+        if plan.dry_run:
+            raise PlannedOnly
         session = stack.enter_context(SessionWriter(out / SESSION, told)) if plan.record else None
         if session is not None and rest is not None:
             session.keep_rest(rest)
         loop.on_step = partial(_note_step, session, step, steps)
         if plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live:
             loop.take_rest = partial(_take_rest, session, model)
-        _say_turns(rig, plan.servo, wanted_mm)
         try:
             loop.run(rig.placed.start_pose(plan.servo.indent_mm))
         except TwinError as error:
@@ -236,6 +252,20 @@ def _told(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
     """The entries that are stored with the results."""
     names = {"sensor": model.sensor.name, "object": plan.stimulus.name, "camera": plan.camera, "arm": plan.arm}
     return names | {"servo": plan.servo.model_dump()}
+
+
+def _say_plan(plan: FollowPlan, rig: Rig, wanted_mm: float, steps: int) -> None:
+    """Check the plan and report it. Of the outline every ``CHECK_MM`` is checked."""
+    planned = [pose for distance, pose in poses_along(rig.placed, plan.servo.indent_mm, wanted_mm)]
+    axis, along, near = LastAxis(getattr(rig.arm, "kinematics", None)), [planned[0]], planned[0]
+    for pose in planned:
+        if np.linalg.norm(pose[:3] - near[:3]) >= CHECK_MM:
+            near = axis.on_turn(pose, near[5])[0]
+            along.append(near)
+    clear = moved(planned[0], -plan.servo.clear_mm * rig.mounting.axis)
+    spent_s = steps / plan.stream_hz if plan.stream_hz else steps * plan.servo.feed_mm / plan.servo.linear_mm_s
+    for line in check_plan(rig, clear, along, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s):
+        LOG.warning("%s", line)
 
 
 def _say_turns(rig: Rig, servo: ServoSpec, wanted_mm: float) -> None:

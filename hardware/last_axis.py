@@ -5,6 +5,7 @@ the range. An orientation slightly beyond an end is held at the end. Farther bey
 which the sensor leaves the object.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -62,25 +63,30 @@ class LastAxis:
         return turned if abs(turned[5] - here[5]) > HALF_TURN_DEG else None
 
 
-def turns_back_mm(placed: PlacedObject, axis: LastAxis, indent_mm: float, length_mm: float) -> list[float]:
-    """Distances along the outline, in mm, after which the last axis will turn back if the object stands at its specified place."""
+def poses_along(placed: PlacedObject, indent_mm: float, length_mm: float) -> Iterator[tuple[float, np.ndarray]]:
+    """Distance along the outline, in mm, and the arm's pose (6,) in contact there, from the start on."""
     outline = placed.outline()
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))])
     way = np.gradient(outline, axis=0)
     angles = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
-    first, found = matrix_of(placed.start_pose(indent_mm)), []
-    near = None
+    first = matrix_of(placed.start_pose(indent_mm))
     for (x, z), angle, distance in zip(outline, angles - angles[0], along, strict=True):
         if distance > length_mm:
-            break
+            return
         c, s = np.cos(angle), np.sin(angle)
         T = np.array([[c, 0, -s, x], [0, 1, 0, 0], [s, 0, c, z], [0, 0, 0, 1.0]])
-        pose = pose_of(placed.T_base_object @ T @ np.linalg.inv(placed.T_base_object) @ first, np.zeros(6))
+        yield float(distance), pose_of(placed.T_base_object @ T @ np.linalg.inv(placed.T_base_object) @ first, np.zeros(6))
+
+
+def turns_back_mm(placed: PlacedObject, axis: LastAxis, indent_mm: float, length_mm: float) -> list[float]:
+    """Distances along the outline, in mm, after which the last axis will turn back if the object stands at its specified place."""
+    near, found = None, []
+    for distance, pose in poses_along(placed, indent_mm, length_mm):
         if near is None:
             near = pose[5] if axis.kinematics is None else axis.kinematics.nearest_pose(pose)[5]
         held, off = axis.on_turn(pose, near)
         if off > HOLD_DEG and (turned := axis.turned_back(held, pose)) is not None:
-            found.append(float(distance))
+            found.append(distance)
             held = turned
         near = held[5]
     return found

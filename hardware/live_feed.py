@@ -5,13 +5,16 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.cameras.choose import open_camera
+from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError
+from hardware.eyes import Eyes
 from hardware.live import LiveSession, estimate_line
 from hardware.safe_arm import SafeArm, try_each
 from hardware.safety import SHIPPED_LIMITS, load_limits
@@ -30,12 +33,16 @@ END_S = 10.0
 
 
 class WatchedArm:
-    """An arm that is shown. It moves only while it is armed, within its limits, and slowly.
+    """An arm that is shown. It moves only while it is armed, within its limits, slowly, and while the camera gives fresh frames.
+
+    Without frames it makes its last steps again, backwards.
 
     Parameters
     ----------
     text : str
         Text for ``open_arm``.
+    source : FrameSource, optional
+        The camera. Without one the arm does not move.
 
     Raises
     ------
@@ -43,7 +50,7 @@ class WatchedArm:
         There is no such arm, or no limits are known for its kind.
     """
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, source: FrameSource | None = None) -> None:
         arm, kind = open_arm(text), kind_of(text)
         if not (SHIPPED_LIMITS / f"{kind}.toml").is_file():
             raise DeviceError(
@@ -53,6 +60,8 @@ class WatchedArm:
         self.name = self._arm.name
         self._armed = False
         self._moves = threading.Lock()
+        self._eyes = Eyes(self._arm, source) if source is not None else None
+        self._steps: list[tuple[int, float]] = []  # axis and length of the steps from the pose at which it was armed
 
     @property
     def armed(self) -> bool:
@@ -82,6 +91,7 @@ class WatchedArm:
 
     def arm(self) -> None:
         """Enable the arm, and set a low speed."""
+        self._steps.clear()
         self._arm.enable()
         self._arm.set_speed(SLOW_MM_S, SLOW_DEG_S)
         self._armed = True
@@ -98,7 +108,7 @@ class WatchedArm:
         Raises
         ------
         DeviceError
-            The arm is not armed, is already moving, or its limits forbid the move.
+            The arm is not armed, is already moving, its limits forbid the move, or the camera gives no fresh frame.
         """
         if not self._armed:
             raise DeviceError(f"{self.name}: read only; arm it first")
@@ -107,7 +117,17 @@ class WatchedArm:
         try:
             target = np.array(self._arm.state().pose, float)
             target[axis] += by_mm
-            self._arm.move_linear(target)
+            move = partial(self._arm.move_linear, target)
+            if self._steps and self._steps[-1] == (axis, -by_mm):  # the way it came needs no frame
+                move()
+                self._steps.pop()
+            elif self._eyes is None:
+                raise DeviceError(f"{self.name}: moves only with a camera; connect one")
+            else:
+                with self._eyes.watched():
+                    self._eyes.stand()
+                    self._eyes.move(move)
+                self._steps.append((axis, by_mm))
         finally:
             self._moves.release()
 
@@ -161,7 +181,7 @@ class CameraFeed:
         self.model = model = model.seeking_rest()
         self._source = open_camera(camera, model.sensor, model.form)
         model.check(model.sensor, self._source.form)
-        self.robot = WatchedArm(arm) if arm else None
+        self.robot = WatchedArm(arm, self._source) if arm else None
         self.name = self._source.name + (f" and {self.robot.name}" if self.robot else "")
         self._session = LiveSession(self._source, model)
         self._writer: SessionWriter | None = None

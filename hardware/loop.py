@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 
 import numpy as np
 
@@ -16,9 +17,11 @@ from hardware.arms.arm import Arm, ArmState
 from hardware.arms.motion import turn_between_deg
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError
+from hardware.eyes import NEAR_MM as PIECES_MM
+from hardware.eyes import BlindError, Eyes, pieces_to
 from hardware.last_axis import HOLD_DEG, LastAxis
 from hardware.rig_geometry import matrix_of, moved
-from hardware.safe_arm import RefusedMoveError, try_each
+from hardware.safe_arm import NoWayBackError, RefusedMoveError, try_each
 from hardware.safety import Code, Sensed
 from hardware.servo import Memory, Reading, servo_step, tangent_of
 from hardware.step import Guard, LoopSettings, StepRecord
@@ -101,6 +104,8 @@ class ServoLoop:
     retreat : callable, optional
         Withdraws the arm. It gets the direction (3,) away from the object in the base frame. By default the arm moves straight by the
         servo's ``clear_mm``.
+    contact_mm : callable, optional
+        Gives the depth of the contact (negative: the gap) at a pose (6,) of the arm, as far as the object's place is known.
     way : callable, optional
         Gives the poses of the path from the arm's pose to the pose clear of the object, which is the last one. By default the path is
         straight.
@@ -122,6 +127,7 @@ class ServoLoop:
     sense: Callable[[Sensed], None] | None = None
     forget: Callable[[], object] | None = None
     retreat: Callable[[np.ndarray], object] | None = None
+    contact_mm: Callable[[np.ndarray], float] | None = None
     way: Callable[[np.ndarray, np.ndarray], list[np.ndarray]] | None = None
     law: Callable[[np.ndarray, Estimate], np.ndarray] | None = None
     take_rest: Callable[[Frame], Estimator] | None = None
@@ -136,6 +142,8 @@ class ServoLoop:
         self._behind_since: float | None = None  # when the arm began to lag too far behind for a new target
         self._view, self._memory = _View(), Memory()
         self._watch = ArmWatch(self.arm)
+        self._eyes = Eyes(self.arm, self.source, lambda time_s: self._watch.pose_at(time_s), self._contact)
+        self._came: list[np.ndarray] = []  # the poses (6,) at which the arm was since it left the pose clear of the object
         self._axis = LastAxis(getattr(self.arm, "kinematics", None), self.mounting.centre_mm)
         self._arrived_s: float | None = None  # when the arm came to the object; None once a frame exposed after that was used
         self._started_s = self._ended_s = 0.0
@@ -151,13 +159,13 @@ class ServoLoop:
             No usable frame or estimate for ``give_up_s``, or the arm failed.
         """
         touching = False
-        with self._watch.watched():
+        with self._watch.watched(), self._eyes.watched():
             try:
                 with self._watch.alert():
                     self._approach(start_pose)
                     touching = True
                     with self._watch.doing("moving to the object"):
-                        self._move(start_pose, wait=True)
+                        self._touch(start_pose)
                     self._follow()
             finally:
                 self._ended_s = time.monotonic()
@@ -167,6 +175,10 @@ class ServoLoop:
 
     def _approach(self, start_pose: np.ndarray) -> None:
         """Move to the pose clear of the object, and take the frame without contact there."""
+        if self.forget is not None:  # the contact of an earlier run
+            self.forget()
+        with self._watch.doing("waiting for a fresh frame"):
+            self._eyes.await_sight(timeout_s=max(self.settings.give_up_s, self.source.first_frame_s))
         with self._watch.doing("enabling"):
             self.arm.enable()
             self.arm.set_speed(self.servo.linear_mm_s, self.servo.angular_deg_s)
@@ -180,6 +192,21 @@ class ServoLoop:
             except (TimeoutError, EOFError) as error:
                 raise DeviceError(f"{error}; check the camera") from error
             self.estimator = self.take_rest(rest)
+        self._came.clear()
+
+    def _touch(self, target: np.ndarray) -> None:
+        """Move straight to a pose (6,) in contact. Near the object each piece of the way follows a frame that shows its beginning."""
+        near_mm = max(self.servo.indent_mm, 0.0) + PIECES_MM if self.source.streams else 0.0
+        for pose in pieces_to(self._state().pose, self._turned_for(target), near_mm):
+            if near_mm:
+                try:
+                    self._exposed_after(self._state().time_s)
+                except TimeoutError as error:
+                    raise BlindError(f"{error}; {self.arm.name} moves only with fresh frames") from error
+            self._move(pose, wait=True)
+
+    def _contact(self, pose: np.ndarray) -> float:
+        return -np.inf if self.contact_mm is None else self.contact_mm(pose)
 
     def require_labels(self, names: tuple[str, ...]) -> None:
         """Raise ``DeviceError`` unless the model has the labels that following needs. Call it before anything moves."""
@@ -246,6 +273,9 @@ class ServoLoop:
             return
         try:
             self._sent = self._move(pose, wait=False)
+        except BlindError as blind:
+            self._hold(str(blind), blind, age_s)
+            return
         except RefusedMoveError as refused:
             if refused.decision.code not in (Code.STALE_FRAME, Code.SLIPPING, Code.HELD_FORCE):
                 raise
@@ -258,7 +288,10 @@ class ServoLoop:
         self._record(state, from_pose, self._sent, fresh=fresh, taken_s=taken_s)
         if self.settings.blocking:
             with self._watch.doing(f"waiting for the end of step {len(self.records)}"):
-                self.arm.wait_settled(self._sent, timeout_s=MOVE_TIMEOUT_S)
+                try:
+                    self._eyes.move(partial(self.arm.wait_settled, self._sent, timeout_s=MOVE_TIMEOUT_S))
+                except BlindError as blind:
+                    self._hold(str(blind), blind, age_s)
 
     def _next(self, from_pose: np.ndarray, fresh: bool) -> tuple[np.ndarray, Memory]:
         """The next pose (6,) of the law, and the sums that it keeps."""
@@ -373,6 +406,7 @@ class ServoLoop:
             self.arm.stop()
             self.notes.append(f"held still before step {len(self.records)}: {reason}")
             LOG.warning("%s: %s", self.arm.name, self.notes[-1])
+        self._eyes.stand()
         held_s = time.monotonic() - self._held_since
         if held_s > self.settings.give_up_s:
             raise DeviceError(f"no usable frame for {held_s:.1f} s, the arm holds still: {reason}") from problem
@@ -396,11 +430,15 @@ class ServoLoop:
         if wait:
             target = self._turned_for(target)
         for _ in range(MOST_PIECES if wait else 1):
+            if wait:
+                self._eyes.await_sight(timeout_s=self.settings.give_up_s)
             state, allowed = self._state(), target
             for guard in self.guards:
                 allowed = guard(state, allowed)
             way_s = max(_apart_mm(allowed, state.pose) / self.servo.linear_mm_s, abs(allowed[5] - state.pose[5]) / self.servo.angular_deg_s)
-            sent = self.arm.move_linear(allowed, wait=wait, timeout_s=MOVE_TIMEOUT_S + SPARE * way_s)
+            send = partial(self.arm.move_linear, allowed, wait=wait, timeout_s=MOVE_TIMEOUT_S + SPARE * way_s)
+            self._came.append(state.pose)
+            sent = self._eyes.move(send, ends=wait)
             if np.linalg.norm(sent[:3] - target[:3]) < NEAR_MM and turn_between_deg(sent, target) < NEAR_DEG:
                 break
         return sent
@@ -432,7 +470,7 @@ class ServoLoop:
             here = self._state().pose
             self._move(self._axis.on_turn(self._away_from(here), here[5])[0], wait=True)
             self._move(self._away_from(target), wait=True)
-            self._move(target, wait=True)
+            self._touch(target)
         self._view, self._sent, self._arrived_s = _View(), None, time.monotonic()
 
     def _away_from(self, pose: np.ndarray) -> np.ndarray:
@@ -440,14 +478,26 @@ class ServoLoop:
         return moved(pose, -self.servo.clear_mm * self.mounting.axis)
 
     def _let_go(self, *, retreat: bool) -> None:
-        """Stop the arm, withdraw it if it may touch the object, and disable it. Every step is tried, even if one before it failed."""
+        """Stop the arm, withdraw it if it may touch the object, and disable it. Every step is tried, even if one before it failed.
+
+        If the arm can't leave the object straight, it goes back through the poses at which it was.
+        """
 
         def back() -> None:
             pose = self.arm.state().pose
-            if self.retreat is not None:
-                self.retreat(-matrix_of(pose)[:3, :3] @ self.mounting.axis)
-            else:
-                self.arm.move_linear(self._axis.on_turn(self._away_from(pose), pose[5])[0], wait=True, timeout_s=MOVE_TIMEOUT_S)
+            try:
+                if self.retreat is not None:
+                    self.retreat(-matrix_of(pose)[:3, :3] @ self.mounting.axis)
+                else:
+                    self.arm.move_linear(self._axis.on_turn(self._away_from(pose), pose[5])[0], wait=True, timeout_s=MOVE_TIMEOUT_S)
+            except NoWayBackError as error:
+                if not self._came:
+                    raise
+                self.notes.append(f"{error}; went back the way it came instead")
+                if self.forget is not None:
+                    self.forget()
+                for there in reversed(self._came):
+                    self.arm.move_linear(there, wait=True, timeout_s=MOVE_TIMEOUT_S)
 
         between = {"retreat": back} if retreat else {}
         self.notes += try_each(stop=self.arm.stop, **between, disable=self.arm.disable)

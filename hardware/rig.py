@@ -20,10 +20,10 @@ from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
-from hardware.errors import DeviceError, leave
+from hardware.errors import leave
 from hardware.loop import ServoLoop
 from hardware.rig_geometry import PlacedObject
-from hardware.safe_arm import SafeArm
+from hardware.safe_arm import NoWayBackError, SafeArm
 from hardware.safety import SHIPPED_LIMITS, load_limits
 from hardware.step import LoopSettings, StepRecord
 from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
@@ -52,8 +52,8 @@ def signals_as_ctrl_c() -> Iterator[None]:
     before (``nohup``) stays ignored. The former handlers are restored at the end.
     """
 
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
+    def interrupt(number: int, _: object) -> None:
+        raise KeyboardInterrupt(number)
 
     before = {ended: signal.getsignal(ended) for ended in (signal.SIGTERM, signal.SIGHUP)}
     for ended, handler in before.items():
@@ -216,6 +216,7 @@ def servo_loop(
 ) -> ServoLoop:
     """The servo loop of a connected rig. A ``SafeArm`` gets the estimated contact, and retreats as far as its limits allow."""
     loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, on_step=on_step)
+    loop.contact_mm = lambda pose: float(rig.placed.touch(pose).indent_mm)
     loop.way = lambda start, clear: way_around(rig.placed, start, clear)
     if isinstance(rig.arm, SafeArm):
         arm = rig.arm
@@ -226,10 +227,10 @@ def servo_loop(
 
 
 def _retreat(arm: SafeArm, away: np.ndarray) -> None:
-    """Withdraw an arm in a direction (3,) of the base frame; ``DeviceError`` if the limits do not allow it."""
+    """Withdraw an arm in a direction (3,) of the base frame; ``NoWayBackError`` if the limits do not allow it."""
     arm.normal = away
     if arm.retreat() is None:
-        raise DeviceError(f"the limits allow no way back: {arm.decisions[-1].decision.reason}; free the sensor by hand")
+        raise NoWayBackError(f"the limits allow no way back: {arm.decisions[-1].decision.reason}; free the sensor by hand")
 
 
 def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[int, float]:

@@ -65,6 +65,10 @@ class RefusedMoveError(DeviceError):
         self.decision = decision
 
 
+class NoWayBackError(DeviceError):
+    """The limits allow no straight way back from an object."""
+
+
 @dataclass(frozen=True)
 class LoggedDecision:
     """A decision, the call that it belongs to, and its time (``time.monotonic()``)."""
@@ -242,7 +246,10 @@ class SafeArm:
 
     def _newest_state(self, call: str) -> ArmState:
         try:
-            return self.arm.state(max_age_s=self.limits.feedback_age_s)
+            state = self.arm.state(max_age_s=self.limits.feedback_age_s)
+            if time.monotonic() - state.time_s > self.limits.feedback_age_s:  # this process was stalled since then
+                state = self.arm.state(max_age_s=self.limits.feedback_age_s)
+            return state
         except StaleDataError as error:
             self._obey(call, Decision(Action.HOLD, Code.STALE_FEEDBACK, str(error)))
             raise

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from hardware.arms.arm import Arm, ArmState
+from hardware.awake import awake_s
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from twin.types import Frame
@@ -111,9 +112,9 @@ class ArmWatch:
         said: tuple[tuple[str, float], float] | None = None  # the newest report, and when to repeat it
         pause_s = WATCH_S
         while not end.wait(pause_s):
-            begun_s = time.monotonic()
+            begun_s = awake_s()
             self._look()
-            pause_s = max(WATCH_S, IDLE_SHARE * (time.monotonic() - begun_s))
+            pause_s = max(WATCH_S, IDLE_SHARE * (awake_s() - begun_s))
             doing = self._doing
             if doing is None:
                 continue

@@ -15,6 +15,8 @@ from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm
 from hardware.arms.dobot_alarms import explain
 from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
+from hardware.arms.supervisor import Supervisor
+from hardware.awake import awake_s
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 # Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take as long as feedback may be old.
@@ -27,6 +29,8 @@ HOME_TIMEOUT_S = 60.0
 PORT_ERRORS = (serial.SerialException, OSError, termios.error, TypeError, ValueError)
 # Bytes of the replies to commands that read.
 REPLY_BYTES = {Id.GET_POSE: 32, Id.ALARMS: 16, Id.QUEUE_INDEX: 8}
+# Messages that stop the arm and empty its queue if this program dies.
+LAST_WORDS = tuple(Message(id, WRITE).to_bytes() for id in (Id.QUEUE_FORCE_STOP, Id.QUEUE_CLEAR))
 # Bytes of a queue index.
 INDEX_BYTES = 8
 # Acceleration in mm/s2 (deg/s2) for each mm/s (deg/s) of speed, in 1/s: full speed is reached within a quarter of a second.
@@ -44,16 +48,21 @@ class Magician(BaseArm):
         For example ``/dev/ttyUSB0``.
     tool_x_mm : float
         Reach of the tool beyond the wrist.
+    supervised : bool
+        Whether a further process stops the arm if this program dies while the arm is enabled.
     """
 
     axes = 4
 
-    def __init__(self, port: str, *, tool_x_mm: float = 0.0) -> None:
+    def __init__(self, port: str, *, tool_x_mm: float = 0.0, supervised: bool = True) -> None:
+        self._supervised = supervised
+        self._supervisor: Supervisor | None = None
         self.name, self._port_name = f"Magician at {port}", port
         self.kinematics = replace(MAGICIAN, r0_mm=tool_x_mm)
         self._serial: serial.Serial | None = None
         self._lock, self._buffer = RLock(), b""
         self._enabled = False
+        self._lost = ""  # how the connection was lost
         self._last_index: int | None = None  # queue index of the newest move; None if no move is pending
 
     @property
@@ -62,6 +71,7 @@ class Magician(BaseArm):
 
     def connect(self) -> None:
         self._require_disconnected()
+        self._lost = ""
         try:
             self._serial = serial.Serial(self._port_name, BAUD, timeout=0.05, write_timeout=REPLY_TIMEOUT_S, exclusive=True)
         except PORT_ERRORS as error:
@@ -90,11 +100,19 @@ class Magician(BaseArm):
         self._request(Id.PTP_COMMON_PARAMS, struct.pack("<2f", 100.0, 100.0), ctrl=WRITE)
         self._forget_queue()
         self._request(Id.QUEUE_START, ctrl=WRITE)
+        if self._supervised and self._supervisor is None:
+            self._supervisor = Supervisor(self._port().fileno(), LAST_WORDS)
         self._enabled = True
 
     def disable(self) -> None:
         self.stop()
         self._enabled = False
+        self._unsupervise()
+
+    def _unsupervise(self) -> None:
+        supervisor, self._supervisor = self._supervisor, None
+        if supervisor is not None:
+            supervisor.end()
 
     def clear_error(self) -> None:
         self._forget_queue()
@@ -120,9 +138,9 @@ class Magician(BaseArm):
 
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         self._require_connected()
-        begun_s = time.monotonic()
+        begun_s, awake_from_s = time.monotonic(), awake_s()
         try:
-            until_s = begun_s + max_age_s
+            until_s = awake_from_s + max_age_s
             last = self._last_index
             moving = last is not None and self._index_of(self._request(Id.QUEUE_INDEX, until_s=until_s)) < last
             values = np.array(struct.unpack("<8f", self._request(Id.GET_POSE, until_s=until_s)))
@@ -131,10 +149,8 @@ class Magician(BaseArm):
             raise
         except DeviceError as error:
             raise StaleDataError(f"{error}. Don't trust the last pose") from error
-        if time.monotonic() - begun_s > max_age_s:
-            raise StaleDataError(
-                f"{self.name}: the arm took {time.monotonic() - begun_s:.2f} s to tell its state (allowed {max_age_s:g} s)"
-            )
+        if (took_s := awake_s() - awake_from_s) > max_age_s:
+            raise StaleDataError(f"{self.name}: the arm took {took_s:.2f} s to tell its state (allowed {max_age_s:g} s)")
         pose = np.array([*values[:3], 0.0, 0.0, values[3]])
         self._require_possible(pose)
         return ArmState(pose, values[4:], begun_s, self._enabled, moving, explain(alarms) if alarms else "")
@@ -205,12 +221,12 @@ class Magician(BaseArm):
     def _request(self, id: Id, params: bytes = b"", *, ctrl: int = 0, until_s: float = np.inf) -> bytes:
         """Send a command and wait for the reply with the same id and ctrl.
 
-        The command is sent again if the reply is missing or damaged, but not after ``until_s`` of ``time.monotonic``.
+        The command is sent again if the reply is missing or damaged, but not after ``until_s`` of ``awake_s``.
         """
         sent = Message(id, ctrl, params).to_bytes()
         with self._lock:
             tries = 0
-            while tries < TRIES and time.monotonic() < until_s:
+            while tries < TRIES and awake_s() < until_s:
                 tries += 1
                 port = self._port()
                 try:
@@ -219,12 +235,15 @@ class Magician(BaseArm):
                     port.write(sent)
                     if (reply := self._reply(port, id, ctrl)) is not None:
                         return reply.params
+                except serial.SerialTimeoutException:  # the arm takes nothing, or this process was stalled
+                    continue
                 except PORT_ERRORS as error:
                     self._close()
-                    raise DeviceNotConnectedError(
+                    self._lost = (
                         f"{self.name}: the port vanished ({error}). The arm goes on with what is queued: switch it off if it moves! "
                         "Plug the cable in, then connect() again"
-                    ) from error
+                    )
+                    raise DeviceNotConnectedError(self._lost) from error
         raise DeviceError(
             f"{self.name}: no valid reply to command {int(id)} in {tries} tries of {REPLY_TIMEOUT_S:g} s; switch the arm on, "
             "check that the port is a Magician's and the cable is sound"
@@ -233,8 +252,11 @@ class Magician(BaseArm):
     def _port(self) -> serial.Serial:
         """The open port; ``DeviceNotConnectedError`` where there is none."""
         if self._serial is None:
-            raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
+            raise DeviceNotConnectedError(self._lost or f"{self.name}: not connected; call connect() first")
         return self._serial
+
+    def _require_connected(self) -> None:
+        self._port()
 
     def _reply(self, port: serial.Serial, id: Id, ctrl: int) -> Message | None:
         """The reply to a command, if it comes in time.
@@ -245,8 +267,8 @@ class Magician(BaseArm):
             A reply of another length came, so the attached device is not a Magician.
         """
         wanted = REPLY_BYTES.get(id) if ctrl == 0 else None
-        deadline = time.monotonic() + REPLY_TIMEOUT_S
-        while time.monotonic() < deadline:
+        deadline = awake_s() + REPLY_TIMEOUT_S
+        while awake_s() < deadline:
             self._buffer += port.read(max(1, port.in_waiting))
             message, self._buffer = take_message(self._buffer)
             while message is not None:
@@ -261,6 +283,7 @@ class Magician(BaseArm):
         return None
 
     def _close(self) -> None:
+        self._unsupervise()
         if self._serial is not None:
             with contextlib.suppress(*PORT_ERRORS):
                 self._serial.close()

@@ -50,6 +50,8 @@ ENABLED_MODES = {Mode.ENABLED, Mode.BACKDRIVE, Mode.RUNNING, Mode.RECORDING, Mod
 MOVING_MODES = {Mode.RUNNING, Mode.JOG}
 PAUSED = "paused by another client; stop() drops the queue, Continue() of that client would execute it"
 DISABLED = "was disabled by another program or at its button; call enable() when nobody else uses it"
+# Requests that stop and disable the arm if this program dies.
+LAST_WORDS = (b"ResetRobot()", b"DisableRobot()")
 # Largest length of a move, mm, in which the turn may determine the speed.
 SHORT_MM = 5.0
 # Old firmware does not reply to moves. With it, a move counts as done after the arm has rested for this time (s).
@@ -85,6 +87,8 @@ class MG400(BaseArm):
         For controllers and emulators that are only similar: feedback counts whatever its test value is, a motion is detected from the
         joints,
         and ``Sync`` is not used.
+    supervised : bool
+        Whether a further process stops and disables the arm if this program dies while the arm is enabled.
     """
 
     axes = 4
@@ -96,7 +100,9 @@ class MG400(BaseArm):
         ports: Mg400Ports = Mg400Ports(),  # noqa: B008  (frozen)
         kinematics: LinkageKinematics = arms.MG400,
         lenient: bool = False,
+        supervised: bool = True,
     ) -> None:
+        self._supervised = supervised
         self.name, self.kinematics = f"MG400 at {host}", kinematics
         self._dashboard = CommandPort(self.name, host, ports.dashboard)
         self._motion = CommandPort(self.name, host, ports.motion)
@@ -144,6 +150,8 @@ class MG400(BaseArm):
             LOG.warning(
                 "%s: is enabled already, so another program may use it; what one of the two stops or disables stands for both", self.name
             )
+        if self._supervised and not self._enabled:
+            self._dashboard.supervise(*LAST_WORDS)
         for request in ("EnableRobot()", "User(0)", "Tool(0)"):
             self._ask(request)
         self._await_mode(lambda mode: mode in ENABLED_MODES, "was not enabled; check its button and that no stop is pressed")
@@ -152,6 +160,7 @@ class MG400(BaseArm):
     def disable(self) -> None:
         self._tell_in_any_case("DisableRobot()", "disabled")
         self._under_way = self._enabled = False
+        self._dashboard.supervise()
         self._shows(lambda packet: int(packet["mode"]) not in ENABLED_MODES)  # so that the next state shows it
 
     def clear_error(self) -> None:
@@ -400,6 +409,7 @@ class MG400(BaseArm):
 
     def _close(self) -> None:
         self._in_use = self._under_way = self._late_replies = self._unstopped = self._enabled = False
+        self._dashboard.supervise()
         self._dashboard.close()
         self._motion.close()
         self._feedback.close()

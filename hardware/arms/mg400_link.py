@@ -10,6 +10,8 @@ import numpy as np
 
 from hardware.arms.arm import FEEDBACK_AGE_S
 from hardware.arms.mg400_wire import PACKET_BYTES, Reply, newest_packet, take_reply, told_apart, why_no_packet
+from hardware.arms.supervisor import Supervisor
+from hardware.awake import awake_s
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 # Longest wait for a connection, in s.
@@ -24,6 +26,8 @@ LOOK_S = 0.05
 RECONNECT_S = 0.5
 # Difference of a joint between two packets, deg, above which the arm is in motion.
 MOTION_DEG = 1e-4
+# Interval in s at which a wait for feedback after a stall checks it.
+STALL_CHECK_S = 0.01
 # Largest number of bytes in one read: more than half a second of feedback.
 BACKLOG_BYTES = 64 * PACKET_BYTES
 
@@ -35,7 +39,9 @@ class CommandPort:
         self._name, self._address = name, (host, port)
         self._socket: socket.socket | None = None
         self._lock, self._buffer = RLock(), ""
-        self._heard = False  # whether anything came over this connection
+        self._heard = False  # whether anything came from this address
+        self._last_words: tuple[bytes, ...] = ()
+        self._supervisor: Supervisor | None = None
 
     @property
     def is_open(self) -> bool:
@@ -54,10 +60,24 @@ class CommandPort:
                 "'twin emulate mg400' and mg400:127.0.0.1"
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._heard = False
+        self.supervise(*self._last_words)
+
+    def supervise(self, *last_words: bytes) -> None:
+        """Have a further process send these requests if this program dies, over this connection or one that is opened after it.
+
+        Without requests there is no such process.
+        """
+        with self._lock:
+            self._last_words = last_words
+            if self._supervisor is not None:
+                self._supervisor.end()
+            self._supervisor = Supervisor(self._socket.fileno(), last_words) if self._socket is not None and last_words else None
 
     def close(self) -> None:
         with self._lock:
+            if self._supervisor is not None:
+                self._supervisor.end()
+                self._supervisor = None
             if self._socket is not None:
                 self._socket.close()
             self._socket, self._buffer = None, ""
@@ -75,9 +95,9 @@ class CommandPort:
         """
         with self._lock:
             self.send(text)
-            deadline = time.monotonic() + timeout_s
-            while time.monotonic() < deadline:
-                if reply := self.poll(text, wait_s=min(LOOK_S, deadline - time.monotonic())):
+            deadline = awake_s() + timeout_s
+            while (left_s := deadline - awake_s()) > 0:
+                if reply := self.poll(text, wait_s=min(LOOK_S, left_s)):
                     return reply
                 look()
             came = self._buffer
@@ -170,6 +190,7 @@ class Feedback:
         self._joints: np.ndarray | None = None
         self.turned_s = -np.inf  # when the joints were last seen in motion
         self._newest: tuple[np.void, float] | None = None
+        self._heard_s = 0.0  # when the newest packet arrived, on the clock of ``awake_s``
         self._arrived, self._ended = Condition(), Event()
         self._thread: Thread | None = None
         self.skipped_bytes = self.reconnects = 0
@@ -205,7 +226,7 @@ class Feedback:
         return float("inf") if newest is None else time.monotonic() - newest[1]
 
     def newest(self, max_age_s: float) -> tuple[np.void, float]:
-        """The newest packet and the time of its arrival.
+        """The newest packet and the time of its arrival. After a stall of this process it waits for what arrived meanwhile.
 
         Raises
         ------
@@ -213,7 +234,8 @@ class Feedback:
             The packet is older than ``max_age_s``.
         """
         with self._arrived:
-            newest = self._newest
+            while (newest := self._newest) is not None and time.monotonic() - newest[1] > max_age_s > awake_s() - self._heard_s:
+                self._arrived.wait(STALL_CHECK_S)
         age_s = np.inf if newest is None else time.monotonic() - newest[1]
         if newest is None or age_s > max_age_s:
             raise StaleDataError(
@@ -248,8 +270,8 @@ class Feedback:
 
     def _read_until_silent(self, connection: socket.socket, ended: Event) -> None:
         connection.settimeout(SILENCE_S / 4)
-        buffer, valid_s = b"", time.monotonic()
-        while not ended.is_set() and time.monotonic() - valid_s < SILENCE_S:
+        buffer, heard_s = b"", awake_s()
+        while not ended.is_set() and awake_s() - heard_s < SILENCE_S:
             try:
                 data = connection.recv(BACKLOG_BYTES)
             except TimeoutError:
@@ -262,10 +284,10 @@ class Feedback:
             packet, buffer, skipped = newest_packet(buffer + data, lenient=self._lenient)
             self.skipped_bytes += skipped
             if packet is not None and len(data) < BACKLOG_BYTES:  # otherwise newer packets are still waiting to be read
-                valid_s = time.monotonic()
+                valid_s, heard_s = time.monotonic(), awake_s()
                 if self._joints is not None and np.abs(packet["q_actual"] - self._joints).max() > MOTION_DEG:
                     self.turned_s = valid_s
                 self._joints = packet["q_actual"].copy()
                 with self._arrived:
-                    self._newest = (packet, valid_s)
+                    self._newest, self._heard_s = (packet, valid_s), heard_s
                     self._arrived.notify_all()

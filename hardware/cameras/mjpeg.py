@@ -151,9 +151,10 @@ class MjpegCamera(LiveSource):
         image, note = decode_jpeg(data)
         number = int(headers["x-sequence"]) if headers.get("x-sequence", "").isdecimal() else None
         lost = max(0, number - self._last - 1) if number is not None and self._last is not None else 0
+        again = number is not None and number == self._last
         if number is not None:
             self._last = number
-        return Picture(image, stamped_s(headers), lost, note)
+        return Picture(image, stamped_s(headers), lost, note, again)
 
     def _finish(self, image: np.ndarray) -> np.ndarray:
         return capture(image, self._spec, self.form)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hardware.awake import awake_s
 from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
 from scenes.sensor import SensorSpec
 from twin.camera.capture import record
@@ -26,6 +27,14 @@ FAILED_PAUSE_S = 0.2
 # A stream counts as frozen if a picture stays the same for this time (s) and this number of times. Pictures of a live sensor differ by
 # noise.
 FROZEN_S, FROZEN_N = 0.5, 5
+# The source is blind if no new picture came for BLIND_S (s) and for BLIND_PERIODS usual times between pictures.
+BLIND_S, BLIND_PERIODS = 0.15, 2.5
+# Number of times between pictures from which the usual one is known.
+RATE_N = 3
+# Least difference, s, between the stamps of two pictures.
+STAMP_S = 1e-4
+# Number of same pictures from which on a picture without noise counts as unchanged.
+SAME_N = 3
 # Largest stated age, s, of a picture at its arrival. An older picture has a time of another clock, or is useless.
 LATE_S = 5.0
 # Gray level (0 to 255) that at least one pixel of a picture must reach. Otherwise the picture is black, because the lamps are off.
@@ -53,12 +62,15 @@ class Picture:
         Number of pictures before this one that the device reports as lost.
     note : str
         What was irregular in its file ("" if nothing).
+    again : bool
+        Whether the device says that it sent this picture before.
     """
 
     image: np.ndarray
     time_s: float
     lost: int = 0
     note: str = ""
+    again: bool = False
 
 
 class ReadFailed(Exception):  # noqa: N818  (no error until it happens too often)
@@ -82,6 +94,8 @@ class LiveSource(Connection):
     is_live = True
     notices_still = True  # whether a picture that does not change is a fault
     notices_late = True  # whether a picture that is older than ``LATE_S`` at its arrival is a fault
+    streams = True  # whether pictures come unasked
+    _spec: SensorSpec | None = None
     _read_last: int  # sequence number of the frame that was read last
     _sequence: int
     _dropped: int
@@ -157,6 +171,25 @@ class LiveSource(Connection):
         """The fault of the pictures, in words: frozen, black or late; "" if there is none."""
         return self._fault
 
+    @property
+    def same_s(self) -> tuple[float, float] | None:
+        """Exposures of the first and the newest of several same pictures, if pictures of this source may repeat; None otherwise."""
+        with self._new:
+            if self._still is None or self._still[2] < SAME_N or self._frame is None:
+                return None
+            return (self._still[1], self._frame.time_s) if self._may_repeat(self._still[0]) else None
+
+    def blind(self) -> str:
+        with self._new:
+            if self._error is not None or self._fault:
+                return str(self._error or self._fault)
+            if not self.streams:
+                return ""
+            quiet_s = awake_s() - self._fresh_s
+            if len(self._periods_s) < RATE_N and quiet_s < START_S:
+                return "has given too few pictures so far"
+            return "" if quiet_s <= max(BLIND_S, BLIND_PERIODS * self._usual_s()) else f"no new picture for {quiet_s:.1f} s"
+
     def connect(self) -> None:
         if self.is_connected:
             raise DeviceAlreadyConnectedError(f"{self.name}: connected already; disconnect() first")
@@ -215,8 +248,8 @@ class LiveSource(Connection):
         self._fault = ""
         self._read_last, self._sequence, self._dropped, self._delivered = -1, 0, 0, 0
         self._still: tuple[np.ndarray, float, int] | None = None  # picture, since when, how often
-        self._came_s = 0.0
-        self._periods_s: deque[float] = deque([1.0 / self.fps], maxlen=KEPT_PERIODS)
+        self._came_s, self._fresh_s, self._stamp_s = 0.0, awake_s(), -np.inf
+        self._periods_s: deque[float] = deque(maxlen=KEPT_PERIODS)
         self._outages_s: list[float] = []
         self._torn: list[str] = []
         self._notes: set[str] = set()
@@ -249,9 +282,16 @@ class LiveSource(Connection):
                     self._look_back(picture)
                     self._sequence += 1 + picture.lost
                     self._dropped += 1 + picture.lost
-                    name = f"frame_{self._sequence:06d}.png"
-                    self._frame = Frame(image, self.form, name, picture.time_s, self._sequence)
+                    if self._is_new(picture):
+                        name = f"frame_{self._sequence:06d}.png"
+                        self._frame = Frame(image, self.form, name, picture.time_s, self._sequence)
+                        if not self._fault:
+                            self._fresh_s = awake_s()
                     self._new.notify_all()
+
+    def _usual_s(self) -> float:
+        """Usual time between two pictures."""
+        return float(np.median(self._periods_s)) if self._periods_s else 1.0 / self.fps
 
     def _pause(self) -> None:
         """Wait before the device is tried again."""
@@ -262,11 +302,24 @@ class LiveSource(Connection):
             self._error = error
             self._new.notify_all()
 
+    def _may_repeat(self, image: np.ndarray) -> bool:
+        """Whether pictures like this one may repeat without a fault: those of the twin, and those that their sender thresholded."""
+        camera = None if self._spec is None or self.form is not Form.RECORDING else self._spec.camera
+        return not self.notices_still or (camera is not None and image.shape[1::-1] != (camera.width_px, camera.height_px))
+
+    def _is_new(self, picture: Picture) -> bool:
+        """Whether a picture has a new number, a new stamp, and a new content if it can't repeat."""
+        repeats = self._still is not None and self._still[2] > 1 and not self._may_repeat(picture.image)
+        before_s, self._stamp_s = self._stamp_s, picture.time_s
+        return not (repeats or picture.again or picture.time_s - before_s < STAMP_S)
+
     def _look_back(self, picture: Picture) -> None:
         """Count an outage before this picture, and note what is irregular in it."""
-        if self._still is None or self._still[2] == 1:  # a server may send its last picture again when it is asked anew
+        if (
+            self._still is None or self._still[2] == 1 or self._may_repeat(picture.image)
+        ):  # a server may send its last picture again when it is asked anew
             period_s, self._came_s = time.monotonic() - self._came_s, time.monotonic()
-            outage = period_s > max(OUTAGE_S, OUTAGE_PERIODS * float(np.median(self._periods_s)))
+            outage = period_s > max(OUTAGE_S, OUTAGE_PERIODS * self._usual_s())
             if self._sequence:  # the first picture comes when the device is ready
                 (self._outages_s if outage else self._periods_s).append(period_s)
         self._notes |= {picture.note} - {""}
@@ -279,15 +332,13 @@ class LiveSource(Connection):
                 f"the picture says that it is {age_s:.0f} s old; set the clock of the camera's computer to that of this one, "
                 "or look for what delays the pictures"
             )
-        if not self.notices_still:
-            return ""
         if self._still is None or not np.array_equal(self._still[0], picture.image):
             self._still = (picture.image, picture.time_s, 1)
             return ""
-        self._repeated += 1
+        self._repeated += not self._may_repeat(picture.image)
         image, since_s, count = self._still
         self._still = (image, since_s, count + 1)
-        if count + 1 >= FROZEN_N and picture.time_s - since_s >= FROZEN_S:
+        if count + 1 >= FROZEN_N and not self._may_repeat(image) and picture.time_s - since_s >= FROZEN_S:
             return f"the picture has been frozen for {picture.time_s - since_s:.1f} s; unplug the camera and connect it again"
         return ""
 

@@ -23,6 +23,8 @@ class SequentialSource(Connection):
     first_frame_s = 0.0
     dropped = 0
     fault = ""
+    streams = False  # frames come when they are read
+    same_s = None
 
     def __init__(self, name: str, form: Form) -> None:
         self.name, self.form = name, form
@@ -36,6 +38,9 @@ class SequentialSource(Connection):
     def notes(self) -> list[str]:
         """Irregularities in the frames read so far, one line each."""
         return []
+
+    def blind(self) -> str:
+        return ""
 
     @property
     def is_connected(self) -> bool:

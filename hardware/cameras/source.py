@@ -19,6 +19,7 @@ class FrameSource(Protocol):
     name: str
     form: Form
     is_live: bool  # a recording waits for its reader, a live source does not
+    streams: bool  # whether frames come unasked: not from a recording, nor from a twin that draws on demand
 
     @property
     def first_frame_s(self) -> float:
@@ -35,6 +36,13 @@ class FrameSource(Protocol):
     @property
     def fault(self) -> str:
         """What is wrong with the pictures ("" if nothing)."""
+
+    @property
+    def same_s(self) -> tuple[float, float] | None:
+        """Exposures (s) of the first and the newest of several equal pictures; None if the picture changes, or could not stay equal."""
+
+    def blind(self) -> str:
+        """Reason why there is no fresh frame; "" if there is one. A fresh frame is new, usable, and at most 3 periods or 0.2 s old."""
 
     def notes(self) -> list[str]:
         """What was irregular in the frames so far, one line each: pauses, damaged, repeated and unreadable frames."""

@@ -61,6 +61,7 @@ class TwinCamera(LiveSource):
     notices_still = False  # the twin's pictures may repeat without a fault
     notices_late = False  # a contact takes as long to compute as the machine needs
     first_frame_s = FIRST_FRAME_S
+    _spec: SensorSpec
 
     def __init__(
         self,
@@ -80,6 +81,7 @@ class TwinCamera(LiveSource):
         self._spec, self._placed, self._arm, self._period_s = spec, placed, arm, 1.0 / fps
         self._seed, self._preview = seed, preview
         self._recording = spec.recording if self.form is Form.RECORDING else None
+        self.streams = not on_demand
         self._on_demand, self._asked = on_demand, threading.Event()
         self._waits_for_arm = waits_for_arm
         self._follower: Follower | None = None

@@ -17,6 +17,7 @@ CLIENT_WAIT_S = 0.5
 FAULTS = {
     "frozen": (None, "the same picture again and again"),
     "black": (None, "the lamps are off"),
+    "resized": (None, "the pictures have half the height"),
     "dropped": (2.0, "every n-th picture is lost"),
     "late": (0.3, "pictures arrive this many seconds after their exposure"),
     "torn": (3.0, "every n-th JPEG ends too early"),
@@ -145,6 +146,8 @@ class CameraEmulator:
             last = image
             if "black" in self.faults:
                 image = np.zeros_like(image)
+            if "resized" in self.faults:
+                image = image[::2]
             self.made += 1
             if "silent" in self.faults or self._every("dropped"):
                 continue

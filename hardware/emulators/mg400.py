@@ -6,6 +6,7 @@ import select
 import socket
 import struct
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from threading import Event, Lock, Thread, Timer
 
@@ -52,6 +53,7 @@ FAULTS = {
     "no-fast-feedback": (None, "nobody listens on 30004"),
     "no-feedback": (None, "nobody listens on 30004 to 30006"),
     "silent-feedback": (1.0, "each feedback connection falls silent after this many seconds"),
+    "late-feedback": (2.0, "feedback arrives this many seconds late"),
     "short-packets": (10.0, "every n-th feedback packet is cut short"),
     "wrong-test-value": (10.0, "every n-th feedback packet has a wrong test value"),
     "collision": (0.5, "each move ends in a collision alarm after this share of its time"),
@@ -68,7 +70,7 @@ FAULTS = {
 # The values that the faults may have.
 RANGES = {
     **dict.fromkeys(("short-packets", "wrong-test-value"), EVERY_NTH),
-    **dict.fromkeys(("emergency-stop", "silent-feedback", "frozen", "die"), SECONDS),
+    **dict.fromkeys(("emergency-stop", "silent-feedback", "late-feedback", "frozen", "die"), SECONDS),
     **dict.fromkeys(("collision", "stall", "slow"), SHARE),
     "error-groups": Range(1, 100, whole=True),
 }
@@ -235,12 +237,15 @@ class Mg400Emulator:
     def _feed(self, client: socket.socket, period_s: float) -> None:
         begun_s = due_s = time.monotonic()
         count = 0
+        waiting: deque[tuple[float, bytes]] = deque()
         while not self._ended.is_set():
             silent_after_s = self.faults.value("silent-feedback")
             silent = silent_after_s is not None and time.monotonic() - begun_s >= silent_after_s
             if not silent and not self._frozen:
                 count += 1
-                client.sendall(self._packet(count))
+                waiting.append((time.monotonic() + (self.faults.value("late-feedback") or 0.0), self._packet(count)))
+            while waiting and waiting[0][0] <= time.monotonic():
+                client.sendall(waiting.popleft()[1])
             due_s = max(due_s + period_s, time.monotonic())
             self._ended.wait(max(0.0, due_s - time.monotonic()) or POLL_S)
 

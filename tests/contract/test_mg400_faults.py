@@ -64,6 +64,7 @@ def test_these_disturb_nothing(fault):
         (("motion-port-closed",), "no other program holds the port"),
         (("no-feedback",), "close other programs"),
         (("silent-feedback=0",), "restart the arm"),
+        (("late-feedback=0.5",), "not executed"),
         (("emergency-stop",), "release the emergency stop"),
         (("collision",), "free the arm by hand"),
         (("stall",), "not executed"),

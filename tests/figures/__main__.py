@@ -15,6 +15,7 @@ from figures import (  # noqa: F401  (each registers its jobs)
     poses,
     recordings,
     robustness,
+    safety,
     servo,
     studio,
     sure,

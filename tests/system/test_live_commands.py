@@ -311,6 +311,16 @@ def refused(*arguments) -> str:
     return str(result.exception)
 
 
+def test_a_dry_run_tells_the_plan_and_moves_nothing(stand_in, tmp_path, monkeypatch, caplog):
+    enabled = []
+    monkeypatch.setattr(SimulatedArm, "enable", lambda arm: enabled.append(arm))
+    told = run("servo", "--object", "can", "--model", "any", "--out", tmp_path / "s", "--steps", 3, "--plain-light", "--dry-run")
+    common = ("--camera", "twin", "--arm", "simulated", "--sensor", "mg400-331", "--plain-light", "--count", 2)
+    run("collect", *common, "--out", tmp_path / "c", "--dry-run")
+    assert not enabled and "nothing was moved" in told
+    assert all(caplog.text.count(f"{part}: ") >= 2 for part in ("camera", "way", "limits", "time"))
+
+
 def test_what_is_not_attached_leaves_no_session_in_the_way(stand_in, tmp_path):
     common = ("--model", "any", "--record")
     told = refused(
@@ -383,5 +393,5 @@ def test_sigterm_makes_a_command_let_go_of_its_arm(tmp_path):
             while not arm.arm.busy() and process.poll() is None:
                 time.sleep(0.01)
             process.send_signal(signal.SIGTERM)
-            assert process.wait(timeout=60) == 130
+            assert process.wait(timeout=60) == 143
         assert not arm.arm.enabled and not arm.arm.busy()

@@ -8,10 +8,15 @@ import errno
 import io
 import logging
 import os
+import signal
 import sys
+import tempfile
+import threading
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -33,6 +38,8 @@ COMMANDS = {
 
 # Exit codes: a failure, a wrong command line, an end by Ctrl-C (128 + the signal's number, as in shells).
 FAILED, MISUSED, INTERRUPTED = 1, 2, 130
+# Longest line about an arm or a camera, in characters. Longer messages, and notes, go to a file.
+LONGEST_LINE = 160
 
 
 class _Commands(TyperGroup):
@@ -97,7 +104,7 @@ def _tell_version(asked: bool) -> None:
     "Press a skin by finite elements, path-trace what the camera inside sees, find the pins, build the graph: "
     "on rendered, recorded and live frames alike.\n\n"
     "Start with 'twin doctor', then 'twin demo --out out/demo'.\n\n"
-    "Exit codes: 0 done, 1 failed, 2 wrong command line, 3 a bad finding of 'twin check', 130 ended by Ctrl-C.",
+    "Exit codes: 0 done, 1 failed, 2 wrong command line, 3 a bad finding of 'twin check', 130 ended by Ctrl-C, 143 by SIGTERM.",
 )
 def _twin(
     version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_tell_version, help="print the version and stop")] = False,
@@ -116,7 +123,8 @@ def main() -> None:
     """Run the command line.
 
     An error that the user can correct is printed as one line on stderr. The exit code is then 2 if the command line itself is wrong, and 1
-    otherwise. Ctrl-C also prints one line; its exit code is 130. A warning is one line without the place in the source.
+    otherwise. Ctrl-C and SIGTERM also print one line; their exit codes are 130 and 143. A warning is one line without the place in the
+    source.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a letter that the encoding lacks is printed as its code, as on stderr
@@ -127,6 +135,7 @@ def main() -> None:
         reason = error if isinstance(error, ImportError) else "the working folder was deleted; change into a folder that exists"
         print(f"twin: error: {reason}", file=sys.stderr)
         sys.exit(FAILED)
+    _end_on_sigterm()
     warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {' '.join(str(message).split())}\n"
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # without a writable home directory it prints four lines of warnings
     try:
@@ -138,17 +147,49 @@ def main() -> None:
             _end_without_room(error)
         if not _for_user(error):
             raise
-        print(f"twin: error: {' '.join(str(error).split())}", file=sys.stderr)
-        _print_notes(error)
+        _print_error(error)
         if isinstance(error, StoreError):
             _print_unsaved(error.unsaved)
         sys.exit(MISUSED if isinstance(error, OptionError) else FAILED)
 
 
+def _end_on_sigterm() -> None:
+    """Make SIGTERM end this process as Ctrl-C does, with its own exit code. Forked processes end at once."""
+    program = os.getpid()
+
+    def end(number: int, _: object) -> None:
+        if os.getpid() != program:
+            os._exit(128 + number)
+        raise KeyboardInterrupt(number)
+
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, end)
+
+
 def _end_interrupted(interrupt: KeyboardInterrupt) -> NoReturn:
+    for number in (signal.SIGINT, signal.SIGTERM):  # a second one must not end the end
+        signal.signal(number, signal.SIG_IGN)
     print("twin: interrupted", file=sys.stderr)
     _print_notes(interrupt)
-    sys.exit(INTERRUPTED)
+    sys.exit(128 + interrupt.args[0] if interrupt.args else INTERRUPTED)
+
+
+def _print_error(error: Exception) -> None:
+    """Print an error as one line, and its notes. Of a device's error the line is short, and what is left out goes to a file."""
+    text = " ".join(str(error).split())
+    devices = sys.modules.get("hardware.errors")  # loaded if there is a device
+    notes = getattr(error, "__notes__", ())
+    if devices is None or not isinstance(error, devices.DeviceError) or (len(text) <= LONGEST_LINE and not notes):
+        print(f"twin: error: {text}", file=sys.stderr)
+        _print_notes(error)
+        return
+    whole = "\n".join([text, *notes])
+    log = Path(tempfile.gettempdir()) / f"twin-{os.getpid()}.log"
+    told = ""
+    with suppress(OSError):
+        log.write_text(whole + "\n", encoding="utf-8")
+        told = f"; details: {log}"
+    print(f"twin: error: {devices.in_short(whole, LONGEST_LINE - len('twin: error: ') - len(told))}{told}", file=sys.stderr)
 
 
 def _end_without_room(error: OSError) -> NoReturn:

@@ -21,6 +21,7 @@ from twin.cli.options import (
     ArmOption,
     AtRest,
     Camera,
+    DryRun,
     Force,
     FormOrAuto,
     KnownPlace,
@@ -150,6 +151,7 @@ def collect_command(
     design: Annotated[str, typer.Option("--design", help="random, even (fill the ranges) or unsure (where they tell most)")] = "random",
     plain_light: PlainLight = False,
     also: Also = None,
+    dry_run: DryRun = False,
     force: Force = False,
 ) -> None:
     from hardware.collect import CollectPlan, collect_frames
@@ -175,6 +177,7 @@ def collect_command(
         limits=limits,
         plain_light=plain_light,
         also=tuple(also or ()),
+        dry_run=dry_run,
     )
     with overwriting(force), signals_as_ctrl_c(), shown(goes_on=True) as progress:
         collected = collect_frames(plan, out, progress=progress)
@@ -235,6 +238,7 @@ def servo(
     plain_light: PlainLight = False,
     at_rest: AtRest = FIRST,
     also: Also = None,
+    dry_run: DryRun = False,
     force: Force = False,
 ) -> None:
     from hardware.following import follow
@@ -261,6 +265,7 @@ def servo(
             plain_light=plain_light,
             known_place=known_place,
             at_rest=at_rest,
+            dry_run=dry_run,
         )
 
 
@@ -294,14 +299,18 @@ def run_along(
     SystemExit
         The run ended early.
     """
-    from hardware.following import FollowPlan
+    from hardware.following import FollowPlan, PlannedOnly
     from hardware.rig import signals_as_ctrl_c
     from scenes import load_object, load_servo
     from twin.cli.progress import shown
 
     plan = FollowPlan(stimulus=load_object(object_name), servo=load_servo(parameters), also=tuple(also or ()), **options)
-    with signals_as_ctrl_c(), shown() as progress:
-        followed = follow(plan, load(run), out, about={kept_as: str(run)}, progress=progress)
+    try:
+        with signals_as_ctrl_c(), shown() as progress:
+            followed = follow(plan, load(run), out, about={kept_as: str(run)}, progress=progress)
+    except PlannedOnly:
+        say(["nothing was moved; leave out --dry-run to begin"])
+        return
     tell(followed)
     if followed.failure:
         raise SystemExit(1)
@@ -338,6 +347,7 @@ def policy_command(
     known_place: KnownPlace = False,
     plain_light: PlainLight = False,
     also: Also = None,
+    dry_run: DryRun = False,
     force: Force = False,
 ) -> None:
     from hardware.following import follow
@@ -362,6 +372,7 @@ def policy_command(
             seed=seed,
             plain_light=plain_light,
             known_place=known_place,
+            dry_run=dry_run,
         )
 
 

@@ -96,6 +96,7 @@ Also = Annotated[
     typer.Option("--also", help="keep it in this format, too, in a subfolder of that name; may be repeated ('twin convert --help')"),
 ]
 PlainLight = Annotated[bool, typer.Option("--plain-light", help="draw the twin's frames with direct light alone, without path tracing")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, and move nothing")]
 ServoName = Annotated[str, typer.Option("--servo", help="gains, speeds and the object's place: a name, or a TOML file")]
 Limits = Annotated[str | None, typer.Option("--limits", help="safety limits: mg400, magician, or a TOML file")]
 AtRest = Annotated[

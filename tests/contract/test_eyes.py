@@ -1,0 +1,252 @@
+"""No motion towards an object without fresh frames: every command, with a camera, an arm or a program that fails in each phase."""
+
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from threading import Timer
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from arms import bench
+from blind_runs import CAMERA_FAULTS, COMMANDS, FAULTS, HEALTHY, PHASES, draw, measure, table
+from noisy_camera import NoisyCamera
+from true_estimator import TrueEstimate, TrueEstimator
+
+from hardware.arms.simulated import SimulatedArm
+from hardware.cameras.mjpeg import MjpegCamera
+from hardware.cameras.reader import Picture
+from hardware.emulators.camera import CameraEmulator
+from hardware.errors import DeviceError
+from hardware.eyes import NEAR_MM, PIECE_MM, BlindError, Eyes, pieces_to
+from hardware.live_feed import CameraFeed
+from hardware.loop import ServoLoop
+from hardware.plan import check_plan
+from hardware.rig import Rig, servo_loop
+from hardware.rig_geometry import PlacedObject, moved
+from hardware.safe_arm import SafeArm
+from hardware.safety import SafetyLimits, load_limits
+from hardware.step import LoopSettings
+from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
+from twin.rig.mounting import Mounting
+from twin.types import Form
+
+RUNS, HEALTHY_RUNS = 320, 20
+SAMPLE = [(COMMANDS[k % 4], PHASES[(k + k // 4) % 4], fault) for k, fault in enumerate((*CAMERA_FAULTS, *FAULTS))]
+FREE = SafetyLimits(box_mm=((-2000, 2000),) * 3)
+
+
+@pytest.mark.parametrize(("seed", "case"), list(enumerate(SAMPLE)), ids=[" ".join(case) for case in SAMPLE])
+def test_a_fault_in_a_phase_stops_the_arm(seed, case):
+    found = measure(seed, case)
+    assert not found.wrong(), found
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_healthy_run_comes_to_its_end(command):
+    found = measure(7, (command, "contact", HEALTHY))
+    assert found.safe and not found.told, found
+
+
+def all_of(cases):
+    """The runs of some seeds and cases, side by side."""
+    with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
+        return list(pool.map(measure, *zip(*cases, strict=True)))
+
+
+@pytest.mark.slow
+def test_no_fault_in_any_phase_goes_on():
+    runs = all_of([(seed, draw(seed)) for seed in range(RUNS)])
+    print(f"\n{len(runs)} runs, seeds 0 to {RUNS - 1}\n{table(runs)}")
+    assert not [run for run in runs if run.wrong()], "\n".join(f"{run}: {run.wrong()}" for run in runs if run.wrong())
+
+
+@pytest.mark.slow
+def test_healthy_runs_all_come_to_their_end():
+    runs = all_of([(seed, (COMMANDS[seed % 4], "contact", HEALTHY)) for seed in range(HEALTHY_RUNS)])
+    assert not [run for run in runs if run.told or not run.safe], runs
+
+
+@pytest.fixture
+def placed():
+    return PlacedObject(load_object("can"), PlacementSpec(), Mounting.of(load_sensor("mg400-331"), load_experiment("surface-2d")))
+
+
+@pytest.fixture
+def arm(placed):
+    with SimulatedArm(pose=placed.start_pose(-60.0)) as arm:
+        arm.enable()
+        yield arm
+
+
+class Switched(NoisyCamera):
+    """A camera that can be switched off, or be given one picture to repeat."""
+
+    off, picture = False, None
+
+    def _grab(self):
+        while self.off and not self._end.wait(0.01):
+            pass
+        made = super()._grab()
+        return made if self.picture is None else Picture(self.picture, made.time_s)
+
+
+def test_the_last_millimetres_are_made_in_pieces():
+    start, target = np.zeros(6), np.array([0, 30.0, 0, 0, 0, 10.0])
+    poses = pieces_to(start, target, NEAR_MM)
+    steps = np.diff([0.0, *(pose[1] for pose in poses)])
+    assert np.isclose(steps[0], 30.0 - NEAR_MM) and (steps[1:] <= PIECE_MM + 1e-9).all() and np.allclose(poses[-1], target)
+    assert len(pieces_to(start, start, NEAR_MM)) == len(pieces_to(start, target, 0.0)) == 1
+
+
+def test_an_arm_does_not_leave_standstill_without_a_frame(arm):
+    source = Switched()
+    source.off = True
+    with source:
+        eyes, before = Eyes(arm, source), arm.state().pose
+        with pytest.raises(BlindError, match="moves only with fresh frames"):
+            eyes.await_sight(timeout_s=0.3)
+        with eyes.watched(), pytest.raises(BlindError):
+            eyes.move(lambda: arm.move_linear(before + [0, 5, 0, 0, 0, 0]))
+    np.testing.assert_array_equal(arm.state().pose, before)
+
+
+def test_a_motion_that_is_sent_after_the_stop_is_stopped_too(arm):
+    with Switched() as source:
+        eyes, target = Eyes(arm, source), arm.state().pose + [0, 90, 0, 0, 0, 0]
+        eyes.await_sight(timeout_s=2.0)
+
+        def send():
+            source.off = True
+            time.sleep(0.5)
+            return arm.move_linear(target, wait=False)
+
+        with eyes.watched(), pytest.raises(BlindError, match="no new picture"):
+            eyes.move(send, ends=False)
+        assert not arm.state().moving
+
+
+def test_a_picture_without_noise_may_repeat_at_rest_and_not_in_contact(arm, placed):
+    """As a stream of thresholded pictures gives."""
+    source = Switched()
+    source.notices_still = False
+    source.picture = np.full((48, 64), 200, np.uint8)
+    poses = {}
+
+    def pose_at(time_s):
+        return placed.start_pose(poses["indent_mm"] if time_s == source.same_s[1] else poses["before_mm"])
+
+    with source:
+        eyes = Eyes(arm, source, pose_at, lambda pose: float(placed.touch(pose).indent_mm))
+        while source.same_s is None or eyes._source.blind():
+            time.sleep(0.01)
+        for before_mm, indent_mm, sees in ((-9.0, -3.0, True), (-9.0, 0.5, True), (2.0, 2.0, True), (-9.0, 1.5, False), (1.0, 2.5, False)):
+            poses.update(before_mm=before_mm, indent_mm=indent_mm)
+            assert (eyes.blind() == "") is sees, (before_mm, indent_mm)
+        assert "in contact" in eyes.blind()
+
+
+def test_a_stream_of_thresholded_pictures_is_not_frozen_at_rest():
+    class Thresholded(NoisyCamera):
+        notices_still = False
+
+        def _grab(self):
+            made = super()._grab()
+            return Picture(np.where(np.indices((360, 360)).sum(axis=0) % 24 < 8, 255, 0).astype(np.uint8), made.time_s)
+
+    with (
+        CameraEmulator(Thresholded(fps=60)) as emulator,
+        MjpegCamera(emulator.url, load_sensor("mg400-331"), Form.RECORDING) as camera,
+    ):
+        first = camera.read(timeout_s=2.0)
+        time.sleep(1.0)
+        assert not camera.fault and not camera.blind() and camera.read_latest().time_s > first.time_s + 0.5 and not camera.notes()
+
+
+@pytest.mark.parametrize("blocking", [True, False])
+def test_an_arm_that_stopped_for_want_of_frames_goes_on_with_them(arm, placed, blocking):
+    with Switched(fps=60) as source:
+        servo = load_servo("surface").model_copy(update={"clear_mm": 20.0})
+        loop = ServoLoop(source, TrueEstimator(arm, placed), arm, servo, placed.mounting, LoopSettings(6, blocking=blocking))
+        waits = iter((True,))
+
+        def step(record, frame, estimate):
+            if record.index == 2 and next(waits, False):
+                source.off = True
+                Timer(0.6, lambda: setattr(source, "off", False)).start()
+
+        loop.on_step = step
+        loop.run(placed.start_pose(3.0))
+    assert len(loop.records) == 6 and len(loop.notes) == (not blocking) and all("held still" in note for note in loop.notes)
+
+
+def test_where_the_limits_allow_no_way_back_the_arm_goes_back_the_way_it_came(placed):
+    arm = SimulatedArm(pose=placed.start_pose(-60.0), time_scale=20.0)
+    safe = SafeArm(arm, FREE)
+    with NoisyCamera() as source, safe:
+        servo = load_servo("surface")
+        loop = servo_loop(Rig(source, safe, placed, True), servo, TrueEstimator(arm, placed), LoopSettings(3))
+        loop.way = lambda start, clear: [clear]
+
+        def narrow(record, frame, estimate):
+            safe.retreat = lambda: None
+
+        loop.on_step = narrow
+        loop.run(placed.start_pose(servo.indent_mm))
+        assert placed.touch(arm.state().pose).indent_mm < -40.0
+    assert any("the way it came" in note for note in loop.notes)
+
+
+def test_the_studio_moves_an_arm_only_with_frames_and_back_without(monkeypatch):
+    source = Switched()
+    monkeypatch.setattr("hardware.live_feed.open_camera", lambda *_: source)
+    model = SimpleNamespace(sensor=load_sensor("mg400-331"), form=Form.RAW, check=lambda *_: None)
+    value = np.zeros(1)
+
+    class Model(SimpleNamespace):
+        def seeking_rest(self):
+            return self
+
+        def __call__(self, frame):
+            return TrueEstimate(("pose_2",), value, value, value)
+
+    feed = CameraFeed("any", "simulated", Model(**vars(model)))
+    feed.start(lambda shot: None, lambda why: None)
+    try:
+        robot = feed.robot
+        robot.arm()
+        while source.blind():
+            time.sleep(0.01)
+        robot.nudge(1, 1.0)
+        source.off = True
+        time.sleep(0.4)
+        with pytest.raises(DeviceError, match="fresh frames"):
+            robot.nudge(1, 1.0)
+        robot.nudge(1, -1.0)
+        with pytest.raises(DeviceError, match="fresh frames"):
+            robot.nudge(1, -1.0)
+        np.testing.assert_allclose(robot._arm.state().pose[1], 0.0, atol=1e-6)
+    finally:
+        source.off = False
+        feed.stop()
+
+
+@pytest.mark.parametrize(
+    ("kind", "servo", "refused"), [("mg400", "surface", ""), ("magician", "surface", "--servo magician"), ("magician", "magician", "")]
+)
+def test_the_plan_is_checked_before_anything_moves(kind, servo, refused):
+    spec = load_servo(servo)
+    placed = PlacedObject(load_object("can"), spec.placement, Mounting.of(load_sensor("mg400-331"), load_experiment(spec.experiment)))
+    with bench(kind) as at, NoisyCamera(fps=60) as source, SafeArm(at.arm, load_limits(kind)) as arm:
+        rig, start, before = Rig(source, arm, placed, False), placed.start_pose(spec.indent_mm), at.reads()
+        clear = moved(start, -spec.clear_mm * placed.mounting.axis)
+        check = partial(check_plan, rig, clear, [start], linear_mm_s=spec.linear_mm_s, spent_s=1.0)
+        if refused:
+            with pytest.raises(DeviceError, match=refused):
+                check()
+        else:
+            lines = check()
+            assert [line.split(":")[0] for line in lines] == ["camera", "way", "limits", "time"] and "frames/s" in lines[0]
+        np.testing.assert_array_equal(at.reads(), before)

@@ -13,6 +13,7 @@ from twin.errors import RenderError
 from twin.optics.variant import report
 from twin.report.skin3d import probe_offscreen
 from twin.store import cache_folder
+from twin.types import Readable
 
 # Folder in which the Linux kernel lists its cameras.
 SYSFS_CAMERAS = Path("/sys/class/video4linux")
@@ -49,8 +50,8 @@ def serial_ports() -> list[Device]:
     return [Device(port.device, port.description or "serial port") for port in sorted(list_ports.comports())]
 
 
-@dataclass(frozen=True)
-class Machine:
+@dataclass(frozen=True, repr=False)
+class Machine(Readable):
     """What this machine has.
 
     Attributes

@@ -13,14 +13,14 @@ from twin.frames import evenly_read, open_recording
 from twin.pins import DetectorSpec, Finding, Grade, examine, with_detector
 from twin.progress import Progress, silent, stage
 from twin.store import writes_file
-from twin.types import Form, Frame
+from twin.types import Form, Frame, Readable
 
 LIMIT = 20  # most frames that are used
 MOST_LIVE = 1000  # most frames of a camera that are kept: 6 GB at 1920 x 1080 in colour
 
 
-@dataclass(frozen=True)
-class Examination:
+@dataclass(frozen=True, repr=False)
+class Examination(Readable):
     """The findings, and the irregularities of the recording."""
 
     findings: list[Finding]

@@ -15,6 +15,7 @@ from twin.estimate import SensorModel
 from twin.progress import Progress, silent
 from twin.report.charts import save_figure
 from twin.store import text_file, writes
+from twin.types import Readable
 
 # Measures that are printed, with their headings.
 SHOWN = {
@@ -54,8 +55,8 @@ class ServoStudyPlan:
     plain_light: bool = False
 
 
-@dataclass(frozen=True)
-class ServoStudy:
+@dataclass(frozen=True, repr=False)
+class ServoStudy(Readable):
     """The result of ``study_servo``.
 
     Attributes

@@ -27,15 +27,15 @@ from training.touched import TouchAnswer
 from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.store import writes
-from twin.types import Form
+from twin.types import Form, Readable
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helper labels
 SHEAR_HELPERS = ("move_1", "move_6")  # these moves
 FILES = (CONFIG, "curves.csv", TENSORS, MAPS, SLIP, DISPLACEMENTS, DOMAIN)  # files of a finished run
 
 
-@dataclass(frozen=True)
-class Trained:
+@dataclass(frozen=True, repr=False)
+class Trained(Readable):
     """A training run and its recordings.
 
     Attributes

@@ -18,7 +18,7 @@ from twin.report.plots import Look, contact_panel
 from twin.report.skin3d import displaced_skin, draw_contact_skin, write_surface
 from twin.simulator import Shot, Simulator
 from twin.store import made_by, write_json, write_npz, writes
-from twin.types import ContactState, FloatArray, Form
+from twin.types import ContactState, FloatArray, Form, Readable
 
 FILES = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
 """Files of a contact, in the order in which they are written."""
@@ -34,8 +34,8 @@ class Pose(Protocol):
         """Indentation from the first touch on."""
 
 
-@dataclass(frozen=True)
-class RenderedContact:
+@dataclass(frozen=True, repr=False)
+class RenderedContact(Readable):
     """A simulated and rendered contact, and its files."""
 
     state: ContactState

@@ -1,5 +1,6 @@
 """Frozen types of the data between the stages, with their shapes and units."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol, TypeAlias
@@ -22,6 +23,20 @@ FINE = 20
 # Values of the option --at-rest other than a file with a frame without contact. "first" uses the first frame that is read; "none" measures
 # displacements from the specification's layout.
 FIRST, NONE = "first", "none"
+
+
+class Readable:
+    """A result in words. Its ``repr`` is the first line, its text all lines."""
+
+    def lines(self) -> Iterable[str]:
+        """The result as lines of text."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {next(iter(self.lines()), '')}>"
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
 
 
 class Form(StrEnum):

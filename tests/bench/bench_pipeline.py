@@ -20,7 +20,7 @@ from drawn_frames import drawn_frame, smooth_warp  # noqa: E402
 
 from scenes import load_sensor  # noqa: E402
 from twin.frames import open_recording  # noqa: E402
-from twin.pins import Pipeline, features, nominal_reference  # noqa: E402
+from twin.pins import Pipeline, node_features, nominal_reference  # noqa: E402
 from twin.types import Form  # noqa: E402
 
 FOLDERS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
@@ -77,7 +77,7 @@ def measure(sensor: str, count: int) -> Times:
     theirs: dict[str, list[float]] = {}
     for k, frame in enumerate(frames[:1] * WARM_UP + frames):
         observation, total = timed(pipeline, frame)
-        _, feature_ms = timed(features, observation.graph, pipeline.reference) if observation.valid else (None, 0.0)
+        _, feature_ms = timed(node_features, observation.graph, pipeline.reference) if observation.valid else (None, 0.0)
         nodes, detect_ms = timed(baseline.detect, frame.image)
         _, graph_ms = timed(baseline.graph, nodes)
         if k >= WARM_UP:

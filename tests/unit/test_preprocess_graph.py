@@ -8,7 +8,7 @@ from scipy.spatial import Voronoi
 
 from scenes import load_sensor
 from twin.frames.forms import from_raw, recording_to_raw
-from twin.pins import features, make_graph, nominal_reference
+from twin.pins import make_graph, node_features, nominal_reference
 from twin.pins.legacy import LEGACY, legacy_graph
 from twin.pins.voronoi import directed_edges, triangulate, voronoi
 from twin.types import Form
@@ -102,16 +102,16 @@ def test_relative_features_don_t_know_the_scale(sensor):
     scaled = type(rest)(**{**vars(rest), "pins_px": 2 * rest.pins_px, "spacing_px": 2 * rest.spacing_px, "area_px2": 4 * rest.area_px2})
     moved = rest.pins_px + np.random.default_rng(0).normal(0, 1, rest.pins_px.shape)
     small, large = (make_graph("voronoi", scale * moved, outmost=rest.outmost) for scale in (1, 2))
-    np.testing.assert_allclose(features(small, rest), features(large, scaled), rtol=1e-9, atol=1e-9)
-    assert features(small, rest).shape == (sensor.pins.count, 5)
-    assert features(small, rest, "pixels").shape == (sensor.pins.count, 3)
+    np.testing.assert_allclose(node_features(small, rest), node_features(large, scaled), rtol=1e-9, atol=1e-9)
+    assert node_features(small, rest).shape == (sensor.pins.count, 5)
+    assert node_features(small, rest, "pixels").shape == (sensor.pins.count, 3)
     with pytest.raises(ValueError, match="they are of two sensors; give the reference of the Pipeline"):
-        features(small, nominal_reference(load_sensor("mg400-331" if sensor.pins.count == 127 else "mg400-127"), Form.RAW))
+        node_features(small, nominal_reference(load_sensor("mg400-331" if sensor.pins.count == 127 else "mg400-127"), Form.RAW))
 
 
 def test_at_rest_the_relative_features_say_so(sensor):
     rest = nominal_reference(sensor, Form.RAW)
-    columns = features(make_graph("voronoi", rest.pins_px, outmost=rest.outmost), rest)
+    columns = node_features(make_graph("voronoi", rest.pins_px, outmost=rest.outmost), rest)
     np.testing.assert_allclose(columns[:, 2:4], 0, atol=1e-12)
     np.testing.assert_allclose(columns[:, 4], 1, rtol=1e-12)
 

@@ -24,7 +24,7 @@ from twin.frames.forms import blob_spec, frame_size, from_raw, is_two_level
 from twin.frames.images import write_image
 from twin.frames.videos import is_cut
 from twin.pins import Pipeline, nominal_reference
-from twin.pins.batch import overlay_name, preprocess_recording, summary_lines
+from twin.pins.batch import overlay_name, preprocess_recording
 from twin.records import open_writer
 from twin.rig.labels import read_arm_labels
 from twin.store import write_text
@@ -140,7 +140,7 @@ def test_a_broken_picture_is_listed_and_skipped(tmp_path, spec, pictures, how, w
     assert [f.name for f in recording] == good
     assert [f["image_name"] for f in recording.failed] == [names[which]] and "\n" not in recording.failed[0]["reason"]
 
-    summary = preprocess_recording(tmp_path / "set", spec, tmp_path / "out")
+    summary = preprocess_recording(tmp_path / "set", spec, tmp_path / "out").summary
     arrays = np.load(tmp_path / "out" / "pins.npz", allow_pickle=False)
     assert arrays["image_name"].tolist() == good and summary["frames"] == 2
     assert [f["image_name"] for f in summary["failed"]] == [names[which]]
@@ -276,7 +276,7 @@ def test_a_video_gives_its_frames(video, spec, tmp_path):
     frames = list(recording)
     assert len(frames) == len(recording) == 12 and recording.form == Form.RAW
     assert frames[11].time_s == pytest.approx(11 / 25, abs=0.05)
-    assert preprocess_recording(video, spec, tmp_path / "out")["exact_fraction"] == 1.0
+    assert preprocess_recording(video, spec, tmp_path / "out").summary["exact_fraction"] == 1.0
 
 
 @pytest.mark.parametrize("share", [0.4, 0.55, 0.7, 0.9, 0.98])
@@ -456,7 +456,7 @@ def test_a_video_that_ends_early_gives_what_is_there(video, spec):
 def test_batch_writes_what_it_promises(tmp_path, spec, pictures):
     names = write_set(tmp_path / "set", "frames_bw", "frame_{}_0.png", [*pictures[:3], np.zeros_like(pictures[0])], (7, 3, 5))
     seen = []
-    summary = preprocess_recording(tmp_path / "set", spec, tmp_path / "out", overlay=True, progress=lambda *at: seen.append(at))
+    made = preprocess_recording(tmp_path / "set", spec, tmp_path / "out", overlay=True, progress=lambda *at: seen.append(at))
     arrays = np.load(tmp_path / "out" / "pins.npz", allow_pickle=False)
     n = spec.pins.count
     assert arrays["image_name"].tolist() == names
@@ -465,10 +465,11 @@ def test_batch_writes_what_it_promises(tmp_path, spec, pictures):
     assert arrays["found"].tolist() == [n, n, 0] and arrays["valid"].tolist() == [True, True, False]
     assert (np.isnan(arrays["pins_px"]) ^ np.isnan(arrays["predicted_px"])).all()
     written = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert written == summary and written["frames"] == 3 and written["exact_fraction"] == pytest.approx(2 / 3)
+    assert written == made.summary and written["frames"] == 3 and written["exact_fraction"] == pytest.approx(2 / 3)
     assert written["in_view"] == n
-    assert next(summary_lines(written, n)).startswith(f"3 frames, all {n} pins found in 66.67 %")
-    assert f"all pins in view ({n - 20} of {n};" in next(summary_lines(written | {"in_view": n - 20.0}, n))
+    assert repr(made).startswith(f"<Preprocessed: 3 frames, all {n} pins found in 66.67 %") and "\n" not in repr(made)
+    assert f"all pins in view ({n - 20} of {n};" in str(replace(made, summary=written | {"in_view": n - 20.0}))
+    assert {len(column) for column in made.to_table().values()} == {3}
     assert written["parameters"]["reference"] == "init_0.png" and set(written["ms"]["total"]) == {"p50", "p95", "p99"}
     assert sorted(p.name for p in (tmp_path / "out" / "overlay").iterdir()) == sorted(names)
     assert seen[-1] == (3, 3)
@@ -696,7 +697,7 @@ def test_the_time_of_a_frame_is_without_that_of_compiling(tmp_path, spec, pictur
         return replace(looks[-1], ms=looks[-1].ms | {"total": 9000.0}) if len(looks) == 1 else looks[-1]
 
     monkeypatch.setattr(Pipeline, "__call__", slow_at_first)
-    assert preprocess_recording(tmp_path / "one.png", spec, tmp_path / "out")["ms"]["total"]["p50"] < 9000
+    assert preprocess_recording(tmp_path / "one.png", spec, tmp_path / "out").summary["ms"]["total"]["p50"] < 9000
 
 
 def test_a_name_that_the_locale_cannot_decode_is_drawn_and_written(tmp_path, spec, pictures):

@@ -21,7 +21,7 @@ from twin.frames.forms import frame_size, from_raw, gray_levels
 from twin.geometry.pins import rest_pins
 from twin.optics.preview import Preview
 from twin.optics.render import Renderer
-from twin.pins import Pipeline, features, make_graph, measure_reference, nominal_reference
+from twin.pins import Pipeline, make_graph, measure_reference, node_features, nominal_reference
 from twin.types import BoolArray, FloatArray, Form, Frame, ImageArray, IntArray, PinState
 
 Kind = Literal["oracle", "pins", "graph", "image", "pose"]
@@ -164,7 +164,7 @@ class Eye:
             return np.clip((pins_px - self.reference.pins_px) / self._spacing, -LARGEST, LARGEST).astype(np.float32)
         graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost) for pins in pins_px]
         if self.kind == "graph":
-            seen = np.stack([features(graph, self.reference) for graph in graphs])
+            seen = np.stack([node_features(graph, self.reference) for graph in graphs])
             return np.clip(seen, -LARGEST, LARGEST).astype(np.float32)
         assert self._estimator is not None
         count = len(pins_px)

@@ -15,7 +15,7 @@ from twin.records import KeptAlso
 from twin.rig.contact import friction_between
 from twin.store import output
 from twin.store.resume import MADE_BY
-from twin.types import FINE
+from twin.types import FINE, Readable
 from twin.workers import outcomes, require_scheduler
 
 
@@ -87,8 +87,8 @@ def generate(
         return Summary(count, store.finish(count), before, failed)
 
 
-@dataclass(frozen=True)
-class Simulated:
+@dataclass(frozen=True, repr=False)
+class Simulated(Readable):
     """A data set that was made, and its folder."""
 
     folder: Path

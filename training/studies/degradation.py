@@ -18,7 +18,7 @@ from twin.judge.degradation.report import REPORT_FILES
 from twin.judge.degradation.study import check_pipelines, real_study, rendered_study
 from twin.progress import Progress, silent
 from twin.store import writes
-from twin.types import Form, Frame
+from twin.types import Form, Frame, Readable
 
 # Pipelines that are judged if none are named.
 PIPELINES = ("twin", "legacy")
@@ -60,8 +60,8 @@ class Plan:
     jobs: int = 1
 
 
-@dataclass(frozen=True)
-class Result:
+@dataclass(frozen=True, repr=False)
+class Result(Readable):
     """The severities at which each pipeline and model fails under each condition, and the files, the page first."""
 
     envelopes: list[Envelope]

@@ -21,6 +21,7 @@ from twin.frames import open_recording
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
+from twin.types import Readable
 
 # Choices of the rows to judge.
 ROWS = ("validation", "all")
@@ -79,8 +80,8 @@ def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
     return replace(data, pins=replace(data.pins, reference=other, measured=True), problems=[*data.problems, OTHER_UNIT])
 
 
-@dataclass(frozen=True)
-class Evaluation:
+@dataclass(frozen=True, repr=False)
+class Evaluation(Readable):
     """Evaluation of a model.
 
     Attributes

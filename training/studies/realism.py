@@ -14,12 +14,13 @@ from twin.judge.pictures.realism import run_realism
 from twin.optics.render import Quality
 from twin.progress import Progress, Step, silent
 from twin.store import writes
+from twin.types import Readable
 
 IMAGES = ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip", "psnr_whole_db")
 
 
-@dataclass(frozen=True)
-class Realism:
+@dataclass(frozen=True, repr=False)
+class Realism(Readable):
     """The result: all figures, as ``metrics.json`` holds them, and the files, the page first."""
 
     metrics: dict[str, Any]

@@ -30,7 +30,7 @@ from twin.objects import build_field
 from twin.objects.analytic import Solid
 from twin.progress import Progress, silent, stage
 from twin.store import Layers, writes_file
-from twin.types import FloatArray, Form
+from twin.types import FloatArray, Form, Readable
 
 FAMILY = "mg400-331"
 """Sensor of the shipped surrogate whose networks are the start of the training for every other sensor."""
@@ -86,8 +86,8 @@ BINS = {"depth_mm": (0.0, 1.5, 3.0, 6.0), "shear_mm": (0.0, 0.5, 1.5, 20.0)}
 """Ends of the ranges in which errors are reported. The shear is the largest sideways motion of a cap."""
 
 
-@dataclass(frozen=True)
-class Distilled:
+@dataclass(frozen=True, repr=False)
+class Distilled(Readable):
     """A fitted surrogate with its errors on paths that it was not trained on, and the files that were written."""
 
     surrogate: Surrogate

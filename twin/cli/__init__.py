@@ -17,6 +17,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
+from twin.cli.command import App
 from twin.errors import OptionError, StoreError, TwinError
 
 # Modules of commands, in the order in which 'twin --help' lists them, each with the title above its commands.
@@ -81,7 +82,7 @@ class FewCommands(TyperGroup):
         return super().resolve_command(ctx, args)
 
 
-app = typer.Typer(name="twin", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = App(name="twin", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
 def _tell_version(asked: bool) -> None:

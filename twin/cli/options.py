@@ -2,10 +2,10 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -165,24 +165,13 @@ def one_recording(folders: list[Path], table: Path | None, no_contact: Path | No
     return [frames_at(folder, table, no_contact) for folder in folders]
 
 
-class Result(Protocol):
-    """The result of a function that does a command's work."""
-
-    @property
-    def written(self) -> Sequence[Path]:
-        """The files that were written."""
-
-    def lines(self) -> Iterable[str]:
-        """The result as lines of text."""
-
-
 def say(lines: Iterable[str]) -> None:
     """Print each line as soon as it is known."""
     for line in lines:
         print(line, flush=True)
 
 
-def tell(result: Result) -> None:
-    """Print a result and the files that were written."""
+def tell(result: Any) -> None:
+    """Print the ``lines()`` of a result, and the files that it names as ``written``, if it does."""
     say(result.lines())
-    say(f"wrote {path}" for path in result.written)
+    say(f"wrote {path}" for path in getattr(result, "written", ()))

@@ -1,12 +1,16 @@
 """The command ``twin convert``: records in the formats of other tools."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from twin.cli import app
-from twin.cli.options import AlsoFormat, Force, Out, if_given, tell
+from twin.cli.options import AlsoFormat, Out, if_given
+from twin.progress import Progress
+
+if TYPE_CHECKING:
+    from twin.records import Converted
 
 HELP_CONVERT = """Translate records to other tools' formats, and back.
 
@@ -55,13 +59,10 @@ def convert_command(
     ] = None,
     task: Annotated[str, typer.Option("--task", metavar="TEXT", help="what the episodes do; by default what each source says")] = "",
     video: Annotated[bool, typer.Option("--video", help="with lerobot: pictures as video, which loses detail")] = False,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Converted":
     from scenes import load_sensor
-    from twin.cli.progress import shown
     from twin.records import convert
-    from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
-        done = convert(sources, out, to, sensor=if_given(load_sensor, sensor), task=task, video=video, progress=progress)
-    tell(done)
+    return convert(sources, out, to, sensor=if_given(load_sensor, sensor), task=task, video=video, progress=progress)

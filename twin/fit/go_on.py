@@ -17,7 +17,7 @@ from twin.fit.optics import OpticsCalibration, calibrate_optics
 from twin.frames import frames_at, open_recording
 from twin.frames.tables import numbers
 from twin.progress import Progress, silent
-from twin.types import FINE, Form
+from twin.types import FINE, Form, Readable
 
 ALIKE = 0.6
 """Least share of varying labels that a table and an experiment have in common, of the labels that vary in either of them."""
@@ -25,8 +25,8 @@ VARIES = 1e-6
 """Least change, mm or deg, of a label that counts as varying."""
 
 
-@dataclass(frozen=True)
-class WholeSensor:
+@dataclass(frozen=True, repr=False)
+class WholeSensor(Readable):
     """A specification made from frames, and what was fitted to it afterwards.
 
     Attributes

@@ -38,7 +38,7 @@ from twin.progress import Bar, Progress, Step, silent, stage
 from twin.report.page import Page, Picture, code
 from twin.report.table import Column
 from twin.store import KEPT, Item, inputs_digest, kept_arrays, kept_json, output, writes_file
-from twin.types import Form, Frame
+from twin.types import Form, Frame, Readable
 
 FRAMES = 6
 """Number of frames that are fitted, spread evenly over the folder."""
@@ -113,8 +113,8 @@ class Calibration:
         ]
 
 
-@dataclass(frozen=True)
-class OpticsCalibration:
+@dataclass(frozen=True, repr=False)
+class OpticsCalibration(Readable):
     """A fitted specification and its files, the ``.toml`` file first."""
 
     found: Calibration

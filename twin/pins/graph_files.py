@@ -20,7 +20,7 @@ from twin.pins.reference import Reference, nominal_reference, spread_out
 from twin.report.charts import new_figure, save_figure
 from twin.report.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes
 from twin.store import write_npz, writes
-from twin.types import Form, PinGraph
+from twin.types import Form, PinGraph, Readable
 
 PINS = ".npz"
 """Suffix of a file of found pins."""
@@ -32,8 +32,8 @@ PICTURE_DPI = 120
 """Resolution of a graph's picture, dots per inch."""
 
 
-@dataclass(frozen=True)
-class Graphs:
+@dataclass(frozen=True, repr=False)
+class Graphs(Readable):
     """Graphs of many frames and the files they were written to.
 
     Attributes

@@ -23,7 +23,7 @@ from twin.records.recording import RecordingWriter, recording_records
 from twin.records.ros2 import Ros2Writer, ros2_records
 from twin.records.session import is_session, session_records
 from twin.store import writes
-from twin.types import Frame
+from twin.types import Frame, Readable
 
 READERS: dict[str, Callable[[Path], Records]] = {
     RecordingWriter.FORMAT: recording_records,
@@ -151,8 +151,8 @@ def open_writer(folder: Path, to: str, about: About, rate_hz: int, *, video: boo
     return pictures(folder, about, rate_hz, held_steps=0 if at_once else HELD_STEPS)
 
 
-@dataclass(frozen=True)
-class Converted:
+@dataclass(frozen=True, repr=False)
+class Converted(Readable):
     """The result of ``convert``.
 
     Attributes

@@ -23,10 +23,11 @@ from training.studies.sim_to_real.twins import contact_of
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
+from twin.types import Readable
 
 
-@dataclass(frozen=True)
-class Result:
+@dataclass(frozen=True, repr=False)
+class Result(Readable):
     """The result of the study.
 
     Attributes

@@ -18,7 +18,7 @@ from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
-from twin.types import Form
+from twin.types import Form, Readable
 
 MODELS = ("gnn", "tac-vgnn", "vgnn", "cnn-v2", "cnn-v1")
 # Batch sizes of the efficiency figure.
@@ -96,8 +96,8 @@ class Plan:
         ]
 
 
-@dataclass(frozen=True)
-class Result:
+@dataclass(frozen=True, repr=False)
+class Result(Readable):
     """The result of the comparison.
 
     Attributes

@@ -1,0 +1,56 @@
+"""What authors of new parts need: protocols and base classes of arms, cameras, models, tasks, degradations and detectors.
+
+arms          Arm ArmState BaseArm FEEDBACK_AGE_S load_limits
+cameras       FrameSource LiveSource Picture ReadFailed capture
+devices       DeviceError Connection
+models        Estimate SensorModel Model PinModel Recipe register_model refuse_sizes
+tasks         Task
+degradations  Condition View over_channels
+detectors     Detector DetectorSpec
+mechanics     SkinSolver
+optics        Preview project rest_pins
+
+The pages below `docs/how-to` show how to add each of them. Each name is imported when it is first used.
+"""
+
+from typing import Any
+
+from twin.lazy import named
+
+_PLACES = {
+    "Arm": "hardware.arms.arm",
+    "ArmState": "hardware.arms.arm",
+    "BaseArm": "hardware.arms.arm",
+    "Condition": "twin.judge.degradation.condition",
+    "Connection": "hardware.errors",
+    "Detector": "twin.pins.detector",
+    "DetectorSpec": "twin.pins.detector_spec",
+    "DeviceError": "hardware.errors",
+    "Estimate": "twin.estimate",
+    "FEEDBACK_AGE_S": "hardware.arms.arm",
+    "FrameSource": "hardware.cameras.source",
+    "LiveSource": "hardware.cameras.reader",
+    "Model": "training.models.part",
+    "Picture": "hardware.cameras.reader",
+    "PinModel": "training.models.part",
+    "Preview": "twin.optics.preview",
+    "ReadFailed": "hardware.cameras.reader",
+    "Recipe": "training.recipes",
+    "SensorModel": "twin.estimate",
+    "SkinSolver": "twin.mechanics",
+    "Task": "training.environments.tasks",
+    "View": "twin.judge.degradation.condition",
+    "capture": "hardware.cameras.reader",
+    "load_limits": "hardware.safety",
+    "over_channels": "twin.judge.degradation.condition",
+    "project": "twin.camera.projection",
+    "refuse_sizes": "training.models.part",
+    "register_model": "training.models:register",
+    "rest_pins": "twin.geometry.pins",
+}
+"""By public name: its module, and its name there if that is another."""
+__all__ = sorted(_PLACES)
+
+
+def __getattr__(name: str) -> Any:
+    return named(_PLACES, "twin.extend", name)

@@ -169,7 +169,7 @@ def build_rig(
         For callers that wait for a frame at each stop. A simulated arm in front of the twin's camera then moves instantly, and the twin
         draws a frame only while a reader waits for it.
     """
-    form = form or (Form.RECORDING if sensor.recording else Form.RAW)
+    form = form or (Form.PROCESSED if sensor.recording else Form.RAW)
     placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
     device: Arm = open_arm(arm)
     simulated = isinstance(device, SimulatedArm)

@@ -43,7 +43,7 @@ def open_camera(
     DeviceError, FrameError
         There is no such camera, recording or file.
     """
-    live_form = form or (Form.RECORDING if spec is not None and spec.recording is not None else Form.RAW)
+    live_form = form or (Form.PROCESSED if spec is not None and spec.recording is not None else Form.RAW)
     if spec is not None:
         frame_size(spec, live_form)
     if text == "twin":

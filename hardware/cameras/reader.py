@@ -307,9 +307,9 @@ def capture(image: np.ndarray, spec: SensorSpec | None, form: Form) -> np.ndarra
         return image
     size = (spec.camera.width_px, spec.camera.height_px)
     if image.shape[1::-1] != size:
-        if form == Form.RECORDING and image.shape[1::-1] == frame_size(spec, form):
+        if form == Form.PROCESSED and image.shape[1::-1] == frame_size(spec, form):
             return gray_levels(image)  # thresholded by the sender
         raise DeviceError(f"delivers {image.shape[1]}x{image.shape[0]}, {spec.name} has {size[0]}x{size[1]}; give the matching sensor")
     if spec.camera.channels == "mono":
         image = gray_levels(image)
-    return record(image, spec.recording) if form == Form.RECORDING and spec.recording is not None else image
+    return record(image, spec.recording) if form == Form.PROCESSED and spec.recording is not None else image

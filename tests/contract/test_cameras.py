@@ -74,7 +74,7 @@ def twin_camera(**options) -> tuple[SimulatedArm, TwinCamera]:
     arm = SimulatedArm(axes=6, pose=placed.start_pose(0.5), time_scale=20.0)
     arm.connect()
     arm.enable()
-    return arm, TwinCamera(sensor, placed, arm.state, Form.RECORDING, **options)
+    return arm, TwinCamera(sensor, placed, arm.state, Form.PROCESSED, **options)
 
 
 @pytest.fixture(scope="module")

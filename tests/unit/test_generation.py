@@ -226,11 +226,11 @@ def _recording(folder, config):
 def test_pins_alone_are_read_like_frames_and_split_by_contact(made):
     folder, config, summary = made
     data = load_dataset(folder, load_sensor("mg400-127"), "surface-2d-shear")
-    assert len(data) == summary.frames and data.pins.form == Form.RECORDING
+    assert len(data) == summary.frames and data.pins.form == Form.PROCESSED
     truth = zarr.open_group(folder / "truth.zarr", mode="r")
     moved = data.pins.nodes_px - data.pins.reference.pins_px
     assert np.abs(moved - (truth["pins_px"][:] - truth["rest_px"][:])).max() < SAME_PX, "displacements, from each sensor's own rest"
-    assert np.allclose(data.pins.reference.pins_px, nominal_reference(config.sensor, Form.RECORDING).pins_px)
+    assert np.allclose(data.pins.reference.pins_px, nominal_reference(config.sensor, Form.PROCESSED).pins_px)
     assert np.isfinite(data.pins.area_px2).all() and np.array_equal(data.pins.lost, ~truth["visible"][:])
     slope = np.tan(np.radians(rig_of(config.sensor).plate_tilt_deg))
     flat = corrected(data.targets.names, data.targets.raw, data.targets.executed, data.targets.move, slope, truth["pose"][:, 0])
@@ -359,7 +359,7 @@ def test_pictures_are_those_of_the_states(tmp_path):
         pytest.skip(str(error))
     data = load_dataset(tmp_path / "set", config.sensor)
     truth = zarr.open_group(tmp_path / "set" / "truth.zarr", mode="r")
-    assert len(data) == 1 and data.pins.form == Form.RECORDING and not data.problems
+    assert len(data) == 1 and data.pins.form == Form.PROCESSED and not data.problems
     assert np.median(np.linalg.norm(data.pins.nodes_px - truth["caps_px"][:], axis=2)) < 0.5
     moved = with_missing(data, arm_labels(data), SimpleNamespace(draw_px=lambda labels, moved_px, contact, seed: -moved_px), 0)
     assert moved.pins.nodes_px == pytest.approx(np.tile(data.pins.reference.pins_px, (1, 1, 1))), "pictures' pins, what is missing added"
@@ -393,7 +393,7 @@ def test_a_scheduler_that_does_not_answer_leaves_nothing_behind(tmp_path):
 
 def test_pins_of_a_data_set_are_given_in_either_form(made):
     folder, config, _ = made
-    recorded, raw = (open_simulated(folder, config.sensor, form)[1] for form in (Form.RECORDING, Form.RAW))
+    recorded, raw = (open_simulated(folder, config.sensor, form)[1] for form in (Form.PROCESSED, Form.RAW))
     for key in ("pins_px", "rest_px"):
         np.testing.assert_allclose(raw_to_recording(config.sensor.recording, raw[key]), recorded[key], atol=SAME_PX)
     assert load_dataset(folder, config.sensor, form=Form.RAW).pins.form == Form.RAW

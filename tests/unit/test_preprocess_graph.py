@@ -98,7 +98,7 @@ def test_node_order_only_permutes_the_graph():
 def test_relative_features_don_t_know_the_scale(sensor):
     if sensor.recording is None:
         pytest.skip("has one form only")
-    rest = nominal_reference(sensor, Form.RECORDING)
+    rest = nominal_reference(sensor, Form.PROCESSED)
     scaled = type(rest)(**{**vars(rest), "pins_px": 2 * rest.pins_px, "spacing_px": 2 * rest.spacing_px, "area_px2": 4 * rest.area_px2})
     moved = rest.pins_px + np.random.default_rng(0).normal(0, 1, rest.pins_px.shape)
     small, large = (make_graph("voronoi", scale * moved, outmost=rest.outmost) for scale in (1, 2))
@@ -119,7 +119,7 @@ def test_at_rest_the_relative_features_say_so(sensor):
 def test_published_edge_counts(sensor):
     if sensor.recording is None:
         pytest.skip("the published method takes recordings")
-    rest = nominal_reference(sensor, Form.RECORDING).pins_px
+    rest = nominal_reference(sensor, Form.PROCESSED).pins_px
     size = LEGACY[sensor.pins.layout].size_px
     nodes = rest * size / sensor.recording.width_px
     graph = legacy_graph(nodes - np.median(nodes), LEGACY[sensor.pins.layout])
@@ -131,9 +131,9 @@ def test_forms_are_inverse(sensor):
     if sensor.recording is None:
         pytest.skip("has one form only")
     raw = np.random.default_rng(0).uniform(0, 400, (50, 2))
-    np.testing.assert_allclose(recording_to_raw(sensor.recording, from_raw(sensor.recording, Form.RECORDING, raw)), raw, atol=1e-9)
+    np.testing.assert_allclose(recording_to_raw(sensor.recording, from_raw(sensor.recording, Form.PROCESSED, raw)), raw, atol=1e-9)
     x0, y0, x1, y1 = sensor.recording.crop_px
-    corners = from_raw(sensor.recording, Form.RECORDING, np.array([[x0 - 0.5, y0 - 0.5], [x1 - 0.5, y1 - 0.5]]))
+    corners = from_raw(sensor.recording, Form.PROCESSED, np.array([[x0 - 0.5, y0 - 0.5], [x1 - 0.5, y1 - 0.5]]))
     np.testing.assert_allclose(corners, [[-0.5, -0.5], [sensor.recording.width_px - 0.5, sensor.recording.height_px - 0.5]], atol=1e-9)
 
 

@@ -40,8 +40,8 @@ def spec():
 def pictures(spec):
     """The rest picture and three in contact."""
     rng = np.random.default_rng(0)
-    rest = nominal_reference(spec, Form.RECORDING).pins_px
-    return [drawn_frame(spec, Form.RECORDING, smooth_warp(rest, amplitude, rng)).image for amplitude in (0.0, 4.0, 6.0, 8.0)]
+    rest = nominal_reference(spec, Form.PROCESSED).pins_px
+    return [drawn_frame(spec, Form.PROCESSED, smooth_warp(rest, amplitude, rng)).image for amplitude in (0.0, 4.0, 6.0, 8.0)]
 
 
 def write_set(root, folder, pattern, pictures, numbers, column="image_name", init=True):
@@ -71,7 +71,7 @@ def test_folder_formats_in_the_order_of_their_table(tmp_path, spec, pictures, fo
     frames = list(recording)
     assert [f.name for f in frames] == recording.names == names
     assert [f.sequence for f in frames] == [0, 1, 2]
-    assert all(f.form == Form.RECORDING for f in frames)
+    assert all(f.form == Form.PROCESSED for f in frames)
     assert recording.reference.name == "init_0.png"
     np.testing.assert_array_equal(recording.labels["pose_2"], [0.0, 0.5, 1.0])
     np.testing.assert_array_equal(frames[1].image, pictures[2])
@@ -166,8 +166,8 @@ def test_form_is_told_by_size_and_can_be_given(tmp_path, spec):
 
 def test_a_form_may_be_given_by_its_name_and_an_unknown_one_names_the_known(tmp_path, spec):
     raw = drawn_frame(spec, Form.RAW, nominal_reference(spec, Form.RAW).pins_px)
-    assert Pipeline(spec, "raw").form is Form.RAW and frame_size(spec, "recording") == frame_size(spec, Form.RECORDING)
-    assert np.array_equal(capture(raw.image, spec, "recording"), capture(raw.image, spec, Form.RECORDING))
+    assert Pipeline(spec, "raw").form is Form.RAW and frame_size(spec, "recording") == frame_size(spec, Form.PROCESSED)
+    assert np.array_equal(capture(raw.image, spec, "recording"), capture(raw.image, spec, Form.PROCESSED))
     write_image(tmp_path / "raw.png", raw.image)
     for unknown in (
         lambda: Pipeline(spec, "foo"),
@@ -205,14 +205,14 @@ def test_a_model_refuses_an_unknown_form_as_it_refuses_the_other_one():
 def test_thresholded_frames_that_were_resized_are_still_such(scale):
     """Small caps are edges for the most part then; as raw frames they would be called saturated."""
     spec = load_sensor("mg400-331")
-    for form in (Form.RECORDING, Form.RAW):
+    for form in (Form.PROCESSED, Form.RAW):
         image = drawn_frame(spec, form, nominal_reference(spec, form).pins_px).image
         resized = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
-        assert is_two_level(resized) == (form == Form.RECORDING)
+        assert is_two_level(resized) == (form == Form.PROCESSED)
 
 
 def test_a_few_gray_pixels_make_no_thresholded_frame_a_gray_picture(spec):
-    image = drawn_frame(spec, Form.RECORDING, nominal_reference(spec, Form.RECORDING).pins_px).image.copy()
+    image = drawn_frame(spec, Form.PROCESSED, nominal_reference(spec, Form.PROCESSED).pins_px).image.copy()
     assert is_two_level(image) and is_two_level(image[..., None])
     image[0, 0] = 128
     assert is_two_level(image) and is_two_level(image[..., None])
@@ -490,12 +490,12 @@ def write_pictures(folder, images):
         assert cv2.imwrite(str(folder / name), image)
 
 
-@pytest.mark.parametrize("given", [None, Form.RECORDING])
+@pytest.mark.parametrize("given", [None, Form.PROCESSED])
 def test_most_frames_decide_on_the_form(tmp_path, spec, pictures, given):
     raw = np.zeros((480, 640), np.uint8)
     write_pictures(tmp_path, {"a.png": raw, **{f"b{k}.png": pictures[1] for k in range(4)}})
     recording = open_recording(tmp_path, spec, given)
-    assert recording.form == Form.RECORDING and recording.size_px == (256, 256)
+    assert recording.form == Form.PROCESSED and recording.size_px == (256, 256)
     assert len(list(recording)) == 4 and [f["image_name"] for f in recording.failed] == ["a.png"]
 
 
@@ -503,7 +503,7 @@ def test_the_first_frame_decides_between_equal_numbers(tmp_path, spec, pictures)
     raw = np.zeros((480, 640), np.uint8)
     write_pictures(tmp_path, {"a.png": raw, "b.png": pictures[1]})
     assert open_recording(tmp_path, spec).form == Form.RAW
-    assert open_recording(tmp_path, spec, Form.RECORDING).size_px == (256, 256)
+    assert open_recording(tmp_path, spec, Form.PROCESSED).size_px == (256, 256)
 
 
 def test_a_form_that_no_frame_has_is_an_error(tmp_path, spec, pictures):
@@ -647,7 +647,7 @@ def test_sixteen_bit_files_of_any_depth_keep_their_levels(tmp_path, spec, pictur
     bright = np.round(pictures[1] * (top / 255)).astype(np.uint16)
     bright[0, 0] = top
     write_pictures(tmp_path, {"a.png": bright // 20, "b.png": bright})
-    recording = open_recording(tmp_path, spec, Form.RECORDING)
+    recording = open_recording(tmp_path, spec, Form.PROCESSED)
     dim, image = (frame.image for frame in recording)
     assert np.abs(image[1:].astype(int) - pictures[1][1:]).max() <= 1
     assert np.abs(dim[1:] - pictures[1][1:] / 20).max() <= 2

@@ -74,8 +74,8 @@ def test_a_viewer_that_goes_is_an_error_at_the_end(monkeypatch):
 def test_frame_pins_and_pose_are_in_the_file(tmp_path):
     pytest.importorskip("rerun", reason="rerun-sdk is optional")
     sensor = load_sensor("mg400-331")
-    pipeline = Pipeline(sensor, Form.RECORDING)
-    frame = replace(drawn_frame(sensor, Form.RECORDING, pipeline.reference.pins_px), time_s=1.0, sequence=7)
+    pipeline = Pipeline(sensor, Form.PROCESSED)
+    frame = replace(drawn_frame(sensor, Form.PROCESSED, pipeline.reference.pins_px), time_s=1.0, sequence=7)
     seen = pipeline(frame)
     assert seen.valid
     value = np.array([1.0, 2.0])

@@ -291,7 +291,7 @@ def test_pins_and_force_are_near_those_of_the_finite_elements(surrogate, sensor,
     true.begin(0, contact)
 
     def px(made):
-        return from_raw(sensor.recording, Form.RECORDING, project(sensor.view, made.felt.caps_mm[0]))
+        return from_raw(sensor.recording, Form.PROCESSED, project(sensor.view, made.felt.caps_mm[0]))
 
     slips = []
     for number, T in enumerate(way):

@@ -99,7 +99,7 @@ def test_the_next_steps_name_the_files_and_colour_frames_that_were_thresholded_g
     folder = folder_of(tmp_path, [cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) for image in images])
     (folder / "targets.csv").write_text("image_name,pose_2\n" + "".join(f"frame_{k}.png,{-k}\n" for k in range(4)))
     out = tmp_path / "sub" / "mine.toml"
-    found = new_sensor(folder, out, form=Form.RECORDING)
+    found = new_sensor(folder, out, form=Form.PROCESSED)
     (contact,) = [step for step in found.next_steps if "calibrate contact" in step]
     assert contact.endswith(f"twin calibrate contact --sensor {out} --frames {folder} --out {tmp_path / 'sub' / 'mine-2.toml'}")
     assert not [step for step in found.next_steps if "calibrate optics" in step]
@@ -379,7 +379,7 @@ def test_without_a_no_contact_frame_shipped_weights_count_from_their_units_pins(
     """The frames show contacts of a unit whose pins stand a little beside the specification's, as the weights know."""
     model = PoseEstimator.load(name)
     known = np.array(model.recorded_sensor.pipeline.recording.rest_px)
-    image = drawn_frame(model.sensor, Form.RECORDING, known).image
+    image = drawn_frame(model.sensor, Form.PROCESSED, known).image
     cv2.imwrite(str(tmp_path / "f_0.png"), image)
     predictions = predict_frames(name, tmp_path)
     assert np.allclose(predictions.estimator.pipeline.reference.pins_px, known)
@@ -395,8 +395,8 @@ def test_a_single_picture_is_counted_from_the_frame_without_contact_of_its_folde
     rest = np.array(model.recorded_sensor.pipeline.recording.rest_px) + [1.0, -2.0]  # this unit's camera looks a little elsewhere
     folder = tmp_path / "frames_bw" if inside else tmp_path
     folder.mkdir(exist_ok=True)
-    cv2.imwrite(str(tmp_path / "init_0.png"), drawn_frame(model.sensor, Form.RECORDING, rest).image)
-    cv2.imwrite(str(folder / "f_0.png"), drawn_frame(model.sensor, Form.RECORDING, smooth_warp(rest, 3.0, np.random.default_rng(0))).image)
+    cv2.imwrite(str(tmp_path / "init_0.png"), drawn_frame(model.sensor, Form.PROCESSED, rest).image)
+    cv2.imwrite(str(folder / "f_0.png"), drawn_frame(model.sensor, Form.PROCESSED, smooth_warp(rest, 3.0, np.random.default_rng(0))).image)
     alone, of_folder = predict_frames("mg400-127", folder / "f_0.png"), predict_frames("mg400-127", tmp_path)
     assert "pins are counted from init_0.png, which lies beside the picture" in alone.recording.problems
     ((_, one),), ((_, other),) = list(alone), list(of_folder)

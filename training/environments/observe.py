@@ -107,7 +107,7 @@ class Eye:
                 raise OptionError(
                     f"observation 'pose': the weights of {sensor.name} learnt from the light on the caps as well; give pictures='preview'"
                 )
-        self.form = self._estimator.form if self._estimator else Form.RECORDING if sensor.recording else Form.RAW
+        self.form = self._estimator.form if self._estimator else Form.PROCESSED if sensor.recording else Form.RAW
         self.reference = nominal_reference(sensor, self.form)
         self._spacing = float(self.reference.spacing_px.mean())
         self._nominal = View(sensor, self.form, pictures)
@@ -211,7 +211,7 @@ def caps_px(sensor: SensorSpec, form: Form, caps_mm: FloatArray) -> FloatArray:
 
 def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[PinState, np.random.Generator], Frame]:
     """Function that makes a frame of one environment's state."""
-    recording = sensor.recording if form == Form.RECORDING else None
+    recording = sensor.recording if form == Form.PROCESSED else None
     window_px = recording.crop_px if recording else None
     preview = Preview(sensor, window_px=window_px)
     renderer = Renderer(sensor, quality="preview", window_px=window_px) if pictures == "traced" else None

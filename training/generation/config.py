@@ -63,8 +63,8 @@ class GenerationConfig(Section):
     def form(self) -> Form:
         """Form of frame in whose pixels the pins are given. Without pictures it is the recordings' form if the sensor has one, else raw."""
         if self.images == "none":
-            return Form.RECORDING if self.sensor.recording else Form.RAW
-        return Form.RECORDING if self.images == "recording" else Form.RAW
+            return Form.PROCESSED if self.sensor.recording else Form.RAW
+        return Form.PROCESSED if self.images == "recording" else Form.RAW
 
     @property
     def image_folder(self) -> str:

@@ -109,7 +109,7 @@ def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
 
 
 def _estimates(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Estimates:
-    if frame.form == Form.RAW and estimator.form == Form.RECORDING and recording is not None:
-        frame = replace(frame, image=record(frame.image, recording), form=Form.RECORDING)
+    if frame.form == Form.RAW and estimator.form == Form.PROCESSED and recording is not None:
+        frame = replace(frame, image=record(frame.image, recording), form=Form.PROCESSED)
     found = estimator(frame)
     return found.value, found.units, found.valid

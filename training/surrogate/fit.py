@@ -408,7 +408,7 @@ def _bending(turned: Sequence[_Truths], answer: FloatArray, read: FloatArray, st
 
 def judge(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]) -> dict[str, Any]:
     """Errors on solved paths: pins in px of the sensor's frames, force, sliding share; for all states and by kind of contact."""
-    lattice, form = lattice_sensor(sensor), Form.RECORDING if sensor.recording else Form.RAW
+    lattice, form = lattice_sensor(sensor), Form.PROCESSED if sensor.recording else Form.RAW
     onto, cap_mm = _interpolation(sensor), sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
     rest, lattice_rest = rest_pins(sensor.geometry), rest_pins(lattice.geometry)
 

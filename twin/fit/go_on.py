@@ -101,7 +101,7 @@ def whole_sensor(
         As ``new_sensor``, ``calibrate_optics`` and ``calibrate_to_file``; or the labels of no experiment vary like the table's.
     """
     at = frames_at(frames, labels or table, no_contact)
-    if optics and open_recording(at, form=form).form == Form.RECORDING:
+    if optics and open_recording(at, form=form).form == Form.PROCESSED:
         raise OptionError(f"{frames}: thresholded frames tell nothing of light and colours; leave out --optics, or give raw camera frames")
     if labels is not None and experiment is None:
         experiment = experiment_like(open_recording(at, form=form).labels)

@@ -321,7 +321,7 @@ def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str, p
         mask_center_px=(x, y),
         mask_radius_px=1.1 * radius,
     )
-    thresholded = frame.form == Form.RECORDING
+    thresholded = frame.form == Form.PROCESSED
     return SensorSpec(
         name=name,
         description=f"Made by 'twin new' from frames of {source}",
@@ -583,7 +583,7 @@ def _size(sensor: SensorSpec, *, given: bool) -> str:
 def sensor_blob(sensor: SensorSpec, tuned: Tuned) -> BlobSpec:
     """The pin detection's settings for the form of frames on which they were tuned."""
     form = tuned.detector.form
-    return sensor.pipeline.recording if form == Form.RECORDING and sensor.pipeline.recording else sensor.pipeline.raw
+    return sensor.pipeline.recording if form == Form.PROCESSED and sensor.pipeline.recording else sensor.pipeline.raw
 
 
 def _comment(source: str, found: Identified, rest: Rest) -> str:

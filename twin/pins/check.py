@@ -126,7 +126,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
         *_twin(spec, form, nominal),
     ]
     return (
-        findings if form == Form.RECORDING else [*_light(frames, seen, spec.pipeline.usual_caps or drawn_caps(spec), pipeline), *findings]
+        findings if form == Form.PROCESSED else [*_light(frames, seen, spec.pipeline.usual_caps or drawn_caps(spec), pipeline), *findings]
     )
 
 

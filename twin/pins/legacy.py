@@ -177,7 +177,7 @@ class LegacyPipeline:
 
     def __call__(self, frame: Frame) -> LegacyObservation:
         """Observe a recorded frame."""
-        if frame.form != Form.RECORDING or frame.image.shape[1::-1] != self.size_px:
+        if frame.form != Form.PROCESSED or frame.image.shape[1::-1] != self.size_px:
             raise FrameError(f"{frame.name or 'frame'}: the published method takes recordings of {self.size_px[0]}x{self.size_px[1]} only")
         n, size = self.count, self.parameters.size_px
         started = perf_counter()

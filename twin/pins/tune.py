@@ -153,7 +153,7 @@ def tune(
     area, contrast = (float(np.nanmedian(values)) for values in zip(*caps, strict=True))
     start = _start(size_px, reference, layout, area, method, form, sensor.pins.layout, polarity)
     sensor = with_detector(sensor, start)
-    tried, judged = list(_settings(start, reference, contrast, form == Form.RECORDING)), frames
+    tried, judged = list(_settings(start, reference, contrast, form == Form.PROCESSED)), frames
     if method in SLOW:
         judged = frames[:: max(len(frames) // SLOW_TUNED_ON, 1)][:SLOW_TUNED_ON]
     rates = [_rate(make_detector(sensor, detector, second_look=False), judged[::GLANCE]) for detector in tried]

@@ -77,7 +77,7 @@ def given_frame(at_rest: str, model: SensorModel) -> Frame | None:
     if at_rest in (FIRST, NONE):
         return None
     if not Path(at_rest).exists():
-        raise FrameError(f"--at-rest {at_rest}: no such file; expected a frame without contact, '{FIRST}' or '{NONE}'")
+        raise FrameError(f"`at_rest` {at_rest}: no such file; expected a frame without contact, '{FIRST}' or '{NONE}'")
     recording = open_recording(at_rest, model.sensor, model.form)
     return recording.reference if recording.reference is not None else recording.read(0)
 
@@ -203,7 +203,7 @@ def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
     try:
         preview.shading = traced_shading(preview)
     except RenderError as error:
-        raise RenderError(f"{error}; or draw with --plain-light, which needs no path tracing") from error
+        raise RenderError(f"{error}; or draw with `plain_light`, which needs no path tracing") from error
     return preview
 
 

@@ -54,7 +54,7 @@ def open_simulated(folder: Path, spec: SensorSpec, form: Form | None = None) -> 
     """
     truth, sensor, given = open_truth(folder)
     if sensor != spec.name:
-        raise FrameError(f"{folder}: simulated for '{sensor}', not for '{spec.name}'; give the matching --sensor")
+        raise FrameError(f"{folder}: simulated for '{sensor}', not for '{spec.name}'; give the matching `sensor`")
     problems: list[str] = []
     table = read_table(folder / TABLE, problems) if (folder / TABLE).is_file() else None
     if table is None:

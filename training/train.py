@@ -131,7 +131,7 @@ def train_model(
         The recordings have no such labels, or can't be joined.
     """
     if labels not in ("corrected", "raw"):
-        raise OptionError(f"--labels must be corrected or raw, got {labels!r}")
+        raise OptionError(f"`labels` must be corrected or raw, got {labels!r}")
     recipe = recipe_of(model, epochs=epochs, batch=batch, members=members, kernel=kernel)
     if threads:
         torch.set_num_threads(threads)
@@ -244,5 +244,5 @@ def columns_of(target: str) -> str | tuple[str, ...]:
     """
     names = tuple(name.strip() for name in target.split(",") if name.strip())
     if not names or len(set(names)) < len(names):
-        raise OptionError(f"--target {target}: give a preset, or label columns with commas between, each once")
+        raise OptionError(f"`target` {target}: give a preset, or label columns with commas between, each once")
     return target if target in (*PRESETS, CONTACT) else names

@@ -16,7 +16,7 @@ your sensor     new_sensor check calibrate_optics calibrate_contact
 how true it is  validate realism robustness audit
 models          make_dataset train evaluate predict load_model
 policies        register_environments learn
-devices         open_camera open_arm SafeArm collect servo run_policy
+devices         open_camera open_arm SafeArm load_limits collect servo run_policy
 other           errors extend __version__
 
 A function such as `train` does what the command of its name does. It takes the command's options as keyword arguments, and returns a
@@ -47,6 +47,7 @@ _PLACES = {
     "evaluate": "twin.cli.learning",
     "learn": "twin.cli.learning",
     "load_experiment": "scenes",
+    "load_limits": "hardware.safety",
     "load_model": "training.estimator:load_remembering",
     "load_object": "scenes",
     "load_sensor": "scenes",

@@ -10,6 +10,7 @@ from hardware.collect import Collected as Collected
 from hardware.examining import Examination as Examination
 from hardware.following import Followed as Followed
 from hardware.safe_arm import SafeArm as SafeArm
+from hardware.safety import load_limits as load_limits
 from scenes import ExperimentSpec as ExperimentSpec
 from scenes import ObjectSpec as ObjectSpec
 from scenes import SensorSpec as SensorSpec

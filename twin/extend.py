@@ -1,12 +1,13 @@
 """What authors of new parts need: protocols and base classes of arms, cameras, models, tasks, degradations and detectors.
 
-arms          Arm ArmState BaseArm FEEDBACK_AGE_S load_limits
+arms          Arm ArmState BaseArm FEEDBACK_AGE_S MG400 Mg400Ports Mg400Emulator
 cameras       FrameSource LiveSource Picture ReadFailed capture
 devices       DeviceError Connection
 models        Estimate SensorModel Model PinModel Recipe register_model refuse_sizes
 tasks         Task
 degradations  Condition View over_channels
 detectors     Detector DetectorSpec
+sensors       PinsSpec
 mechanics     SkinSolver
 optics        Preview project rest_pins
 
@@ -30,9 +31,13 @@ _PLACES = {
     "FEEDBACK_AGE_S": "hardware.arms.arm",
     "FrameSource": "hardware.cameras.source",
     "LiveSource": "hardware.cameras.reader",
+    "MG400": "hardware.arms.mg400",
+    "Mg400Emulator": "hardware.emulators.mg400",
+    "Mg400Ports": "hardware.arms.mg400",
     "Model": "training.models.part",
     "Picture": "hardware.cameras.reader",
     "PinModel": "training.models.part",
+    "PinsSpec": "scenes.pins",
     "Preview": "twin.optics.preview",
     "ReadFailed": "hardware.cameras.reader",
     "Recipe": "training.recipes",
@@ -41,7 +46,6 @@ _PLACES = {
     "Task": "training.environments.tasks",
     "View": "twin.judge.degradation.condition",
     "capture": "hardware.cameras.reader",
-    "load_limits": "hardware.safety",
     "over_channels": "twin.judge.degradation.condition",
     "project": "twin.camera.projection",
     "refuse_sizes": "training.models.part",

@@ -100,7 +100,7 @@ def test_a_tuning_says_whether_its_pins_at_rest_were_made_from_contacts(spec, fo
         for px, name in ((uneven, "f_0.png"), (foreign[1][1], "init_0.png"))
     )
     made, measured = tune([contact], spec), tune([contact], spec, given=given)
-    assert made.detector.blob.rest_origin == "contacts" and "--no-contact" in made.rest.line()
+    assert made.detector.blob.rest_origin == "contacts" and "`no_contact`" in made.rest.line()
     assert measured.detector.blob.rest_origin == "measured" and "init_0.png" in measured.rest.line()
     assert np.linalg.norm(np.array(measured.detector.pins_px) - foreign[1][1], axis=1).max() < 0.5
 

@@ -197,7 +197,7 @@ def test_a_damaged_record_of_the_code_is_refused(made, tmp_path, content):
     copy = tmp_path / "set"
     shutil.copytree(folder, copy)
     (copy / "made_by.json").write_text(content)
-    with pytest.raises(StoreError, match=r"made_by\.json.*give another --out"):
+    with pytest.raises(StoreError, match=r"made_by\.json.*give another `out`"):
         generate(copy, config, COUNT + 1)
 
 
@@ -270,7 +270,7 @@ def test_a_broken_off_run_ends_with_the_same_bytes(made, tmp_path, monkeypatch):
 def test_a_larger_count_goes_on_where_a_smaller_one_ended(made, tmp_path):
     folder, config, _ = made
     generate(tmp_path / "set", config, 2)
-    with pytest.raises(DatasetError, match="holds contacts up to 1; give --count 2 or more"):
+    with pytest.raises(DatasetError, match="holds contacts up to 1; give `count` 2 or more"):
         generate(tmp_path / "set", config, 1)
     assert generate(tmp_path / "set", config, COUNT).before == 2
     assert contents(tmp_path / "set") == contents(folder)
@@ -318,7 +318,7 @@ def test_a_data_set_made_by_other_code_is_refused_and_left_as_it_was(made, tmp_p
     assert solver in told["modules"] and "numpy" in told["libraries"]
     record.write_text(json.dumps(told | {"modules": told["modules"] | {solver: "0" * 16}}))
     before = contents(tmp_path / "set")
-    with pytest.raises(StoreError, match=rf"made by another version of the program \({solver} changed\); give another --out, or remove"):
+    with pytest.raises(StoreError, match=rf"made by another version of the program \({solver} changed\); give another `out`, or remove"):
         generate(tmp_path / "set", config, COUNT + 1)
     assert contents(tmp_path / "set") == before
     record.unlink()
@@ -380,13 +380,13 @@ def test_labels_say_where_the_arm_was_sent_however_far_it_gives_way(tmp_path):
 
 @pytest.mark.parametrize("count", [0, -1, 2_000_000_000, 99_999_999_999_999_999_999])
 def test_a_count_beyond_all_bounds_is_refused_before_anything_is_made(tmp_path, count):
-    with pytest.raises(DatasetError, match=rf"--count {count}: a data set has 1 to \d+ contacts"):
+    with pytest.raises(DatasetError, match=rf"`count` {count}: a data set has 1 to \d+ contacts"):
         generate(tmp_path / "out", small_config(tmp_path), count)
     assert not (tmp_path / "out").exists()
 
 
 def test_a_scheduler_that_does_not_answer_leaves_nothing_behind(tmp_path):
-    with pytest.raises(DatasetError, match="--scheduler nowhere: no scheduler answers"):
+    with pytest.raises(DatasetError, match="`scheduler` nowhere: no scheduler answers"):
         generate(tmp_path / "out", small_config(tmp_path), 1, scheduler="nowhere")
     assert not (tmp_path / "out").exists()
 

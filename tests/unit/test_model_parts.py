@@ -96,7 +96,7 @@ def test_a_new_model_trains_is_judged_estimates_and_is_kept_with_no_other_change
 
 
 def test_what_a_new_model_does_not_provide_it_says(data, toy, tmp_path):
-    with pytest.raises(TrainingError, match="line has no modes that a Gaussian process could see; train it with --no-kernel"):
+    with pytest.raises(TrainingError, match="line has no modes that a Gaussian process could see; train it with `kernel=False`"):
         recipe_of(toy, kernel=True)
     with pytest.raises(TrainingError, match="line has no part that can be left out"):
         variant_named("line-without-pins")
@@ -266,7 +266,7 @@ def test_a_small_copy_holds_the_processes_beside_the_networks_up_to_a_number_of_
     close = {"rtol": 0, "atol": 0.02}  # of half precision, mm and deg
     np.testing.assert_allclose(small.predict_rows(data, rows).mean, whole.predict_rows(data, rows).mean, **close)
     monkeypatch.setattr("training.packed.MOST_ROWS", 1)
-    with pytest.raises(TrainingError, match="has Gaussian processes of .* frames beside its networks.*--no-kernel"):
+    with pytest.raises(TrainingError, match="has Gaussian processes of .* frames beside its networks.*`kernel=False`"):
         pack(tmp_path / "run", tmp_path / "none")
 
 

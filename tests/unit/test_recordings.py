@@ -667,7 +667,7 @@ def test_overlays_of_pictures_with_equal_stems_are_all_kept(tmp_path, spec, pict
 def test_frames_without_pins_are_one_error_with_the_files_written(tmp_path, spec, pictures):
     black = np.zeros_like(pictures[0])
     write_pictures(tmp_path / "set", {"a.png": black, "b.png": black})
-    with pytest.raises(FrameError, match="in none of 2 frames; the first, a.png: .*--sensor, --form") as error:
+    with pytest.raises(FrameError, match="in none of 2 frames; the first, a.png: .*`sensor`, `form`") as error:
         preprocess_recording(tmp_path / "set", spec, tmp_path / "out")
     summary_path = tmp_path / "out" / "summary.json"
     message = str(error.value)

@@ -72,7 +72,7 @@ def test_pins_are_found_in_the_pictures(tmp_path):
     for k, step in enumerate(episode.steps()):
         np.testing.assert_allclose(step.values["pins"], shifted(k)[0], atol=0.3)  # the frames have two levels
     unknown = open_records(session(tmp_path / "t", about={"camera": "x"}))
-    assert "pins" not in with_pins(unknown).about.numbers and "--sensor" in with_pins(unknown).notes[-1]
+    assert "pins" not in with_pins(unknown).about.numbers and "`sensor`" in with_pins(unknown).notes[-1]
     assert with_pins(unknown, SENSOR).about.numbers["pins"] == 254
     with pytest.raises(FrameError, match="mg400-331 are 360x360"):
         with_pins(unknown, load_sensor("mg400-331"))
@@ -154,7 +154,7 @@ def test_a_data_sets_truth_goes_with_it(tmp_path):
 
 def test_pins_without_pictures_are_refused(tmp_path):
     (tmp_path / "truth.zarr").mkdir()
-    with pytest.raises(RecordError, match="--images raw"):
+    with pytest.raises(RecordError, match="`images` raw"):
         open_records(tmp_path)
 
 

@@ -58,7 +58,7 @@ class Stream:
 @pytest.mark.parametrize("target", ["rerun+http://127.0.0.1:1/proxy", "rerun+http:///proxy"])
 def test_an_address_at_which_no_viewer_answers_is_an_error_when_it_is_opened(monkeypatch, target):
     monkeypatch.setitem(sys.modules, "rerun", SimpleNamespace(RecordingStream=Stream))
-    with pytest.raises(DeviceError, match=f"--rerun {re.escape(target)}: can't be opened .*start a viewer"), RerunView("title", target):
+    with pytest.raises(DeviceError, match=f"`rerun` {re.escape(target)}: can't be opened .*start a viewer"), RerunView("title", target):
         pytest.fail("it was opened")
 
 

@@ -376,7 +376,7 @@ def test_sensors_that_remember_time_are_refused(sensor):
         require_dome(sensor.model_copy(update={"gel": gel}))
     with pytest.raises(OptionError, match="half sphere"):
         require_dome(load_sensor("pad-round"))
-    with pytest.raises(OptionError, match="--paths 3"):
+    with pytest.raises(OptionError, match="`paths` 3"):
         distil(sensor, "never.safetensors", paths=3)
 
 

@@ -171,7 +171,7 @@ def test_a_pressed_or_foreign_frame_at_rest_is_an_error_of_every_reader(tmp_path
     pressed = known + 15.0 * away * np.exp(-4 * (away**2).sum(axis=1))[:, None]
     for image, words in ((drawn(model, pressed).image, "seems pressed"), (np.zeros((256, 256), np.uint8), "no use as no-contact frame")):
         cv2.imwrite(str(tmp_path / "init_0.png"), image)
-        with pytest.raises(FrameError, match=f"init_0.png: .*{words}.*--no-contact FRAME"):
+        with pytest.raises(FrameError, match=f"init_0.png: .*{words}.*`no_contact` FRAME"):
             predict_frames("mg400-127", tmp_path)
 
 
@@ -229,7 +229,7 @@ def test_the_written_copy_is_a_sensor_and_wrong_sides_are_refused(tmp_path):
         registered_view(spec, frames["rest"], {"x": frames["x"], "y": frames["rest"]})
     with pytest.raises(FrameError, match="fit no view"):
         registered_view(spec, frames["rest"], {"x": frames["x"], "-x": frames["x"], "y": frames["y"]})
-    with pytest.raises(FrameError, match="--push left: must be"):
+    with pytest.raises(FrameError, match="`push` left: must be"):
         registered_view(spec, frames["rest"], {"left": frames["x"], "y": frames["y"]})
 
 

@@ -27,7 +27,7 @@ MOST_CONTACTS = 1_000_000
 """Most contacts of a data set. At one second each, a core needs twelve days for them."""
 
 
-def require_count(count: int, option: str = "--count") -> None:
+def require_count(count: int, option: str = "`count`") -> None:
     """Raise ``DatasetError`` if a data set can't have this number of contacts; ``option`` names the source of the number."""
     if not 1 <= count <= MOST_CONTACTS:
         raise DatasetError(f"{option} {count}: a data set has 1 to {MOST_CONTACTS} contacts")

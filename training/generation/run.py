@@ -177,7 +177,7 @@ def simulate_dataset(
         There is no such format, or a library is missing.
     """
     if also and config.images == "none":
-        raise OptionError("--also keeps pictures; give --images raw, gray or recording with it")
+        raise OptionError("`also` keeps pictures; give `images` raw, gray or recording with it")
     with KeptAlso(out, also, config.sensor, at_once=False) as kept:
         with stage(progress, f"{config.experiment.name}, {config.sensor.name}") as step:
             made = generate(out, config, count, workers=workers, scheduler=scheduler, progress=step)

@@ -87,5 +87,5 @@ def recipe_of(model: str, **changes: object) -> Recipe:
         if getattr(recipe, key) < 1:
             raise TrainingError(f"{key} must be at least 1, got {getattr(recipe, key)}")
     if recipe.kernel and not chosen.has_modes:
-        raise TrainingError(f"{model} has no modes that a Gaussian process could see; train it with --no-kernel")
+        raise TrainingError(f"{model} has no modes that a Gaussian process could see; train it with `kernel=False`")
     return recipe

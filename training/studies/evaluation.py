@@ -184,14 +184,14 @@ def evaluate_run(
     With models of several kinds of contact (``ContactEstimator``), each frame is judged by the most probable of those kinds whose labels
     the recording varies. ``taken_for`` of the metrics shows the classification among all kinds.
     """
-    for value, allowed, option in ((rows, ROWS, "--rows"), (labels, LABELS, "--labels")):
+    for value, allowed, option in ((rows, ROWS, "`rows`"), (labels, LABELS, "`labels`")):
         if value not in allowed:
             raise TrainingError(f"{option} must be {' or '.join(allowed)}, got {value!r}")
     several, parts, kinds = models_of_kinds(run, recordings[0]), [], []
     if several is None:
         estimator = PoseEstimator.load(run)
     elif rows == "validation":
-        raise TrainingError(f"{run}: models of several kinds of contact; which rows they kept out is not known; give --rows all")
+        raise TrainingError(f"{run}: models of several kinds of contact; which rows they kept out is not known; give `rows` all")
     else:
         kinds = several.for_labels(open_recording(recordings[0], several.sensor, several.form))
         estimator = several.parts[kinds[0]]

@@ -106,7 +106,7 @@ def compare_with_renders(
         Nothing can be rendered here.
     """
     if thorough and not test:
-        raise OptionError("--thorough adds to the two-sample test, but --no-two-sample leaves it out; give one of them")
+        raise OptionError("`thorough` adds to the two-sample test, but `two_sample=False` leaves it out; give one of them")
     asked = (_thorough if thorough else _quick) if test else None
     found = run_realism(
         frames,

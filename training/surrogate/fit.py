@@ -167,7 +167,7 @@ def distil(
     """
     require_dome(sensor)
     if paths < LEAST_PATHS:
-        raise OptionError(f"--paths {paths}: expected at least {LEAST_PATHS}")
+        raise OptionError(f"`paths` {paths}: expected at least {LEAST_PATHS}")
     with stage(progress, f"contacts of {sensor.name}") as step:
         solved = solve_paths(sensor, range(seed * 100_000, seed * 100_000 + paths), processes=processes, progress=step)
     with stage(progress, "network") as step:

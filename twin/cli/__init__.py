@@ -18,6 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from twin.cli.command import App
+from twin.cli.options import as_options
 from twin.errors import OptionError, StoreError, TwinError
 
 # Modules of commands, in the order in which 'twin --help' lists them, each with the title above its commands.
@@ -128,7 +129,7 @@ def main() -> None:
         reason = error if isinstance(error, ImportError) else "the working folder was deleted; change into a folder that exists"
         print(f"twin: error: {reason}", file=sys.stderr)
         sys.exit(FAILED)
-    warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {' '.join(str(message).split())}\n"
+    warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {as_options(' '.join(str(message).split()))}\n"
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # without a writable home directory it prints four lines of warnings
     try:
         command_line()(prog_name="twin")
@@ -139,7 +140,7 @@ def main() -> None:
             _end_without_room(error)
         if not _for_user(error):
             raise
-        print(f"twin: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"twin: error: {as_options(' '.join(str(error).split()))}", file=sys.stderr)
         _print_notes(error)
         if isinstance(error, StoreError):
             _print_unsaved(error.unsaved)
@@ -179,4 +180,4 @@ def _for_user(error: Exception) -> bool:
 def _print_notes(error: BaseException) -> None:
     """Print each note of an error on stderr. A note states a failure after the error, for example that an arm could not be stopped."""
     for note in getattr(error, "__notes__", ()):
-        print(f"twin: note: {' '.join(note.split())}", file=sys.stderr)
+        print(f"twin: note: {as_options(' '.join(note.split()))}", file=sys.stderr)

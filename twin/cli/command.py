@@ -26,8 +26,6 @@ from twin.errors import OptionError
 from twin.progress import Progress, silent
 
 Made = TypeVar("Made")
-NAMED_OTHERWISE = {"obj": "object"}
-"""Options whose argument in Python has another name, because theirs means something else there."""
 
 
 class App(typer.Typer):

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from collections.abc import Callable, Iterable
 from enum import StrEnum
 from pathlib import Path
@@ -112,7 +113,7 @@ AtRest = Annotated[
 def _even(value: int) -> int:
     """The number, if it is even."""
     if value % 2:
-        raise OptionError(f"--across {value}: give an even number")
+        raise OptionError(f"`across` {value}: give an even number")
     return value
 
 
@@ -161,14 +162,30 @@ def one_recording(folders: list[Path], table: Path | None, no_contact: Path | No
     from twin.frames import frames_at
 
     if len(folders) > 1 and (table or no_contact):
-        raise OptionError("--table and --no-contact belong to one recording; with several --data put each table beside its frames")
+        raise OptionError("`table` and `no_contact` belong to one recording; with several `data` put each table beside its frames")
     return [frames_at(folder, table, no_contact) for folder in folders]
+
+
+NAMED_OTHERWISE = {"obj": "object"}
+"""Options whose argument in Python has another name."""
+
+
+def as_options(text: str) -> str:
+    """A message with the options of the command line in place of the arguments of Python, which stand in it as `name` or `name=value`."""
+
+    def option(found: re.Match[str]) -> str:
+        name, value = found[1], found[2]
+        negation = "no-" if value == "False" else ""
+        named = f"--{negation}{NAMED_OTHERWISE.get(name, name).replace('_', '-')}"
+        return named if value in (None, "True", "False") else f"{named} {value}"
+
+    return re.sub(r"`([a-z][a-z0-9_]*)(?:=([^`]*))?`", option, text)
 
 
 def say(lines: Iterable[str]) -> None:
     """Print each line as soon as it is known."""
     for line in lines:
-        print(line, flush=True)
+        print(as_options(line), flush=True)
 
 
 def tell(result: Any) -> None:

@@ -102,7 +102,7 @@ def whole_sensor(
     """
     at = frames_at(frames, labels or table, no_contact)
     if optics and open_recording(at, form=form).form == Form.PROCESSED:
-        raise OptionError(f"{frames}: thresholded frames tell nothing of light and colours; leave out --optics, or give raw camera frames")
+        raise OptionError(f"{frames}: thresholded frames tell nothing of light and colours; leave out `optics`, or give raw camera frames")
     if labels is not None and experiment is None:
         experiment = experiment_like(open_recording(at, form=form).labels)
     made = new_sensor(
@@ -154,7 +154,7 @@ def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
     share, *_, name = max(found, key=lambda each: each[:3])
     if share < ALIKE:
         raise OptionError(
-            f"no experiment has contacts whose labels vary like the table's ({', '.join(sorted(varying))}); name one with --experiment "
+            f"no experiment has contacts whose labels vary like the table's ({', '.join(sorted(varying))}); name one with `experiment` "
             f"('twin experiments' lists them)"
         )
     return load_experiment(name)

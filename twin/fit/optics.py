@@ -70,7 +70,7 @@ RING_HELD = "ring, LEDs' places and reflections: held; the frames show no bright
 """Note for frames that show no ring."""
 REST_MADE = (
     "the camera's kind, focal length and distance: held as 'twin new' chose them without a frame without contact; pictures of the same "
-    "contact are alike, depths in mm may not be; give --no-contact FRAME"
+    "contact are alike, depths in mm may not be; give `no_contact` FRAME"
 )
 """Note for a camera that was fitted to rest places estimated from contacts."""
 Stage = Callable[[SensorSpec], SensorSpec]

@@ -202,7 +202,7 @@ def tell_form(known: KnownFrames, image: np.ndarray) -> Form:
     fitting = [form for form, expected in known.size_px.items() if expected == size]
     if not fitting:
         expected = " or ".join(f"{times(expected)} ({form})" for form, expected in known.size_px.items())
-        raise FrameError(f"expected {expected} for {known.sensor}, got {times(size)}; use the matching --sensor or the unresized frame")
+        raise FrameError(f"expected {expected} for {known.sensor}, got {times(size)}; use the matching `sensor` or the unresized frame")
     if len(fitting) == 1:
         return fitting[0]
     return Form.PROCESSED if is_two_level(image) else Form.RAW

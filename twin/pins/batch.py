@@ -35,17 +35,17 @@ FULL_CHANGE = 0.3
 """Relative change of a cell's area at both ends of the colour scale."""
 NO_REFERENCE = (
     "no frame without contact was used: the pins at rest are those of the specification, which makes errors of a pose up to four times "
-    "larger; record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+    "larger; record one frame without contact (init_0.png beside the frames, or `no_contact` FRAME)"
 )
 """Note for a recording without a usable no-contact frame."""
 NO_OWN_REFERENCE = (
     "no frame without contact was used: the pins at rest are those that were measured before on this unit; if the camera or the tip was "
-    "touched since, record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+    "touched since, record one frame without contact (init_0.png beside the frames, or `no_contact` FRAME)"
 )
 """Note for a specification that holds the pins' measured places at rest."""
 MADE_FROM_CONTACTS = (
     "no frame without contact was used, and none when the specification was made: the pins' rest places were made from contacts; expect "
-    "errors of a tenth of a spacing or so; record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+    "errors of a tenth of a spacing or so; record one frame without contact (init_0.png beside the frames, or `no_contact` FRAME)"
 )
 """Note for a specification whose places at rest were estimated from contacts."""
 MEASURED_BEFORE = "measured before"
@@ -299,5 +299,5 @@ def _nothing_found(path: str | Path, summary: dict, summary_path: Path) -> str:
     bad = summary["invalid"] + summary["failed"]
     return (
         f"{path}: the pins were found in none of {len(bad)} frames; the first, {bad[0]['image_name']}: {bad[0]['reason']}; "
-        f"check --sensor, --form and the [pipeline] section of the specification (details in {summary_path})"
+        f"check `sensor`, `form` and the [pipeline] section of the specification (details in {summary_path})"
     )

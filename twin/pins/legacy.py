@@ -68,7 +68,7 @@ def legacy_parameters(layout: Layout) -> LegacyParameters:
         The release has none for it.
     """
     if layout not in LEGACY:
-        raise FrameError(f"the published method knows only layouts of rings and hexagons, not '{layout}'; use another --method")
+        raise FrameError(f"the published method knows only layouts of rings and hexagons, not '{layout}'; use another `method`")
     return LEGACY[layout]
 
 

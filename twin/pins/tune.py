@@ -135,7 +135,7 @@ def tune(
     if layout is None or layout.explained < LEAST_SHOWN:
         raise FrameError(
             f"none of {len(frames)} frames shows {sensor.pins.in_words()}{_shown_instead(images)}; "
-            "check --sensor, focus and light, or give frames with less contact"
+            "check `sensor`, focus and light, or give frames with less contact"
         )
     if known is None:
         doubts = other_layout(layout, images)
@@ -214,7 +214,7 @@ def other_layout(layout: Candidate, images: list[np.ndarray]) -> list[str]:
     if not same and (more or smoother):
         return [
             f"these frames show {_in_words(found)} rather than {layout.pins.in_words()}: {layout.left_over:g} pin-like spots of a "
-            f"frame are none of these pins, and {layout.not_seen:g} of the pins are not seen; give the right --sensor, or make one with "
+            f"frame are none of these pins, and {layout.not_seen:g} of the pins are not seen; give the right `sensor`, or make one with "
             "'twin new'"
         ]
     if layout.explained < SURE_EXPLAINED:

@@ -108,7 +108,7 @@ def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[d
             chosen = rows_in_range(data, plan.experiment)
             if not len(chosen):
                 raise TrainingError(
-                    f"{thing.name}: none of its contacts has labels within the ranges of {plan.experiment.name}; give more --tests"
+                    f"{thing.name}: none of its contacts has labels within the ranges of {plan.experiment.name}; give more `tests`"
                 )
             off = label_error(estimator.predict_rows(data, chosen).mean, data.targets.corrected[chosen], data.targets.units)
             error, bias = np.abs(off).mean(axis=0), off.mean(axis=0)

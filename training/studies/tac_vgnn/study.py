@@ -81,11 +81,11 @@ class Plan:
 
     def __post_init__(self) -> None:
         if self.labels not in ("corrected", "raw"):
-            raise OptionError(f"--labels must be corrected or raw, got {self.labels!r}")
+            raise OptionError(f"`labels` must be corrected or raw, got {self.labels!r}")
         if not self.models or not self.seeds:
-            raise OptionError("nothing to compare: give at least one of --models and of --seeds")
+            raise OptionError("nothing to compare: give at least one of `models` and of `seeds`")
         if any(batch < 1 for batch in self.batches):
-            raise OptionError(f"--batches {','.join(map(str, self.batches))}: a batch has at least 1 frame")
+            raise OptionError(f"`batches` {','.join(map(str, self.batches))}: a batch has at least 1 frame")
 
     def runs(self) -> list[PlannedRun]:
         """Every run of the study."""

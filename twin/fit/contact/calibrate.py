@@ -177,7 +177,7 @@ def calibrate_to_file(
     """
     names = [parameter.name for parameter in PARAMETERS]
     if unknown := set(hold) - set(names):
-        raise OptionError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
+        raise OptionError(f"`hold` {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
     folder = folder_beside(out, "contact")
     parameters = tuple(parameter for parameter in PARAMETERS if parameter.name not in hold)
     with output(folder, "index.html", "calibration.json", "*.png", "contacts"), stage(progress, "contacts") as step:

@@ -101,7 +101,7 @@ def test_paths_may_be_text_and_the_pins_of_another_sensor_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("named", "told"),
     [
-        ("ur5-331", "'ur5-331' .331 pins., the given sensor is 'mg400-331' .331 pins.; leave --sensor out"),
+        ("ur5-331", "'ur5-331' .331 pins., the given sensor is 'mg400-331' .331 pins.; leave `sensor` out"),
         ("mg400-331", ""),
         ("/home/u/mg400-331.toml", ""),
         ("", ""),

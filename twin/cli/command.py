@@ -193,16 +193,18 @@ def converted(name: str, kind: Any, value: Any) -> Any:
             raise OptionError(f"`{name}`: expected {len(parts)} numbers, got {value!r}")
         return tuple(converted(name, part, each) for part, each in zip(parts, value, strict=True))
     if get_origin(kind) is Literal or isinstance(kind, type) and issubclass(kind, Enum):
-        allowed = parts or [each.value for each in kind]
+        allowed = parts or list(kind)
         if value not in allowed:
             raise OptionError(f"`{name}`: expected {' or '.join(map(str, allowed))}, got {value!r}")
         return value if parts else kind(value)
     if kind is Path and isinstance(value, str | os.PathLike):
         return Path(value)
-    if kind is str and not isinstance(value, bool | Real):
-        return (
-            os.fspath(value) if isinstance(value, os.PathLike) else ",".join(map(str, value)) if isinstance(value, list | tuple) else value
-        )
+    if kind is str and isinstance(value, list | tuple):
+        return ",".join(map(str, value))
+    if kind is str and isinstance(value, str | os.PathLike):
+        return os.fspath(value)
+    if kind is str and hasattr(value, "model_dump"):  # a specification in place of its name
+        return value
     if kind is bool and value in (True, False):
         return bool(value)
     if kind is int and isinstance(value, Integral) and not isinstance(value, bool):

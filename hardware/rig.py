@@ -24,7 +24,7 @@ from hardware.errors import DeviceError, leave
 from hardware.loop import ServoLoop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
-from hardware.safety import SHIPPED_LIMITS, load_limits
+from hardware.safety import load_limits
 from hardware.step import LoopSettings, StepRecord
 from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
@@ -172,13 +172,11 @@ def build_rig(
     form = form or (Form.PROCESSED if sensor.recording else Form.RAW)
     placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
     device: Arm = open_arm(arm)
-    simulated = isinstance(device, SimulatedArm)
-    if simulated and camera == TWIN and at_once:
+    simulated = kind_of(arm) == "simulated"  # by its name: an arm of another package is guarded, whatever class it has
+    if isinstance(device, SimulatedArm) and camera == TWIN and at_once:
         device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
     if not simulated or limits is not None:
-        kind = kind_of(arm)
-        if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file():
-            device = SafeArm(device, load_limits(limits or kind))
+        device = SafeArm(device, load_limits(limits or kind_of(arm)))
     twin = None
     if camera == TWIN:
         preview = drawn(sensor, form, plain_light)

@@ -12,6 +12,7 @@ from scenes.base import SpecError
 from scenes.experiment import ExperimentSpec
 from scenes.files import LONGEST_PATH, LONGEST_SHOWN, read_toml, shown
 from scenes.object import MeshShape, ObjectSpec
+from scenes.plugins import other_files
 from scenes.randomisation import RandomisationSpec
 from scenes.sensor import SensorSpec
 from scenes.servo import ServoSpec
@@ -145,11 +146,8 @@ def load_servo(name_or_path: str | Path | ServoSpec) -> ServoSpec:
 
 
 def _list(kind: str) -> dict[str, Path]:
-    found = {}
-    for folder in (SHIPPED / kind, user_spec_dir() / kind):
-        for path in sorted(folder.glob("*.toml")):
-            found[path.stem] = path
-    return found
+    shipped, own = ({path.stem: path for path in sorted(folder.glob("*.toml"))} for folder in (SHIPPED / kind, user_spec_dir() / kind))
+    return shipped | other_files(kind, shipped) | own
 
 
 def _find(name_or_path: str | Path, kind: str) -> Path:

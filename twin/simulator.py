@@ -223,7 +223,8 @@ class Simulator:
         same = len(state.caps_mm) == len(rest.caps_mm) and state.nodes_mm.shape == rest.nodes_mm.shape
         if same:
             lengths = [np.linalg.norm(each.caps_mm - each.base_mm, axis=1) for each in (state, rest)]
-            same = np.allclose(*lengths, atol=_SAME_MM) and np.allclose(state.nodes_mm[window], rest.nodes_mm[window], atol=_SAME_MM)
+            still = [each.nodes_mm[window] for each in (state, rest)]
+            same = all(np.allclose(one, other, atol=_SAME_MM) for one, other in (lengths, still))
         if not same:
             raise ContactError(f"the state is not one of {self.spec.name}, but of another sensor; press the object against this one")
 

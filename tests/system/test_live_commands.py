@@ -363,7 +363,7 @@ def test_pins_are_not_counted_from_a_pressed_sensor(tmp_path):
     write_image(tmp_path / "pressed" / "frame_0.png", drawn_frame(sensor, Form.PROCESSED, pressed_px).image)
     common = ("live", "--camera", tmp_path / "pressed", "--headless", "--record", tmp_path / "s", "--at-rest")
     told = refused(*common, "first")
-    assert "seems pressed" in told and "--at-rest FRAME" in told and not (tmp_path / "s").exists()
+    assert "seems pressed" in told and "`at_rest` FRAME" in told and not (tmp_path / "s").exists()
     assert "seems pressed" in refused(*common, tmp_path / "pressed" / "frame_0.png")
 
 

@@ -3,6 +3,7 @@
 from dataclasses import asdict, fields
 
 from scenes.files import shown
+from scenes.plugins import others
 from training.models.cnn.model import CNN_V1, CNN_V2
 from training.models.graphs.model import GNN, TAC_VGNN, TAC_VGNN_RELEASE
 from training.models.part import Model, Variant
@@ -47,6 +48,9 @@ def model_named(name: str) -> Model:
     TrainingError
         There is no such model.
     """
+    if name not in MODELS:
+        given = others("models", MODELS, is_one=lambda part: isinstance(part, Model))
+        MODELS.update({model.name: model for model in given.values()})
     if name not in MODELS:
         raise TrainingError(f"no model '{shown(name)}'; choose one of {', '.join(MODELS)}")
     return MODELS[name]

@@ -16,13 +16,9 @@ import twin.extend
 ROOT = Path(__file__).parents[2]
 STUBS = {ROOT / "twin" / "__init__.pyi": twin, ROOT / "twin" / "extend.pyi": twin.extend}
 WIDER = {
+    "AlsoFormat": "str",
     "Path": "Path | str",
-    "list[Path]": "Path | str | Sequence[Path | str]",
-    "list[str]": "str | Sequence[str]",
-    "list[AlsoFormat]": "str | Sequence[str]",
     "Form": "Form | str",
-    "Images": "str",
-    "States": "str",
 }
 """What a function takes in Python, by the type on the command line."""
 SPECIFICATIONS = {"sensor": "SensorSpec", "obj": "ObjectSpec", "experiment": "ExperimentSpec", "servo": "ServoSpec"}
@@ -70,6 +66,9 @@ def _function(name: str, signature: inspect.Signature) -> list[str]:
         kind = re.sub(r"\b(?:pathlib|twin\.types|twin\.progress|twin\.cli\.\w+|typing)\.", "", inspect.formatannotation(each.annotation))
         optional = kind.endswith(" | None") or kind.startswith("Optional[")
         kind = kind.removesuffix(" | None").removeprefix("Optional[").removesuffix("]" if kind.startswith("Optional[") else "")
+        if several := re.fullmatch(r"list\[(.*)\]", kind):
+            one = WIDER.get(several[1], several[1])
+            kind = f"{one} | Sequence[{one}]"
         kind = WIDER.get(kind, kind)
         if each.name in SPECIFICATIONS and kind == "str":
             kind = f"str | Path | {SPECIFICATIONS[each.name]}"

@@ -66,7 +66,7 @@ def test_each_part_is_used_whatever_is_imported_first(first, installed, tmp_path
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
         "force True",
-        "camera (480, 640)",
+        "camera (320, 320)",
         "guard SafeArm example arm at here",
         "arms True",
         "model True",

@@ -6,7 +6,6 @@
 - ``twin check``: whether the sensor is well.
 """
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -99,20 +98,12 @@ Example:
 """
 
 
-class Kind(StrEnum):
-    """Kinds of graphs."""
-
-    KNN = "knn"
-    DELAUNAY = "delaunay"
-    VORONOI = "voronoi"
-
-
 @app.command("graph", help=HELP_GRAPH)
 def graph(
     path: Annotated[Path, typer.Argument(help="frame, folder of frames, or pins.npz")],
     sensor: Sensor,
     out: Out,
-    kind: Annotated[Kind, typer.Option("--kind", help="kind of graph")] = Kind.VORONOI,
+    kind: Annotated[Literal["knn", "delaunay", "voronoi"], typer.Option("--kind", help="kind of graph")] = "voronoi",
     form: FormOrAuto = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="the published release's own method and boundary, to compare with")] = False,
     table: Table = None,
@@ -123,7 +114,7 @@ def graph(
     from twin.pins.graph_files import write_graphs_of
 
     spec, at = sensor_with(sensor, pipeline), frames_at(path, table, no_contact)
-    return write_graphs_of(at, spec, out, kind=kind.value, form=form, legacy=legacy)
+    return write_graphs_of(at, spec, out, kind=kind, form=form, legacy=legacy)
 
 
 HELP_TUNE = """Find parameters of the pin detection for your own frames.

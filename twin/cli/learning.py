@@ -9,9 +9,8 @@
 - ``twin learn``: a policy of a task.
 """
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -102,22 +101,6 @@ Examples:
 """
 
 
-class Images(StrEnum):
-    """The kinds of pictures in a data set."""
-
-    RAW = "raw"
-    GRAY = "gray"
-    RECORDING = "recording"
-    NONE = "none"
-
-
-class States(StrEnum):
-    """The states of a contact that become frames."""
-
-    ALL = "all"
-    END = "end"
-
-
 @app.command("dataset", help=HELP_DATASET, goes_on=True)
 def make_dataset(
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="experiment name ('twin experiments') or file")],
@@ -127,8 +110,8 @@ def make_dataset(
     obj: Annotated[
         str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
     ] = None,
-    images: Annotated[Images, typer.Option("--images", help="what pictures to make")] = Images.RAW,
-    states: Annotated[States, typer.Option("--states", help="which states of a contact become frames")] = States.END,
+    images: Annotated[Literal["raw", "gray", "recording", "none"], typer.Option("--images", help="what pictures to make")] = "raw",
+    states: Annotated[Literal["all", "end"], typer.Option("--states", help="which states of a contact become frames")] = "end",
     randomise: Annotated[
         str | None, typer.Option("--randomise", metavar="R", help="randomisation name or file; nothing if not given")
     ] = None,
@@ -149,8 +132,8 @@ def make_dataset(
         refined_if(residual, load_sensor(sensor)),
         load_experiment(experiment),
         touched=if_given(load_object, obj),
-        images=images.value,
-        states=states.value,
+        images=images,
+        states=states,
         randomisation=if_given(load_randomisation, randomise),
         seed=seed,
         quality=quality,

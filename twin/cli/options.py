@@ -84,14 +84,8 @@ KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stan
 ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS, magician:PORT")]
 
 
-class AlsoFormat(StrEnum):
-    """Further formats in which a record can be kept, as in ``twin.records.ALSO``, whose import would load the pin detection."""
-
-    LEROBOT = "lerobot"
-    HUGGINGFACE = "huggingface"
-    MCAP = "mcap"
-
-
+# Further formats in which a record can be kept, as in ``twin.records.ALSO``, whose import would load the pin detection.
+AlsoFormat = StrEnum("AlsoFormat", {name.upper(): name for name in ("lerobot", "huggingface", "mcap")})
 Also = Annotated[
     list[AlsoFormat] | None,
     typer.Option("--also", help="keep it in this format, too, in a subfolder of that name; may be repeated ('twin convert --help')"),

@@ -209,6 +209,20 @@ def test_every_command_and_option_that_a_text_names_exists(package):
     assert wrong_hints("run 'twin tun' or 'twin emulate ur5 --port 1 --no-such'") == ["twin tun", "twin emulate ur5", "--no-such"]
 
 
+OF_FUNCTIONS = {"indent_mm", "tilt_deg", "shear_mm", "twist_deg", "offset_mm", "quality"}  # arguments that no command needs to have
+ARGUMENTS = {option.name for command in TREE.values() for option in command.params} | OF_FUNCTIONS
+MARKED = re.compile(r"`([a-z][a-z0-9_]*)(?:=\w+)?`")
+
+
+@pytest.mark.parametrize("package", OURS)
+def test_every_argument_that_an_error_names_exists(package):
+    """The command line turns each into its option."""
+    for path in sorted((ROOT / package).rglob("*.py")):
+        raised = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Raise)]
+        texts = [part.value for node in raised for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str)]
+        assert not {name for text in texts for name in MARKED.findall(text)} - ARGUMENTS, path.relative_to(ROOT)
+
+
 @pytest.mark.parametrize("name", ["nope", "nope.toml"])
 @pytest.mark.parametrize("load", [load_sensor, load_object, load_experiment, load_randomisation, load_servo])
 def test_a_name_that_is_not_known_names_commands_that_exist(load, name):

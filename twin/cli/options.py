@@ -85,7 +85,7 @@ ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, s
 
 
 # Further formats in which a record can be kept, as in ``twin.records.ALSO``, whose import would load the pin detection.
-AlsoFormat = StrEnum("AlsoFormat", {name.upper(): name for name in ("lerobot", "huggingface", "mcap")})
+AlsoFormat = StrEnum("AlsoFormat", {"LEROBOT": "lerobot", "HUGGINGFACE": "huggingface", "MCAP": "mcap"})
 Also = Annotated[
     list[AlsoFormat] | None,
     typer.Option("--also", help="keep it in this format, too, in a subfolder of that name; may be repeated ('twin convert --help')"),

@@ -5,6 +5,7 @@ which a model measures the pins' displacements. ``signals_as_ctrl_c`` makes sign
 """
 
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -48,14 +49,15 @@ TWIN_FRAME_S = 60.0
 def signals_as_ctrl_c() -> Iterator[None]:
     """Context in which SIGTERM and a closed terminal (SIGHUP) raise ``KeyboardInterrupt`` as Ctrl-C does.
 
-    So the arm is stopped, withdrawn and disabled after these signals, too. Use it in the main thread only. A signal that was ignored
-    before (``nohup``) stays ignored. The former handlers are restored at the end.
+    So the arm is stopped, withdrawn and disabled after these signals, too. In another thread than the main one it changes nothing. A
+    signal that was ignored before (``nohup``) stays ignored. The former handlers are restored at the end.
     """
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    before = {ended: signal.getsignal(ended) for ended in (signal.SIGTERM, signal.SIGHUP)}
+    handled = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
+    before = {ended: signal.getsignal(ended) for ended in handled}
     for ended, handler in before.items():
         if handler is not signal.SIG_IGN:
             signal.signal(ended, interrupt)

@@ -196,31 +196,24 @@ def wrong_hints(text: str) -> list[str]:
     return [found[0] for found in wrong] + [name for name in re.findall(r"(?<![\w-])--[a-z][a-z0-9-]+", text) if name not in OPTIONS]
 
 
-@pytest.mark.parametrize("package", OURS)
-def test_every_command_and_option_that_a_text_names_exists(package):
-    wrong = [
-        f"{path.relative_to(ROOT)}:{node.lineno}: {hint}"
-        for path in sorted((ROOT / package).rglob("*.py"))
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value not in NOT_COMMANDS
-        for hint in wrong_hints(node.value)
-    ]
-    assert not wrong
-    assert wrong_hints("run 'twin tun' or 'twin emulate ur5 --port 1 --no-such'") == ["twin tun", "twin emulate ur5", "--no-such"]
-
-
 OF_FUNCTIONS = {"indent_mm", "tilt_deg", "shear_mm", "twist_deg", "offset_mm", "quality"}  # arguments that no command needs to have
 ARGUMENTS = {option.name for command in TREE.values() for option in command.params} | OF_FUNCTIONS
 MARKED = re.compile(r"`([a-z][a-z0-9_]*)(?:=\w+)?`")
 
 
 @pytest.mark.parametrize("package", OURS)
-def test_every_argument_that_an_error_names_exists(package):
-    """The command line turns each into its option."""
+def test_every_command_option_and_argument_that_a_text_names_exists(package):
+    """An error names an argument as `name`, which the command line turns into its option."""
+    wrong = []
     for path in sorted((ROOT / package).rglob("*.py")):
-        raised = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Raise)]
-        texts = [part.value for node in raised for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str)]
-        assert not {name for text in texts for name in MARKED.findall(text)} - ARGUMENTS, path.relative_to(ROOT)
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        texts = [node for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+        raised = [part for node in nodes if isinstance(node, ast.Raise) for part in ast.walk(node) if isinstance(part, ast.Constant)]
+        hints = [(node, hint) for node in texts if node.value not in NOT_COMMANDS for hint in wrong_hints(node.value)]
+        hints += [(node, name) for node in raised for name in MARKED.findall(str(node.value)) if name not in ARGUMENTS]
+        wrong += [f"{path.relative_to(ROOT)}:{node.lineno}: {hint}" for node, hint in hints]
+    assert not wrong
+    assert wrong_hints("run 'twin tun' or 'twin emulate ur5 --port 1 --no-such'") == ["twin tun", "twin emulate ur5", "--no-such"]
 
 
 @pytest.mark.parametrize("name", ["nope", "nope.toml"])

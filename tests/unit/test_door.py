@@ -3,6 +3,7 @@
 import inspect
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -199,3 +200,12 @@ def test_results_are_one_line_a_table_and_files(simulator, pressed, tmp_path):
         assert all(path.is_file() for path in result.save(tmp_path / "kept"))
     again = type(pressed).load(tmp_path / "kept")
     assert all(np.array_equal(value, getattr(pressed, name)) for name, value in vars(again).items())
+
+
+def test_a_function_works_in_any_thread(tmp_path):
+    """Signals belong to the main thread: elsewhere they are left alone."""
+    with ThreadPoolExecutor(1) as pool:
+        collected = pool.submit(
+            twin.collect, camera="twin", arm="simulated", sensor="mg400-127", count=1, plain_light=True, out=tmp_path / "set"
+        ).result()
+    assert collected.lines() and (tmp_path / "set" / "targets.csv").is_file()

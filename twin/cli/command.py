@@ -55,15 +55,10 @@ class App(typer.Typer):
 
             @wraps(work)
             def command(*, force: bool = False, **given: Any) -> None:
-                from twin.cli.progress import shown
                 from twin.store import overwriting
 
                 with overwriting(force):
-                    if "progress" in options:
-                        with shown(goes_on=goes_on) as given["progress"]:
-                            made = work(**given)
-                    else:
-                        made = work(**given)
+                    made = _done(work, given, progress=True, goes_on=goes_on)
                     if made is not None:
                         tell(made)
                 if code := exit_code(made):
@@ -75,6 +70,18 @@ class App(typer.Typer):
             return as_function(work, help or inspect.getdoc(work) or "")
 
         return register
+
+
+def _done(work: Callable[..., Made], given: dict[str, Any], *, progress: Progress | bool | None, goes_on: bool = False) -> Made:
+    """Do the work, which reports to ``progress`` if it reports at all: True shows bars."""
+    if "progress" not in inspect.signature(work).parameters:
+        return work(**given)
+    if progress is not True:
+        return work(**given, progress=progress or silent)
+    from twin.cli.progress import shown
+
+    with shown(goes_on=goes_on) as bars:
+        return work(**given, progress=bars)
 
 
 def writes(options: Any) -> bool:
@@ -116,14 +123,7 @@ def as_function(work: Callable[..., Made], help: str) -> Callable[..., Made]:
         try:
             taken = {name: taken_as(name, _plain(options[name]), marks[name], value) for name, value in bound.items()}
             with overwriting(force):
-                if "progress" not in options:
-                    return work(**taken)
-                if progress is not True:
-                    return work(**taken, progress=progress or silent)
-                from twin.cli.progress import shown
-
-                with shown() as bars:
-                    return work(**taken, progress=bars)
+                return _done(work, taken, progress=progress)
         except typer.BadParameter as error:
             raise OptionError(f"{error.param_hint or ''} {error.message}".strip()) from error
 

@@ -66,7 +66,7 @@ def _require_in_front(placed: PlacedObject, start: np.ndarray, clear: np.ndarray
     if gap_mm < 0.0:
         raise DeviceError(
             f"the straight way to the {placed.spec.name} leads {-gap_mm:.0f} mm behind its surface, which has no known end; jog the arm "
-            "to the side from which the sensor is to touch it, or correct the object's place ('placement' in the file for --servo)"
+            "to the side from which the sensor is to touch it, or correct the object's place ('placement' in the file for `servo`)"
         )
 
 

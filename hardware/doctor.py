@@ -4,15 +4,18 @@ import importlib.metadata
 import importlib.util
 import platform
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from serial.tools import list_ports
 
+from scenes import list_experiments, list_objects, list_randomisations, list_sensors
+from scenes.plugins import plugin_lines
 from twin.errors import RenderError
 from twin.optics.variant import report
 from twin.report.skin3d import probe_offscreen
 from twin.store import cache_folder
+from twin.types import Readable
 
 # Folder in which the Linux kernel lists its cameras.
 SYSFS_CAMERAS = Path("/sys/class/video4linux")
@@ -49,8 +52,8 @@ def serial_ports() -> list[Device]:
     return [Device(port.device, port.description or "serial port") for port in sorted(list_ports.comports())]
 
 
-@dataclass(frozen=True)
-class Machine:
+@dataclass(frozen=True, repr=False)
+class Machine(Readable):
     """What this machine has.
 
     Attributes
@@ -69,6 +72,8 @@ class Machine:
         The folder from which each of the program's own packages is imported.
     kept : Path or None
         The folder of stored results; None if nothing is stored.
+    plugins : list of str
+        Lines on the parts that other packages offer.
     """
 
     packages: dict[str, str]
@@ -78,6 +83,7 @@ class Machine:
     devices: dict[str, list[Device]]
     places: dict[str, Path]
     kept: Path | None
+    plugins: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         """The result as lines of text."""
@@ -91,6 +97,8 @@ class Machine:
             lines += [f"  {kind}: {device.node} ({device.description})" for device in found]
             if not found:
                 lines.append(f"  {kind}: none found; {DEVICES[kind]}")
+        if self.plugins:
+            lines += ["", "Parts of other packages", *(f"  {line}" for line in self.plugins)]
         return [*lines, "", self._verdict()]
 
     def _verdict(self) -> str:
@@ -113,9 +121,11 @@ class Machine:
 def examine_machine() -> Machine:
     """Look for packages, Mitsuba's variants, LLVM, a GPU, offscreen 3D, cameras and serial ports. Opens no device."""
     rendering, can_render = _rendering()
+    for names in (list_sensors, list_objects, list_experiments, list_randomisations):
+        names()  # so that a clash of names is known
     devices = dict(zip(DEVICES, (cameras(), serial_ports()), strict=True))
     versions = {name: _version(name) for name in PACKAGES}
-    return Machine(versions, rendering, can_render, probe_offscreen(), devices, _places(), cache_folder())
+    return Machine(versions, rendering, can_render, probe_offscreen(), devices, _places(), cache_folder(), plugin_lines())
 
 
 def _places() -> dict[str, Path]:

@@ -31,11 +31,11 @@ class StaleDataError(DeviceError):
     """The newest frame or feedback is older than allowed."""
 
 
-def cannot_listen(who: str, host: str, port: int, error: OSError, *, option: str = "--port") -> DeviceError:
+def cannot_listen(who: str, host: str, port: int, error: OSError, *, option: str = "`port`") -> DeviceError:
     """The error of a server that can't listen. It names the address, the reason and the remedy; ``option`` is the option for the port."""
     foreign = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
     remedy = (
-        "give an address of this machine with --host, such as 127.0.0.1" if foreign else f"end what uses the port, or give another {option}"
+        "give an address of this machine with `host`, such as 127.0.0.1" if foreign else f"end what uses the port, or give another {option}"
     )
     return DeviceError(f"{who}: can't listen on {host}:{port} ({error.strerror}); {remedy}")
 

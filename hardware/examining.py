@@ -13,14 +13,14 @@ from twin.frames import evenly_read, open_recording
 from twin.pins import DetectorSpec, Finding, Grade, examine, with_detector
 from twin.progress import Progress, silent, stage
 from twin.store import writes_file
-from twin.types import Form, Frame
+from twin.types import Form, Frame, Readable
 
 LIMIT = 20  # most frames that are used
 MOST_LIVE = 1000  # most frames of a camera that are kept: 6 GB at 1920 x 1080 in colour
 
 
-@dataclass(frozen=True)
-class Examination:
+@dataclass(frozen=True, repr=False)
+class Examination(Readable):
     """The findings, and the irregularities of the recording."""
 
     findings: list[Finding]
@@ -80,7 +80,7 @@ def examine_sensor(
     """
     if detector is not None and detector.method != "twin":
         raise FrameError(
-            f"{detector.name}: tuned for method '{detector.method}', --pipeline takes method 'twin'; run 'twin tune' without --method"
+            f"{detector.name}: tuned for method '{detector.method}', `pipeline` takes method 'twin'; run 'twin tune' without `method`"
         )
     views = []
     if no_contact is not None and (pushes or twist is not None):
@@ -88,7 +88,7 @@ def examine_sensor(
         mirrored = "mirrored and " if view.mirrored else ""
         views.append(f"the camera's picture is {mirrored}turned by {view.turn_deg:.1f} deg against the given specification")
     elif no_contact is not None or pushes or twist is not None or out is not None:
-        raise OptionError("--no-contact, --push and --out belong together: give a frame without contact, and pushes to known sides")
+        raise OptionError("`no_contact`, `push` and `out` belong together: give a frame without contact, and pushes to known sides")
     seeing = sensor if detector is None else with_detector(sensor, detector)  # frames have the size for which the detector was tuned
     frames, notes = frames_of(source, seeing, form, limit)
     with stage(progress, "frames") as step:
@@ -108,6 +108,6 @@ def frames_of(source: str, sensor: SensorSpec | None, form: Form | None, limit: 
         recording = open_recording(Path(source), sensor, form)
         return evenly_read(recording, limit), recording.notes()
     if limit > MOST_LIVE:
-        raise FrameError(f"--limit {limit}: at most {MOST_LIVE} frames of a camera, as they are kept until the end")
+        raise FrameError(f"`limit` {limit}: at most {MOST_LIVE} frames of a camera, as they are kept until the end")
     with camera:
         return [await_frame(camera) for _ in range(limit)], []

@@ -117,8 +117,15 @@ class FollowPlan:
             object.__setattr__(self, "camera", TWIN)
 
 
-class PlannedOnly(Exception):  # noqa: N818  (no error)
-    """The plan was checked, and a dry run ends there."""
+@dataclass(frozen=True)
+class DryRunDone:
+    """The result of a plan that was checked, and not carried out."""
+
+    failure: str = ""
+
+    def lines(self) -> list[str]:
+        """The result as lines of text."""
+        return ["nothing was moved; leave out --dry-run to begin"]
 
 
 @dataclass(frozen=True)
@@ -158,7 +165,7 @@ class Followed:
 @writes("trajectory.csv", "trajectory.png", "measures.json", SESSION)
 def follow(
     plan: FollowPlan, model: SensorModel, out: Path, *, about: dict[str, Any] | None = None, progress: Progress = silent
-) -> Followed:
+) -> Followed | DryRunDone:
     """Follow an object and write the results to ``out``. A run that ends before its last step also has results.
 
     Parameters
@@ -172,8 +179,6 @@ def follow(
     ------
     TwinError
         The run could not begin, or it ended before its first step.
-    PlannedOnly
-        The plan is a dry run, and its check is done.
     """
     kept = KeptAlso(out / SESSION, plan.also, model.sensor)
     rest = given_frame(plan.at_rest, model)
@@ -198,7 +203,7 @@ def follow(
             loop.require_labels(model(first).names)
         _say_turns(rig, plan.servo, wanted_mm)
         if plan.dry_run:
-            raise PlannedOnly
+            return DryRunDone()
         session = stack.enter_context(SessionWriter(out / SESSION, told)) if plan.record else None
         if session is not None and rest is not None:
             session.keep_rest(rest)

@@ -40,13 +40,13 @@ class RerunView:
 
     def __init__(self, title: str, target: str) -> None:
         if target != VIEWER and "://" not in target and not target.endswith(SUFFIX):
-            raise OptionError(f"--rerun {target}: expected '{VIEWER}', a file *{SUFFIX} or an address rerun+http://...")
+            raise OptionError(f"`rerun` {target}: expected '{VIEWER}', a file *{SUFFIX} or an address rerun+http://...")
         if target.endswith(SUFFIX) and "://" not in target and Path(target).exists():
-            raise DeviceError(f"--rerun {target}: is there already; give a new file, or remove it")
+            raise DeviceError(f"`rerun` {target}: is there already; give a new file, or remove it")
         try:
             import rerun
         except ImportError as error:
-            raise DeviceError("--rerun needs the package rerun-sdk; install it: pip install 'tactip-twin[rerun]'") from error
+            raise DeviceError("`rerun` needs the package rerun-sdk; install it: pip install 'tactip-twin[rerun]'") from error
         self._rerun, self._title, self._target = rerun, title, target
         self._stream: rerun.RecordingStream | None = None
         self.url = "Rerun's viewer" if target == VIEWER else target
@@ -72,7 +72,7 @@ class RerunView:
             stream.flush(timeout_sec=ANSWER_S)  # connecting itself reports no error, but flushing does
         except (RuntimeError, OSError, ValueError) as error:
             remedy = "start a viewer ('rerun' prints its address) and give rerun+http://HOST:9876/proxy, or a file"
-            raise DeviceError(f"--rerun {self._target}: can't be opened ({error}); {remedy} *{SUFFIX}") from error
+            raise DeviceError(f"`rerun` {self._target}: can't be opened ({error}); {remedy} *{SUFFIX}") from error
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -80,13 +80,13 @@ class RerunView:
         try:
             stream.flush(timeout_sec=ANSWER_S)
         except RuntimeError as error:
-            raise DeviceError(f"--rerun {self._target}: gone before the end ({error}); the last pictures are missing there") from error
+            raise DeviceError(f"`rerun` {self._target}: gone before the end ({error}); the last pictures are missing there") from error
         finally:
             stream.disconnect()
 
     def _opened(self) -> rerun.RecordingStream:
         if self._stream is None:
-            raise DeviceError(f"--rerun {self._target}: not open; use the view as a context manager")
+            raise DeviceError(f"`rerun` {self._target}: not open; use the view as a context manager")
         return self._stream
 
     def show(self, shot: LiveShot, seen: Observation) -> None:

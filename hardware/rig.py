@@ -5,6 +5,7 @@ which a model measures the pins' displacements. ``signals_as_ctrl_c`` makes sign
 """
 
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from hardware.errors import leave
 from hardware.loop import ServoLoop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import NoWayBackError, SafeArm
-from hardware.safety import SHIPPED_LIMITS, load_limits
+from hardware.safety import load_limits
 from hardware.step import LoopSettings, StepRecord
 from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
@@ -48,14 +49,15 @@ TWIN_FRAME_S = 60.0
 def signals_as_ctrl_c() -> Iterator[None]:
     """Context in which SIGTERM and a closed terminal (SIGHUP) raise ``KeyboardInterrupt`` as Ctrl-C does.
 
-    So the arm is stopped, withdrawn and disabled after these signals, too. Use it in the main thread only. A signal that was ignored
-    before (``nohup``) stays ignored. The former handlers are restored at the end.
+    So the arm is stopped, withdrawn and disabled after these signals, too. In another thread than the main one it changes nothing. A
+    signal that was ignored before (``nohup``) stays ignored. The former handlers are restored at the end.
     """
 
     def interrupt(number: int, _: object) -> None:
         raise KeyboardInterrupt(number)
 
-    before = {ended: signal.getsignal(ended) for ended in (signal.SIGTERM, signal.SIGHUP)}
+    handled = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
+    before = {ended: signal.getsignal(ended) for ended in handled}
     for ended, handler in before.items():
         if handler is not signal.SIG_IGN:
             signal.signal(ended, interrupt)
@@ -77,7 +79,7 @@ def given_frame(at_rest: str, model: SensorModel) -> Frame | None:
     if at_rest in (FIRST, NONE):
         return None
     if not Path(at_rest).exists():
-        raise FrameError(f"--at-rest {at_rest}: no such file; expected a frame without contact, '{FIRST}' or '{NONE}'")
+        raise FrameError(f"`at_rest` {at_rest}: no such file; expected a frame without contact, '{FIRST}' or '{NONE}'")
     recording = open_recording(at_rest, model.sensor, model.form)
     return recording.reference if recording.reference is not None else recording.read(0)
 
@@ -169,16 +171,14 @@ def build_rig(
         For callers that wait for a frame at each stop. A simulated arm in front of the twin's camera then moves instantly, and the twin
         draws a frame only while a reader waits for it.
     """
-    form = form or (Form.RECORDING if sensor.recording else Form.RAW)
+    form = form or (Form.PROCESSED if sensor.recording else Form.RAW)
     placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
     device: Arm = open_arm(arm)
-    simulated = isinstance(device, SimulatedArm)
-    if simulated and camera == TWIN and at_once:
+    simulated = kind_of(arm) == "simulated"  # by its name: an arm of another package is guarded, whatever class it has
+    if isinstance(device, SimulatedArm) and camera == TWIN and at_once:
         device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
     if not simulated or limits is not None:
-        kind = kind_of(arm)
-        if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file():
-            device = SafeArm(device, load_limits(limits or kind))
+        device = SafeArm(device, load_limits(limits or kind_of(arm)))
     twin = None
     if camera == TWIN:
         preview = drawn(sensor, form, plain_light)
@@ -203,7 +203,7 @@ def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
     try:
         preview.shading = traced_shading(preview)
     except RenderError as error:
-        raise RenderError(f"{error}; or draw with --plain-light, which needs no path tracing") from error
+        raise RenderError(f"{error}; or draw with `plain_light`, which needs no path tracing") from error
     return preview
 
 

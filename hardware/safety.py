@@ -17,6 +17,7 @@ from hardware.errors import DeviceError
 from scenes.base import Fraction, NonNegative, Positive, Section, SpecError
 from scenes.files import LONGEST_PATH, shown
 from scenes.load import read_section
+from scenes.plugins import other_files
 
 # Number of bisections of a path in the search for its last allowed place: 100 mm are divided to 0.01 mm.
 CLIP_HALVINGS = 14
@@ -105,6 +106,7 @@ def load_limits(name_or_path: str | Path) -> SafetyLimits:
         There are no such limits, the file does not exist, or its content is not valid.
     """
     shipped = {file.stem: file for file in sorted(SHIPPED_LIMITS.glob("*.toml"))}
+    shipped |= other_files("limits", shipped)
     path, example = shipped.get(str(name_or_path), Path(name_or_path)), SHIPPED_LIMITS / "mg400.toml"
     if not str(name_or_path) or not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
         told = f"{shown(path, LONGEST_PATH)}: no such file" if path.suffix else f"no limits are called '{shown(name_or_path)}'"

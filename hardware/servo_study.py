@@ -15,6 +15,7 @@ from twin.estimate import SensorModel
 from twin.progress import Progress, silent
 from twin.report.charts import save_figure
 from twin.store import text_file, writes
+from twin.types import Readable
 
 # Measures that are printed, with their headings.
 SHOWN = {
@@ -54,8 +55,8 @@ class ServoStudyPlan:
     plain_light: bool = False
 
 
-@dataclass(frozen=True)
-class ServoStudy:
+@dataclass(frozen=True, repr=False)
+class ServoStudy(Readable):
     """The result of ``study_servo``.
 
     Attributes
@@ -106,7 +107,9 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
             asked = FollowPlan(thing, plan.servo, steps=plan.steps, seed=plan.seed, plain_light=plan.plain_light)
             folder = out / folder_name(label) / thing.name
             try:
-                found[label, thing.name] = follow(asked, model, folder, about={"model": label})
+                followed = follow(asked, model, folder, about={"model": label})
+                assert isinstance(followed, Followed)
+                found[label, thing.name] = followed
             except StoreError:
                 raise
             except TwinError as error:

@@ -12,6 +12,7 @@ from scenes.base import SpecError
 from scenes.experiment import ExperimentSpec
 from scenes.files import LONGEST_PATH, LONGEST_SHOWN, read_toml, shown
 from scenes.object import MeshShape, ObjectSpec
+from scenes.plugins import other_files
 from scenes.randomisation import RandomisationSpec
 from scenes.sensor import SensorSpec
 from scenes.servo import ServoSpec
@@ -56,18 +57,20 @@ def list_randomisations() -> dict[str, Path]:
     return _list("randomisations")
 
 
-def load_sensor(name_or_path: str | Path) -> SensorSpec:
-    """Load a sensor by name or by the path of its TOML file.
+def load_sensor(name_or_path: str | Path | SensorSpec) -> SensorSpec:
+    """Load a sensor by name or by the path of its TOML file; as the other loaders, it returns a specification as it is.
 
     Raises
     ------
     SpecError
         There is no such sensor, or its file is not valid. The message names the file, the key and the remedy.
     """
+    if isinstance(name_or_path, SensorSpec):
+        return name_or_path
     return read_section(_find(name_or_path, "sensors"), SensorSpec)
 
 
-def load_object(name_or_path: str | Path) -> ObjectSpec:
+def load_object(name_or_path: str | Path | ObjectSpec) -> ObjectSpec:
     """Load an object by name, by the path of its TOML file, or a mesh file itself (in mm).
 
     Raises
@@ -75,7 +78,9 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
     SpecError
         There is no such object, or its file is not valid. The message names the file, the key and the remedy.
     """
-    path = Path(name_or_path)
+    if isinstance(name_or_path, ObjectSpec):
+        return name_or_path
+    path = Path(name_or_path) if isinstance(name_or_path, str | os.PathLike) else Path()
     if path.suffix.lower() in MESH_SUFFIXES:
         if not os.path.isfile(path):  # unlike ``Path.is_file`` it is also False for a text that can't be a path
             raise SpecError(f"{shown(path, LONGEST_PATH)}: no such mesh file; give the path of an existing STL, OBJ or PLY")
@@ -107,7 +112,7 @@ def _digest(mesh: Path) -> str:
         raise SpecError(f"{mesh}: can't be read ({error.strerror}); give a mesh file that may be read") from error
 
 
-def load_experiment(name_or_path: str | Path) -> ExperimentSpec:
+def load_experiment(name_or_path: str | Path | ExperimentSpec) -> ExperimentSpec:
     """Load an experiment by name or by the path of its TOML file.
 
     Raises
@@ -115,10 +120,12 @@ def load_experiment(name_or_path: str | Path) -> ExperimentSpec:
     SpecError
         There is no such experiment, or its file is not valid. The message names the file, the key and the remedy.
     """
+    if isinstance(name_or_path, ExperimentSpec):
+        return name_or_path
     return read_section(_find(name_or_path, "experiments"), ExperimentSpec)
 
 
-def load_randomisation(name_or_path: str | Path) -> RandomisationSpec:
+def load_randomisation(name_or_path: str | Path | RandomisationSpec) -> RandomisationSpec:
     """Load a randomisation by name or by the path of its TOML file.
 
     Raises
@@ -126,23 +133,26 @@ def load_randomisation(name_or_path: str | Path) -> RandomisationSpec:
     SpecError
         There is no such randomisation, or its file is not valid. The message names the file, the key and the remedy.
     """
+    if isinstance(name_or_path, RandomisationSpec):
+        return name_or_path
     return read_section(_find(name_or_path, "randomisations"), RandomisationSpec)
 
 
-def load_servo(name_or_path: str | Path) -> ServoSpec:
+def load_servo(name_or_path: str | Path | ServoSpec) -> ServoSpec:
     """Load servo parameters by name or by the path of their TOML file; ``SpecError`` as the others."""
+    if isinstance(name_or_path, ServoSpec):
+        return name_or_path
     return read_section(_find(name_or_path, "servos"), ServoSpec)
 
 
 def _list(kind: str) -> dict[str, Path]:
-    found = {}
-    for folder in (SHIPPED / kind, user_spec_dir() / kind):
-        for path in sorted(folder.glob("*.toml")):
-            found[path.stem] = path
-    return found
+    shipped, own = ({path.stem: path for path in sorted(folder.glob("*.toml"))} for folder in (SHIPPED / kind, user_spec_dir() / kind))
+    return shipped | other_files(kind, shipped) | own
 
 
 def _find(name_or_path: str | Path, kind: str) -> Path:
+    if not isinstance(name_or_path, str | os.PathLike):
+        raise SpecError(f"expected a name or a file of {kind}, got {name_or_path!r}")
     path, known = Path(name_or_path), _list(kind)
     listed = f"known: {', '.join(known)}" if kind in UNLISTED else f"'twin {kind}' lists them"
     if path.suffix != ".toml" and os.path.isfile(path):

@@ -141,8 +141,8 @@ class ContactEstimator:
             The frame does not belong to the sensor.
         """
         started = perf_counter()
-        if frame.form == Form.RAW and self.form == Form.RECORDING and self.sensor.recording is not None:
-            frame = replace(frame, image=record(frame.image, self.sensor.recording), form=Form.RECORDING)
+        if frame.form == Form.RAW and self.form == Form.PROCESSED and self.sensor.recording is not None:
+            frame = replace(frame, image=record(frame.image, self.sensor.recording), form=Form.PROCESSED)
         seen = self._any.pins_in(frame)
         if isinstance(seen, Unseen):
             return self._any.unseen(seen, started)

@@ -61,7 +61,7 @@ class Dataset:
             The data set was joined from several recordings.
         """
         if len(self.folders) > 1:
-            raise FrameError(f"pictures are read from one recording at a time, these are {len(self.folders)}; give one --data")
+            raise FrameError(f"pictures are read from one recording at a time, these are {len(self.folders)}; give one `data`")
         return self.folders[0]
 
     def rows(self, index: np.ndarray) -> "Dataset":

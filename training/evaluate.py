@@ -69,13 +69,13 @@ def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndar
         return np.arange(len(data))
     split, known = estimator.config["split"], estimator.config["rows"]
     if split is None:
-        raise TrainingError("the run was trained on all rows; give a recording it has not seen, and --rows all")
+        raise TrainingError("the run was trained on all rows; give a recording it has not seen, and `rows` all")
     if "kept_out" in known:
         return rows_named(data, known["kept_out"])
     if known.get("usable") != len(data):
         raise TrainingError(
             f"the run was trained on part of {known.get('usable')} rows, this recording has {len(data)}; "
-            "give --rows all for a recording it has not seen"
+            "give `rows` all for a recording it has not seen"
         )
     return data.natural_order()[split_rows(len(data), split, data.in_order().group)[1]]
 
@@ -297,7 +297,7 @@ def judge_changes(
         The data set has no pictures.
     """
     if is_pins_only(data.folder):
-        raise TrainingError(f"{data.folder}: a data set of pins has no pictures to change; render it, or judge without --robustness")
+        raise TrainingError(f"{data.folder}: a data set of pins has no pictures to change; render it, or judge without `robustness`")
     recording = open_recording(data.folder, data.pins.sensor, data.pins.form)
     place = {name: k for k, name in enumerate(recording.names)}
     changes: dict[str, Change] = {"none": lambda image, rng, estimator: image} | CHANGES

@@ -50,7 +50,7 @@ def rows_named(data: Dataset, names: list[str]) -> np.ndarray:
         raise TrainingError(
             f"{', '.join(map(str, data.folders))}: {len(missing)} of the {len(names)} frames that the run kept out of its training are not "
             f"among its {len(data)} usable ones ({', '.join(missing[:NAMED])}{', ...' if len(missing) > NAMED else ''}){said}; "
-            "give exactly what the run was trained on, or --rows all for a recording it has not seen"
+            "give exactly what the run was trained on, or `rows` all for a recording it has not seen"
         )
     return np.array([row for name in names for row in found[name]], int)
 
@@ -75,7 +75,7 @@ def learnt_before(learnt: np.ndarray | None, data: Dataset) -> list[str]:
         return []
     return [
         f"{int(known.sum())} of these {len(data)} frames are frames that the run learnt from (first {data.pins.image_name[known][0]}): "
-        "errors on them are smaller than on new ones; give a recording it has not seen, or --rows validation"
+        "errors on them are smaller than on new ones; give a recording it has not seen, or `rows` validation"
     ]
 
 

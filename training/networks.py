@@ -29,9 +29,9 @@ def choose_device(name: str) -> str:
         It is ``cuda``, and PyTorch finds no GPU.
     """
     if name not in ("auto", "cpu", "cuda"):
-        raise OptionError(f"--device must be auto, cpu or cuda, got {name!r}")
+        raise OptionError(f"`device` must be auto, cpu or cuda, got {name!r}")
     if name == "cuda" and not torch.cuda.is_available():
-        raise TrainingError("--device cuda: PyTorch finds no GPU here; give --device cpu, or install a PyTorch built for your GPU")
+        raise TrainingError("`device` cuda: PyTorch finds no GPU here; give `device` cpu, or install a PyTorch built for your GPU")
     return "cuda" if name != "cpu" and torch.cuda.is_available() else "cpu"
 
 

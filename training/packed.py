@@ -63,7 +63,7 @@ def pack(run: Path, out: Path) -> int:
     if rows > MOST_ROWS:
         raise TrainingError(
             f"{run}: has Gaussian processes of {rows} frames beside its networks, and a small copy holds {MOST_ROWS} at most; "
-            "train with --no-kernel"
+            "train with `kernel=False`"
         )
     model = model_named(config["model"])
     kept = {key: value for key, value in content.items() if key not in NOT_PACKED}

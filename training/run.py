@@ -38,7 +38,7 @@ FOLDS = 10  # parts of the training rows; each network of an ensemble holds out 
 KEEP_EVERY_S = 20.0  # s between two checkpoints
 FEWEST_PARTS = 3  # least number of rows, or groups of rows: with fewer, almost no rows are left beside the held-out part
 MOST_SEED = 2**32 - 1  # largest seed. PyTorch takes seeds of 64 bits, and each network has its own seed
-BEGIN_ANEW = "remove it to begin anew, or give another --out"  # remedy for a damaged checkpoint
+BEGIN_ANEW = "remove it to begin anew, or give another `out`"  # remedy for a damaged checkpoint
 EXTRA_WEIGHT = 0.3  # weight of a helper label in the loss; requested labels have the weight 1
 
 
@@ -116,7 +116,7 @@ def train_run(
     """
     started = monotonic()
     if max_minutes is not None and not max_minutes >= 0:  # also true for NaN, with which the training would never stop
-        raise TrainingError(f"--max-minutes {max_minutes}: give a time of 0 or more")
+        raise TrainingError(f"`max_minutes` {max_minutes}: give a time of 0 or more")
     data = data.in_order()
     train = training_rows(config, data)
     parts = len(train if data.group is None else np.unique(data.group[train]))
@@ -318,7 +318,7 @@ def _opened(out: Path, resolved: dict) -> dict | None:
     path = out / CHECKPOINT
     if not path.is_file():
         if (out / TENSORS).is_file():
-            raise TrainingError(f"{out}: holds a finished run; give another --out")
+            raise TrainingError(f"{out}: holds a finished run; give another `out`")
         write_text(out / CONFIG, json.dumps(resolved, indent=1) + "\n")
         return None
     state = read_tensors(path, BEGIN_ANEW)
@@ -333,7 +333,7 @@ def _opened(out: Path, resolved: dict) -> dict | None:
 def _require_same(out: Path, wanted: dict, found: Mapping, state: str) -> None:
     if differs := difference(json.loads(_identity(wanted)), found):
         raise TrainingError(
-            f"{out}: holds a run with other settings or data, {state} ({differs}); give another --out, or the same settings and data"
+            f"{out}: holds a run with other settings or data, {state} ({differs}); give another `out`, or the same settings and data"
         )
 
 

@@ -54,7 +54,7 @@ def open_simulated(folder: Path, spec: SensorSpec, form: Form | None = None) -> 
     """
     truth, sensor, given = open_truth(folder)
     if sensor != spec.name:
-        raise FrameError(f"{folder}: simulated for '{sensor}', not for '{spec.name}'; give the matching --sensor")
+        raise FrameError(f"{folder}: simulated for '{sensor}', not for '{spec.name}'; give the matching `sensor`")
     problems: list[str] = []
     table = read_table(folder / TABLE, problems) if (folder / TABLE).is_file() else None
     if table is None:
@@ -73,7 +73,7 @@ def open_simulated(folder: Path, spec: SensorSpec, form: Form | None = None) -> 
     form = form or given
     if form != given:
         for key in ("pins_px", "rest_px"):
-            raw_px = recording_to_raw(spec.recording, arrays[key]) if given == Form.RECORDING else arrays[key]
+            raw_px = recording_to_raw(spec.recording, arrays[key]) if given == Form.PROCESSED else arrays[key]
             arrays[key] = from_raw(spec.recording, form, raw_px)
     return Recording(folder, form, names, frame_size(spec, form), labels, problems=problems), arrays
 

@@ -27,15 +27,15 @@ from training.touched import TouchAnswer
 from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.store import writes
-from twin.types import Form
+from twin.types import Form, Readable
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helper labels
 SHEAR_HELPERS = ("move_1", "move_6")  # these moves
 FILES = (CONFIG, "curves.csv", TENSORS, MAPS, SLIP, DISPLACEMENTS, DOMAIN)  # files of a finished run
 
 
-@dataclass(frozen=True)
-class Trained:
+@dataclass(frozen=True, repr=False)
+class Trained(Readable):
     """A training run and its recordings.
 
     Attributes
@@ -131,7 +131,7 @@ def train_model(
         The recordings have no such labels, or can't be joined.
     """
     if labels not in ("corrected", "raw"):
-        raise OptionError(f"--labels must be corrected or raw, got {labels!r}")
+        raise OptionError(f"`labels` must be corrected or raw, got {labels!r}")
     recipe = recipe_of(model, epochs=epochs, batch=batch, members=members, kernel=kernel)
     if threads:
         torch.set_num_threads(threads)
@@ -244,5 +244,5 @@ def columns_of(target: str) -> str | tuple[str, ...]:
     """
     names = tuple(name.strip() for name in target.split(",") if name.strip())
     if not names or len(set(names)) < len(names):
-        raise OptionError(f"--target {target}: give a preset, or label columns with commas between, each once")
+        raise OptionError(f"`target` {target}: give a preset, or label columns with commas between, each once")
     return target if target in (*PRESETS, CONTACT) else names

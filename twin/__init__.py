@@ -1,7 +1,74 @@
-"""Digital twin of the TacTip: simulate contacts of the skin, render the frames of its camera, find the pins, and build their graph."""
+"""Digital twin of the TacTip, a soft tactile sensor with a camera inside.
 
+    import twin
+
+    simulator = twin.Simulator(twin.load_sensor("mg400-331"))
+    pose = twin.ContactPose(indent_mm=3.0, tilt_deg=(0.0, 5.0))
+    state = simulator.press(twin.load_object("cylinder"), pose)
+    rendered = simulator.render(state, form=twin.Form.PROCESSED)
+    observation = twin.Pipeline(simulator.spec, rendered.frame.form)(rendered.frame)
+    print(state, rendered, observation, sep="\\n")
+
+specifications  load_sensor load_object load_experiment
+simulation      Simulator ContactPose
+frames, pins    Frame Form Pipeline Observation node_features preprocess tune
+your sensor     new_sensor check calibrate_optics calibrate_contact
+how true it is  validate realism robustness audit
+models          make_dataset train evaluate predict load_model
+policies        register_environments learn
+devices         open_camera open_arm SafeArm load_limits collect servo run_policy
+other           errors extend __version__
+
+A function such as `train` does what the command of its name does. It takes the command's options as keyword arguments, and returns a
+result: `print(str(result))` shows it, `result.written` names its files. `help(twin.train)` explains each argument. `twin.extend` is for
+authors of new sensors, arms, cameras, models and tasks. Each name is imported when it is first used.
+"""
+
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
+
+from twin.lazy import named
+
+_PLACES = {
+    "ContactPose": "twin.mechanics.path",
+    "Form": "twin.types",
+    "Frame": "twin.types",
+    "Observation": "twin.types",
+    "Pipeline": "twin.pins.pipeline",
+    "SafeArm": "hardware.safe_arm",
+    "Simulator": "twin.simulator",
+    "audit": "twin.cli.calibration",
+    "calibrate_contact": "twin.cli.calibration",
+    "calibrate_optics": "twin.cli.calibration",
+    "check": "twin.cli.frames",
+    "collect": "twin.cli.live",
+    "evaluate": "twin.cli.learning",
+    "learn": "twin.cli.learning",
+    "load_experiment": "scenes",
+    "load_limits": "hardware.safety",
+    "load_model": "training.estimator:load_remembering",
+    "load_object": "scenes",
+    "load_sensor": "scenes",
+    "make_dataset": "twin.cli.learning",
+    "new_sensor": "twin.cli.calibration",
+    "node_features": "twin.pins.graph",
+    "open_arm": "hardware.arms.open_arm",
+    "open_camera": "hardware.cameras.choose",
+    "predict": "twin.cli.learning",
+    "preprocess": "twin.cli.frames",
+    "realism": "twin.cli.calibration",
+    "register_environments": "training.environments:register_all",
+    "robustness": "twin.cli.calibration",
+    "run_policy": "twin.cli.live",
+    "servo": "twin.cli.live",
+    "train": "twin.cli.learning",
+    "tune": "twin.cli.frames",
+    "validate": "twin.cli.calibration",
+}
+"""By public name: its module, and its name there if that is another."""
+_MODULES = ("errors", "extend")
 
 
 def require_own(*names: str) -> None:
@@ -13,5 +80,18 @@ def require_own(*names: str) -> None:
             hiding = Path(spec.origin).parent if spec.submodule_search_locations else spec.origin
             raise ImportError(f"{hiding} hides {home / name} of tactip-twin; rename it, or start in another folder")
 
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib import metadata
+
+        return metadata.version("tactip-twin")
+    if name in _MODULES:
+        return import_module(f"twin.{name}")
+    require_own("training", "hardware")
+    return named(_PLACES, "twin", name)
+
+
+__all__ = ["__version__", *sorted([*_PLACES, *_MODULES])]
 
 require_own("scenes")

@@ -6,7 +6,6 @@ from typing import Any, ClassVar, Protocol
 
 from scenes import SensorSpec
 from scenes.object import ObjectSpec
-from twin.errors import ContactError
 from twin.frames.images import write_image
 from twin.mechanics.path import ContactPose
 from twin.objects import build_field
@@ -16,9 +15,9 @@ from twin.progress import Progress, silent, stage
 from twin.report.charts import save_figure
 from twin.report.plots import Look, contact_panel
 from twin.report.skin3d import displaced_skin, draw_contact_skin, write_surface
-from twin.simulator import Shot, Simulator
+from twin.simulator import RenderedFrame, Simulator
 from twin.store import made_by, write_json, write_npz, writes
-from twin.types import ContactState, FloatArray, Form
+from twin.types import ContactState, FloatArray, Form, Readable
 
 FILES = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
 """Files of a contact, in the order in which they are written."""
@@ -34,19 +33,19 @@ class Pose(Protocol):
         """Indentation from the first touch on."""
 
 
-@dataclass(frozen=True)
-class RenderedContact:
+@dataclass(frozen=True, repr=False)
+class RenderedContact(Readable):
     """A simulated and rendered contact, and its files."""
 
     state: ContactState
-    shot: Shot
+    rendered: RenderedFrame
     look: Look
     written: list[Path]
 
     def lines(self) -> list[str]:
         """The result as lines of text: force, contact area and number of visible caps, and what the pipeline finds of them."""
         force = self.state.force_n.round(2) + 0.0  # 0.0 turns negative zeros into positive ones
-        visible = self.shot.truth.visible
+        visible = self.rendered.truth.visible
         seen = self.look.observation
         found = f"the pipeline finds {seen.found} of {len(seen.pins_px)} pins in the picture"
         useless = f"note: the pipeline can't use the picture: {seen.reason}; 'twin check' tells where the specification is wrong"
@@ -91,34 +90,32 @@ def render_contact(
     RenderError
         If the renderer does not work on this machine.
     """
-    if pose.indent_mm < 0:
-        raise ContactError(f"--indent-mm {pose.indent_mm:g}: the object would not touch; give 0 for no contact, or more")
     simulator = Simulator(sensor, quality=quality)
     simulator.check_form(form)
     with stage(progress, f"press {touched.name}") as step:
         state = simulator.press(touched, pose, progress=step)
     with stage(progress, "render"):
-        shot = simulator.shoot(state, form=form, seed=seed)
+        rendered = simulator.render(state, form=form, seed=seed)
     with stage(progress, "pictures"):
-        written, look = write_contact(out, simulator, touched, pose, state, shot)
-    return RenderedContact(state, shot, look, written)
+        written, look = write_contact(out, simulator, touched, pose, state, rendered)
+    return RenderedContact(state, rendered, look, written)
 
 
 def write_contact(
-    out: Path, simulator: Simulator, touched: ObjectSpec, pose: Pose, state: ContactState, shot: Shot
+    out: Path, simulator: Simulator, touched: ObjectSpec, pose: Pose, state: ContactState, rendered: RenderedFrame
 ) -> tuple[list[Path], Look]:
     """Write all files of one contact into a folder. Returns the files, and what the pipeline sees in the picture."""
     spec = simulator.spec
-    write_image(out / "frame.png", shot.frame.image)
-    write_exr(out / "frame.exr", shot.linear, simulator.renderer.choice)
-    write_npz(out / "truth.npz", asdict(shot.truth) | contact_arrays(state), compressed=True)
-    record = contact_record(simulator, touched, pose, state, shot)
+    write_image(out / "frame.png", rendered.frame.image)
+    write_exr(out / "frame.exr", rendered.linear, simulator.renderer.choice)
+    write_npz(out / "truth.npz", asdict(rendered.truth) | contact_arrays(state), compressed=True)
+    record = contact_record(simulator, touched, pose, state, rendered)
     write_json(out / "truth.json", record | {"made_by": made_by(Simulator, inputs=[spec, touched, pose])})
 
     mesh = simulator.solver.mesh
     write_surface(out / "skin.vtp", displaced_skin(mesh, state))
     draw_contact_skin(mesh, spec.pins, state, build_field(touched), out / "skin.png")
-    look = look_at(simulator, shot)
+    look = look_at(simulator, rendered)
     title = f"{spec.name} against {touched.name}, {pose.indent_mm:g} mm deep, {state.force_n[2]:.2f} N"
     save_figure(out / "panel.png", contact_panel(out / "skin.png", look, title), dpi=110)
     return [out / name for name in FILES], look
@@ -130,15 +127,17 @@ def contact_arrays(state: ContactState) -> dict[str, FloatArray]:
     return {f"contact_{name.removeprefix('contact_')}": getattr(state, name) for name in names}
 
 
-def look_at(simulator: Simulator, shot: Shot) -> Look:
-    """Run the pipeline on a shot, and on the frame without contact of the same sensor."""
-    form = shot.frame.form
+def look_at(simulator: Simulator, rendered: RenderedFrame) -> Look:
+    """Run the pipeline on a rendered frame, and on the frame without contact of the same sensor."""
+    form = rendered.frame.form
     pipeline = Pipeline(simulator.spec, form)
-    rest = pipeline(simulator.shoot_rest(form).frame)  # first: it loads compiled code, which must not count in the times of the shot
-    return Look(shot.frame, pipeline(shot.frame), rest)
+    rest = pipeline(simulator.render_rest(form).frame)  # first: it loads compiled code, which must not count in its times
+    return Look(rendered.frame, pipeline(rendered.frame), rest)
 
 
-def contact_record(simulator: Simulator, touched: ObjectSpec, pose: Pose, state: ContactState, shot: Shot) -> dict[str, object]:
+def contact_record(
+    simulator: Simulator, touched: ObjectSpec, pose: Pose, state: ContactState, rendered: RenderedFrame
+) -> dict[str, object]:
     """The content of ``truth.json``: forces on the object in the sensor frame, the pose, and all resolved specifications."""
     return {
         "force_n": state.force_n.tolist(),
@@ -146,10 +145,10 @@ def contact_record(simulator: Simulator, touched: ObjectSpec, pose: Pose, state:
         "area_mm2": state.area_mm2,
         "pose": asdict(pose),
         "T_sensor_object": state.T_sensor_object.tolist(),
-        "form": str(shot.frame.form),
+        "form": str(rendered.frame.form),
         "elastic_nmm": state.elastic_nmm,
         "residual": state.residual,
-        "seconds": {"render": shot.seconds},
+        "seconds": {"render": rendered.seconds},
         **simulator.describe(),
         "sensor": simulator.spec.model_dump(mode="json"),
         "object": touched.model_dump(mode="json"),

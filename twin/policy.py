@@ -156,7 +156,7 @@ class PolicyModel:
             )
         self.policy = policy
         self.sensor = SensorSpec.model_validate(policy.about["sensor"])
-        self.form = Form.RECORDING if self.sensor.recording else Form.RAW
+        self.form = Form.PROCESSED if self.sensor.recording else Form.RAW
         self._nominal = nominal_reference(self.sensor, self.form)
         self._goal = np.asarray(policy.about["goal"] if goal is None else goal, np.float32)
         self._stack: list[FloatArray] = []

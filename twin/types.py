@@ -1,8 +1,10 @@
 """Frozen types of the data between the stages, with their shapes and units."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol, TypeAlias
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +26,25 @@ FINE = 20
 FIRST, NONE = "first", "none"
 
 
+class Readable:
+    """A result in words. Its ``repr`` is the first line, its text all lines."""
+
+    def lines(self) -> Iterable[str]:
+        """The result as lines of text."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {next(iter(self.lines()), '')}>"
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+
 class Form(StrEnum):
     """The two forms of a sensor's frames."""
 
     RAW = "raw"  # the camera's own frame
-    RECORDING = "recording"  # cropped, thresholded and resized at capture
+    PROCESSED = "recording"  # cropped, thresholded and resized at capture, as files and options call the frames of the recordings
 
 
 @dataclass(frozen=True)
@@ -52,6 +68,16 @@ class Frame:
     name: str = ""
     time_s: float = 0.0
     sequence: int = 0
+
+    def __repr__(self) -> str:
+        height, width = self.image.shape[:2]
+        return f"<Frame: {width} x {height} px, {self.form}{f', {self.name}' if self.name else ''}>"
+
+
+def _save(folder: str | Path, name: str, arrays: dict[str, Any]) -> list[Path]:
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(Path(folder) / name, **arrays)
+    return [Path(folder) / name]
 
 
 class PinState(Protocol):
@@ -134,6 +160,26 @@ class ContactState:
     dissipated_nmm: float
     residual: float
 
+    def __repr__(self) -> str:
+        x, y, z = self.force_n.round(2) + 0.0  # 0.0 turns negative zeros into positive ones
+        return f"<ContactState: force {x:+.2f} {y:+.2f} {z:+.2f} N, contact area {self.area_mm2:.1f} mm2>"
+
+    def to_table(self) -> dict[str, np.ndarray]:
+        """Columns with a row for each contact point (sensor frame): ``pandas.DataFrame(state.to_table())``."""
+        names = [(f"{axis}_mm", self.contact_mm[:, k]) for k, axis in enumerate("xyz")]
+        names += [(f"traction_{axis}_mpa", self.traction_mpa[:, k]) for k, axis in enumerate("xyz")]
+        return dict(names) | {"area_mm2": self.point_area_mm2, "pressure_mpa": self.pressure_mpa, "slipping": self.slipping}
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write ``state.npz``, which holds all attributes, into a folder, made if missing. Returns the files."""
+        return _save(folder, "state.npz", vars(self))
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "ContactState":
+        """The state that ``save`` wrote into a folder."""
+        with np.load(Path(folder) / "state.npz") as kept:
+            return cls(**{name: kept[name] if kept[name].ndim else kept[name].item() for name in kept})
+
     @property
     def pressure_mpa(self) -> FloatArray:
         """Normal pressure (c,) at each contact point, relative to the skin's area at rest."""
@@ -199,6 +245,9 @@ class PinGraph:
     area_px2: FloatArray
     cells: list[FloatArray] = field(default_factory=list)
 
+    def __repr__(self) -> str:
+        return f"<PinGraph: {self.kind}, {len(self.nodes_px)} nodes, {len(self.edges)} edges>"
+
 
 @dataclass(frozen=True)
 class Observation:
@@ -234,6 +283,20 @@ class Observation:
     graph: PinGraph | None
     extra_px: FloatArray
     ms: dict[str, float]
+
+    def __repr__(self) -> str:
+        return f"<Observation: {self.found} of {self.expected} pins found, {'valid' if self.valid else self.reason}>"
+
+    def to_table(self) -> dict[str, np.ndarray]:
+        """Columns with a row for each pin, in the specification's order: ``pandas.DataFrame(observation.to_table())``."""
+        found, count = np.isfinite(self.pins_px[:, 0]), len(self.pins_px)
+        places = np.where(found[:, None], self.pins_px, self.predicted_px)
+        area = np.full(count, np.nan) if self.graph is None else self.graph.area_px2
+        return {"pin": np.arange(count), "x_px": places[:, 0], "y_px": places[:, 1], "found": found, "area_px2": area}
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write ``pins.npz``, which holds the columns of ``to_table``, into a folder, made if missing. Returns the files."""
+        return _save(folder, "pins.npz", self.to_table())
 
     @property
     def complete(self) -> bool:

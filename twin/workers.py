@@ -253,7 +253,7 @@ def _client(scheduler: str) -> Iterator["Client"]:
         try:
             client = Client(scheduler, timeout="10s")
         except (OSError, ValueError) as error:
-            raise DatasetError(f"--scheduler {scheduler}: no scheduler answers there ({error}); start one with 'dask scheduler'") from error
+            raise DatasetError(f"`scheduler` {scheduler}: no scheduler answers there ({error}); start one with 'dask scheduler'") from error
         try:
             yield client
         finally:

@@ -55,7 +55,7 @@ def text_of(page: str, members: list[Module]) -> str:
     for module in members:
         tree = module.tree
         lines += [f"## {module.name}", "", markdown(ast.get_docstring(tree)), ""]
-        exported = _exported(tree) if module.path.name == "__init__.py" else {}
+        exported = _exported(tree) if module.path.name in ("__init__.py", "extend.py") else {}
         if exported:
             first = min(exported)
             lines += [
@@ -167,8 +167,10 @@ def _exported(tree: ast.Module) -> dict[str, str]:
         if isinstance(node, ast.ImportFrom) and node.module
         for alias in node.names
     }
-    lists = [node.value for node in tree.body if isinstance(node, ast.Assign) and any(ast.unparse(t) == "__all__" for t in node.targets)]
-    names = [name for each in lists for name in ast.literal_eval(each)]
+    assigned = {ast.unparse(target): node.value for node in tree.body if isinstance(node, ast.Assign) for target in node.targets}
+    if "_PLACES" in assigned:  # names that are imported when they are first used
+        return {name: place.replace(":", ".") for name, place in ast.literal_eval(assigned["_PLACES"]).items()}
+    names = ast.literal_eval(assigned["__all__"]) if "__all__" in assigned else []
     return {name: places[name] for name in names if name in places}
 
 

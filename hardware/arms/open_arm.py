@@ -8,7 +8,9 @@ from hardware.arms.mg400_wire import DASHBOARD_PORT, DEFAULT_HOSTS
 from hardware.arms.simulated import SimulatedArm
 from hardware.errors import DeviceError
 from scenes.files import shown
+from scenes.plugins import others
 
+KINDS = ("simulated", "mg400", "mg400-lenient", "magician")
 ARM_SPECS = (
     "mg400 or mg400:ADDRESS[:DASHBOARD_PORT] (an arm, or 127.0.0.1 with 'twin emulate mg400'), mg400-lenient:ADDRESS[:DASHBOARD_PORT] "
     "(a controller that is only alike), magician or magician:/dev/ttyUSB0, "
@@ -41,7 +43,11 @@ def open_arm(spec: str) -> Arm:
         return MG400(host or DEFAULT_HOSTS["LAN1"], ports=ports, lenient=kind == "mg400-lenient")
     if kind == "magician":
         return Magician(rest or _attached_magician())
-    raise DeviceError(f"no arm '{shown(spec)}'; there are: {ARM_SPECS}")
+    there = others("arms", KINDS)
+    if kind in there:
+        arm: Arm = there[kind](rest)
+        return arm
+    raise DeviceError(f"no arm '{shown(spec)}'; there are: {', '.join((ARM_SPECS, *there))}")
 
 
 def kind_of(spec: str) -> str:

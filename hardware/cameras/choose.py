@@ -9,6 +9,7 @@ from hardware.cameras.uvc import UvcCamera, UvcSettings
 from hardware.errors import DeviceError
 from hardware.session import SessionSource
 from scenes.files import LONGEST_PATH, shown
+from scenes.plugins import others
 from scenes.sensor import SensorSpec
 from twin.frames.forms import frame_size
 from twin.records.session import is_session
@@ -43,7 +44,7 @@ def open_camera(
     DeviceError, FrameError
         There is no such camera, recording or file.
     """
-    live_form = form or (Form.RECORDING if spec is not None and spec.recording is not None else Form.RAW)
+    live_form = form or (Form.PROCESSED if spec is not None and spec.recording is not None else Form.RAW)
     if spec is not None:
         frame_size(spec, live_form)
     if text == "twin":
@@ -52,6 +53,10 @@ def open_camera(
         return twin
     if text.isdecimal() or text.startswith("/dev/"):
         return UvcCamera(int(text) if text.isdecimal() else text, spec, live_form, settings)
+    kind, _, rest = text.partition(":")
+    if (there := others("cameras", ("twin", "http", "https"))) and kind in there:
+        source: FrameSource = there[kind](rest, spec, live_form)
+        return source
     if "://" in text:
         return MjpegCamera(text, spec, live_form)
     if not os.path.exists(text):

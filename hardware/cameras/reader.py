@@ -304,7 +304,7 @@ class LiveSource(Connection):
 
     def _may_repeat(self, image: np.ndarray) -> bool:
         """Whether pictures like this one may repeat without a fault: those of the twin, and those that their sender thresholded."""
-        camera = None if self._spec is None or self.form is not Form.RECORDING else self._spec.camera
+        camera = None if self._spec is None or self.form is not Form.PROCESSED else self._spec.camera
         return not self.notices_still or (camera is not None and image.shape[1::-1] != (camera.width_px, camera.height_px))
 
     def _is_new(self, picture: Picture) -> bool:
@@ -358,9 +358,9 @@ def capture(image: np.ndarray, spec: SensorSpec | None, form: Form) -> np.ndarra
         return image
     size = (spec.camera.width_px, spec.camera.height_px)
     if image.shape[1::-1] != size:
-        if form == Form.RECORDING and image.shape[1::-1] == frame_size(spec, form):
+        if form == Form.PROCESSED and image.shape[1::-1] == frame_size(spec, form):
             return gray_levels(image)  # thresholded by the sender
         raise DeviceError(f"delivers {image.shape[1]}x{image.shape[0]}, {spec.name} has {size[0]}x{size[1]}; give the matching sensor")
     if spec.camera.channels == "mono":
         image = gray_levels(image)
-    return record(image, spec.recording) if form == Form.RECORDING and spec.recording is not None else image
+    return record(image, spec.recording) if form == Form.PROCESSED and spec.recording is not None else image

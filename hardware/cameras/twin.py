@@ -80,7 +80,7 @@ class TwinCamera(LiveSource):
         frame_size(spec, self.form)
         self._spec, self._placed, self._arm, self._period_s = spec, placed, arm, 1.0 / fps
         self._seed, self._preview = seed, preview
-        self._recording = spec.recording if self.form is Form.RECORDING else None
+        self._recording = spec.recording if self.form is Form.PROCESSED else None
         self.streams = not on_demand
         self._on_demand, self._asked = on_demand, threading.Event()
         self._waits_for_arm = waits_for_arm
@@ -160,7 +160,7 @@ class TwinCamera(LiveSource):
 
 def preview_of(spec: SensorSpec, form: Form) -> Preview:
     """The preview of the part of the raw frame that a form needs."""
-    return Preview(spec, window_px=spec.recording.crop_px if form == Form.RECORDING and spec.recording is not None else None)
+    return Preview(spec, window_px=spec.recording.crop_px if form == Form.PROCESSED and spec.recording is not None else None)
 
 
 def steady(image: np.ndarray, response: ResponseSpec, rng: np.random.Generator) -> np.ndarray:

@@ -110,7 +110,7 @@ class MagicianEmulator:
             except OSError as error:
                 self.unplug()
                 raise TwinError(
-                    f"{self._link}: can't make the link ({error.strerror}); remove what is there or give another --link"
+                    f"{self._link}: can't make the link ({error.strerror}); remove what is there or give another `link`"
                 ) from error
         self._thread = Thread(target=self._serve, daemon=True, name="magician-emulator")
         self._thread.start()

@@ -159,7 +159,7 @@ class Mg400Emulator:
                 listener.bind((self.host, 0 if self._port_offset is None else port + self._port_offset))
             except OSError as error:
                 self.stop()
-                raise cannot_listen("mg400", self.host, port + (self._port_offset or 0), error, option="--port-offset") from error
+                raise cannot_listen("mg400", self.host, port + (self._port_offset or 0), error, option="`port_offset`") from error
             self.ports[port] = listener.getsockname()[1]
             if port not in deaf:
                 listener.listen()

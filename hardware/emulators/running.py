@@ -98,7 +98,7 @@ def emulate_magician(
 
 def _require_time_scale(time_scale: float) -> None:
     if not SLOWEST <= time_scale <= FASTEST:
-        raise DeviceError(f"--time-scale {time_scale:g}: expected {SLOWEST:g} to {FASTEST:g} times the real arm's speed")
+        raise DeviceError(f"`time_scale` {time_scale:g}: expected {SLOWEST:g} to {FASTEST:g} times the real arm's speed")
 
 
 def fault_lines(known: dict[str, tuple[float | None, str]]) -> list[str]:

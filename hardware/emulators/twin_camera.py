@@ -44,7 +44,7 @@ class FeedbackPose:
         kind, _, rest = spec.partition(":")
         host, _, port = rest.partition(":")
         if kind not in ("mg400", "mg400-lenient") or not host or (port and not port.isdecimal()):
-            raise OptionError(f"--arm {spec}: expected mg400:ADDRESS, for example mg400:127.0.0.1 with 'twin emulate mg400' running")
+            raise OptionError(f"`arm` {spec}: expected mg400:ADDRESS, for example mg400:127.0.0.1 with 'twin emulate mg400' running")
         offset = int(port) - DASHBOARD_PORT if port else 0
         require_ports(offset)
         return cls(host, tuple(number + offset for number in FEEDBACK_PERIOD_S), lenient=kind != "mg400")

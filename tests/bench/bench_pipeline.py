@@ -20,7 +20,7 @@ from drawn_frames import drawn_frame, smooth_warp  # noqa: E402
 
 from scenes import load_sensor  # noqa: E402
 from twin.frames import open_recording  # noqa: E402
-from twin.pins import Pipeline, features, nominal_reference  # noqa: E402
+from twin.pins import Pipeline, node_features, nominal_reference  # noqa: E402
 from twin.types import Form  # noqa: E402
 
 FOLDERS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
@@ -35,9 +35,9 @@ def take_frames(spec, count):
         picked = np.linspace(0, len(recording) - 1, min(count, len(recording))).astype(int)
         return [recording.read(k) for k in picked], f"recorded frames ({folder.name})"
     rng = np.random.default_rng(0)
-    rest = nominal_reference(spec, Form.RECORDING)
+    rest = nominal_reference(spec, Form.PROCESSED)
     pitch = rest.spacing_px.mean()
-    frames = [drawn_frame(spec, Form.RECORDING, smooth_warp(rest.pins_px, rng.uniform(0, pitch), rng)) for _ in range(count)]
+    frames = [drawn_frame(spec, Form.PROCESSED, smooth_warp(rest.pins_px, rng.uniform(0, pitch), rng)) for _ in range(count)]
     return frames, "drawn frames (no recordings found; set TACTIP_REAL)"
 
 
@@ -72,12 +72,12 @@ def measure(sensor: str, count: int) -> Times:
     cv2.setNumThreads(1)
     spec = load_sensor(sensor)
     frames, what = take_frames(spec, count)
-    pipeline, baseline = Pipeline(spec, Form.RECORDING), Baseline(spec)
+    pipeline, baseline = Pipeline(spec, Form.PROCESSED), Baseline(spec)
     ours: dict[str, list[float]] = {}
     theirs: dict[str, list[float]] = {}
     for k, frame in enumerate(frames[:1] * WARM_UP + frames):
         observation, total = timed(pipeline, frame)
-        _, feature_ms = timed(features, observation.graph, pipeline.reference) if observation.valid else (None, 0.0)
+        _, feature_ms = timed(node_features, observation.graph, pipeline.reference) if observation.valid else (None, 0.0)
         nodes, detect_ms = timed(baseline.detect, frame.image)
         _, graph_ms = timed(baseline.graph, nodes)
         if k >= WARM_UP:

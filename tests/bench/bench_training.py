@@ -24,7 +24,7 @@ DRAWN = 200  # different graphs; repeated up to the number of frames
 
 def drawn_table(sensor: str, frames: int) -> PinTable:
     spec = load_sensor(sensor)
-    reference = nominal_reference(spec, Form.RECORDING)
+    reference = nominal_reference(spec, Form.PROCESSED)
     rng = np.random.default_rng(0)
     rest, n = reference.pins_px, spec.pins.count
     wave = np.sin((rest - rest.mean(axis=0)) / 40)
@@ -32,7 +32,7 @@ def drawn_table(sensor: str, frames: int) -> PinTable:
     area = np.stack([make_graph("voronoi", frame, outmost=reference.outmost).area_px2 for frame in nodes])
     take = np.arange(frames) % DRAWN
     none = np.zeros((frames, n), bool)
-    return PinTable(spec, Form.RECORDING, reference, take.astype(str), nodes[take], area[take], none, np.ones(frames, bool))
+    return PinTable(spec, Form.PROCESSED, reference, take.astype(str), nodes[take], area[take], none, np.ones(frames, bool))
 
 
 def inputs_of(name: str, pins: PinTable) -> Inputs:

@@ -158,7 +158,7 @@ def test_a_stream_of_thresholded_pictures_is_not_frozen_at_rest():
 
     with (
         CameraEmulator(Thresholded(fps=60)) as emulator,
-        MjpegCamera(emulator.url, load_sensor("mg400-331"), Form.RECORDING) as camera,
+        MjpegCamera(emulator.url, load_sensor("mg400-331"), Form.PROCESSED) as camera,
     ):
         first = camera.read(timeout_s=2.0)
         time.sleep(1.0)

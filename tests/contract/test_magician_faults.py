@@ -128,7 +128,7 @@ def test_homing_ends_at_home_with_its_tool():
 
 def test_a_link_that_can_not_be_made_is_one_clear_error(tmp_path):
     (tmp_path / "arm").write_text("mine")
-    with pytest.raises(TwinError, match="--link"):
+    with pytest.raises(TwinError, match="`link`"):
         MagicianEmulator(link=tmp_path / "arm").start()
     assert (tmp_path / "arm").read_text() == "mine"
 
@@ -253,7 +253,7 @@ def test_a_link_that_leads_nowhere_is_replaced_and_one_in_use_is_not(tmp_path):
     link.symlink_to("/dev/pts/no-such-terminal")  # as a killed emulator leaves it
     with MagicianEmulator(link=link), Magician(str(link)) as arm:
         assert arm.state().joints_deg.shape == (4,)
-        with pytest.raises(TwinError, match="--link"):
+        with pytest.raises(TwinError, match="`link`"):
             MagicianEmulator(link=link).start()
         assert arm.state().joints_deg.shape == (4,)
 

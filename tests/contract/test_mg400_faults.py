@@ -263,7 +263,7 @@ def test_a_taken_port_is_an_error_with_a_remedy():
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         offset = taken.getsockname()[1] - 29999
-        with pytest.raises(TwinError, match="--port-offset"):
+        with pytest.raises(TwinError, match="`port_offset`"):
             Mg400Emulator(port_offset=offset).start()
 
 

@@ -29,7 +29,7 @@ def test_the_object_is_where_the_arms_force_leaves_it_and_rubs_as_the_rig_does(r
     arm = SimulatedArm(axes=6, pose=start, time_scale=np.inf)
     arm.connect()
     arm.enable()
-    camera = TwinCamera(spec, placed, arm.state, Form.RECORDING, on_demand=True)
+    camera = TwinCamera(spec, placed, arm.state, Form.PROCESSED, on_demand=True)
     with camera:
         camera.read(timeout_s=camera.first_frame_s)
         arm.move_linear(moved(start, DRAG_MM * mounting.across))
@@ -52,7 +52,7 @@ def test_a_picture_that_took_long_to_compute_is_shown(monkeypatch):
     arm = SimulatedArm(axes=6, pose=placed.start_pose(-5.0), time_scale=np.inf)
     arm.connect()
     late_s = 0.1
-    with TwinCamera(spec, placed, arm.state, Form.RECORDING, on_demand=True) as camera:
+    with TwinCamera(spec, placed, arm.state, Form.PROCESSED, on_demand=True) as camera:
         camera.read(timeout_s=camera.first_frame_s)
         move = camera._follower.move
         monkeypatch.setattr(camera._follower, "move", lambda *told: time.sleep(2 * late_s) or move(*told))

@@ -138,6 +138,6 @@ def at_rest(work: Path) -> Measured:
     for name, recording in RECORDED.items():
         simulator = Simulator(load_sensor(name))
         recorded = open_recording(real_folder(recording), simulator.spec).reference.image
-        rendered = simulator.shoot(simulator.rest, form=Form.RECORDING).frame.image
+        rendered = simulator.render(simulator.rest, form=Form.PROCESSED).frame.image
         found[f"{name}_ssim"] = Value(compare_images(recorded, rendered, np.ones(recorded.shape[:2], bool)).ssim)
     return found

@@ -58,7 +58,7 @@ def drawn_frame(spec: SensorSpec, form: Form, centers_px, *, noise_sd=0.0, rng=N
     radius = cap_radii_px(spec, form) if radius_px is None else radius_px
     blur = 0.8 if form == Form.RAW else 0.5
     image = draw_discs(frame_size(spec, form), centers_px, radius, blur_px=blur, noise_sd=noise_sd, rng=rng)
-    if form == Form.RECORDING:
+    if form == Form.PROCESSED:
         image = np.where(image > 107, 255, 0).astype(np.uint8)
     elif spec.camera.channels == "color":
         image = np.repeat(image[..., None], 3, axis=2)

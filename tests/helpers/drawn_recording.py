@@ -33,7 +33,7 @@ def drawn_pins(labels, reference):
 def drawn_dataset(folder: Path) -> Dataset:
     """``FRAMES`` frames of ``mg400-127`` with depth and angle as labels; three of ten moves were not executed."""
     spec = load_sensor("mg400-127")
-    reference = nominal_reference(spec, Form.RECORDING)
+    reference = nominal_reference(spec, Form.PROCESSED)
     rng = np.random.default_rng(0)
     raw = np.column_stack([rng.uniform(-4, 0, FRAMES), rng.uniform(-20, 20, FRAMES), rng.uniform(-5, 5, (FRAMES, 2))])
     executed = (rng.random(FRAMES) < 0.7).astype(float)
@@ -42,7 +42,7 @@ def drawn_dataset(folder: Path) -> Dataset:
     nodes = drawn_pins(true, reference) + rng.normal(0, 0.02, (FRAMES, 127, 2))
     area = np.stack([make_graph("voronoi", n, outmost=reference.outmost).area_px2 for n in nodes])
     names = np.array([f"f_{k}.png" for k in range(FRAMES)])
-    pins = PinTable(spec, Form.RECORDING, reference, names, nodes, area, np.zeros((FRAMES, 127), bool), np.ones(FRAMES, bool))
+    pins = PinTable(spec, Form.PROCESSED, reference, names, nodes, area, np.zeros((FRAMES, 127), bool), np.ones(FRAMES, bool))
     targets = Targets(("pose_2", "pose_6"), raw[:, :2], true[:, :2], executed, raw[:, 2:])
     return Dataset(pins, targets, (folder,))
 

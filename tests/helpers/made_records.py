@@ -8,7 +8,7 @@ from twin.types import Form
 PINS = 7
 ABOUT = About(
     sensor="mg400-127",
-    form=Form.RECORDING,
+    form=Form.PROCESSED,
     size_px=(32, 24),
     gray=True,
     numbers={"pins": 2 * PINS, "pose": 6, "move": 6, "wrench": 6, "estimate": 2, "low": 2, "high": 2, "action": 6},

@@ -66,7 +66,7 @@ class Harmless:
     def recording(self) -> Path:
         """A labelled recording: pins that follow depth, angle and shear, moves of which some had not been executed."""
         spec = load_sensor(SENSOR)
-        rest = nominal_reference(spec, Form.RECORDING).pins_px
+        rest = nominal_reference(spec, Form.PROCESSED).pins_px
         rng = np.random.default_rng(0)
         labels = np.column_stack([rng.uniform(-4, 0, ROWS), rng.uniform(-20, 20, ROWS), rng.uniform(-5, 5, (ROWS, 2))])
         executed = rng.random(ROWS) < 0.7
@@ -74,11 +74,11 @@ class Harmless:
         (path / "frames_bw").mkdir(parents=True)
         table, moves = ["image_name,pose_2,pose_6,move_1,move_6"], ["image_name,executed"]
         for k, label in enumerate(labels):
-            picture = drawn_frame(spec, Form.RECORDING, moved(rest, label * [1, 1, executed[k], executed[k]])).image
+            picture = drawn_frame(spec, Form.PROCESSED, moved(rest, label * [1, 1, executed[k], executed[k]])).image
             cv2.imwrite(str(path / "frames_bw" / f"f_{k}.png"), picture)
             table.append(f"f_{k}.png," + ",".join(f"{v:.4f}" for v in label))
             moves.append(f"f_{k}.png,{int(executed[k])}")
-        cv2.imwrite(str(path / "init_0.png"), drawn_frame(spec, Form.RECORDING, rest).image)
+        cv2.imwrite(str(path / "init_0.png"), drawn_frame(spec, Form.PROCESSED, rest).image)
         (path / "targets.csv").write_text("\n".join(table) + "\n")
         (path / "move_executed.csv").write_text("\n".join(moves) + "\n")
         return path

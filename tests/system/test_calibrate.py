@@ -59,7 +59,7 @@ def test_a_known_sensor_is_found_again(tmp_path):
     frames.mkdir()
     for k, tilt in enumerate([(0.0, 0.0), (8.0, -5.0), (-6.0, 7.0), (3.0, 9.0)]):
         state = simulator.press(load_object("plane"), ContactPose(indent_mm=2.0 + 0.5 * k, tilt_deg=tilt))
-        cv2.imwrite(str(frames / f"{k}.png"), simulator.shoot(state, seed=k).frame.image[..., ::-1])
+        cv2.imwrite(str(frames / f"{k}.png"), simulator.render(state, seed=k).frame.image[..., ::-1])
     found = fit_optics(frames, start, tmp_path / "work", limit=4)
     print(found.before, found.after)
     assert found.after["psnr_db"] > max(33.0, found.before["psnr_db"] + 3)

@@ -42,10 +42,10 @@ def emulated():
         with pose, CameraEmulator(TwinCamera(sensor, placed, pose, Form.RAW)) as camera:
             ports = Mg400Ports(arm.ports[DASHBOARD_PORT], arm.ports[MOTION_PORT], tuple(arm.ports[p] for p in list(FEEDBACK_PERIOD_S)[:2]))
             safe = SafeArm(MG400("127.0.0.1", ports=ports), load_limits("mg400"))
-            with Rig(MjpegCamera(camera.url, sensor, Form.RECORDING), safe, placed, True) as rig:
+            with Rig(MjpegCamera(camera.url, sensor, Form.PROCESSED), safe, placed, True) as rig:
                 rig.source.read(timeout_s=FIRST_S)
                 truth = SimpleNamespace(track=SimpleNamespace(pose=arm.pose))
-                yield rig, servo, camera, TrueEstimator(truth, placed), Pipeline(sensor, Form.RECORDING)
+                yield rig, servo, camera, TrueEstimator(truth, placed), Pipeline(sensor, Form.PROCESSED)
 
 
 def assert_let_go(rig):

@@ -53,7 +53,7 @@ class StandIn:
     """Looks like a ``PoseEstimator``; in the twin it knows the truth, elsewhere it tells the picture's mean level."""
 
     def __init__(self) -> None:
-        self.sensor, self.form, self.counts_from_rest = load_sensor("mg400-331"), Form.RECORDING, False
+        self.sensor, self.form, self.counts_from_rest = load_sensor("mg400-331"), Form.PROCESSED, False
         self.pipeline = Pipeline(self.sensor, self.form)
         self.true: TrueEstimator | None = None
 
@@ -136,7 +136,7 @@ def test_pins_are_counted_from_a_frame_taken_clear_of_the_object_and_so_they_are
     out = tmp_path / "servo"
     run("servo", "--object", "can", "--out", out, "--steps", 4, "--plain-light", "--record")
     rest = SessionSource(out / "session").rest
-    pipeline = Pipeline(load_sensor("mg400-331"), Form.RECORDING)
+    pipeline = Pipeline(load_sensor("mg400-331"), Form.PROCESSED)
     seen = pipeline(rest)
     assert seen.valid and np.linalg.norm(seen.graph.nodes_px - pipeline.reference.pins_px, axis=1).max() < 1.0  # px: nothing is touched
     assert "4 of 4 estimates are those that were recorded" in run("live", "--replay", out / "session", "--headless")
@@ -190,8 +190,8 @@ def test_collect_in_the_twin_makes_a_recording_that_is_gone_on_with(tmp_path):
     assert len(kept.episodes) == 2 and kept.about.sensor == "mg400-331" and set(kept.about.numbers) == {"pins", "pose", "move", "action"}
     sensor = load_sensor("mg400-331")
     recording = open_recording(tmp_path, sensor)
-    assert recording.form is Form.RECORDING and len(recording) == 2 and not recording.problems
-    pipeline, rest = Pipeline(sensor, Form.RECORDING), recording.reference
+    assert recording.form is Form.PROCESSED and len(recording) == 2 and not recording.problems
+    pipeline, rest = Pipeline(sensor, Form.PROCESSED), recording.reference
     without = pipeline(rest).graph.nodes_px
     for frame in recording:
         assert np.linalg.norm(pipeline(frame).graph.nodes_px - without, axis=1).max() > 2.0
@@ -220,7 +220,7 @@ class ShownPictures(LiveSource):
     """A live source of given pictures, one after the other, again and again."""
 
     def __init__(self, images) -> None:
-        super().__init__("pictures", Form.RECORDING)
+        super().__init__("pictures", Form.PROCESSED)
         self._images, self._next = images, 0
 
     def _open(self) -> None:
@@ -278,12 +278,12 @@ def test_the_page_shows_the_newest_frame_with_estimate_and_rates():
 
 def test_a_view_draws_pins_graph_cells_and_text():
     sensor = load_sensor("mg400-331")
-    preview = preview_of(sensor, Form.RECORDING)
+    preview = preview_of(sensor, Form.PROCESSED)
     image = record(
         expose(preview.render(), sensor.capture, origin_px=preview.window_px[:2]), sensor.recording, origin_px=preview.window_px[:2]
     )
-    pipeline = Pipeline(sensor, Form.RECORDING)
-    frame = Frame(image, Form.RECORDING, "rest")
+    pipeline = Pipeline(sensor, Form.PROCESSED)
+    frame = Frame(image, Form.PROCESSED, "rest")
     seen = pipeline(frame)
     assert seen.valid
     same = voronoi_map(image.shape, seen, seen.graph.area_px2)
@@ -365,15 +365,15 @@ def test_a_view_that_can_not_be_opened_is_told_before_anything_is_recorded(stand
 
 def test_pins_are_not_counted_from_a_pressed_sensor(tmp_path):
     sensor = load_sensor("mg400-331")
-    pipeline = Pipeline(sensor, Form.RECORDING)
+    pipeline = Pipeline(sensor, Form.PROCESSED)
     rest_px = pipeline.reference.pins_px
     away = rest_px - rest_px.mean(axis=0)
     pressed_px = rest_px + 0.15 * away * np.exp(-((np.linalg.norm(away, axis=1) / 60.0)[:, None] ** 2))
     (tmp_path / "pressed").mkdir()
-    write_image(tmp_path / "pressed" / "frame_0.png", drawn_frame(sensor, Form.RECORDING, pressed_px).image)
+    write_image(tmp_path / "pressed" / "frame_0.png", drawn_frame(sensor, Form.PROCESSED, pressed_px).image)
     common = ("live", "--camera", tmp_path / "pressed", "--headless", "--record", tmp_path / "s", "--at-rest")
     told = refused(*common, "first")
-    assert "seems pressed" in told and "--at-rest FRAME" in told and not (tmp_path / "s").exists()
+    assert "seems pressed" in told and "`at_rest` FRAME" in told and not (tmp_path / "s").exists()
     assert "seems pressed" in refused(*common, tmp_path / "pressed" / "frame_0.png")
 
 

@@ -115,7 +115,7 @@ def test_the_rendered_frame_without_contact_is_like_the_recorded_one(real_dir, f
     spec = load_sensor(SETS[folder])
     recorded = open_recording(real_dir / folder, spec).reference.image
     simulator = Simulator(spec)
-    rendered = simulator.shoot(simulator.rest, form=Form.RECORDING).frame.image
+    rendered = simulator.render(simulator.rest, form=Form.PROCESSED).frame.image
     likeness = compare_images(recorded, rendered, np.ones(recorded.shape[:2], bool))
     turned = compare_images(recorded, np.ascontiguousarray(rendered[::-1]), np.ones(recorded.shape[:2], bool))
     print(f"\n{folder}: SSIM {likeness.ssim:.3f}, PSNR {likeness.psnr_db:.1f} dB; mirrored {turned.ssim:.3f}, {turned.psnr_db:.1f} dB")

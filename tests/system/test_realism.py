@@ -21,7 +21,7 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("frames")
     simulator = Simulator(load_sensor(SENSOR))
     state = simulator.press(load_object("plane"), ContactPose(indent_mm=2.5, tilt_deg=(6.0, -4.0)))
-    cv2.imwrite(str(path / "press.png"), simulator.shoot(state, seed=5).frame.image[..., ::-1])
+    cv2.imwrite(str(path / "press.png"), simulator.render(state, seed=5).frame.image[..., ::-1])
     cv2.imwrite(str(path / "dark.png"), DARK)
     return path
 

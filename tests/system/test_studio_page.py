@@ -54,12 +54,12 @@ def client(studio):
 
 def write_recording(folder, spec, count):
     """A labelled recording of drawn frames; its first label can't be right."""
-    reference, rng = nominal_reference(spec, Form.RECORDING), np.random.default_rng(0)
+    reference, rng = nominal_reference(spec, Form.PROCESSED), np.random.default_rng(0)
     (folder / "frames_bw").mkdir(parents=True)
-    write_image(folder / "init_0.png", drawn_frame(spec, Form.RECORDING, reference.pins_px).image)
+    write_image(folder / "init_0.png", drawn_frame(spec, Form.PROCESSED, reference.pins_px).image)
     rows = ["image_name,pose_2,pose_6,move_1,move_6"]
     for k in range(count):
-        frame = drawn_frame(spec, Form.RECORDING, smooth_warp(reference.pins_px, 3.0, rng))
+        frame = drawn_frame(spec, Form.PROCESSED, smooth_warp(reference.pins_px, 3.0, rng))
         write_image(folder / "frames_bw" / f"frame_{k}_0.png", frame.image)
         rows.append(f"frame_{k}_0.png,{40.0 if k == 0 else -3.0},0.0,0.0,0.0")
     (folder / "targets.csv").write_text("\n".join(rows) + "\n")
@@ -305,11 +305,11 @@ def test_of_feeds_connected_at_the_same_time_one_stays_and_every_other_lets_go_o
 
 
 def test_a_specification_is_proposed_corrected_and_used(studio, client, tmp_path):
-    reference, rng = nominal_reference(load_sensor(SENSOR), Form.RECORDING), np.random.default_rng(1)
+    reference, rng = nominal_reference(load_sensor(SENSOR), Form.PROCESSED), np.random.default_rng(1)
     middle = reference.pins_px.mean(axis=0)
     radius = np.linalg.norm(reference.pins_px - middle, axis=1).max()
     for k in range(4):
-        frame = drawn_frame(load_sensor(SENSOR), Form.RECORDING, smooth_warp(reference.pins_px, 2.0, rng))
+        frame = drawn_frame(load_sensor(SENSOR), Form.PROCESSED, smooth_warp(reference.pins_px, 2.0, rng))
         cv2.circle(frame.image, tuple(int(v) for v in middle), int(1.16 * radius), 255, 4)  # the housing: nothing is cut off
         write_image(tmp_path / f"mine_{k}.png", frame.image)
     client.set("mode", "Your own sensor")

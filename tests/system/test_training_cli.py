@@ -44,13 +44,13 @@ def twin(*arguments):
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recording")
     spec = load_sensor("mg400-127")
-    reference = nominal_reference(spec, Form.RECORDING)
+    reference = nominal_reference(spec, Form.PROCESSED)
     rng = np.random.default_rng(0)
     labels = np.column_stack([rng.uniform(-4, 0, FRAMES), np.sort(rng.uniform(-20, 20, FRAMES)), rng.uniform(-5, 5, (FRAMES, 2))])
     (folder / "frames_bw").mkdir()
     rows = ["image_name,pose_2,pose_6,move_1,move_6"]
     for k, px in enumerate(drawn_pins(labels, reference)):
-        cv2.imwrite(str(folder / "frames_bw" / f"f_{k}.png"), drawn_frame(spec, Form.RECORDING, px).image)
+        cv2.imwrite(str(folder / "frames_bw" / f"f_{k}.png"), drawn_frame(spec, Form.PROCESSED, px).image)
         rows.append(f"f_{k}.png," + ",".join(f"{v:.6f}" for v in labels[k]))
     (folder / "targets.csv").write_text("\n".join(rows) + "\n")
     return folder

@@ -1,16 +1,18 @@
 """Tutorials and pages on how to add things run as they stand and print what they say: Python in one namespace, commands by the program."""
 
+import ast
 import re
 import shlex
 from pathlib import Path
 
 import pytest
 from command import run_twin
-from generators.notebooks import Block, blocks, run_pages, tutorials
+from generators.notebooks import DOCS, Block, blocks, run_pages, tutorials
 
 from training.models import MODELS
 
-QUICK = {"first-contact", "arm", "camera", "object", "sensor", "degradation", "material-law"}
+TUTORIALS = DOCS / "tutorials"
+QUICK = {"first-contact", "five-scripts", "arm", "camera", "object", "sensor", "degradation", "material-law"}
 """Pages that take a few seconds at most."""
 
 
@@ -56,6 +58,17 @@ def test_every_tutorial_has_code_that_runs():
     for path in tutorials():
         languages = [block.language for block in blocks(path.read_text(encoding="utf-8"))]
         assert "python" in languages, path.name
+
+
+def test_the_five_scripts_are_short_and_need_one_import():
+    """The last block of Python of each section is the script; what stands before it makes its files."""
+    sections = (TUTORIALS / "five-scripts.md").read_text(encoding="utf-8").split("\n## ")[1:]
+    scripts = [[block.code for block in blocks(section) if block.language == "python"][-1] for section in sections]
+    for code, most in zip(scripts, (8, 6, 6, 5, 6), strict=True):
+        statements = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.stmt)]
+        imported = {alias.name for node in statements if isinstance(node, ast.Import) for alias in node.names}
+        assert len(statements) <= most and imported <= {"twin", "numpy", "cv2", "trimesh", "gymnasium"}
+        assert not any(isinstance(node, ast.ImportFrom) for node in statements)
 
 
 @pytest.mark.parametrize(

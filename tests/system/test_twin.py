@@ -30,8 +30,8 @@ def at_rest(simulators):
 
     @cache
     def make(name, form):
-        shot = simulators[name].shoot(simulators[name].rest, form=form)
-        return shot, Pipeline(simulators[name].spec, form)(shot.frame)
+        rendered = simulators[name].render(simulators[name].rest, form=form)
+        return rendered, Pipeline(simulators[name].spec, form)(rendered.frame)
 
     return make
 
@@ -39,9 +39,9 @@ def at_rest(simulators):
 @pytest.mark.parametrize(("name", "form"), FORMS)
 def test_rendered_caps_are_found_where_they_project(simulators, at_rest, name, form):
     simulator = simulators[name]
-    shot, observation = at_rest(name, form)
-    assert observation.found == simulator.spec.pins.count and shot.truth.visible.all()
-    error = observation.pins_px - shot.truth.caps_px
+    rendered, observation = at_rest(name, form)
+    assert observation.found == simulator.spec.pins.count and rendered.truth.visible.all()
+    error = observation.pins_px - rendered.truth.caps_px
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < CENTROID_RMS_PX
 
 
@@ -68,8 +68,8 @@ def test_cells_at_the_contact_grow_with_depth(simulators):
 def test_a_form_may_be_given_by_its_name(simulators):
     simulator = simulators["mg400-127"]
     for form in Form:
-        shot = simulator.shoot(simulator.rest, form=str(form))
-        assert shot.frame.form is form and shot.frame.image.shape == simulator.shoot_rest(form).frame.image.shape
+        rendered = simulator.render(simulator.rest, form=str(form))
+        assert rendered.frame.form is form and rendered.frame.image.shape == simulator.render_rest(form).frame.image.shape
 
 
 def test_a_name_is_no_specification(simulators):
@@ -82,7 +82,7 @@ def test_a_name_is_no_specification(simulators):
 @pytest.fixture(scope="module")
 def pressed(simulators):
     simulator = simulators["mg400-127"]
-    return simulator.shoot(simulator.press(load_object("plane"), ContactPose(indent_mm=3.0)))
+    return simulator.render(simulator.press(load_object("plane"), ContactPose(indent_mm=3.0)))
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(1, -1), *(pytest.param(*more, marks=pytest.mark.slow) for more in ((0, 1), (0, -1), (1, 1)))])
@@ -90,7 +90,7 @@ def test_a_drag_carries_the_pins_along(simulators, pressed, axis, sign):
     simulator = simulators["mg400-127"]
     shear = [0.0, 0.0]
     shear[axis] = 2.0 * sign
-    dragged = simulator.shoot(simulator.press(load_object("plane"), ContactPose(indent_mm=3.0, shear_mm=tuple(shear))))
+    dragged = simulator.render(simulator.press(load_object("plane"), ContactPose(indent_mm=3.0, shear_mm=tuple(shear))))
     pipeline = Pipeline(simulator.spec, Form.RAW)
     moved = np.nanmean(pipeline(dragged.frame).pins_px - pipeline(pressed.frame).pins_px, axis=0)
     assert sign * moved[axis] > 1.0
@@ -112,8 +112,8 @@ def test_the_same_contact_gives_the_same_frame(simulators):
     pose = ContactPose(indent_mm=2.0, twist_deg=5.0)
     states = [simulator.press(load_object("sphere"), pose) for _ in range(2)]
     assert np.array_equal(states[0].nodes_mm, states[1].nodes_mm)
-    shots = [simulator.shoot(state, seed=3) for state in states]
-    assert np.array_equal(shots[0].frame.image, shots[1].frame.image)
+    rendered = [simulator.render(state, seed=3) for state in states]
+    assert np.array_equal(rendered[0].frame.image, rendered[1].frame.image)
 
 
 def test_a_picture_in_which_the_pipeline_finds_no_pins_is_said():
@@ -122,6 +122,6 @@ def test_a_picture_in_which_the_pipeline_finds_no_pins_is_said():
     aside = spec.pipeline.raw.model_copy(update={"mask_center_px": (60.0, 60.0), "mask_radius_px": 50.0})
     blind = spec.model_copy(update={"pipeline": spec.pipeline.model_copy(update={"raw": aside})})
     simulator = Simulator(blind, quality="drawn")
-    shot = simulator.shoot(simulator.rest)
-    said = RenderedContact(simulator.rest, shot, look_at(simulator, shot), []).lines()
+    rendered = simulator.render(simulator.rest)
+    said = RenderedContact(simulator.rest, rendered, look_at(simulator, rendered), []).lines()
     assert "note: the pipeline can't use the picture: too few pins" in said[1]

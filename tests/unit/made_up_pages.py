@@ -49,7 +49,7 @@ class Rows(SimpleNamespace):
 
 def pins():
     """No-contact pins of the sensor."""
-    return nominal_reference(load_sensor(SENSOR), Form.RECORDING)
+    return nominal_reference(load_sensor(SENSOR), Form.PROCESSED)
 
 
 def sim_to_real(out: Path) -> Path:
@@ -135,7 +135,7 @@ def contact_calibration(out: Path) -> Path:
     names = ["a.png", f"{HOSTILE}.png", "c.png", "d.png"]
     moved = rng.normal(0, 1, (2, 2, FRAMES, 127, 2))
     pins_px = reference.pins_px + moved[1, 0] + rng.normal(0, 0.2, moved[1, 0].shape)
-    measured = MeasuredFrames(Form.RECORDING, names, [], pins_px, reference.pins_px, [HOSTILE])
+    measured = MeasuredFrames(Form.PROCESSED, names, [], pins_px, reference.pins_px, [HOSTILE])
     fit = SimpleNamespace(
         before_px=np.array([1.0, 3.0, 2.0, 1.5]),
         after_px=np.array([0.3, 0.4, np.nan, 0.2]),
@@ -173,7 +173,7 @@ def audit(out: Path) -> Path:
     shape = (frames, 127)
     nodes = reference.pins_px + rng.normal(0, 1, (*shape, 2))
     table = PinTable(
-        load_sensor(SENSOR), Form.RECORDING, reference, names, nodes, np.ones(shape), np.zeros(shape, bool), np.ones(frames, bool)
+        load_sensor(SENSOR), Form.PROCESSED, reference, names, nodes, np.ones(shape), np.zeros(shape, bool), np.ones(frames, bool)
     )
     raw = rng.uniform(-3, 3, (frames, 4))
     targets = SimpleNamespace(names=PRESETS["surface-2d-shear"], raw=raw)

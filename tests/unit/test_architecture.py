@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from hostile.forked_program import LIBRARIES as FORKED_LIBRARIES
 
+import twin
 from twin.store.fingerprint import LIBRARIES as FINGERPRINTED
 
 ROOT = Path(__file__).parents[2]
@@ -25,6 +26,7 @@ MAY_IMPORT = {
 }
 TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may import those before it
     "errors",
+    "lazy",
     "types",
     "progress",
     "store",
@@ -49,10 +51,13 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "demo",
     "studio",
     "cli",
+    "extend",
+    "__main__",
 )
 BY_HAND = {"pyoidn"}  # installed by hand for the one measurement that needs it, as its head says
 NAMED_OTHERWISE = {"rerun": "rerun-sdk"}  # imported under another name than it is installed by, and not installed everywhere
-COMPOSITION_ROOTS = ("twin/cli/",)  # the outermost layer may join everything; nothing joins it (test_command_line)
+# The outermost layer may join everything, and nothing joins it: the command line (test_command_line), and the names that Python offers.
+COMPOSITION_ROOTS = ("twin/cli/", "twin/__init__.py", "twin/__main__.py", "twin/extend.py")
 
 
 @cache
@@ -122,8 +127,17 @@ def test_the_order_refuses_an_import_that_points_outwards():
     assert against_the_order("pins", names, TWIN_LAYERS) == {"twin.fit.optics", "twin"}
 
 
-def test_twin_itself_imports_nothing_of_ours():
-    assert not {name for name in imports_of(ROOT / "twin" / "__init__.py") if name.split(".")[0] in MAY_IMPORT}
+def test_twin_itself_imports_its_names_when_they_are_used():
+    ours = {name for name in imports_of(ROOT / "twin" / "__init__.py") if name.split(".")[0] in MAY_IMPORT}
+    assert ours == {"twin.lazy"}
+
+
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_nothing_inside_imports_a_name_that_is_there_for_users(package):
+    """``import twin`` and ``twin.extend`` join all packages, so a module that took a name from them would import upwards."""
+    for path in sources(package):
+        taken = {name.removeprefix("twin.") for name in imports_of(path)} & {*twin.__all__, "twin"}
+        assert taken <= {"errors"}, f"{path.relative_to(ROOT)} takes {taken} from twin"
 
 
 def test_imports_name_their_package_in_full():
@@ -222,6 +236,7 @@ def test_no_module_is_a_drawer_for_everything():
     ("module", "heavy"),
     [
         ("scenes", ("numpy", "torch", "mitsuba", "pyvista", "cv2")),
+        ("twin", ("numpy", "torch", "mitsuba", "pyvista", "numba", "cv2", "pydantic", "typer")),
         ("twin.studio.studio", ("torch", "mitsuba", "pyvista", "matplotlib", "trimesh")),  # the first picture would wait for them
     ],
 )

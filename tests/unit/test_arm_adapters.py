@@ -282,7 +282,7 @@ def test_a_gray_camera_gives_pictures_of_three_channels():
         assert (camera.width, camera.height) == (64, 48)
         for picture in (camera.read(), camera.async_read(), camera.read_latest()):
             assert picture.shape == (48, 64, 3) and np.array_equal(picture[..., 0], picture[..., 2])
-    known = LeRobotCamera(MjpegCamera("http://127.0.0.1:1/", load_sensor("mg400-331"), Form.RECORDING))
+    known = LeRobotCamera(MjpegCamera("http://127.0.0.1:1/", load_sensor("mg400-331"), Form.PROCESSED))
     assert (known.width, known.height) == (360, 360)
     robot = LeRobotArm(SimulatedArm(), cameras={"front": LeRobotCamera(NoisyCamera())})
     with pytest.raises(DeviceError, match="width and height"):

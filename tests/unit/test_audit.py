@@ -30,7 +30,7 @@ def arm(labels):
 def planted():
     """Labels of which some are wrong, pins that tell the truth, and which is which."""
     spec = load_sensor("mg400-127")
-    reference = nominal_reference(spec, Form.RECORDING)
+    reference = nominal_reference(spec, Form.PROCESSED)
     rng = np.random.default_rng(1)
     labels = np.column_stack([rng.uniform(-3.6, 0, FRAMES), np.sort(rng.uniform(-20, 20, FRAMES)), rng.uniform(-5, 5, (FRAMES, 2))])
     executed = rng.random(FRAMES) < 0.65
@@ -47,7 +47,7 @@ def planted():
     nodes[411] = nodes[410]
     names = np.array([f"f_{k}.png" for k in range(FRAMES)])
     shape = (FRAMES, 127)
-    pins = PinTable(spec, Form.RECORDING, reference, names, nodes, np.ones(shape), np.zeros(shape, bool), np.ones(FRAMES, bool))
+    pins = PinTable(spec, Form.PROCESSED, reference, names, nodes, np.ones(shape), np.zeros(shape, bool), np.ones(FRAMES, bool))
     return pins, labels, executed, sign, untouched
 
 
@@ -134,12 +134,12 @@ def test_a_recording_of_an_edge_around_the_circle_is_audited_as_a_plate_is():
     columns = [before[:, 2], before[:, 1], turn.real, turn.imag, before[:, 1] * turn.real, before[:, 1] * turn.imag]
     columns += [dragged.real, dragged.imag, move[:, 5] * executed]
     spec = load_sensor("mg400-127")
-    reference = nominal_reference(spec, Form.RECORDING)
+    reference = nominal_reference(spec, Form.PROCESSED)
     nodes = reference.pins_px + np.einsum("mc,cnd->mnd", np.array(columns).T, rng.normal(0, 0.4, (9, 127, 2)))
     nodes += rng.normal(0, 0.05, nodes.shape)
     pose[[40, 500], 5] *= -1
     names, shape = np.array([f"f_{k}.png" for k in range(900)]), (900, 127)
-    pins = PinTable(spec, Form.RECORDING, reference, names, nodes, np.ones(shape), np.zeros(shape, bool), np.ones(900, bool))
+    pins = PinTable(spec, Form.PROCESSED, reference, names, nodes, np.ones(shape), np.zeros(shape, bool), np.ones(900, bool))
     found = audit_labels(pins, pose, move)
     assert not found.untold and set(np.flatnonzero(found.wrong_sign)) >= {40, 500} and found.wrong_sign.sum() < 5
     clear = (np.abs(move[:, :2]).max(axis=1) > 1) & ~found.wrong_sign

@@ -27,6 +27,7 @@ CLI = ROOT / "twin" / "cli"
 OURS = ("scenes", "twin", "training", "hardware")
 FEW = 8  # statements of a command beside its imports: specifications loaded, a plan, a call, what is printed, an exit code
 ENTRY = {"main", "command_line"}  # what others may take from the command line
+ROOTS = {ROOT / "twin" / "__init__.py", ROOT / "twin" / "__main__.py"}  # they offer its functions to Python, and start it
 NO_LOGIC = (ast.For, ast.While, ast.AsyncFor, ast.Try, ast.Lambda, ast.FunctionDef, ast.ClassDef, ast.ListComp, ast.DictComp, ast.SetComp)
 NOT_COMMANDS = {"twin alone", "twin and labelled frames", "twin read", "twin read, no label", "twin read, evenly chosen frames", "twin of "}
 HEAVY = {"numpy", "scipy", "torch", "cv2", "mitsuba", "drjit", "numba", "pyvista", "matplotlib"}
@@ -88,28 +89,29 @@ def test_a_command_is_options_and_one_call(command):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_function_of_the_packages_is_behind_every_command(command):
     """What a command imports, or what its module imports at its top, is also called in its body."""
-    called = {
-        part.id for call in ast.walk(command) if isinstance(call, ast.Call) for part in ast.walk(call.func) if isinstance(part, ast.Name)
-    }
+    called = {part.id for call in ast.walk(command) if isinstance(call, ast.Call) for part in ast.walk(call) if isinstance(part, ast.Name)}
     ours = {name for source, name in [*imported(command), *IMPORTS[command.name]] if _is_ours(source)}
     assert {name for name in called & ours if not name.startswith("load_")}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_that_writes_overwrites_nothing_foreign_unless_it_is_forced(command):
-    """Every command with ``--out`` has ``--force``, and what it calls opens its output by the store before it works.
+    """What a command with ``--out`` calls opens its output by the store before it works. ``App.command`` adds ``--force``.
 
     The folder of ``--maps`` is opened by what writes each frame's maps (``Predictions``).
     """
     names = {argument.arg for argument in command.args.args}
-    assert ("force" in names) == bool(names & {"out", "maps"})
-    if "force" in names:
-        entered = [ast.unparse(item.context_expr) for part in ast.walk(command) if isinstance(part, ast.With) for item in part.items]
-        assert entered[0] == "overwriting(force)"
+    assert "force" not in names and "with overwriting" not in ast.unparse(command)
     if "out" in names:
         behind = [_behind(source, name) for source, name in imported(command) if _is_ours(source)]
         opens = ("@writes", " generate(", " new_sensor(")  # the second and third open what they write themselves
         assert [each for each in behind if inspect.isfunction(each) and any(word in inspect.getsource(each) for word in opens)]
+
+
+def test_every_command_that_writes_can_be_forced():
+    for words, command in TREE.items():
+        names = {option.name for option in command.params}
+        assert ("force" in names) == bool(names & {"out", "maps"}), words
 
 
 def _behind(source, name):
@@ -158,11 +160,11 @@ def test_the_command_line_computes_nothing(path):
 
 
 def test_nothing_takes_the_command_line_for_a_library():
-    own = {CLI, ROOT / "tests" / "unit" / "test_progress.py"}  # the bars are no command, and are tested apart
+    own = {CLI, *(ROOT / "tests" / "unit" / f"test_{name}.py" for name in ("progress", "door"))}  # what is no command is tested apart
     for package in (*OURS, "tests"):
         for path in sorted((ROOT / package).rglob("*.py")):
             source = path.read_text()
-            if re.search(r"\bcli\b", source) and not own & {path, path.parent}:
+            if re.search(r"\bcli\b", source) and not (own | ROOTS) & {path, path.parent}:
                 found = imported(ast.parse(source))
                 taken = {name or module for module, name in found if module.startswith("twin.cli")}
                 taken |= {name for module, name in found if module == "twin" and name == "cli"}
@@ -194,15 +196,22 @@ def wrong_hints(text: str) -> list[str]:
     return [found[0] for found in wrong] + [name for name in re.findall(r"(?<![\w-])--[a-z][a-z0-9-]+", text) if name not in OPTIONS]
 
 
+OF_FUNCTIONS = {"indent_mm", "tilt_deg", "shear_mm", "twist_deg", "offset_mm", "quality"}  # arguments that no command needs to have
+ARGUMENTS = {option.name for command in TREE.values() for option in command.params} | OF_FUNCTIONS
+MARKED = re.compile(r"`([a-z][a-z0-9_]*)(?:=\w+)?`")
+
+
 @pytest.mark.parametrize("package", OURS)
-def test_every_command_and_option_that_a_text_names_exists(package):
-    wrong = [
-        f"{path.relative_to(ROOT)}:{node.lineno}: {hint}"
-        for path in sorted((ROOT / package).rglob("*.py"))
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value not in NOT_COMMANDS
-        for hint in wrong_hints(node.value)
-    ]
+def test_every_command_option_and_argument_that_a_text_names_exists(package):
+    """An error names an argument as `name`, which the command line turns into its option."""
+    wrong = []
+    for path in sorted((ROOT / package).rglob("*.py")):
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        texts = [node for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+        raised = [part for node in nodes if isinstance(node, ast.Raise) for part in ast.walk(node) if isinstance(part, ast.Constant)]
+        hints = [(node, hint) for node in texts if node.value not in NOT_COMMANDS for hint in wrong_hints(node.value)]
+        hints += [(node, name) for node in raised for name in MARKED.findall(str(node.value)) if name not in ARGUMENTS]
+        wrong += [f"{path.relative_to(ROOT)}:{node.lineno}: {hint}" for node, hint in hints]
     assert not wrong
     assert wrong_hints("run 'twin tun' or 'twin emulate ur5 --port 1 --no-such'") == ["twin tun", "twin emulate ur5", "--no-such"]
 

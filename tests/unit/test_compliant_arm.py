@@ -21,7 +21,7 @@ def config(tmp_path_factory):
 
 def model_of(config, **rig):
     sensor = config.sensor.model_copy(update={"rig": config.sensor.rig.model_copy(update=rig)})
-    return ContactModel(sensor, config.experiment, config.object, Form.RECORDING, across=ACROSS)
+    return ContactModel(sensor, config.experiment, config.object, Form.PROCESSED, across=ACROSS)
 
 
 def force_across_n(model, label):

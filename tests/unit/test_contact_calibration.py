@@ -37,7 +37,7 @@ def telling(home):
 
 def frames(config, sensor, seeds, *, bad=()):
     """Frames of a rig; every third move was not executed, of ``bad`` ones the pins are nonsense."""
-    model = ContactModel(sensor, config.experiment, config.object, Form.RECORDING, across=ACROSS)
+    model = ContactModel(sensor, config.experiment, config.object, Form.PROCESSED, across=ACROSS)
     labels, pins, done = [], [], []
     for k, seed in enumerate(seeds):
         label = draw_label(config.experiment, np.random.default_rng(seed))
@@ -48,7 +48,7 @@ def frames(config, sensor, seeds, *, bad=()):
         done.append(k % 3 != 2)
     pins = np.stack(pins)
     pins[0, :3] = np.nan  # lost ones
-    return MeasuredFrames(Form.RECORDING, [f"f_{k}" for k in range(len(pins))], labels, pins, model.rest_px, []), np.array(done)
+    return MeasuredFrames(Form.PROCESSED, [f"f_{k}" for k in range(len(pins))], labels, pins, model.rest_px, []), np.array(done)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def prepared(tmp_path_factory):
     config = small_config(home, experiment=load_experiment(telling(home)))
     true = config.sensor.model_copy(update={"rig": config.sensor.rig.model_copy(update=TRUTH)})
     measured, done = frames(config, true, range(FRAMES), bad=(4,))
-    setup = Setup(config.sensor, config.experiment, config.object, Form.RECORDING, ACROSS, home / "contacts", parameters=FITTED)
+    setup = Setup(config.sensor, config.experiment, config.object, Form.PROCESSED, ACROSS, home / "contacts", parameters=FITTED)
     held, _ = frames(config, true, range(100, 103))
     return setup, measured, done, held
 
@@ -139,7 +139,7 @@ def test_weighed_presses_fix_the_scale_of_forces_and_leave_the_pins_where_they_a
     np.testing.assert_allclose(
         simulated_n(stiffer, config.experiment, config.object, labels[:1], across=ACROSS), found.scale * simulated[:1], rtol=SAME_FORCE
     )
-    models = [ContactModel(each, config.experiment, config.object, Form.RECORDING, across=ACROSS) for each in (sensor, stiffer)]
+    models = [ContactModel(each, config.experiment, config.object, Form.PROCESSED, across=ACROSS) for each in (sensor, stiffer)]
     before, after = (model.displacement_px(labels[0]) for model in models)
     np.testing.assert_allclose(after, before, atol=SAME_PX)
 

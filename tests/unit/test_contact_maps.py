@@ -97,7 +97,7 @@ def test_a_small_copy_keeps_its_maps_and_damaged_ones_are_refused(contacts, tmp_
 def test_maps_are_written_as_arrays_and_as_a_picture(contacts, tmp_path):
     _, run, sensor = contacts
     estimator = PoseEstimator.load(run)
-    frame = Frame(np.zeros((300, 300), np.uint8), Form.RECORDING, name="frame_7.png")
+    frame = Frame(np.zeros((300, 300), np.uint8), Form.PROCESSED, name="frame_7.png")
     arrays, picture = write_frame_maps(tmp_path, estimator, frame, pressed_maps(sensor.geometry))
     with np.load(arrays) as file:
         np.testing.assert_allclose(file["force_n"].sum(axis=0), file["resultant_n"])
@@ -120,7 +120,7 @@ def test_a_frame_unlike_any_of_the_training_has_no_maps(contacts, monkeypatch):
     pins = load_dataset(folder, sensor, estimator.names).pins.rows(np.array([0]))
     strange = replace(pins, nodes_px=pins.nodes_px + np.random.default_rng(0).normal(0, 5, pins.nodes_px.shape))
     monkeypatch.setattr(estimator, "pins_in", lambda frame: OneFrame(strange))
-    made, maps = estimator.contact_maps(Frame(np.zeros((300, 300), np.uint8), Form.RECORDING))
+    made, maps = estimator.contact_maps(Frame(np.zeros((300, 300), np.uint8), Form.PROCESSED))
     assert not made.valid and maps is None
 
 

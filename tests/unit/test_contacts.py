@@ -133,9 +133,9 @@ def test_several_models_are_one_that_says_the_kind(data, models):
     shares = models.taken_for(shown.pins)
     assert shares["ridge"] > 0.9 and sum(shares.values()) == pytest.approx(1.0)
     spec, rest = data.pins.sensor, data.pins.reference.pins_px
-    made = models(drawn_frame(spec, Form.RECORDING, shown.pins.nodes_px[0]))
+    made = models(drawn_frame(spec, Form.PROCESSED, shown.pins.nodes_px[0]))
     assert made.valid and made.contact == "ridge" and np.isfinite(made.value).all()
-    still = models(drawn_frame(spec, Form.RECORDING, rest - 2.0 * (shown.pins.nodes_px[1] - rest)))
+    still = models(drawn_frame(spec, Form.PROCESSED, rest - 2.0 * (shown.pins.nodes_px[1] - rest)))
     assert not still.valid and still.contact == "" and "no contact that the weights know (bump, ridge)" in still.reason
 
 
@@ -143,7 +143,7 @@ def test_a_raw_frame_is_recorded_before_its_kind_is_told(data, models):
     spec = data.pins.sensor
     raw_px = recording_to_raw(spec.recording, drawn_kind(data, "bump", 1, 21).pins.nodes_px[0])
     raw = drawn_frame(spec, Form.RAW, raw_px)
-    recorded = Frame(record(raw.image, spec.recording), Form.RECORDING)
+    recorded = Frame(record(raw.image, spec.recording), Form.PROCESSED)
     np.testing.assert_array_equal(models(raw).value, models(recorded).value)
     assert models(raw).contact == "bump"
 
@@ -189,11 +189,11 @@ def test_the_ur5s_weights_are_small_and_know_its_four_kinds_and_what_they_saw():
     folder = contacts_folder("ur5-331")
     assert folder is not None and sum(path.stat().st_size for path in folder.parent.rglob("*") if path.is_file()) < MOST_BYTES
     models = ContactEstimator.load(folder)
-    assert set(models.parts) == {kind for kind, _ in UR5_SETS.values()} and models.form == Form.RECORDING
+    assert set(models.parts) == {kind for kind, _ in UR5_SETS.values()} and models.form == Form.PROCESSED
     for kind, part in models.parts.items():
         assert all(kind.split("-")[0] in {"plate", "edge"} and name.startswith("ur5-331-") for name in part.config["recordings"])
         assert part.config["rows"]["train"] > 0 and part.config["rows"]["kept_out"]
-    black = models(Frame(np.zeros((128, 128), np.uint8), Form.RECORDING))
+    black = models(Frame(np.zeros((128, 128), np.uint8), Form.PROCESSED))
     assert not black.valid and black.contact == ""
 
 

@@ -27,11 +27,11 @@ SAME_PLATE_MM = 0.025  # about what the best models of the recordings err by
 
 def write_recording(folder, rows, frames, *, table_header=HEADER):
     spec = load_sensor(SENSOR)
-    rest = nominal_reference(spec, Form.RECORDING).pins_px
+    rest = nominal_reference(spec, Form.PROCESSED).pins_px
     (folder / "frames_bw").mkdir(parents=True)
     for name in frames:
         px = smooth_warp(rest, 4.0, np.random.default_rng(len(name) + sum(map(ord, name))))
-        cv2.imwrite(str(folder / "frames_bw" / name), drawn_frame(spec, Form.RECORDING, px).image)
+        cv2.imwrite(str(folder / "frames_bw" / name), drawn_frame(spec, Form.PROCESSED, px).image)
     (folder / "targets.csv").write_text("\n".join([table_header, *rows]) + "\n")
     return spec
 

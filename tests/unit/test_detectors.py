@@ -100,7 +100,7 @@ def test_a_tuning_says_whether_its_pins_at_rest_were_made_from_contacts(spec, fo
         for px, name in ((uneven, "f_0.png"), (foreign[1][1], "init_0.png"))
     )
     made, measured = tune([contact], spec), tune([contact], spec, given=given)
-    assert made.detector.blob.rest_origin == "contacts" and "--no-contact" in made.rest.line()
+    assert made.detector.blob.rest_origin == "contacts" and "`no_contact`" in made.rest.line()
     assert measured.detector.blob.rest_origin == "measured" and "init_0.png" in measured.rest.line()
     assert np.linalg.norm(np.array(measured.detector.pins_px) - foreign[1][1], axis=1).max() < 0.5
 
@@ -138,12 +138,12 @@ def test_frames_without_a_layout_are_refused(spec):
 
 
 def test_recordings_are_tuned_without_a_crop(spec):
-    rest = nominal_reference(spec, Form.RECORDING).pins_px
-    frames = [drawn_frame(spec, Form.RECORDING, smooth_warp(rest, 4.0, np.random.default_rng(k))) for k in range(2)]
+    rest = nominal_reference(spec, Form.PROCESSED).pins_px
+    frames = [drawn_frame(spec, Form.PROCESSED, smooth_warp(rest, 4.0, np.random.default_rng(k))) for k in range(2)]
     detector = tune(frames, spec).detector
-    assert detector.form == Form.RECORDING and detector.recording is None and detector.blob.threshold_block_px == 0
+    assert detector.form == Form.PROCESSED and detector.recording is None and detector.blob.threshold_block_px == 0
     assert all(make_detector(spec, detector)(frame).valid for frame in frames)
-    assert make_detector(spec, shipped_detector(spec, Form.RECORDING, "legacy"))(frames[0]).pins_px is None
+    assert make_detector(spec, shipped_detector(spec, Form.PROCESSED, "legacy"))(frames[0]).pins_px is None
 
 
 def test_a_tuning_that_is_worse_than_the_specification_says_so(spec, tuned, tmp_path, monkeypatch):

@@ -36,6 +36,7 @@ def test_every_module_stands_on_a_page():
     assert sorted(members) == [module.name for module in api.modules()] and len(members) > 250
     text = api.text_of("twin.pins", api.pages()["twin.pins"])
     assert "### Pipeline\n" in text and "as in `from twin.pins import" in text and "\n#### Pipeline." in text
+    assert "`Simulator`" in api.text_of("twin", api.pages()["twin"])
 
 
 @pytest.mark.parametrize("command", ALL_COMMANDS)

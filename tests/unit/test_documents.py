@@ -12,6 +12,8 @@ from figures import tables
 from generators import api, commands
 from generators.notebooks import blocks
 
+import twin
+import twin.extend
 from twin.demo.page import NEXT
 
 ROOT = Path(__file__).parents[2]
@@ -167,9 +169,14 @@ def test_a_wrong_command_is_found():
     ]
 
 
+OFFERED = {"twin": twin.__all__, "twin.extend": twin.extend.__all__}
+
+
 @cache
 def names_of(module: str) -> set[str]:
     """What a module of ours offers."""
+    if module in OFFERED:
+        return set(OFFERED[module])
     path = ROOT / Path(*module.split("."))
     source = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
     found: set[str] = {each.stem for each in path.iterdir()} if path.is_dir() else set()
@@ -190,6 +197,18 @@ def test_python_is_python_and_what_it_imports_is_there(path):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in api.PACKAGES:
                 missing = {alias.name for alias in node.names} - names_of(node.module)
                 assert not missing, f"line {block.line}: {node.module} has no {missing}"
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=name_of)
+def test_users_import_twin_alone(path):
+    """In the README and the tutorials; other pages may go deeper, but none takes the name for something else."""
+    for block in blocks(path.read_text(encoding="utf-8")):
+        for node in ast.walk(ast.parse(block.code)) if block.language == "python" else ():
+            assert not (isinstance(node, ast.Name) and node.id == "twin" and isinstance(node.ctx, ast.Store)), f"line {block.line}"
+            if path.name == "README.md" or path.parent.name == "tutorials":
+                names = {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
+                names |= {node.module} if isinstance(node, ast.ImportFrom) and node.module else set()
+                assert {name for name in names if name.split(".")[0] in api.PACKAGES} <= {"twin", "twin.extend"}, f"line {block.line}"
 
 
 def test_every_extra_is_told():

@@ -12,7 +12,7 @@ from twin.pins import nominal_reference
 from twin.types import Form
 
 UNITS = ("mm", "deg")
-REFERENCE = nominal_reference(load_sensor("mg400-127"), Form.RECORDING)
+REFERENCE = nominal_reference(load_sensor("mg400-127"), Form.PROCESSED)
 SPACING_PX = float(REFERENCE.spacing_px.mean())
 PLACES = (REFERENCE.pins_px - REFERENCE.pins_px.mean(axis=0)) / SPACING_PX
 NONE_LOST = np.zeros(len(PLACES), bool)

@@ -197,7 +197,7 @@ def test_a_damaged_record_of_the_code_is_refused(made, tmp_path, content):
     copy = tmp_path / "set"
     shutil.copytree(folder, copy)
     (copy / "made_by.json").write_text(content)
-    with pytest.raises(StoreError, match=r"made_by\.json.*give another --out"):
+    with pytest.raises(StoreError, match=r"made_by\.json.*give another `out`"):
         generate(copy, config, COUNT + 1)
 
 
@@ -226,11 +226,11 @@ def _recording(folder, config):
 def test_pins_alone_are_read_like_frames_and_split_by_contact(made):
     folder, config, summary = made
     data = load_dataset(folder, load_sensor("mg400-127"), "surface-2d-shear")
-    assert len(data) == summary.frames and data.pins.form == Form.RECORDING
+    assert len(data) == summary.frames and data.pins.form == Form.PROCESSED
     truth = zarr.open_group(folder / "truth.zarr", mode="r")
     moved = data.pins.nodes_px - data.pins.reference.pins_px
     assert np.abs(moved - (truth["pins_px"][:] - truth["rest_px"][:])).max() < SAME_PX, "displacements, from each sensor's own rest"
-    assert np.allclose(data.pins.reference.pins_px, nominal_reference(config.sensor, Form.RECORDING).pins_px)
+    assert np.allclose(data.pins.reference.pins_px, nominal_reference(config.sensor, Form.PROCESSED).pins_px)
     assert np.isfinite(data.pins.area_px2).all() and np.array_equal(data.pins.lost, ~truth["visible"][:])
     slope = np.tan(np.radians(rig_of(config.sensor).plate_tilt_deg))
     flat = corrected(data.targets.names, data.targets.raw, data.targets.executed, data.targets.move, slope, truth["pose"][:, 0])
@@ -270,7 +270,7 @@ def test_a_broken_off_run_ends_with_the_same_bytes(made, tmp_path, monkeypatch):
 def test_a_larger_count_goes_on_where_a_smaller_one_ended(made, tmp_path):
     folder, config, _ = made
     generate(tmp_path / "set", config, 2)
-    with pytest.raises(DatasetError, match="holds contacts up to 1; give --count 2 or more"):
+    with pytest.raises(DatasetError, match="holds contacts up to 1; give `count` 2 or more"):
         generate(tmp_path / "set", config, 1)
     assert generate(tmp_path / "set", config, COUNT).before == 2
     assert contents(tmp_path / "set") == contents(folder)
@@ -318,7 +318,7 @@ def test_a_data_set_made_by_other_code_is_refused_and_left_as_it_was(made, tmp_p
     assert solver in told["modules"] and "numpy" in told["libraries"]
     record.write_text(json.dumps(told | {"modules": told["modules"] | {solver: "0" * 16}}))
     before = contents(tmp_path / "set")
-    with pytest.raises(StoreError, match=rf"made by another version of the program \({solver} changed\); give another --out, or remove"):
+    with pytest.raises(StoreError, match=rf"made by another version of the program \({solver} changed\); give another `out`, or remove"):
         generate(tmp_path / "set", config, COUNT + 1)
     assert contents(tmp_path / "set") == before
     record.unlink()
@@ -359,7 +359,7 @@ def test_pictures_are_those_of_the_states(tmp_path):
         pytest.skip(str(error))
     data = load_dataset(tmp_path / "set", config.sensor)
     truth = zarr.open_group(tmp_path / "set" / "truth.zarr", mode="r")
-    assert len(data) == 1 and data.pins.form == Form.RECORDING and not data.problems
+    assert len(data) == 1 and data.pins.form == Form.PROCESSED and not data.problems
     assert np.median(np.linalg.norm(data.pins.nodes_px - truth["caps_px"][:], axis=2)) < 0.5
     moved = with_missing(data, arm_labels(data), SimpleNamespace(draw_px=lambda labels, moved_px, contact, seed: -moved_px), 0)
     assert moved.pins.nodes_px == pytest.approx(np.tile(data.pins.reference.pins_px, (1, 1, 1))), "pictures' pins, what is missing added"
@@ -380,20 +380,20 @@ def test_labels_say_where_the_arm_was_sent_however_far_it_gives_way(tmp_path):
 
 @pytest.mark.parametrize("count", [0, -1, 2_000_000_000, 99_999_999_999_999_999_999])
 def test_a_count_beyond_all_bounds_is_refused_before_anything_is_made(tmp_path, count):
-    with pytest.raises(DatasetError, match=rf"--count {count}: a data set has 1 to \d+ contacts"):
+    with pytest.raises(DatasetError, match=rf"`count` {count}: a data set has 1 to \d+ contacts"):
         generate(tmp_path / "out", small_config(tmp_path), count)
     assert not (tmp_path / "out").exists()
 
 
 def test_a_scheduler_that_does_not_answer_leaves_nothing_behind(tmp_path):
-    with pytest.raises(DatasetError, match="--scheduler nowhere: no scheduler answers"):
+    with pytest.raises(DatasetError, match="`scheduler` nowhere: no scheduler answers"):
         generate(tmp_path / "out", small_config(tmp_path), 1, scheduler="nowhere")
     assert not (tmp_path / "out").exists()
 
 
 def test_pins_of_a_data_set_are_given_in_either_form(made):
     folder, config, _ = made
-    recorded, raw = (open_simulated(folder, config.sensor, form)[1] for form in (Form.RECORDING, Form.RAW))
+    recorded, raw = (open_simulated(folder, config.sensor, form)[1] for form in (Form.PROCESSED, Form.RAW))
     for key in ("pins_px", "rest_px"):
         np.testing.assert_allclose(raw_to_recording(config.sensor.recording, raw[key]), recorded[key], atol=SAME_PX)
     assert load_dataset(folder, config.sensor, form=Form.RAW).pins.form == Form.RAW

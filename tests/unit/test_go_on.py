@@ -32,7 +32,7 @@ def test_a_table_tells_how_its_contacts_were_made(labels, name):
 
 
 def test_a_table_like_no_experiment_is_refused_with_the_labels_that_vary():
-    with pytest.raises(OptionError, match="pose_1, pose_4.*--experiment"):
+    with pytest.raises(OptionError, match="pose_1, pose_4.*`experiment`"):
         experiment_like(varying("pose_1", "pose_4"))
     with pytest.raises(OptionError, match="no label of a contact varies"):
         experiment_like(varying())
@@ -51,7 +51,7 @@ def test_light_is_not_sought_in_thresholded_frames(tmp_path):
     folder.mkdir()
     for k in range(2):
         cv2.imwrite(str(folder / f"f{k}.png"), np.where(np.indices((60, 80)).sum(axis=0) % 9 < 3, 255, 0).astype(np.uint8))
-    with pytest.raises(OptionError, match="thresholded frames.*leave out --optics"):
+    with pytest.raises(OptionError, match="thresholded frames.*leave out `optics`"):
         whole_sensor(folder, tmp_path / "mine.toml", optics=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
 

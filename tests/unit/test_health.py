@@ -88,8 +88,8 @@ def test_a_black_frame_is_bad_and_nothing_crashes():
 
 def test_frames_that_cannot_be_used_are_named():
     spec = load_sensor("mg400-127")
-    rest = nominal_reference(spec, Form.RECORDING).pins_px
-    shown = [drawn_frame(spec, Form.RECORDING, rest, name=f"frame_{k}.png") for k in range(4)]
+    rest = nominal_reference(spec, Form.PROCESSED).pins_px
+    shown = [drawn_frame(spec, Form.PROCESSED, rest, name=f"frame_{k}.png") for k in range(4)]
     shown[2] = replace(shown[2], image=np.zeros_like(shown[2].image))
     found = {each.name: each for each in examine(shown, spec)}["pins"]
     assert "3 of 4 frames can be used; not frame_2.png" in found.text and "no pins" in found.remedy
@@ -133,12 +133,12 @@ def test_frames_of_the_size_for_which_the_detector_was_tuned_are_checked(tmp_pat
 
     The pins are compared with the calibrated ones in the other size, not with those of the tuning itself."""
     spec, size_px = load_sensor("mg400-127"), (320, 320)
-    scale = np.array(size_px) / frame_size(spec, Form.RECORDING)
-    rest_px = (nominal_reference(spec, Form.RECORDING).pins_px + 0.5) * scale - 0.5 + [shift_px, 0.0]
+    scale = np.array(size_px) / frame_size(spec, Form.PROCESSED)
+    rest_px = (nominal_reference(spec, Form.PROCESSED).pins_px + 0.5) * scale - 0.5 + [shift_px, 0.0]
     write_image(tmp_path / "a.png", draw_discs(size_px, rest_px, 5.0, level=(0, 255)))
-    blob = blob_spec(spec.pipeline, Form.RECORDING).model_copy(update={"mask_center_px": (159.5, 159.5), "mask_radius_px": 158.0})
+    blob = blob_spec(spec.pipeline, Form.PROCESSED).model_copy(update={"mask_center_px": (159.5, 159.5), "mask_radius_px": 158.0})
     places = tuple(map(tuple, rest_px.tolist()))
-    tuned = DetectorSpec(name="mine", method="twin", form=Form.RECORDING, size_px=size_px, blob=blob, pins_px=places)
+    tuned = DetectorSpec(name="mine", method="twin", form=Form.PROCESSED, size_px=size_px, blob=blob, pins_px=places)
     found = {each.name: each for each in examine_sensor(str(tmp_path / "a.png"), spec, detector=tuned).findings}
     assert found["pins"].verdict is Grade.GOOD
     assert (found["shift"].verdict is Grade.GOOD) == (not shift_px), found

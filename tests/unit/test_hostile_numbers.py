@@ -42,9 +42,9 @@ SENSOR = (SHIPPED / "sensors" / "mg400-127.toml").read_text()
 
 @pytest.mark.parametrize("number", [float("inf"), float("nan"), 0.0, -1.0, 1e9])
 def test_rates_that_are_none_are_refused_with_their_range(number):
-    with pytest.raises(DeviceError, match="--time-scale .*: expected 0.001 to 1000"):
+    with pytest.raises(DeviceError, match="`time_scale` .*: expected 0.001 to 1000"):
         emulate_mg400(time_scale=number)
-    with pytest.raises(DeviceError, match="--time-scale .*: expected 0.001 to 1000"):
+    with pytest.raises(DeviceError, match="`time_scale` .*: expected 0.001 to 1000"):
         emulate_magician(time_scale=number)
     with pytest.raises(DeviceError, match="--rate .*: expected 0.1 to 1000 decisions a second"):
         FollowPlan(load_object("can"), load_servo("surface"), stream_hz=number)
@@ -101,13 +101,13 @@ def test_a_fault_that_is_none_is_told_before_an_arm_is_looked_for():
 
 
 def test_an_address_of_no_machine_here_and_a_port_in_use_have_remedies_of_their_own():
-    with pytest.raises(DeviceError, match=r"can't listen on 999\.1\.1\.1:\d+ .*; give an address of this machine with --host"):
+    with pytest.raises(DeviceError, match=r"can't listen on 999\.1\.1\.1:\d+ .*; give an address of this machine with `host`"):
         Mg400Emulator(host="999.1.1.1").start()
-    with pytest.raises(DeviceError, match=r"can't listen on 192\.0\.2\.1:\d+ .*; give an address of this machine with --host"):
+    with pytest.raises(DeviceError, match=r"can't listen on 192\.0\.2\.1:\d+ .*; give an address of this machine with `host`"):
         CameraEmulator(NoisyCamera(), host="192.0.2.1").start()
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(DeviceError, match=f"can't listen on 127.0.0.1:{port} .*; end what uses the port, or give another --port"):
+        with pytest.raises(DeviceError, match=f"can't listen on 127.0.0.1:{port} .*; end what uses the port, or give another `port`"):
             CameraEmulator(NoisyCamera(), port=port).start()
 
 
@@ -156,7 +156,7 @@ def test_a_mistyped_run_gets_the_nearest_name(tmp_path):
 
 
 def test_an_object_above_the_sensor_is_refused_before_anything_is_made(tmp_path):
-    with pytest.raises(ContactError, match="--indent-mm -1: .*give 0 for no contact"):
+    with pytest.raises(ContactError, match="`indent_mm` -1: .*give 0 for no contact"):
         render_contact(load_sensor("mg400-127"), load_object("plane"), ContactPose(indent_mm=-1.0), tmp_path / "out")
 
 

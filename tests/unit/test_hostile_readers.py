@@ -48,7 +48,7 @@ def spec():
 
 @pytest.fixture(scope="module")
 def frame(spec):
-    return drawn_frame(spec, Form.RECORDING, nominal_reference(spec, Form.RECORDING).pins_px)
+    return drawn_frame(spec, Form.PROCESSED, nominal_reference(spec, Form.PROCESSED).pins_px)
 
 
 def encoded(frame, suffix: str) -> bytes:
@@ -130,7 +130,7 @@ def test_a_folder_of_damaged_frames_is_read_or_refused(tmp_path, spec, frame, na
 
 @pytest.fixture(scope="module")
 def pins_bytes(spec):  # of one frame
-    rest = nominal_reference(spec, Form.RECORDING).pins_px
+    rest = nominal_reference(spec, Form.PROCESSED).pins_px
     file = io.BytesIO()
     np.savez(file, image_name=np.array(["f_0.png"]), pins_px=rest[None], predicted_px=rest[None], valid=np.ones(1, bool))
     return file.getvalue()
@@ -210,7 +210,7 @@ def test_any_table_of_moves_gives_shares_between_0_and_1_or_a_problem(tmp_path, 
 
 def pins_file(path: Path, spec, **arrays) -> Path:
     """A ``pins.npz`` of two frames with some arrays replaced; None leaves one out."""
-    rest = np.stack([nominal_reference(spec, Form.RECORDING).pins_px] * 2)
+    rest = np.stack([nominal_reference(spec, Form.PROCESSED).pins_px] * 2)
     found = {"image_name": np.array(["f_0.png", "f_1.png"]), "pins_px": rest, "predicted_px": rest, "valid": np.ones(2, bool)} | arrays
     np.savez(path, **{name: array for name, array in found.items() if array is not None})
     return path
@@ -274,7 +274,7 @@ def test_a_specification_whose_pins_lie_beyond_any_frame_is_refused(spec):
     with np.errstate(over="ignore"):
         far = spec.model_copy(update={"camera": spec.camera.model_copy(update={"fx_px": 1e308})})
         with pytest.raises(TwinError, match=r"pins at rest .* far off any frame; mend \[camera\]"):
-            nominal_reference(far, Form.RECORDING)
+            nominal_reference(far, Form.PROCESSED)
 
 
 def written_arrays(tmp_path: Path) -> bytes:
@@ -351,7 +351,7 @@ def test_steps_before_any_bytes_that_are_none_are_read(tmp_path, session, conten
 @pytest.fixture(scope="module")
 def collection(tmp_path_factory, frame):
     folder = tmp_path_factory.mktemp("collected") / "collection"
-    made = Collection(folder, {"seed": 1}, Form.RECORDING)
+    made = Collection(folder, {"seed": 1}, Form.PROCESSED)
     for k in range(2):
         made.keep(k, frame, np.arange(6.0), np.zeros(6), {"attempt": 0})
     assert made.count == 2
@@ -366,6 +366,6 @@ def test_a_damaged_collection_is_gone_on_with_or_refused(tmp_path, collection, d
     shutil.copytree(collection, folder)
     (folder / name).write_bytes(data.draw(damage((folder / name).read_bytes())) if content is None else content)
     try:
-        assert Collection(folder, {"seed": 1}, Form.RECORDING).count >= 0
+        assert Collection(folder, {"seed": 1}, Form.PROCESSED).count >= 0
     except OURS as error:
         assert str(folder) in str(error) and len(str(error).splitlines()) == 1

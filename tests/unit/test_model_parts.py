@@ -87,16 +87,16 @@ def test_a_new_model_trains_is_judged_estimates_and_is_kept_with_no_other_change
         truth = data.targets.corrected[:, k]
         assert errors[name]["mae"] < LEARNT * np.abs(truth - truth.mean()).mean()
     assert (made.half_width > 0).all() and np.isnan(made.executed).all()
-    one = estimator(drawn_frame(data.pins.sensor, Form.RECORDING, data.pins.nodes_px[rows[0]]))
+    one = estimator(drawn_frame(data.pins.sensor, Form.PROCESSED, data.pins.nodes_px[rows[0]]))
     assert one.valid and (np.abs(one.value - made.mean[0]) < 2 * made.half_width[0]).all()
-    blank = estimator(Frame(np.zeros((256, 256), np.uint8), Form.RECORDING))
+    blank = estimator(Frame(np.zeros((256, 256), np.uint8), Form.PROCESSED))
     assert not blank.valid and "no pins" in blank.reason
     again = PoseEstimator.load(tmp_path)
     assert np.array_equal(again.predict_rows(data, rows).mean, made.mean)
 
 
 def test_what_a_new_model_does_not_provide_it_says(data, toy, tmp_path):
-    with pytest.raises(TrainingError, match="line has no modes that a Gaussian process could see; train it with --no-kernel"):
+    with pytest.raises(TrainingError, match="line has no modes that a Gaussian process could see; train it with `kernel=False`"):
         recipe_of(toy, kernel=True)
     with pytest.raises(TrainingError, match="line has no part that can be left out"):
         variant_named("line-without-pins")
@@ -104,7 +104,7 @@ def test_what_a_new_model_does_not_provide_it_says(data, toy, tmp_path):
     with pytest.raises(TrainingError, match="small copy of line"):
         pack(tmp_path, tmp_path / "small")
     with pytest.raises(FrameError, match="counts pins from rest, line does not"):
-        PoseEstimator.load(tmp_path).at_rest(Frame(np.zeros((256, 256), np.uint8), Form.RECORDING))
+        PoseEstimator.load(tmp_path).at_rest(Frame(np.zeros((256, 256), np.uint8), Form.PROCESSED))
 
 
 def test_a_name_is_registered_once(toy):
@@ -138,7 +138,7 @@ def test_a_model_of_pictures_refuses_pins_instead_of_guessing(data):
     estimator = PoseEstimator(config, content | {"reference_px": torch.from_numpy(reference.pins_px)})
     with pytest.raises(TrainingError, match="cnn-v2 estimates from pictures, not from pins"):
         estimator.predict_table(data.pins)
-    assert estimator(drawn_frame(data.pins.sensor, Form.RECORDING, data.pins.nodes_px[3])).valid
+    assert estimator(drawn_frame(data.pins.sensor, Form.PROCESSED, data.pins.nodes_px[3])).valid
 
 
 def names_asked_for(source: str, names: set[str]) -> list[int]:
@@ -266,7 +266,7 @@ def test_a_small_copy_holds_the_processes_beside_the_networks_up_to_a_number_of_
     close = {"rtol": 0, "atol": 0.02}  # of half precision, mm and deg
     np.testing.assert_allclose(small.predict_rows(data, rows).mean, whole.predict_rows(data, rows).mean, **close)
     monkeypatch.setattr("training.packed.MOST_ROWS", 1)
-    with pytest.raises(TrainingError, match="has Gaussian processes of .* frames beside its networks.*--no-kernel"):
+    with pytest.raises(TrainingError, match="has Gaussian processes of .* frames beside its networks.*`kernel=False`"):
         pack(tmp_path / "run", tmp_path / "none")
 
 

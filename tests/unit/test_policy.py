@@ -55,7 +55,7 @@ def test_policies_that_a_rig_cannot_run_are_refused(policy, tmp_path):
     with pytest.raises(PolicyError, match="ObjectRoll"):
         load_for_outlines(path)
     with pytest.raises(FrameError, match="ur5-331"):
-        PolicyModel(policy).check(load_sensor("ur5-331"), Form.RECORDING)
+        PolicyModel(policy).check(load_sensor("ur5-331"), Form.PROCESSED)
 
 
 def test_an_arm_is_moved_as_the_environment_moves_its_tool(policy):
@@ -85,7 +85,7 @@ def test_a_frame_gives_the_action_that_its_observation_gives(policy):
 
 def test_a_frame_without_pins_gives_no_action(policy):
     model = PolicyModel(policy)
-    told = model(Frame(np.zeros((360, 360), np.uint8), Form.RECORDING))
+    told = model(Frame(np.zeros((360, 360), np.uint8), Form.PROCESSED))
     assert not told.valid and told.reason and np.isnan(told.value).all()
 
 

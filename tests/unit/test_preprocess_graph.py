@@ -8,7 +8,7 @@ from scipy.spatial import Voronoi
 
 from scenes import load_sensor
 from twin.frames.forms import from_raw, recording_to_raw
-from twin.pins import features, make_graph, nominal_reference
+from twin.pins import make_graph, node_features, nominal_reference
 from twin.pins.legacy import LEGACY, legacy_graph
 from twin.pins.voronoi import directed_edges, triangulate, voronoi
 from twin.types import Form
@@ -98,20 +98,20 @@ def test_node_order_only_permutes_the_graph():
 def test_relative_features_don_t_know_the_scale(sensor):
     if sensor.recording is None:
         pytest.skip("has one form only")
-    rest = nominal_reference(sensor, Form.RECORDING)
+    rest = nominal_reference(sensor, Form.PROCESSED)
     scaled = type(rest)(**{**vars(rest), "pins_px": 2 * rest.pins_px, "spacing_px": 2 * rest.spacing_px, "area_px2": 4 * rest.area_px2})
     moved = rest.pins_px + np.random.default_rng(0).normal(0, 1, rest.pins_px.shape)
     small, large = (make_graph("voronoi", scale * moved, outmost=rest.outmost) for scale in (1, 2))
-    np.testing.assert_allclose(features(small, rest), features(large, scaled), rtol=1e-9, atol=1e-9)
-    assert features(small, rest).shape == (sensor.pins.count, 5)
-    assert features(small, rest, "pixels").shape == (sensor.pins.count, 3)
+    np.testing.assert_allclose(node_features(small, rest), node_features(large, scaled), rtol=1e-9, atol=1e-9)
+    assert node_features(small, rest).shape == (sensor.pins.count, 5)
+    assert node_features(small, rest, "pixels").shape == (sensor.pins.count, 3)
     with pytest.raises(ValueError, match="they are of two sensors; give the reference of the Pipeline"):
-        features(small, nominal_reference(load_sensor("mg400-331" if sensor.pins.count == 127 else "mg400-127"), Form.RAW))
+        node_features(small, nominal_reference(load_sensor("mg400-331" if sensor.pins.count == 127 else "mg400-127"), Form.RAW))
 
 
 def test_at_rest_the_relative_features_say_so(sensor):
     rest = nominal_reference(sensor, Form.RAW)
-    columns = features(make_graph("voronoi", rest.pins_px, outmost=rest.outmost), rest)
+    columns = node_features(make_graph("voronoi", rest.pins_px, outmost=rest.outmost), rest)
     np.testing.assert_allclose(columns[:, 2:4], 0, atol=1e-12)
     np.testing.assert_allclose(columns[:, 4], 1, rtol=1e-12)
 
@@ -119,7 +119,7 @@ def test_at_rest_the_relative_features_say_so(sensor):
 def test_published_edge_counts(sensor):
     if sensor.recording is None:
         pytest.skip("the published method takes recordings")
-    rest = nominal_reference(sensor, Form.RECORDING).pins_px
+    rest = nominal_reference(sensor, Form.PROCESSED).pins_px
     size = LEGACY[sensor.pins.layout].size_px
     nodes = rest * size / sensor.recording.width_px
     graph = legacy_graph(nodes - np.median(nodes), LEGACY[sensor.pins.layout])
@@ -131,9 +131,9 @@ def test_forms_are_inverse(sensor):
     if sensor.recording is None:
         pytest.skip("has one form only")
     raw = np.random.default_rng(0).uniform(0, 400, (50, 2))
-    np.testing.assert_allclose(recording_to_raw(sensor.recording, from_raw(sensor.recording, Form.RECORDING, raw)), raw, atol=1e-9)
+    np.testing.assert_allclose(recording_to_raw(sensor.recording, from_raw(sensor.recording, Form.PROCESSED, raw)), raw, atol=1e-9)
     x0, y0, x1, y1 = sensor.recording.crop_px
-    corners = from_raw(sensor.recording, Form.RECORDING, np.array([[x0 - 0.5, y0 - 0.5], [x1 - 0.5, y1 - 0.5]]))
+    corners = from_raw(sensor.recording, Form.PROCESSED, np.array([[x0 - 0.5, y0 - 0.5], [x1 - 0.5, y1 - 0.5]]))
     np.testing.assert_allclose(corners, [[-0.5, -0.5], [sensor.recording.width_px - 0.5, sensor.recording.height_px - 0.5]], atol=1e-9)
 
 

@@ -27,9 +27,9 @@ SAME_PIN_PX = 3.0  # a pin further from its truth carries another pin's name
 
 FORMS = [
     ("mg400-331", Form.RAW),
-    ("mg400-331", Form.RECORDING),
+    ("mg400-331", Form.PROCESSED),
     ("mg400-127", Form.RAW),
-    ("mg400-127", Form.RECORDING),
+    ("mg400-127", Form.PROCESSED),
     ("ur5-331", Form.RAW),
 ]
 
@@ -247,7 +247,7 @@ def test_a_view_displaced_out_of_its_mask_is_followed(pipeline):
 
 
 def test_rings_turned_on_by_a_pin_score_less_than_the_truth():
-    rest = nominal_reference(load_sensor("mg400-331"), Form.RECORDING)
+    rest = nominal_reference(load_sensor("mg400-331"), Form.PROCESSED)
     true = np.arange(len(rest.pins_px))
     turned, first = true.copy(), 1
     for ring in range(1, 11):
@@ -284,7 +284,7 @@ def misnamed(observation, truth_px, spacing_px):
 
 @pytest.mark.parametrize("level", [0, 255])
 @pytest.mark.parametrize(
-    "name, form, pins", [("mg400-331", Form.RECORDING, (171, 180, 183, 234)), ("ur5-331", Form.RAW, (168, 180, 228, 288))]
+    "name, form, pins", [("mg400-331", Form.PROCESSED, (171, 180, 183, 234)), ("ur5-331", Form.RAW, (168, 180, 228, 288))]
 )
 def test_pins_behind_a_hole_are_named_right_or_the_frame_is_not_valid(name, form, pins, level):
     """A dark or bright disc over a sixth of the pins. Behind it a sector fits as well if its names are shifted by a pin along the rings."""
@@ -303,7 +303,7 @@ def test_pins_behind_a_hole_are_named_right_or_the_frame_is_not_valid(name, form
 @pytest.mark.parametrize("width", [1.2, 2.2, 3.2])
 def test_a_part_across_a_gap_loses_wrong_names_and_keeps_right_ones(width):
     """Beyond a dark bar, each ring's names are shifted along the ring by a pin, as if the labelling had begun there."""
-    rest = nominal_reference(load_sensor("mg400-331"), Form.RECORDING)
+    rest = nominal_reference(load_sensor("mg400-331"), Form.PROCESSED)
     spacing = float(np.median(rest.spacing_px))
     beyond = (rest.pins_px - rest.pins_px[0])[:, 0] / spacing - 5
     seen = np.flatnonzero(np.abs(beyond) > width / 2)
@@ -327,7 +327,7 @@ def test_a_part_across_a_gap_loses_wrong_names_and_keeps_right_ones(width):
 @pytest.mark.parametrize("name", ["mg400-331", "mg400-127"])
 def test_a_torn_picture_is_named_right_or_not_valid(name, torn):
     """The lower half is displaced by one to two pins, so that most of its pins lie where pins of other names should be."""
-    pipeline = Pipeline(load_sensor(name), Form.RECORDING)
+    pipeline = Pipeline(load_sensor(name), Form.PROCESSED)
     truth = pipeline.reference.pins_px + 0.0
     frame = draw(pipeline, truth)
     half = len(frame.image) // 2
@@ -347,7 +347,7 @@ def test_a_rim_of_another_size_is_not_valid(pipeline):
 
 def test_a_frame_that_lacks_its_rim_is_not_valid():
     """Four of five pins are found, but a layout of one ring less explains the frame as well: so it looks where a threshold is too high."""
-    pipeline = Pipeline(load_sensor("mg400-331"), Form.RECORDING)
+    pipeline = Pipeline(load_sensor("mg400-331"), Form.PROCESSED)
     pins_px, rim = pipeline.reference.pins_px, pipeline.reference.outmost
     radii = cap_radii_px(pipeline.spec, pipeline.form)
 
@@ -360,7 +360,7 @@ def test_a_frame_that_lacks_its_rim_is_not_valid():
 
 
 def test_exchanged_pins_fold_the_layout():
-    rest = nominal_reference(load_sensor("mg400-331"), Form.RECORDING)
+    rest = nominal_reference(load_sensor("mg400-331"), Form.PROCESSED)
     exchanged = rest.pins_px.copy()
     exchanged[[5, 15]] = exchanged[[15, 5]]
     assert folded_fraction(rest, rest.pins_px) == 0.0 < folded_fraction(rest, exchanged)
@@ -372,7 +372,7 @@ def test_a_raw_frame_and_its_recording_show_the_same_pins(name):
     rest = nominal_reference(spec, Form.RAW).pins_px
     truth = smooth_warp(rest, 8.0, np.random.default_rng(0))
     raw = drawn_frame(spec, Form.RAW, truth, noise_sd=1.0, rng=np.random.default_rng(1))
-    observation = Pipeline(spec, Form.RECORDING)(Frame(record(raw.image, spec.recording), Form.RECORDING))
+    observation = Pipeline(spec, Form.PROCESSED)(Frame(record(raw.image, spec.recording), Form.PROCESSED))
     assert observation.found == len(truth)
     assert rms(errors_px(observation, raw_to_recording(spec.recording, truth))) < CENTROID_BINARY_PX
 
@@ -386,7 +386,7 @@ def test_no_blob_is_two_pins(pipeline):
 
 
 def test_order_of_blobs_doesn_t_matter():
-    rest = nominal_reference(load_sensor("mg400-331"), Form.RECORDING)
+    rest = nominal_reference(load_sensor("mg400-331"), Form.PROCESSED)
     rng = np.random.default_rng(5)
     blobs = np.concatenate([smooth_warp(rest.pins_px, 12.0, rng)[5:], rng.uniform(80, 280, (8, 2))])
     area = rng.uniform(40, 60, len(blobs))
@@ -430,7 +430,7 @@ def test_a_wrong_image_is_an_error_with_a_remedy(pipeline):
     for image in wrong:
         with pytest.raises(FrameError, match="expected.*got.*;"):
             pipeline(Frame(image, pipeline.form))
-    other = Form.RAW if pipeline.form == Form.RECORDING else Form.RECORDING
+    other = Form.RAW if pipeline.form == Form.PROCESSED else Form.PROCESSED
     with pytest.raises(FrameError, match="form"):
         pipeline(Frame(np.zeros((height, width), np.uint8), other))
 
@@ -455,11 +455,11 @@ def test_measured_reference_is_where_the_pins_are(pipeline):
 def test_published_method_counts_drawn_pins():
     for name, edges in (("mg400-331", 1860), ("mg400-127", 684)):
         spec = load_sensor(name)
-        rest = nominal_reference(spec, Form.RECORDING)
-        frame = drawn_frame(spec, Form.RECORDING, rest.pins_px)
+        rest = nominal_reference(spec, Form.PROCESSED)
+        frame = drawn_frame(spec, Form.PROCESSED, rest.pins_px)
         observation = LegacyPipeline(spec.pins, spec.recording)(frame)
         assert observation.valid and observation.found == spec.pins.count and len(observation.graph.edges) == edges
-        one_less = drawn_frame(spec, Form.RECORDING, rest.pins_px[1:], radius_px=cap_radii_px(spec, Form.RECORDING)[1:])
+        one_less = drawn_frame(spec, Form.PROCESSED, rest.pins_px[1:], radius_px=cap_radii_px(spec, Form.PROCESSED)[1:])
         assert not LegacyPipeline(spec.pins, spec.recording)(one_less).valid
 
 
@@ -483,7 +483,7 @@ UR5_EVERY = 250  # one frame in so many: 20 of each set
 def test_nearly_every_picture_of_the_ur5_shows_every_pin(real_dir, kind):
     spec = load_sensor("ur5-331")
     recording = open_recording(real_dir / f"ur5-331-{kind}", spec)
-    assert recording.form == Form.RECORDING
+    assert recording.form == Form.PROCESSED
     pipeline = Pipeline(spec, recording.form)
     observations = [pipeline(recording.read(k)) for k in range(0, len(recording), UR5_EVERY)]
     assert all(o.valid for o in observations)

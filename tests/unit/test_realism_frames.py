@@ -68,7 +68,7 @@ def test_an_empty_folder_is_said_to_be_empty(tmp_path, spec):
 
 def test_thresholded_recordings_are_refused(tmp_path):
     spec = load_sensor("mg400-331")
-    image = drawn_frame(spec, Form.RECORDING, nominal_reference(spec, Form.RECORDING).pins_px).image
+    image = drawn_frame(spec, Form.PROCESSED, nominal_reference(spec, Form.PROCESSED).pins_px).image
     with pytest.raises(FrameError, match="raw camera frames"):
         read(tmp_path, spec, {"frame.png": image})
 

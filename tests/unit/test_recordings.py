@@ -24,7 +24,7 @@ from twin.frames.forms import blob_spec, frame_size, from_raw, is_two_level
 from twin.frames.images import write_image
 from twin.frames.videos import is_cut
 from twin.pins import Pipeline, nominal_reference
-from twin.pins.batch import overlay_name, preprocess_recording, summary_lines
+from twin.pins.batch import overlay_name, preprocess_recording
 from twin.records import open_writer
 from twin.rig.labels import read_arm_labels
 from twin.store import write_text
@@ -40,8 +40,8 @@ def spec():
 def pictures(spec):
     """The rest picture and three in contact."""
     rng = np.random.default_rng(0)
-    rest = nominal_reference(spec, Form.RECORDING).pins_px
-    return [drawn_frame(spec, Form.RECORDING, smooth_warp(rest, amplitude, rng)).image for amplitude in (0.0, 4.0, 6.0, 8.0)]
+    rest = nominal_reference(spec, Form.PROCESSED).pins_px
+    return [drawn_frame(spec, Form.PROCESSED, smooth_warp(rest, amplitude, rng)).image for amplitude in (0.0, 4.0, 6.0, 8.0)]
 
 
 def write_set(root, folder, pattern, pictures, numbers, column="image_name", init=True):
@@ -71,7 +71,7 @@ def test_folder_formats_in_the_order_of_their_table(tmp_path, spec, pictures, fo
     frames = list(recording)
     assert [f.name for f in frames] == recording.names == names
     assert [f.sequence for f in frames] == [0, 1, 2]
-    assert all(f.form == Form.RECORDING for f in frames)
+    assert all(f.form == Form.PROCESSED for f in frames)
     assert recording.reference.name == "init_0.png"
     np.testing.assert_array_equal(recording.labels["pose_2"], [0.0, 0.5, 1.0])
     np.testing.assert_array_equal(frames[1].image, pictures[2])
@@ -140,7 +140,7 @@ def test_a_broken_picture_is_listed_and_skipped(tmp_path, spec, pictures, how, w
     assert [f.name for f in recording] == good
     assert [f["image_name"] for f in recording.failed] == [names[which]] and "\n" not in recording.failed[0]["reason"]
 
-    summary = preprocess_recording(tmp_path / "set", spec, tmp_path / "out")
+    summary = preprocess_recording(tmp_path / "set", spec, tmp_path / "out").summary
     arrays = np.load(tmp_path / "out" / "pins.npz", allow_pickle=False)
     assert arrays["image_name"].tolist() == good and summary["frames"] == 2
     assert [f["image_name"] for f in summary["failed"]] == [names[which]]
@@ -166,8 +166,8 @@ def test_form_is_told_by_size_and_can_be_given(tmp_path, spec):
 
 def test_a_form_may_be_given_by_its_name_and_an_unknown_one_names_the_known(tmp_path, spec):
     raw = drawn_frame(spec, Form.RAW, nominal_reference(spec, Form.RAW).pins_px)
-    assert Pipeline(spec, "raw").form is Form.RAW and frame_size(spec, "recording") == frame_size(spec, Form.RECORDING)
-    assert np.array_equal(capture(raw.image, spec, "recording"), capture(raw.image, spec, Form.RECORDING))
+    assert Pipeline(spec, "raw").form is Form.RAW and frame_size(spec, "recording") == frame_size(spec, Form.PROCESSED)
+    assert np.array_equal(capture(raw.image, spec, "recording"), capture(raw.image, spec, Form.PROCESSED))
     write_image(tmp_path / "raw.png", raw.image)
     for unknown in (
         lambda: Pipeline(spec, "foo"),
@@ -205,14 +205,14 @@ def test_a_model_refuses_an_unknown_form_as_it_refuses_the_other_one():
 def test_thresholded_frames_that_were_resized_are_still_such(scale):
     """Small caps are edges for the most part then; as raw frames they would be called saturated."""
     spec = load_sensor("mg400-331")
-    for form in (Form.RECORDING, Form.RAW):
+    for form in (Form.PROCESSED, Form.RAW):
         image = drawn_frame(spec, form, nominal_reference(spec, form).pins_px).image
         resized = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
-        assert is_two_level(resized) == (form == Form.RECORDING)
+        assert is_two_level(resized) == (form == Form.PROCESSED)
 
 
 def test_a_few_gray_pixels_make_no_thresholded_frame_a_gray_picture(spec):
-    image = drawn_frame(spec, Form.RECORDING, nominal_reference(spec, Form.RECORDING).pins_px).image.copy()
+    image = drawn_frame(spec, Form.PROCESSED, nominal_reference(spec, Form.PROCESSED).pins_px).image.copy()
     assert is_two_level(image) and is_two_level(image[..., None])
     image[0, 0] = 128
     assert is_two_level(image) and is_two_level(image[..., None])
@@ -276,7 +276,7 @@ def test_a_video_gives_its_frames(video, spec, tmp_path):
     frames = list(recording)
     assert len(frames) == len(recording) == 12 and recording.form == Form.RAW
     assert frames[11].time_s == pytest.approx(11 / 25, abs=0.05)
-    assert preprocess_recording(video, spec, tmp_path / "out")["exact_fraction"] == 1.0
+    assert preprocess_recording(video, spec, tmp_path / "out").summary["exact_fraction"] == 1.0
 
 
 @pytest.mark.parametrize("share", [0.4, 0.55, 0.7, 0.9, 0.98])
@@ -456,7 +456,7 @@ def test_a_video_that_ends_early_gives_what_is_there(video, spec):
 def test_batch_writes_what_it_promises(tmp_path, spec, pictures):
     names = write_set(tmp_path / "set", "frames_bw", "frame_{}_0.png", [*pictures[:3], np.zeros_like(pictures[0])], (7, 3, 5))
     seen = []
-    summary = preprocess_recording(tmp_path / "set", spec, tmp_path / "out", overlay=True, progress=lambda *at: seen.append(at))
+    made = preprocess_recording(tmp_path / "set", spec, tmp_path / "out", overlay=True, progress=lambda *at: seen.append(at))
     arrays = np.load(tmp_path / "out" / "pins.npz", allow_pickle=False)
     n = spec.pins.count
     assert arrays["image_name"].tolist() == names
@@ -465,10 +465,11 @@ def test_batch_writes_what_it_promises(tmp_path, spec, pictures):
     assert arrays["found"].tolist() == [n, n, 0] and arrays["valid"].tolist() == [True, True, False]
     assert (np.isnan(arrays["pins_px"]) ^ np.isnan(arrays["predicted_px"])).all()
     written = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert written == summary and written["frames"] == 3 and written["exact_fraction"] == pytest.approx(2 / 3)
+    assert written == made.summary and written["frames"] == 3 and written["exact_fraction"] == pytest.approx(2 / 3)
     assert written["in_view"] == n
-    assert next(summary_lines(written, n)).startswith(f"3 frames, all {n} pins found in 66.67 %")
-    assert f"all pins in view ({n - 20} of {n};" in next(summary_lines(written | {"in_view": n - 20.0}, n))
+    assert repr(made).startswith(f"<Preprocessed: 3 frames, all {n} pins found in 66.67 %") and "\n" not in repr(made)
+    assert f"all pins in view ({n - 20} of {n};" in str(replace(made, summary=written | {"in_view": n - 20.0}))
+    assert {len(column) for column in made.to_table().values()} == {3}
     assert written["parameters"]["reference"] == "init_0.png" and set(written["ms"]["total"]) == {"p50", "p95", "p99"}
     assert sorted(p.name for p in (tmp_path / "out" / "overlay").iterdir()) == sorted(names)
     assert seen[-1] == (3, 3)
@@ -489,12 +490,12 @@ def write_pictures(folder, images):
         assert cv2.imwrite(str(folder / name), image)
 
 
-@pytest.mark.parametrize("given", [None, Form.RECORDING])
+@pytest.mark.parametrize("given", [None, Form.PROCESSED])
 def test_most_frames_decide_on_the_form(tmp_path, spec, pictures, given):
     raw = np.zeros((480, 640), np.uint8)
     write_pictures(tmp_path, {"a.png": raw, **{f"b{k}.png": pictures[1] for k in range(4)}})
     recording = open_recording(tmp_path, spec, given)
-    assert recording.form == Form.RECORDING and recording.size_px == (256, 256)
+    assert recording.form == Form.PROCESSED and recording.size_px == (256, 256)
     assert len(list(recording)) == 4 and [f["image_name"] for f in recording.failed] == ["a.png"]
 
 
@@ -502,7 +503,7 @@ def test_the_first_frame_decides_between_equal_numbers(tmp_path, spec, pictures)
     raw = np.zeros((480, 640), np.uint8)
     write_pictures(tmp_path, {"a.png": raw, "b.png": pictures[1]})
     assert open_recording(tmp_path, spec).form == Form.RAW
-    assert open_recording(tmp_path, spec, Form.RECORDING).size_px == (256, 256)
+    assert open_recording(tmp_path, spec, Form.PROCESSED).size_px == (256, 256)
 
 
 def test_a_form_that_no_frame_has_is_an_error(tmp_path, spec, pictures):
@@ -646,7 +647,7 @@ def test_sixteen_bit_files_of_any_depth_keep_their_levels(tmp_path, spec, pictur
     bright = np.round(pictures[1] * (top / 255)).astype(np.uint16)
     bright[0, 0] = top
     write_pictures(tmp_path, {"a.png": bright // 20, "b.png": bright})
-    recording = open_recording(tmp_path, spec, Form.RECORDING)
+    recording = open_recording(tmp_path, spec, Form.PROCESSED)
     dim, image = (frame.image for frame in recording)
     assert np.abs(image[1:].astype(int) - pictures[1][1:]).max() <= 1
     assert np.abs(dim[1:] - pictures[1][1:] / 20).max() <= 2
@@ -666,7 +667,7 @@ def test_overlays_of_pictures_with_equal_stems_are_all_kept(tmp_path, spec, pict
 def test_frames_without_pins_are_one_error_with_the_files_written(tmp_path, spec, pictures):
     black = np.zeros_like(pictures[0])
     write_pictures(tmp_path / "set", {"a.png": black, "b.png": black})
-    with pytest.raises(FrameError, match="in none of 2 frames; the first, a.png: .*--sensor, --form") as error:
+    with pytest.raises(FrameError, match="in none of 2 frames; the first, a.png: .*`sensor`, `form`") as error:
         preprocess_recording(tmp_path / "set", spec, tmp_path / "out")
     summary_path = tmp_path / "out" / "summary.json"
     message = str(error.value)
@@ -696,7 +697,7 @@ def test_the_time_of_a_frame_is_without_that_of_compiling(tmp_path, spec, pictur
         return replace(looks[-1], ms=looks[-1].ms | {"total": 9000.0}) if len(looks) == 1 else looks[-1]
 
     monkeypatch.setattr(Pipeline, "__call__", slow_at_first)
-    assert preprocess_recording(tmp_path / "one.png", spec, tmp_path / "out")["ms"]["total"]["p50"] < 9000
+    assert preprocess_recording(tmp_path / "one.png", spec, tmp_path / "out").summary["ms"]["total"]["p50"] < 9000
 
 
 def test_a_name_that_the_locale_cannot_decode_is_drawn_and_written(tmp_path, spec, pictures):

@@ -94,14 +94,14 @@ def test_paths_may_be_text_and_the_pins_of_another_sensor_are_refused(tmp_path):
     other = load_sensor("mg400-127")
     found = {"pins": 2 * other.pins.count + 2}
     of_another = replace(ABOUT, numbers=found)
-    with pytest.raises(FrameError, match="is 'mg400-127' .127 pins.; leave --sensor out, or give the matching one"):
+    with pytest.raises(FrameError, match="is 'mg400-127' .127 pins.; leave `sensor` out, or give the matching one"):
         with_pins(Records(of_another, []), other)
 
 
 @pytest.mark.parametrize(
     ("named", "told"),
     [
-        ("ur5-331", "'ur5-331' .331 pins., the given sensor is 'mg400-331' .331 pins.; leave --sensor out"),
+        ("ur5-331", "'ur5-331' .331 pins., the given sensor is 'mg400-331' .331 pins.; leave `sensor` out"),
         ("mg400-331", ""),
         ("/home/u/mg400-331.toml", ""),
         ("", ""),
@@ -328,5 +328,5 @@ def test_a_video_has_the_pictures_in_their_order(tmp_path):
     found = open_records(written(tmp_path / "r", "lerobot", episodes, video=True))
     means = [[float(step.image.mean()) for step in episode.steps()] for episode in found.episodes]
     np.testing.assert_allclose(means, [[30, 50], [120, 140]], atol=4.0)
-    with pytest.raises(RecordError, match="--video"):
+    with pytest.raises(RecordError, match="`video`"):
         written(tmp_path / "m", "mcap", video=True)

@@ -19,24 +19,24 @@ from twin.store import contents
 from twin.types import Form, Frame
 
 SENSOR = load_sensor("mg400-127")
-REST_PX = nominal_reference(SENSOR, Form.RECORDING).pins_px
+REST_PX = nominal_reference(SENSOR, Form.PROCESSED).pins_px
 NAMES = ("frame_0_0.png", "frame_0_1.png", "frame_1_0.png")
 
 
 def shifted(k):
     """Pins of the k-th picture, and the picture."""
     pins_px = REST_PX + [0.8 * k, -0.5 * k]
-    return pins_px, drawn_frame(SENSOR, Form.RECORDING, pins_px).image
+    return pins_px, drawn_frame(SENSOR, Form.PROCESSED, pins_px).image
 
 
 def session(folder, steps=3, about=None):
     told = {"sensor": "mg400-127", "arm": "mg400:x", "object": "can", "servo": load_servo("surface").model_dump()}
     with SessionWriter(folder, told if about is None else about) as writer:
-        writer.keep_rest(Frame(shifted(0)[1], Form.RECORDING))
+        writer.keep_rest(Frame(shifted(0)[1], Form.PROCESSED))
         for k in range(steps):
             line = {"names": ["pose_2", "pose_6"], "value": [k, np.nan], "low": [k - 1, 0], "high": [k + 1, 0]}
             poses = {"exposed_pose": np.arange(6) + k, "sent": np.arange(6) - k}
-            writer.append(Frame(shifted(k)[1], Form.RECORDING, f"f{k}", 50.0 + 0.1 * k, k + 1), line | poses)
+            writer.append(Frame(shifted(k)[1], Form.PROCESSED, f"f{k}", 50.0 + 0.1 * k, k + 1), line | poses)
     return folder
 
 
@@ -72,7 +72,7 @@ def test_pins_are_found_in_the_pictures(tmp_path):
     for k, step in enumerate(episode.steps()):
         np.testing.assert_allclose(step.values["pins"], shifted(k)[0], atol=0.3)  # the frames have two levels
     unknown = open_records(session(tmp_path / "t", about={"camera": "x"}))
-    assert "pins" not in with_pins(unknown).about.numbers and "--sensor" in with_pins(unknown).notes[-1]
+    assert "pins" not in with_pins(unknown).about.numbers and "`sensor`" in with_pins(unknown).notes[-1]
     assert with_pins(unknown, SENSOR).about.numbers["pins"] == 254
     with pytest.raises(FrameError, match="mg400-331 are 360x360"):
         with_pins(unknown, load_sensor("mg400-331"))
@@ -154,7 +154,7 @@ def test_a_data_sets_truth_goes_with_it(tmp_path):
 
 def test_pins_without_pictures_are_refused(tmp_path):
     (tmp_path / "truth.zarr").mkdir()
-    with pytest.raises(RecordError, match="--images raw"):
+    with pytest.raises(RecordError, match="`images` raw"):
         open_records(tmp_path)
 
 

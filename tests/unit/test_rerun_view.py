@@ -58,7 +58,7 @@ class Stream:
 @pytest.mark.parametrize("target", ["rerun+http://127.0.0.1:1/proxy", "rerun+http:///proxy"])
 def test_an_address_at_which_no_viewer_answers_is_an_error_when_it_is_opened(monkeypatch, target):
     monkeypatch.setitem(sys.modules, "rerun", SimpleNamespace(RecordingStream=Stream))
-    with pytest.raises(DeviceError, match=f"--rerun {re.escape(target)}: can't be opened .*start a viewer"), RerunView("title", target):
+    with pytest.raises(DeviceError, match=f"`rerun` {re.escape(target)}: can't be opened .*start a viewer"), RerunView("title", target):
         pytest.fail("it was opened")
 
 
@@ -74,8 +74,8 @@ def test_a_viewer_that_goes_is_an_error_at_the_end(monkeypatch):
 def test_frame_pins_and_pose_are_in_the_file(tmp_path):
     pytest.importorskip("rerun", reason="rerun-sdk is optional")
     sensor = load_sensor("mg400-331")
-    pipeline = Pipeline(sensor, Form.RECORDING)
-    frame = replace(drawn_frame(sensor, Form.RECORDING, pipeline.reference.pins_px), time_s=1.0, sequence=7)
+    pipeline = Pipeline(sensor, Form.PROCESSED)
+    frame = replace(drawn_frame(sensor, Form.PROCESSED, pipeline.reference.pins_px), time_s=1.0, sequence=7)
     seen = pipeline(frame)
     assert seen.valid
     value = np.array([1.0, 2.0])

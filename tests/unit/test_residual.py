@@ -93,7 +93,7 @@ def test_it_is_off_unless_it_is_asked_for_and_gray_frames_never_have_it(residual
 
 
 def test_a_sensor_without_a_network_and_one_with_too_few_weights_are_refused(residual):
-    with pytest.raises(RenderError, match="no residual network.*leave --residual out"):
+    with pytest.raises(RenderError, match="no residual network.*leave `residual` out"):
         with_residual(load_sensor("mg400-331"))
     with pytest.raises(ValidationError, match="weights has 7090 numbers, 16 channels and 2 noises need 7091"):
         ResidualSpec.model_validate(residual.model_dump() | {"weights": residual.weights[1:]})

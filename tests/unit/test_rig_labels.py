@@ -46,7 +46,7 @@ def test_what_is_missing_is_said(tmp_path):
 def test_a_label_that_the_experiment_varies_must_not_be_missing(tmp_path):
     """Without the edge's direction every contact would be simulated along the same edge."""
     found = recording(tmp_path, "image_name,pose_2,pose_3\na.png,1,4\nb.png,2,4\n")
-    with pytest.raises(FrameError, match=r"no label pose_6, which the experiment edge-circle varies \(found .*pose_3\).*--experiment"):
+    with pytest.raises(FrameError, match=r"no label pose_6, which the experiment edge-circle varies \(found .*pose_3\).*`experiment`"):
         read_arm_labels(found, load_experiment("edge-circle"))
     assert len(read_arm_labels(found)) == 2
 

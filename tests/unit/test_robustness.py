@@ -20,10 +20,10 @@ def estimator(trained):
 
 def test_each_change_moves_the_pins_as_named(data, estimator):
     rest = data.pins.reference.pins_px
-    image = drawn_frame(data.pins.sensor, Form.RECORDING, rest).image
+    image = drawn_frame(data.pins.sensor, Form.PROCESSED, rest).image
     middle = (np.array(image.shape[::-1]) - 1) / 2
     seen = {
-        name: estimator.pipeline(Frame(change(image, np.random.default_rng(1), estimator), Form.RECORDING))
+        name: estimator.pipeline(Frame(change(image, np.random.default_rng(1), estimator), Form.PROCESSED))
         for name, change in CHANGES.items()
     }
     z, at_rest = {}, (rest - middle) @ [1, 1j]
@@ -41,7 +41,7 @@ def test_the_table_has_every_change_and_every_frame(data, estimator, tmp_path):
     rows = np.arange(6)
     lines = ["image_name,pose_2,pose_6"]
     for k in rows:
-        image = drawn_frame(data.pins.sensor, Form.RECORDING, data.pins.nodes_px[k]).image
+        image = drawn_frame(data.pins.sensor, Form.PROCESSED, data.pins.nodes_px[k]).image
         cv2.imwrite(str(folder / "frames_bw" / data.pins.image_name[k]), image if k else 0 * image)  # the first shows nothing
         lines.append(f"{data.pins.image_name[k]},0,0")
     (folder / "targets.csv").write_text("\n".join(lines) + "\n")

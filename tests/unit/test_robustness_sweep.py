@@ -307,7 +307,7 @@ def test_pipelines_are_checked_before_the_work(tmp_path):
         with pytest.raises(TwinError, match=says):
             check_pipelines(names)
     for models in (("run", "run"), ("twin",)):
-        with pytest.raises(TwinError, match="--model: each needs a name of its own"):
+        with pytest.raises(TwinError, match="`model`: each needs a name of its own"):
             check_pipelines(["twin"], models)
     check_pipelines(["twin"], ("run", "other"))
 

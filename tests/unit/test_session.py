@@ -31,7 +31,7 @@ with SessionWriter(sys.argv[1], {"camera": "none"}) as session:
 
 
 def frame(k: int, image=None) -> Frame:
-    return Frame(np.full((8, 8), k, np.uint8) if image is None else image, Form.RECORDING, f"f{k}", 0.5 * k, k + 1)
+    return Frame(np.full((8, 8), k, np.uint8) if image is None else image, Form.PROCESSED, f"f{k}", 0.5 * k, k + 1)
 
 
 def test_pauses_unread_frames_and_frames_that_are_used_again_are_said(tmp_path):
@@ -96,7 +96,7 @@ def test_a_frame_that_serves_several_steps_is_kept_once_and_comes_as_often(tmp_p
             session.append(frame(k), {})
     assert len(list((tmp_path / "s" / FRAMES).iterdir())) == 2
     with SessionSource(tmp_path / "s") as source:
-        assert source.form is Form.RECORDING
+        assert source.form is Form.PROCESSED
         assert [source.read().sequence for _ in range(3)] == [1, 1, 2]
 
 

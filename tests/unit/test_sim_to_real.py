@@ -132,7 +132,7 @@ def test_intervals_are_widened_to_what_labelled_frames_say(data, corrected):
 
 def test_contacts_of_another_experiment_are_refused(data):
     far = replace(data, targets=replace(data.targets, corrected=data.targets.corrected + [50.0, 0.0]))
-    with pytest.raises(TrainingError, match="^0 simulated states .*--contacts"):
+    with pytest.raises(TrainingError, match="^0 simulated states .*`contacts`"):
         states_like(far, data.rows(FEW))
     assert len(states_like(data, data.rows(FEW))) >= len(FEW)
 

@@ -127,7 +127,7 @@ def test_a_model_that_remembers_tells_slip_besides_and_forgets_a_contact_that_en
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(type(remembering.part), "pins_in", pins_in)
-        made = [remembering(Frame(np.zeros((8, 8), np.uint8), Form.RECORDING)) for _ in range(4)]
+        made = [remembering(Frame(np.zeros((8, 8), np.uint8), Form.PROCESSED)) for _ in range(4)]
     assert [each.valid for each in made] == [True, True, False, True]
     assert len(made[0].value) == len(made[0].names) == len(made[2].value)
     np.testing.assert_allclose(made[3].value, made[0].value)

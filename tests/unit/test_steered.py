@@ -25,7 +25,7 @@ ROUNDING = 1e-6
 @pytest.fixture(scope="module")
 def rest():
     """A layout with six equal sectors."""
-    places = nominal_reference(load_sensor("mg400-127"), Form.RECORDING).pins_px
+    places = nominal_reference(load_sensor("mg400-127"), Form.PROCESSED).pins_px
     corner = (places - places[0]) @ [1, 1j]
     ring = np.concatenate([r * np.exp(2j * np.pi * np.arange(6 * r) / (6 * r)) for r in range(1, 7)])
     assert len(ring) == len(corner) - 1

@@ -285,7 +285,7 @@ def test_a_damaged_item_is_made_anew(tmp_path):
 def test_a_whole_keeps_to_the_code_that_began_it(tmp_path):
     require_same_code(tmp_path, SkinSolver, begun=False)
     require_same_code(tmp_path, SkinSolver, begun=True)
-    with pytest.raises(StoreError, match="made by another version .*is new.* more.*; give another --out"):
+    with pytest.raises(StoreError, match="made by another version .*is new.* more.*; give another `out`"):
         require_same_code(tmp_path, "twin.optics.render", begun=True)
 
 
@@ -310,7 +310,7 @@ def test_a_folder_is_held_by_one_run_and_let_go_of_when_that_is_killed(tmp_path)
     with subprocess.Popen(run, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True) as holder:
         try:
             assert holder.stdout.readline() == "held\n"
-            with pytest.raises(StoreError, match="another run is at work there; wait .* or give another --out"), locked(tmp_path):
+            with pytest.raises(StoreError, match="another run is at work there; wait .* or give another `out`"), locked(tmp_path):
                 pass
         finally:
             holder.kill()

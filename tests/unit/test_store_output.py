@@ -53,7 +53,7 @@ def test_what_others_wrote_is_not_overwritten_and_the_work_does_not_begin(tmp_pa
     else:
         (tmp_path / name).write_text("by hand")
     before = everything(tmp_path)
-    with pytest.raises(StoreError, match=rf"{NOT_OURS}.*\({name}\).*--force"):
+    with pytest.raises(StoreError, match=rf"{NOT_OURS}.*\({name}\).*`force=True`"):
         work(tmp_path)
     assert everything(tmp_path) == before
     with overwriting():

@@ -224,7 +224,7 @@ def test_what_is_no_link_to_a_state_is_refused_in_one_line(link):
 def test_a_page_that_can_not_listen_says_so_and_does_not_wait():
     with socket.create_server(("127.0.0.1", 65535)):
         for host, port in (("999.1.1.1", 8090), ("nowhere.invalid", 8090), ("127.0.0.1", 65535)):
-            with pytest.raises(TwinError, match=f"--host {host} --port {port}: can't listen there"):
+            with pytest.raises(TwinError, match=f"`host` {host} `port` {port}: can't listen there"):
                 Page("page", host=host, port=port)
 
 

@@ -291,7 +291,7 @@ def test_pins_and_force_are_near_those_of_the_finite_elements(surrogate, sensor,
     true.begin(0, contact)
 
     def px(made):
-        return from_raw(sensor.recording, Form.RECORDING, project(sensor.view, made.felt.caps_mm[0]))
+        return from_raw(sensor.recording, Form.PROCESSED, project(sensor.view, made.felt.caps_mm[0]))
 
     slips = []
     for number, T in enumerate(way):
@@ -376,7 +376,7 @@ def test_sensors_that_remember_time_are_refused(sensor):
         require_dome(sensor.model_copy(update={"gel": gel}))
     with pytest.raises(OptionError, match="half sphere"):
         require_dome(load_sensor("pad-round"))
-    with pytest.raises(OptionError, match="--paths 3"):
+    with pytest.raises(OptionError, match="`paths` 3"):
         distil(sensor, "never.safetensors", paths=3)
 
 

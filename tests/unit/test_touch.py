@@ -27,7 +27,7 @@ LEAST_TOLD = 0.9  # of the contacts between 1 and 5 mm
 
 
 def form_of(spec):
-    return Form.RAW if spec.name == "ur5-331" else Form.RECORDING
+    return Form.RAW if spec.name == "ur5-331" else Form.PROCESSED
 
 
 def pins_at_rest(spec):
@@ -80,7 +80,7 @@ def test_a_prints_tolerances_are_no_contact(name):
 
 def test_a_turned_and_scaled_dent_is_the_same_dent():
     spec = load_sensor("mg400-331")
-    reference = nominal_reference(spec, Form.RECORDING)
+    reference = nominal_reference(spec, Form.PROCESSED)
     middle = reference.pins_px.mean(axis=0)
     away = reference.pins_px - middle - [30.0, 0.0]
     dented = reference.pins_px + 0.2 * away * np.exp(-((np.linalg.norm(away, axis=1) / 30.0)[:, None] ** 2))
@@ -94,10 +94,10 @@ def test_a_turned_and_scaled_dent_is_the_same_dent():
 def test_a_pressed_sensor_is_refused(thing, indent_mm):
     spec = load_sensor("mg400-331")
     state = SkinSolver(spec, resolution=Resolution(across=12)).press(load_object(thing), ContactPose(indent_mm=indent_mm))
-    pressed_px = from_raw(spec.recording, Form.RECORDING, project(spec.view, state.caps_mm))
-    measure_reference(spec, Form.RECORDING, drawn_frame(spec, Form.RECORDING, pins_at_rest(spec)))
-    with pytest.raises(FrameError, match="seems pressed.*dented by .*--at-rest FRAME"):
-        measure_reference(spec, Form.RECORDING, drawn_frame(spec, Form.RECORDING, pressed_px))
+    pressed_px = from_raw(spec.recording, Form.PROCESSED, project(spec.view, state.caps_mm))
+    measure_reference(spec, Form.PROCESSED, drawn_frame(spec, Form.PROCESSED, pins_at_rest(spec)))
+    with pytest.raises(FrameError, match="seems pressed.*dented by .*`at_rest` FRAME"):
+        measure_reference(spec, Form.PROCESSED, drawn_frame(spec, Form.PROCESSED, pressed_px))
 
 
 def real_view(spec, frame):

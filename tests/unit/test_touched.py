@@ -37,7 +37,7 @@ class Seeing:
 
 
 def answer_of(name):
-    reference = nominal_reference(load_sensor(name), Form.RECORDING)
+    reference = nominal_reference(load_sensor(name), Form.PROCESSED)
     return reference, TouchAnswer(reference), np.zeros(len(reference.pins_px), bool)
 
 
@@ -60,7 +60,7 @@ def test_a_light_touch_is_told(name, touched):
     reference, answer, none = answer_of(name)
     solver = SkinSolver(spec, resolution=Resolution(10))
     rest, state = solver.rest(), solver.press(load_object(touched), ContactPose(LIGHT_MM))
-    truth = cap_truth(spec, rest, state, Form.RECORDING)
+    truth = cap_truth(spec, rest, state, Form.PROCESSED)
     assert np.linalg.norm(state.force_n) < 0.5
     rng = np.random.default_rng(1)
     places = reference.pins_px + truth.caps_px - truth.rest_px
@@ -80,7 +80,7 @@ def test_lost_pins_do_not_count():
 def test_a_frame_without_contact_gives_no_pose_and_says_why():
     estimator = PoseEstimator.load("mg400-127")
     reference, answer, none = answer_of("mg400-127")
-    frame = Frame(np.zeros((256, 256), np.uint8), Form.RECORDING, "f")
+    frame = Frame(np.zeros((256, 256), np.uint8), Form.PROCESSED, "f")
     seen = SimpleNamespace(
         valid=True,
         graph=SimpleNamespace(nodes_px=reference.pins_px, area_px2=reference.area_px2),
@@ -89,7 +89,7 @@ def test_a_frame_without_contact_gives_no_pose_and_says_why():
         found=127,
         expected=127,
     )
-    pipeline = SimpleNamespace(form=Form.RECORDING, reference=reference)
+    pipeline = SimpleNamespace(form=Form.PROCESSED, reference=reference)
     trained = replace(estimator._trained, pipeline=Seeing(seen, **vars(pipeline)), touched=answer)
     found = estimator.part.estimate_frame(trained, frame)
     assert isinstance(found, Unseen) and found.touched < 0.5
@@ -107,10 +107,10 @@ def test_what_only_some_models_use_is_computed_for_them_alone_and_once(monkeypat
     monkeypatch.setattr(part, "cap_light", lambda frame, nodes_px, reference: asked.append("light") or np.zeros(len(nodes_px)))
     trained = replace(
         estimator._trained,
-        pipeline=Seeing(seen, form=Form.RECORDING, reference=reference),
+        pipeline=Seeing(seen, form=Form.PROCESSED, reference=reference),
         touched=lambda nodes_px, lost: asked.append("touched") or 0.9,
     )
-    frame = Frame(np.zeros((256, 256), np.uint8), Form.RECORDING, "f")
+    frame = Frame(np.zeros((256, 256), np.uint8), Form.PROCESSED, "f")
     assert estimator.part.estimate_frame(trained, frame).touched == 0.9
     assert asked == ["touched"]
     TOUCH.pins_in(trained, frame)

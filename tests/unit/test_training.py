@@ -237,11 +237,11 @@ def test_intervals_from_too_few_frames_are_said_to_be_too_narrow(data, tmp_path)
 
 def test_one_frame_at_a_time_says_what_the_table_says(data, trained):
     estimator = PoseEstimator.load(trained)
-    frame = drawn_frame(data.pins.sensor, Form.RECORDING, data.pins.nodes_px[3])
+    frame = drawn_frame(data.pins.sensor, Form.PROCESSED, data.pins.nodes_px[3])
     one = estimator(frame)
-    seen = Pipeline(data.pins.sensor, Form.RECORDING, data.pins.reference)(frame)
+    seen = Pipeline(data.pins.sensor, Form.PROCESSED, data.pins.reference)(frame)
     table = PinTable(
-        data.pins.sensor, Form.RECORDING, data.pins.reference, np.array(["f"]), seen.graph.nodes_px[None], seen.graph.area_px2[None],
+        data.pins.sensor, Form.PROCESSED, data.pins.reference, np.array(["f"]), seen.graph.nodes_px[None], seen.graph.area_px2[None],
         np.isnan(seen.pins_px[None, :, 0]), np.ones(1, bool),
     )  # fmt: skip
     assert one.valid and np.allclose(one.value, estimator.predict_table(table).mean[0], atol=1e-6)
@@ -260,15 +260,15 @@ def test_another_sensors_frames_are_refused(data, trained):
     pins = replace(data.pins, sensor=other)
     with pytest.raises(FrameError, match="trained on recording frames of 'mg400-127'.*'mg400-331'"):
         estimator.predict_table(pins)
-    rest = nominal_reference(other, Form.RECORDING).pins_px
+    rest = nominal_reference(other, Form.PROCESSED).pins_px
     with pytest.raises(FrameError, match="expected 256x256"):
-        estimator(drawn_frame(other, Form.RECORDING, rest))
+        estimator(drawn_frame(other, Form.PROCESSED, rest))
     with pytest.raises(FrameError, match="expected a recording frame"):
         estimator(Frame(np.zeros((256, 256), np.uint8), Form.RAW))
 
 
 def test_a_frame_without_pins_is_not_valid_and_says_why(trained):
-    made = PoseEstimator.load(trained)(Frame(np.zeros((256, 256), np.uint8), Form.RECORDING))
+    made = PoseEstimator.load(trained)(Frame(np.zeros((256, 256), np.uint8), Form.PROCESSED))
     assert not made.valid and "no pins" in made.reason and np.isnan(made.value).all()
 
 

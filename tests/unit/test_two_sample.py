@@ -92,7 +92,7 @@ def test_each_judge_tells_what_it_tells_alone():
 
 
 def test_a_thorough_test_that_is_left_out_is_an_error(tmp_path):
-    with pytest.raises(OptionError, match="--thorough adds to the two-sample test, but --no-two-sample leaves it out"):
+    with pytest.raises(OptionError, match="`thorough` adds to the two-sample test, but `two_sample=False` leaves it out"):
         compare_with_renders(tmp_path, load_sensor("ur5-331"), tmp_path / "out", test=False, thorough=True)
 
 

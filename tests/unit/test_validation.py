@@ -26,15 +26,15 @@ def recorded(tmp_path_factory):
     """A recording drawn from simulated pins: half of the moves not executed, another friction than the rig's."""
     folder = tmp_path_factory.mktemp("recorded")
     config = small_config(folder, randomisation=None)
-    model = ContactModel(config.sensor, config.experiment, config.object, Form.RECORDING, across=ACROSS)
-    rest_px = nominal_reference(config.sensor, Form.RECORDING).pins_px
+    model = ContactModel(config.sensor, config.experiment, config.object, Form.PROCESSED, across=ACROSS)
+    rest_px = nominal_reference(config.sensor, Form.PROCESSED).pins_px
     (folder / "set" / "frames_bw").mkdir(parents=True)
-    cv2.imwrite(str(folder / "set" / "init_0.png"), drawn_frame(config.sensor, Form.RECORDING, rest_px).image)
+    cv2.imwrite(str(folder / "set" / "init_0.png"), drawn_frame(config.sensor, Form.PROCESSED, rest_px).image)
     rows, done = ["image_name,pose_2,pose_6,move_1,move_6"], ["image_name,executed"]
     for k in range(COUNT):
         label = draw_label(config.experiment, np.random.default_rng(k), executed_share=float(k % 2))
         px = rest_px + model.displacement_px(label, FRICTION)
-        cv2.imwrite(str(folder / "set" / "frames_bw" / f"f_{k}.png"), drawn_frame(config.sensor, Form.RECORDING, px).image)
+        cv2.imwrite(str(folder / "set" / "frames_bw" / f"f_{k}.png"), drawn_frame(config.sensor, Form.PROCESSED, px).image)
         rows.append(",".join([f"f_{k}.png", *(repr(float(v)) for v in (label.pose[1], label.pose[5], label.move[0], label.move[5]))]))
         done.append(f"f_{k}.png,{int(label.executed)}")
     (folder / "set" / "targets.csv").write_text("\n".join(rows) + "\n")

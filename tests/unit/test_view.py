@@ -50,7 +50,7 @@ def known_of(name):
 
 
 def drawn(model, px, name="init_0.png"):
-    return drawn_frame(model.sensor, Form.RECORDING, px, name=name)
+    return drawn_frame(model.sensor, Form.PROCESSED, px, name=name)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_the_known_units_pins_tell_every_view(name, turn_deg, mirrored):
 @pytest.mark.parametrize("name", WEIGHTS)
 def test_another_unit_is_not_taken_for_the_known_one(name):
     model, rng = model_of(name), np.random.default_rng(1)
-    nominal = nominal_reference(model.sensor, Form.RECORDING)
+    nominal = nominal_reference(model.sensor, Form.PROCESSED)
     for _ in range(10):
         other = nominal.pins_px + PRINT_PITCHES * nominal.spacing_px.mean() * rng.standard_normal(nominal.pins_px.shape)
         view = view_of(carried(other, turn_deg=1.0), make_reference(known_of(name), model.sensor.pins), model.sensor.pins)
@@ -141,13 +141,13 @@ def test_a_small_displacement_of_the_picture_is_corrected(name, change):
 
 def test_displacements_from_rest_are_turned_and_scaled_as_their_view():
     spec = load_sensor("mg400-127")
-    rest = nominal_reference(spec, Form.RECORDING)
+    rest = nominal_reference(spec, Form.PROCESSED)
     nodes = rest.pins_px[None] + np.random.default_rng(0).normal(0, 2, (3, *rest.pins_px.shape))
     middle, area = rest.pins_px.mean(axis=0), np.tile(rest.area_px2, (3, 1))
     view = lambda px: 1.03 * (px - middle) @ np.array([[np.cos(0.05), np.sin(0.05)], [-np.sin(0.05), np.cos(0.05)]]) + middle + [3.0, -2.0]  # noqa: E731
     own = make_reference(view(rest.pins_px), spec.pins)
     none = np.zeros(area.shape, bool)
-    table = PinTable(spec, Form.RECORDING, own, np.array(list("abc")), view(nodes), area * 1.03**2, none, np.ones(3, bool), measured=True)
+    table = PinTable(spec, Form.PROCESSED, own, np.array(list("abc")), view(nodes), area * 1.03**2, none, np.ones(3, bool), measured=True)
     again = table.seen_from(rest)
     assert np.allclose(again.nodes_px, nodes) and np.allclose(again.area_px2, area)
 
@@ -171,7 +171,7 @@ def test_a_pressed_or_foreign_frame_at_rest_is_an_error_of_every_reader(tmp_path
     pressed = known + 15.0 * away * np.exp(-4 * (away**2).sum(axis=1))[:, None]
     for image, words in ((drawn(model, pressed).image, "seems pressed"), (np.zeros((256, 256), np.uint8), "no use as no-contact frame")):
         cv2.imwrite(str(tmp_path / "init_0.png"), image)
-        with pytest.raises(FrameError, match=f"init_0.png: .*{words}.*--no-contact FRAME"):
+        with pytest.raises(FrameError, match=f"init_0.png: .*{words}.*`no_contact` FRAME"):
             predict_frames("mg400-127", tmp_path)
 
 
@@ -187,9 +187,9 @@ def pushed(name):
 
 def frames_of(name, **change):
     spec, caps = pushed(name)
-    places = [from_raw(spec.recording, Form.RECORDING, project(spec.view, each)) for each in caps.values()]
+    places = [from_raw(spec.recording, Form.PROCESSED, project(spec.view, each)) for each in caps.values()]
     seen = np.split(carried(np.concatenate([places[0], *places]), **change)[len(places[0]) :], len(places))
-    return spec, {side: drawn_frame(spec, Form.RECORDING, px, name=f"{side}.png") for side, px in zip(caps, seen, strict=True)}
+    return spec, {side: drawn_frame(spec, Form.PROCESSED, px, name=f"{side}.png") for side, px in zip(caps, seen, strict=True)}
 
 
 @pytest.mark.parametrize(
@@ -205,9 +205,9 @@ def test_pushes_to_known_sides_tell_turn_and_mirror(tmp_path, change, by):
     )
     assert view.mirrored == change.get("mirrored", False) == made.camera.mirrored
     assert abs((made.camera.turn_deg - change.get("turn_deg", 0.0) + 180) % 360 - 180) < 0.5
-    pipeline, spacing = Pipeline(made, Form.RECORDING), nominal_reference(spec, Form.RECORDING).spacing_px.mean()
+    pipeline, spacing = Pipeline(made, Form.PROCESSED), nominal_reference(spec, Form.PROCESSED).spacing_px.mean()
     for side, caps_mm in pushed(name)[1].items():
-        away = pipeline(frames[side]).pins_px - from_raw(made.recording, Form.RECORDING, project(made.view, caps_mm))
+        away = pipeline(frames[side]).pins_px - from_raw(made.recording, Form.PROCESSED, project(made.view, caps_mm))
         assert np.nanmax(np.linalg.norm(away, axis=1)) < 0.2 * spacing
 
 
@@ -216,7 +216,7 @@ def test_the_written_copy_is_a_sensor_and_wrong_sides_are_refused(tmp_path):
     for side, frame in frames.items():
         cv2.imwrite(str(tmp_path / f"{side}.png"), frame.image)
     rest, pushes = tmp_path / "rest.png", [f"x:{tmp_path / 'x.png'}", f"y:{tmp_path / 'y.png'}"]
-    made, _ = register_files(spec, rest, pushes, form=Form.RECORDING, out=tmp_path / "mine.toml")
+    made, _ = register_files(spec, rest, pushes, form=Form.PROCESSED, out=tmp_path / "mine.toml")
     again = load_sensor(tmp_path / "mine.toml")
     assert (
         again.camera.turn_deg == pytest.approx(made.camera.turn_deg) and again.pipeline.recording.rest_px == made.pipeline.recording.rest_px
@@ -229,7 +229,7 @@ def test_the_written_copy_is_a_sensor_and_wrong_sides_are_refused(tmp_path):
         registered_view(spec, frames["rest"], {"x": frames["x"], "y": frames["rest"]})
     with pytest.raises(FrameError, match="fit no view"):
         registered_view(spec, frames["rest"], {"x": frames["x"], "-x": frames["x"], "y": frames["y"]})
-    with pytest.raises(FrameError, match="--push left: must be"):
+    with pytest.raises(FrameError, match="`push` left: must be"):
         registered_view(spec, frames["rest"], {"left": frames["x"], "y": frames["y"]})
 
 
@@ -270,7 +270,7 @@ def test_a_turn_at_the_limit_is_measured(tmp_path):
 def test_a_dark_frame_is_no_frame_at_rest():
     spec = load_sensor("mg400-127")
     with pytest.raises(FrameError, match="no use as no-contact frame, no pins"):
-        measure_reference(spec, Form.RECORDING, Frame(np.zeros((256, 256), np.uint8), Form.RECORDING, "init_0.png"))
+        measure_reference(spec, Form.PROCESSED, Frame(np.zeros((256, 256), np.uint8), Form.PROCESSED, "init_0.png"))
 
 
 def warped(frame, centre_px, *, turn_deg=0.0, scale=1.0):

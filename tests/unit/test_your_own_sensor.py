@@ -99,14 +99,14 @@ def test_the_next_steps_name_the_files_and_colour_frames_that_were_thresholded_g
     folder = folder_of(tmp_path, [cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) for image in images])
     (folder / "targets.csv").write_text("image_name,pose_2\n" + "".join(f"frame_{k}.png,{-k}\n" for k in range(4)))
     out = tmp_path / "sub" / "mine.toml"
-    found = new_sensor(folder, out, form=Form.RECORDING)
+    found = new_sensor(folder, out, form=Form.PROCESSED)
     (contact,) = [step for step in found.next_steps if "calibrate contact" in step]
     assert contact.endswith(f"twin calibrate contact --sensor {out} --frames {folder} --out {tmp_path / 'sub' / 'mine-2.toml'}")
     assert not [step for step in found.next_steps if "calibrate optics" in step]
 
 
 def test_the_size_of_the_tip_is_said_to_be_assumed(made):
-    assert any(line.startswith("assumed: tip of radius 20 mm") and "--radius-mm" in line for line in made[0].lines())
+    assert any(line.startswith("assumed: tip of radius 20 mm") and "`radius_mm`" in line for line in made[0].lines())
 
 
 @pytest.mark.slow
@@ -136,7 +136,7 @@ def test_lengths_that_do_not_belong_to_the_camera_are_found_by_a_check(made):
     shrunk = spec.model_copy(update={"skin": spec.skin.model_copy(update={"outer_radius_mm": 10.0})})
     findings = {f.name: f for f in examine(frames, shrunk)}
     assert findings["pins"].verdict is Grade.GOOD
-    assert findings["twin"].verdict is Grade.BAD and "--radius-mm" in findings["twin"].remedy
+    assert findings["twin"].verdict is Grade.BAD and "`radius_mm`" in findings["twin"].remedy
 
 
 def test_a_layout_of_too_few_pins_for_a_camera_is_told(tmp_path):
@@ -205,7 +205,7 @@ def test_without_a_no_contact_frame_a_rest_layout_is_made_and_said():
     found = rest_found(layout, [str(k) for k in range(12)])
     error = np.sqrt(np.mean(np.sum((found.pins_px - rest) ** 2, axis=1)))
     median = np.sqrt(np.mean(np.sum((layout.rest_px - rest) ** 2, axis=1)))
-    assert found.source == "made" and "--no-contact" in found.line()
+    assert found.source == "made" and "`no_contact`" in found.line()
     assert error < 0.6 * median
 
 
@@ -231,7 +231,7 @@ def test_a_layout_that_was_given_and_is_wrong_is_told_which_one_is_right():
     images = frames_of(rest_of(PINS), 2)
     found = _given(PinsSpec(rings=3), images)
     assert not found.sure and "61 pins in 4 rings explain 100.0 %" in found.doubts[0], found.doubts
-    with pytest.raises(FrameError, match="they show 61 pins in 4 rings; leave --layout out"):
+    with pytest.raises(FrameError, match="they show 61 pins in 4 rings; leave `layout` out"):
         _given(PinsSpec(rings=2), images)
     assert _given(PINS, images).sure
 
@@ -244,7 +244,7 @@ def test_a_layout_of_no_known_kind_is_asked_for(tmp_path):
     rest = project(spec.view, rest_pins(spec.geometry).caps_mm)
     warped = (rest if k == 0 else smooth_warp(rest, 3.0, np.random.default_rng(k)) for k in range(4))
     folder = folder_of(tmp_path, [drawn_frame(spec, Form.RAW, px).image for px in warped], ["init_0.png", "a.png", "b.png", "c.png"])
-    with pytest.raises(FrameError, match=r"layout is not recognised.*--layout positions:FILE.csv"):
+    with pytest.raises(FrameError, match=r"layout is not recognised.*`layout` positions:FILE.csv"):
         new_sensor(folder, tmp_path / "mine.toml")
 
 
@@ -332,7 +332,7 @@ def test_a_table_or_no_contact_frame_of_no_use_is_an_error(tmp_path):
         frames_at(folder, None, small),
         frames_at(folder, None, tmp_path / "no.png"),
     ):
-        with pytest.raises(FrameError, match="--table|--no-contact"):
+        with pytest.raises(FrameError, match="`table`|`no_contact`"):
             open_recording(at)
 
 
@@ -379,7 +379,7 @@ def test_without_a_no_contact_frame_shipped_weights_count_from_their_units_pins(
     """The frames show contacts of a unit whose pins stand a little beside the specification's, as the weights know."""
     model = PoseEstimator.load(name)
     known = np.array(model.recorded_sensor.pipeline.recording.rest_px)
-    image = drawn_frame(model.sensor, Form.RECORDING, known).image
+    image = drawn_frame(model.sensor, Form.PROCESSED, known).image
     cv2.imwrite(str(tmp_path / "f_0.png"), image)
     predictions = predict_frames(name, tmp_path)
     assert np.allclose(predictions.estimator.pipeline.reference.pins_px, known)
@@ -395,8 +395,8 @@ def test_a_single_picture_is_counted_from_the_frame_without_contact_of_its_folde
     rest = np.array(model.recorded_sensor.pipeline.recording.rest_px) + [1.0, -2.0]  # this unit's camera looks a little elsewhere
     folder = tmp_path / "frames_bw" if inside else tmp_path
     folder.mkdir(exist_ok=True)
-    cv2.imwrite(str(tmp_path / "init_0.png"), drawn_frame(model.sensor, Form.RECORDING, rest).image)
-    cv2.imwrite(str(folder / "f_0.png"), drawn_frame(model.sensor, Form.RECORDING, smooth_warp(rest, 3.0, np.random.default_rng(0))).image)
+    cv2.imwrite(str(tmp_path / "init_0.png"), drawn_frame(model.sensor, Form.PROCESSED, rest).image)
+    cv2.imwrite(str(folder / "f_0.png"), drawn_frame(model.sensor, Form.PROCESSED, smooth_warp(rest, 3.0, np.random.default_rng(0))).image)
     alone, of_folder = predict_frames("mg400-127", folder / "f_0.png"), predict_frames("mg400-127", tmp_path)
     assert "pins are counted from init_0.png, which lies beside the picture" in alone.recording.problems
     ((_, one),), ((_, other),) = list(alone), list(of_folder)

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import register, registry
 
 from training.environments.batch import Options
 from training.environments.environment import TactileEnv, TactileVectorEnv
-from training.environments.tasks import TASKS
+from training.environments.tasks import TASKS, add_tasks
 
 NAMESPACE = "tactip"
 """First part of the environments' ids."""
@@ -22,14 +22,15 @@ VERSION = 0
 
 def ids() -> tuple[str, ...]:
     """The ids of all environments."""
+    add_tasks()
     return tuple(f"{NAMESPACE}/{name}-v{VERSION}" for name in TASKS)
 
 
 def register_all() -> None:
     """Register the environments; a second call has no effect. Some versions of gymnasium call it where the package is installed."""
-    for name, full in zip(TASKS, ids(), strict=True):
+    where = "training.environments.environment"
+    for full, name in zip(ids(), TASKS, strict=True):
         if full not in registry:
-            where = "training.environments.environment"
             register(id=full, entry_point=f"{where}:TactileEnv", vector_entry_point=f"{where}:TactileVectorEnv", kwargs={"task": name})
 
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from scenes import ObjectSpec, RandomisationSpec, SensorSpec, load_experiment, load_object, load_randomisation, load_sensor
 from scenes.files import shown
 from training.environments.observe import IMAGE_PX, KINDS, LARGEST, PICTURES, Eye, Kind, Pictures
-from training.environments.tasks import TASKS, Judged, Seen
+from training.environments.tasks import TASKS, Judged, Seen, add_tasks
 from training.environments.world import AXES, Surfaces, Tool, motions
 from training.generation.config import draw_friction, draw_sensor
 from training.surrogate.contacts import SurrogateContacts
@@ -50,6 +50,7 @@ def require_whole(name: str, given: Any, least: int) -> None:
 
 def require_task(task: str) -> None:
     """Raise ``OptionError`` if there is no task of this name."""
+    add_tasks()
     if task not in TASKS:
         near = get_close_matches(str(task).lower(), [name.lower() for name in TASKS], n=1)
         hint = "".join(f"did you mean {name!r}? " for name in TASKS if name.lower() in near)

@@ -28,7 +28,7 @@ from twin.policy import Policy, flattened
 from twin.progress import Progress, Step, silent, stage
 from twin.report.charts import new_figure, save_figure
 from twin.store import Layers, text_file, write_json, writes
-from twin.types import FloatArray
+from twin.types import FloatArray, Readable
 
 COMPONENTS, ROUGH_COMPONENTS = 48, 24
 """Numbers of principal components of the pins' motion that a network gets, with and without sight."""
@@ -95,8 +95,8 @@ class LearnPlan:
             require_whole(name, getattr(self, name), least)
 
 
-@dataclass(frozen=True)
-class Learnt:
+@dataclass(frozen=True, repr=False)
+class Learnt(Readable):
     """The result of the learning. ``curve`` holds (steps, seconds, share of success, mean reward) after each update."""
 
     policy: Policy

@@ -21,7 +21,7 @@ from twin.frames.forms import frame_size, from_raw, gray_levels
 from twin.geometry.pins import rest_pins
 from twin.optics.preview import Preview
 from twin.optics.render import Renderer
-from twin.pins import Pipeline, features, make_graph, measure_reference, nominal_reference
+from twin.pins import Pipeline, make_graph, measure_reference, node_features, nominal_reference
 from twin.types import BoolArray, FloatArray, Form, Frame, ImageArray, IntArray, PinState
 
 Kind = Literal["oracle", "pins", "graph", "image", "pose"]
@@ -107,7 +107,7 @@ class Eye:
                 raise OptionError(
                     f"observation 'pose': the weights of {sensor.name} learnt from the light on the caps as well; give pictures='preview'"
                 )
-        self.form = self._estimator.form if self._estimator else Form.RECORDING if sensor.recording else Form.RAW
+        self.form = self._estimator.form if self._estimator else Form.PROCESSED if sensor.recording else Form.RAW
         self.reference = nominal_reference(sensor, self.form)
         self._spacing = float(self.reference.spacing_px.mean())
         self._nominal = View(sensor, self.form, pictures)
@@ -164,7 +164,7 @@ class Eye:
             return np.clip((pins_px - self.reference.pins_px) / self._spacing, -LARGEST, LARGEST).astype(np.float32)
         graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost) for pins in pins_px]
         if self.kind == "graph":
-            seen = np.stack([features(graph, self.reference) for graph in graphs])
+            seen = np.stack([node_features(graph, self.reference) for graph in graphs])
             return np.clip(seen, -LARGEST, LARGEST).astype(np.float32)
         assert self._estimator is not None
         count = len(pins_px)
@@ -211,7 +211,7 @@ def caps_px(sensor: SensorSpec, form: Form, caps_mm: FloatArray) -> FloatArray:
 
 def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[PinState, np.random.Generator], Frame]:
     """Function that makes a frame of one environment's state."""
-    recording = sensor.recording if form == Form.RECORDING else None
+    recording = sensor.recording if form == Form.PROCESSED else None
     window_px = recording.crop_px if recording else None
     preview = Preview(sensor, window_px=window_px)
     renderer = Renderer(sensor, quality="preview", window_px=window_px) if pictures == "traced" else None

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.object import ObjectSpec, SphereShape
+from scenes.plugins import others
 from training.environments.world import Surfaces, Tool, motions, standing_on, turn_about
 from training.surrogate.felt import Felt
 from twin.errors import OptionError
@@ -459,3 +460,8 @@ def _seen_in_plane(away_mm: FloatArray, T_work: FloatArray) -> FloatArray:
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ObjectRoll, ObjectPush)}
 """All tasks by their names."""
+
+
+def add_tasks() -> None:
+    """Add the tasks that other packages offer."""
+    TASKS.update(others("tasks", TASKS, is_one=lambda part: isinstance(part, type) and issubclass(part, Task)))

@@ -27,7 +27,7 @@ MOST_CONTACTS = 1_000_000
 """Most contacts of a data set. At one second each, a core needs twelve days for them."""
 
 
-def require_count(count: int, option: str = "--count") -> None:
+def require_count(count: int, option: str = "`count`") -> None:
     """Raise ``DatasetError`` if a data set can't have this number of contacts; ``option`` names the source of the number."""
     if not 1 <= count <= MOST_CONTACTS:
         raise DatasetError(f"{option} {count}: a data set has 1 to {MOST_CONTACTS} contacts")
@@ -63,8 +63,8 @@ class GenerationConfig(Section):
     def form(self) -> Form:
         """Form of frame in whose pixels the pins are given. Without pictures it is the recordings' form if the sensor has one, else raw."""
         if self.images == "none":
-            return Form.RECORDING if self.sensor.recording else Form.RAW
-        return Form.RECORDING if self.images == "recording" else Form.RAW
+            return Form.PROCESSED if self.sensor.recording else Form.RAW
+        return Form.PROCESSED if self.images == "recording" else Form.RAW
 
     @property
     def image_folder(self) -> str:

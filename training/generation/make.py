@@ -125,8 +125,8 @@ def _row(config: GenerationConfig, draw: Draw, simulator: Simulator, state: Cont
 
 def _png(config: GenerationConfig, simulator: Simulator, state: ContactState, seed: int) -> bytes:
     with nullcontext() if simulator.renderer.drawn else one_thread(simulator.renderer.choice):
-        shot = simulator.shoot(state, form=config.form, seed=seed)
-    image = shot.frame.image if config.images != "gray" else gray_levels(shot.frame.image)
+        rendered = simulator.render(state, form=config.form, seed=seed)
+    image = rendered.frame.image if config.images != "gray" else gray_levels(rendered.frame.image)
     return cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes()
 
 

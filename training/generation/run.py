@@ -15,7 +15,7 @@ from twin.records import KeptAlso
 from twin.rig.contact import friction_between
 from twin.store import output
 from twin.store.resume import MADE_BY
-from twin.types import FINE
+from twin.types import FINE, Readable
 from twin.workers import outcomes, require_scheduler
 
 
@@ -87,8 +87,8 @@ def generate(
         return Summary(count, store.finish(count), before, failed)
 
 
-@dataclass(frozen=True)
-class Simulated:
+@dataclass(frozen=True, repr=False)
+class Simulated(Readable):
     """A data set that was made, and its folder."""
 
     folder: Path
@@ -177,7 +177,7 @@ def simulate_dataset(
         There is no such format, or a library is missing.
     """
     if also and config.images == "none":
-        raise OptionError("--also keeps pictures; give --images raw, gray or recording with it")
+        raise OptionError("`also` keeps pictures; give `images` raw, gray or recording with it")
     with KeptAlso(out, also, config.sensor, at_once=False) as kept:
         with stage(progress, f"{config.experiment.name}, {config.sensor.name}") as step:
             made = generate(out, config, count, workers=workers, scheduler=scheduler, progress=step)

@@ -104,7 +104,7 @@ class Store:
             if config.images != "none":
                 self.pictures.mkdir(exist_ok=True)
         except OSError as error:
-            raise DatasetError(f"{folder}: can't be written to ({error.strerror}); give another folder with --out") from error
+            raise DatasetError(f"{folder}: can't be written to ({error.strerror}); give another folder with `out`") from error
 
     def finished(self) -> set[int]:
         """Indices of the contacts that are done. They include ``REST`` if the frame without contact is done or no pictures are wanted."""
@@ -119,7 +119,7 @@ class Store:
         """Raise DatasetError if the folder holds more contacts than the ``count`` that are wanted."""
         highest = max(self.finished(), default=REST)
         if highest >= count:
-            raise DatasetError(f"{self.folder}: holds contacts up to {highest}; give --count {highest + 1} or more, or another --out")
+            raise DatasetError(f"{self.folder}: holds contacts up to {highest}; give `count` {highest + 1} or more, or another `out`")
 
     def add(self, outcome: Outcome) -> None:
         """Write the pictures and the record of a contact.
@@ -202,7 +202,7 @@ class Store:
             before, now = read_record(path), json.loads(text)
             if before != now:
                 other = ", ".join(key for key in {**now, **before} if before.get(key) != now.get(key))
-                raise DatasetError(f"{self.folder}: holds a data set made otherwise ({other}); repeat its options, or give another --out")
+                raise DatasetError(f"{self.folder}: holds a data set made otherwise ({other}); repeat its options, or give another `out`")
             require_same_code(self.folder, make_contact, begun=True)
             return
         require_same_code(self.folder, make_contact, begun=False)
@@ -228,7 +228,7 @@ def read_record(path: Path) -> dict[str, Any]:
         how = "it holds no record"
     except (OSError, ValueError, RecursionError) as error:
         how = getattr(error, "strerror", None) or "no readable JSON"
-    raise DatasetError(f"{path}: damaged ({how}); copy the data set anew, or make it anew in another --out")
+    raise DatasetError(f"{path}: damaged ({how}); copy the data set anew, or make it anew in another `out`")
 
 
 def refuse_foreign(folder: Path) -> None:
@@ -239,7 +239,7 @@ def refuse_foreign(folder: Path) -> None:
     ours = written_by_us(folder)  # files of a run that was killed before it wrote its configuration
     strange = [name for name in found if name not in ours]
     if strange:
-        raise DatasetError(f"{folder}: holds something else ({', '.join(strange[:3])}); give an empty or a new folder with --out")
+        raise DatasetError(f"{folder}: holds something else ({', '.join(strange[:3])}); give an empty or a new folder with `out`")
 
 
 class TruthFile:

@@ -3,6 +3,7 @@
 from dataclasses import asdict, fields
 
 from scenes.files import shown
+from scenes.plugins import others
 from training.models.cnn.model import CNN_V1, CNN_V2
 from training.models.graphs.model import GNN, TAC_VGNN, TAC_VGNN_RELEASE
 from training.models.part import Model, Variant
@@ -48,6 +49,9 @@ def model_named(name: str) -> Model:
         There is no such model.
     """
     if name not in MODELS:
+        given = others("models", MODELS, is_one=lambda part: isinstance(part, Model))
+        MODELS.update({model.name: model for model in given.values()})
+    if name not in MODELS:
         raise TrainingError(f"no model '{shown(name)}'; choose one of {', '.join(MODELS)}")
     return MODELS[name]
 
@@ -87,5 +91,5 @@ def recipe_of(model: str, **changes: object) -> Recipe:
         if getattr(recipe, key) < 1:
             raise TrainingError(f"{key} must be at least 1, got {getattr(recipe, key)}")
     if recipe.kernel and not chosen.has_modes:
-        raise TrainingError(f"{model} has no modes that a Gaussian process could see; train it with --no-kernel")
+        raise TrainingError(f"{model} has no modes that a Gaussian process could see; train it with `kernel=False`")
     return recipe

@@ -261,7 +261,7 @@ class Model(ABC):
         TrainingError
             The model has none: see ``has_modes``.
         """
-        raise TrainingError(f"{self.name} has no modes that a Gaussian process could see; train it with --no-kernel")
+        raise TrainingError(f"{self.name} has no modes that a Gaussian process could see; train it with `kernel=False`")
 
     @abstractmethod
     def estimate_frame(self, trained: Trained, frame: Frame) -> Prediction | Unseen:

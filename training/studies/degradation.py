@@ -17,7 +17,7 @@ from twin.judge.degradation.study import check_pipelines, real_study, rendered_s
 from twin.judge.degradation.sweep import Answer
 from twin.progress import Progress, silent
 from twin.store import writes
-from twin.types import Form, Frame
+from twin.types import Form, Frame, Readable
 
 # Pipelines that are judged if none are named.
 PIPELINES = ("twin", "legacy")
@@ -58,8 +58,8 @@ class Plan:
     jobs: int = 1
 
 
-@dataclass(frozen=True)
-class Result:
+@dataclass(frozen=True, repr=False)
+class Result(Readable):
     """The severities at which each pipeline and model fails under each condition, and the files, the page first."""
 
     envelopes: list[Envelope]
@@ -107,7 +107,7 @@ def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
 
 
 def _estimates(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Answer:
-    if frame.form == Form.RAW and estimator.form == Form.RECORDING and recording is not None:
-        frame = replace(frame, image=record(frame.image, recording), form=Form.RECORDING)
+    if frame.form == Form.RAW and estimator.form == Form.PROCESSED and recording is not None:
+        frame = replace(frame, image=record(frame.image, recording), form=Form.PROCESSED)
     found = estimator(frame)
     return Answer(found.value, found.low, found.high, found.units, estimator.label_range, found.valid)

@@ -21,6 +21,7 @@ from twin.frames import open_recording
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
+from twin.types import Readable
 
 # Choices of the rows to judge.
 ROWS = ("validation", "all")
@@ -79,8 +80,8 @@ def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
     return replace(data, pins=replace(data.pins, reference=other, measured=True), problems=[*data.problems, OTHER_UNIT])
 
 
-@dataclass(frozen=True)
-class Evaluation:
+@dataclass(frozen=True, repr=False)
+class Evaluation(Readable):
     """Evaluation of a model.
 
     Attributes
@@ -183,14 +184,14 @@ def evaluate_run(
     With models of several kinds of contact (``ContactEstimator``), each frame is judged by the most probable of those kinds whose labels
     the recording varies. ``taken_for`` of the metrics shows the classification among all kinds.
     """
-    for value, allowed, option in ((rows, ROWS, "--rows"), (labels, LABELS, "--labels")):
+    for value, allowed, option in ((rows, ROWS, "`rows`"), (labels, LABELS, "`labels`")):
         if value not in allowed:
             raise TrainingError(f"{option} must be {' or '.join(allowed)}, got {value!r}")
     several, parts, kinds = models_of_kinds(run, recordings[0]), [], []
     if several is None:
         estimator = PoseEstimator.load(run)
     elif rows == "validation":
-        raise TrainingError(f"{run}: models of several kinds of contact; which rows they kept out is not known; give --rows all")
+        raise TrainingError(f"{run}: models of several kinds of contact; which rows they kept out is not known; give `rows` all")
     else:
         kinds = several.for_labels(open_recording(recordings[0], several.sensor, several.form))
         estimator = several.parts[kinds[0]]

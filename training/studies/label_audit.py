@@ -21,7 +21,7 @@ from twin.report.page import Page, Picture
 from twin.report.table import Column
 from twin.rig.labels import as_executed
 from twin.store import made_by, write_json, write_text, writes
-from twin.types import Form
+from twin.types import Form, Readable
 
 # Columns of a table that an audit reads.
 NAMES = tuple(f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, len(UNITS) + 1))
@@ -35,8 +35,8 @@ NAMED = 8
 LARGE_MOVE = 1.0
 
 
-@dataclass(frozen=True)
-class LabelAudit:
+@dataclass(frozen=True, repr=False)
+class LabelAudit(Readable):
     """The result of an audit, and its files.
 
     Attributes

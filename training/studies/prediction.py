@@ -142,13 +142,13 @@ def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = N
             recording.problems += [OTHER_UNIT] if other else []
     if maps is not None:
         if not isinstance(estimator, PoseEstimator):
-            raise TrainingError(f"{run}: models of several kinds of contact have no contact maps; leave --maps out")
+            raise TrainingError(f"{run}: models of several kinds of contact have no contact maps; leave `maps` out")
         estimator.require_maps()
     if sequence:
         if not isinstance(estimator, PoseEstimator) or estimator.slip is None:
             raise TrainingError(
                 f"{run}: does not tell slip; train touch on simulated drags ('twin dataset --experiment drag --randomise drag "
-                "--states all'), or leave --sequence out"
+                "--states all'), or leave `sequence` out"
             )
         estimator = estimator.remembering()
     return Predictions(estimator, recording, maps)

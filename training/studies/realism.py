@@ -14,12 +14,13 @@ from twin.judge.pictures.realism import run_realism
 from twin.optics.render import Quality
 from twin.progress import Progress, Step, silent
 from twin.store import writes
+from twin.types import Readable
 
 IMAGES = ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip", "psnr_whole_db")
 
 
-@dataclass(frozen=True)
-class Realism:
+@dataclass(frozen=True, repr=False)
+class Realism(Readable):
     """The result: all figures, as ``metrics.json`` holds them, and the files, the page first."""
 
     metrics: dict[str, Any]
@@ -105,7 +106,7 @@ def compare_with_renders(
         Nothing can be rendered here.
     """
     if thorough and not test:
-        raise OptionError("--thorough adds to the two-sample test, but --no-two-sample leaves it out; give one of them")
+        raise OptionError("`thorough` adds to the two-sample test, but `two_sample=False` leaves it out; give one of them")
     asked = (_thorough if thorough else _quick) if test else None
     found = run_realism(
         frames,

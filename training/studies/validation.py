@@ -10,14 +10,14 @@ from twin.judge.labelled.compare import Comparison
 from twin.judge.labelled.report import summary_of, write_validation
 from twin.progress import Progress, silent, stage
 from twin.store import writes
-from twin.types import FINE, Form
+from twin.types import FINE, Form, Readable
 
 # Number of frames for which an individual friction is fitted.
 FRICTION_FRAMES = 5
 
 
-@dataclass(frozen=True)
-class Validation:
+@dataclass(frozen=True, repr=False)
+class Validation(Readable):
     """The result of a validation.
 
     Attributes

@@ -30,7 +30,7 @@ from twin.objects import build_field
 from twin.objects.analytic import Solid
 from twin.progress import Progress, silent, stage
 from twin.store import Layers, writes_file
-from twin.types import FloatArray, Form
+from twin.types import FloatArray, Form, Readable
 
 FAMILY = "mg400-331"
 """Sensor of the shipped surrogate whose networks are the start of the training for every other sensor."""
@@ -86,8 +86,8 @@ BINS = {"depth_mm": (0.0, 1.5, 3.0, 6.0), "shear_mm": (0.0, 0.5, 1.5, 20.0)}
 """Ends of the ranges in which errors are reported. The shear is the largest sideways motion of a cap."""
 
 
-@dataclass(frozen=True)
-class Distilled:
+@dataclass(frozen=True, repr=False)
+class Distilled(Readable):
     """A fitted surrogate with its errors on paths that it was not trained on, and the files that were written."""
 
     surrogate: Surrogate
@@ -167,7 +167,7 @@ def distil(
     """
     require_dome(sensor)
     if paths < LEAST_PATHS:
-        raise OptionError(f"--paths {paths}: expected at least {LEAST_PATHS}")
+        raise OptionError(f"`paths` {paths}: expected at least {LEAST_PATHS}")
     with stage(progress, f"contacts of {sensor.name}") as step:
         solved = solve_paths(sensor, range(seed * 100_000, seed * 100_000 + paths), processes=processes, progress=step)
     with stage(progress, "network") as step:
@@ -408,7 +408,7 @@ def _bending(turned: Sequence[_Truths], answer: FloatArray, read: FloatArray, st
 
 def judge(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]) -> dict[str, Any]:
     """Errors on solved paths: pins in px of the sensor's frames, force, sliding share; for all states and by kind of contact."""
-    lattice, form = lattice_sensor(sensor), Form.RECORDING if sensor.recording else Form.RAW
+    lattice, form = lattice_sensor(sensor), Form.PROCESSED if sensor.recording else Form.RAW
     onto, cap_mm = _interpolation(sensor), sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
     rest, lattice_rest = rest_pins(sensor.geometry), rest_pins(lattice.geometry)
 

@@ -32,7 +32,7 @@ def with_residual(spec: SensorSpec) -> SensorSpec:
     """
     residual = spec.response.residual
     if residual is None:
-        raise RenderError(f"sensor {spec.name} has no residual network (response.residual); leave --residual out, or use ur5-331")
+        raise RenderError(f"sensor {spec.name} has no residual network (response.residual); leave `residual` out, or use ur5-331")
     response = spec.response.model_copy(update={"residual": residual.model_copy(update={"used": True})})
     return spec.model_copy(update={"response": response})
 

@@ -22,6 +22,8 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
+from twin.cli.command import App
+from twin.cli.options import as_options
 from twin.errors import OptionError, StoreError, TwinError
 
 # Modules of commands, in the order in which 'twin --help' lists them, each with the title above its commands.
@@ -88,7 +90,7 @@ class FewCommands(TyperGroup):
         return super().resolve_command(ctx, args)
 
 
-app = typer.Typer(name="twin", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = App(name="twin", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
 def _tell_version(asked: bool) -> None:
@@ -136,7 +138,7 @@ def main() -> None:
         print(f"twin: error: {reason}", file=sys.stderr)
         sys.exit(FAILED)
     _end_on_sigterm()
-    warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {' '.join(str(message).split())}\n"
+    warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {as_options(' '.join(str(message).split()))}\n"
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # without a writable home directory it prints four lines of warnings
     try:
         command_line()(prog_name="twin")
@@ -176,9 +178,9 @@ def _end_interrupted(interrupt: KeyboardInterrupt) -> NoReturn:
 
 def _print_error(error: Exception) -> None:
     """Print an error as one line, and its notes. Of a device's error the line is short, and what is left out goes to a file."""
-    text = " ".join(str(error).split())
+    text = as_options(" ".join(str(error).split()))
     devices = sys.modules.get("hardware.errors")  # loaded if there is a device
-    notes = getattr(error, "__notes__", ())
+    notes = [as_options(note) for note in getattr(error, "__notes__", ())]
     if devices is None or not isinstance(error, devices.DeviceError) or (len(text) <= LONGEST_LINE and not notes):
         print(f"twin: error: {text}", file=sys.stderr)
         _print_notes(error)
@@ -219,4 +221,4 @@ def _for_user(error: Exception) -> bool:
 def _print_notes(error: BaseException) -> None:
     """Print each note of an error on stderr. A note states a failure after the error, for example that an arm could not be stopped."""
     for note in getattr(error, "__notes__", ()):
-        print(f"twin: note: {' '.join(note.split())}", file=sys.stderr)
+        print(f"twin: note: {as_options(' '.join(note.split()))}", file=sys.stderr)

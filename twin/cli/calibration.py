@@ -9,16 +9,16 @@
 """
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from twin.cli import FewCommands, app
+from twin.cli.command import App
 from twin.cli.options import (
     CORES,
     QUALITY,
     Across,
-    Force,
     FormOrAuto,
     NoContact,
     Out,
@@ -32,10 +32,19 @@ from twin.cli.options import (
     refined_if,
     say,
     sensor_with,
-    tell,
 )
 from twin.errors import OptionError
+from twin.progress import Progress
 from twin.types import FINE
+
+if TYPE_CHECKING:
+    from training.studies.degradation import Result
+    from training.studies.label_audit import LabelAudit
+    from training.studies.realism import Realism
+    from training.studies.validation import Validation
+    from twin.fit.contact.calibrate import ContactCalibration
+    from twin.fit.go_on import WholeSensor
+    from twin.fit.optics import OpticsCalibration
 
 HELP_NEW = """Make a specification of your own sensor from its frames.
 
@@ -72,7 +81,7 @@ Example:
 
 
 @app.command("new", help=HELP_NEW)
-def new(
+def new_sensor(
     out: Annotated[Path, typer.Option("--out", metavar="MY.toml", help="the specification to write")],
     frames: Annotated[Path | None, typer.Argument(help="folder of frames, video or recording")] = None,
     camera: Annotated[str, typer.Option("--camera", metavar="C", help="a live camera instead: 0, /dev/videoN, http://...")] = "",
@@ -90,43 +99,39 @@ def new(
     table: Table = None,
     form: FormOrAuto = None,
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = 40,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "WholeSensor":
     from hardware.cameras.choose import open_camera
     from hardware.gather import gather_frames
     from scenes import load_experiment
     from scenes.pins import layout_from
-    from twin.cli.progress import shown
     from twin.fit.go_on import whole_sensor
-    from twin.store import overwriting
 
     if (frames is None) == (not camera):
-        raise OptionError("give either a folder of frames or --camera")
-    with overwriting(force):
-        if frames is None:
-            frames = gather_frames(open_camera(camera), out.with_name(f"{out.stem}-frames"))
-        with shown() as progress:
-            made = whole_sensor(
-                frames,
-                out,
-                labels=labels,
-                optics=optics,
-                experiment=if_given(load_experiment, experiment),
-                contacts=contacts,
-                workers=workers,
-                across=across,
-                layout=if_given(layout_from, layout),
-                radius_mm=radius_mm,
-                no_contact=no_contact,
-                table=table,
-                form=form,
-                limit=limit,
-                progress=progress,
-            )
-    tell(made)
+        raise OptionError("give either a folder of frames or `camera`")
+    if frames is None:
+        frames = gather_frames(open_camera(camera), out.with_name(f"{out.stem}-frames"))
+    return whole_sensor(
+        frames,
+        out,
+        labels=labels,
+        optics=optics,
+        experiment=if_given(load_experiment, experiment),
+        contacts=contacts,
+        workers=workers,
+        across=across,
+        layout=if_given(layout_from, layout),
+        radius_mm=radius_mm,
+        no_contact=no_contact,
+        table=table,
+        form=form,
+        limit=limit,
+        progress=progress,
+    )
 
 
-calibrate_app = typer.Typer(
+calibrate_app = App(
     cls=FewCommands, help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None
 )
 app.add_typer(calibrate_app, name="calibrate")
@@ -158,7 +163,7 @@ Example:
 
 
 @calibrate_app.command("optics", help=HELP_CALIBRATE_OPTICS)
-def optics(
+def calibrate_optics(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="folder of raw frames, in contact or not")],
     out: Annotated[Path, typer.Option("--out", metavar="SPEC.toml", help="the specification to write")],
@@ -167,15 +172,12 @@ def optics(
     ] = None,
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="fit at most N frames, evenly spread")] = 6,
     pipeline: Tuning = None,
-    force: Force = False,
-) -> None:
-    from twin.cli.progress import shown
+    *,
+    progress: Progress,
+) -> "OpticsCalibration":
     from twin.fit.optics import calibrate_optics
-    from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
-        found = calibrate_optics(frames, sensor_with(sensor, pipeline), out, limit=limit, no_contact=no_contact, progress=progress)
-    tell(found)
+    return calibrate_optics(frames, sensor_with(sensor, pipeline), out, limit=limit, no_contact=no_contact, progress=progress)
 
 
 HELP_CALIBRATE_CONTACT = """Fit the contact to labelled frames of the real sensor.
@@ -207,8 +209,8 @@ Example:
 """
 
 
-@calibrate_app.command("contact", help=HELP_CALIBRATE_CONTACT)
-def contact(
+@calibrate_app.command("contact", help=HELP_CALIBRATE_CONTACT, goes_on=True)
+def calibrate_contact(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording with its no-contact frame")],
     out: Annotated[Path, typer.Option("--out", metavar="SPEC.toml", help="the specification to write")],
@@ -217,7 +219,7 @@ def contact(
     experiment: Annotated[
         str, typer.Option("--experiment", metavar="E", help="how they were recorded ('twin experiments')")
     ] = "surface-2d",
-    object_: Annotated[
+    obj: Annotated[
         str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
     ] = None,
     hold: Annotated[list[str] | None, typer.Option("--hold", metavar="KEY", help="leave this parameter as it is; may be repeated")] = None,
@@ -227,30 +229,27 @@ def contact(
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "ContactCalibration":
     from scenes import load_experiment, load_object
-    from twin.cli.progress import shown
     from twin.fit.contact.calibrate import calibrate_to_file
     from twin.frames import frames_at
-    from twin.store import overwriting
 
-    with overwriting(force), shown(goes_on=True) as progress:
-        found = calibrate_to_file(
-            frames_at(frames, table, no_contact),
-            sensor_with(sensor, pipeline),
-            load_experiment(experiment),
-            out,
-            touched=if_given(load_object, object_),
-            labels=labels,
-            seed=seed,
-            hold=hold or (),
-            workers=workers,
-            across=across,
-            form=form,
-            progress=progress,
-        )
-    tell(found)
+    return calibrate_to_file(
+        frames_at(frames, table, no_contact),
+        sensor_with(sensor, pipeline),
+        load_experiment(experiment),
+        out,
+        touched=if_given(load_object, obj),
+        labels=labels,
+        seed=seed,
+        hold=hold or (),
+        workers=workers,
+        across=across,
+        form=form,
+        progress=progress,
+    )
 
 
 HELP_VALIDATE = """Compare the twin's pins with those of real frames.
@@ -277,9 +276,7 @@ def validate(
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording")],
     out: Out,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how it was recorded ('twin experiments')")] = "surface-2d",
-    object_: Annotated[
-        str | None, typer.Option("--object", metavar="O", help="the touched object; the experiment's own if not given")
-    ] = None,
+    obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the touched object; the experiment's own if not given")] = None,
     limit: Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help="N frames, chosen at random")] = None,
     friction_frames: Annotated[
         int, typer.Option("--friction-frames", min=0, metavar="N", help="frames for which the best friction is searched, 9 contacts each")
@@ -290,29 +287,26 @@ def validate(
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Validation":
     from scenes import load_experiment, load_object
     from training.studies.validation import validate_contacts
-    from twin.cli.progress import shown
     from twin.frames import frames_at
-    from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
-        found = validate_contacts(
-            sensor_with(sensor, pipeline),
-            frames_at(frames, table, no_contact),
-            load_experiment(experiment),
-            out,
-            touched=if_given(load_object, object_),
-            limit=limit,
-            friction_frames=friction_frames,
-            seed=seed,
-            across=across,
-            form=form,
-            progress=progress,
-        )
-    tell(found)
+    return validate_contacts(
+        sensor_with(sensor, pipeline),
+        frames_at(frames, table, no_contact),
+        load_experiment(experiment),
+        out,
+        touched=if_given(load_object, obj),
+        limit=limit,
+        friction_frames=friction_frames,
+        seed=seed,
+        across=across,
+        form=form,
+        progress=progress,
+    )
 
 
 HELP_REALISM = """Compare real raw frames with their renders.
@@ -378,28 +372,25 @@ def realism(
     ] = False,
     table: Table = None,
     pipeline: Tuning = None,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Realism":
     from training.studies.realism import compare_with_renders
-    from twin.cli.progress import shown
     from twin.frames import frames_at
-    from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
-        found = compare_with_renders(
-            frames_at(path, table),
-            refined_if(residual, sensor_with(sensor, pipeline)),
-            out,
-            pose_aligned=pose_aligned,
-            limit=limit,
-            fitted=fitted,
-            without=without or (),
-            quality=quality,
-            test=two_sample,
-            thorough=thorough,
-            progress=progress,
-        )
-    tell(found)
+    return compare_with_renders(
+        frames_at(path, table),
+        refined_if(residual, sensor_with(sensor, pipeline)),
+        out,
+        pose_aligned=pose_aligned,
+        limit=limit,
+        fitted=fitted,
+        without=without or (),
+        quality=quality,
+        test=two_sample,
+        thorough=thorough,
+        progress=progress,
+    )
 
 
 HELP_ROBUSTNESS = """How far may the sensor degrade before preprocessing fails?
@@ -460,7 +451,7 @@ def _list_conditions(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.command("robustness", help=HELP_ROBUSTNESS)
+@app.command("robustness", help=HELP_ROBUSTNESS, goes_on=True)
 def robustness(
     sensor: Sensor,
     out: Out,
@@ -481,13 +472,12 @@ def robustness(
     rendered: Annotated[bool, typer.Option("--rendered/--no-rendered", help="raw --frames beside rendered ones")] = True,
     jobs: Annotated[int, typer.Option("--jobs", min=1, metavar="N", help="processes")] = CORES,
     show: Annotated[bool, typer.Option("--list", is_eager=True, callback=_list_conditions, help="list the conditions and stop")] = False,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Result":
     from scenes import load_sensor
     from training.studies import degradation
-    from twin.cli.progress import shown
     from twin.judge.degradation.plan import SweepPlan, load_plan
-    from twin.store import overwriting
 
     plan = degradation.Plan(
         load_sensor(sensor),
@@ -499,9 +489,7 @@ def robustness(
         rendered=rendered,
         jobs=jobs,
     )
-    with overwriting(force), shown(goes_on=True) as progress:
-        found = degradation.run(plan, out, progress=progress)
-    tell(found)
+    return degradation.run(plan, out, progress=progress)
 
 
 HELP_AUDIT = """Find what is wrong with the labels of a recording.
@@ -533,14 +521,11 @@ def audit(
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "LabelAudit":
     from training.studies.label_audit import audit_recording
-    from twin.cli.progress import shown
     from twin.frames import frames_at
-    from twin.store import overwriting
 
     spec = sensor_with(sensor, pipeline)
-    with overwriting(force), shown() as progress:
-        found = audit_recording(frames_at(data, table, no_contact), spec, out, form=form, progress=progress)
-    tell(found)
+    return audit_recording(frames_at(data, table, no_contact), spec, out, form=form, progress=progress)

@@ -6,14 +6,20 @@
 - ``twin check``: whether the sensor is well.
 """
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from twin.cli import app
-from twin.cli.options import Force, FormOrAuto, NoContact, Out, Sensor, Table, Tuning, if_given, say, sensor_with, tell
+from twin.cli.options import FormOrAuto, NoContact, Out, Sensor, Table, Tuning, if_given, sensor_with
+from twin.progress import Progress
+
+if TYPE_CHECKING:
+    from hardware.examining import Examination
+    from twin.pins.batch import Preprocessed
+    from twin.pins.graph_files import Graphs
+    from twin.pins.tune_files import TunedOnFrames
 
 HELP_PREPROCESS = """Find the pins in every frame.
 
@@ -52,20 +58,16 @@ def preprocess(
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
-    force: Force = False,
-) -> None:
-    from twin.cli.progress import shown
+    *,
+    progress: Progress,
+) -> "Preprocessed":
     from twin.frames import frames_at
-    from twin.pins.batch import preprocess_recording, summary_lines
+    from twin.pins.batch import preprocess_recording
     from twin.progress import stage
-    from twin.store import overwriting
 
     spec = sensor_with(sensor, pipeline)
-    with overwriting(force), shown() as progress, stage(progress, "frames") as step:
-        at = frames_at(path, table, no_contact)
-        summary = preprocess_recording(at, spec, out, form=form, overlay=overlay, progress=step)
-    say(summary_lines(summary, spec.pins.count))
-    say(f"wrote {out / name}" for name in ("pins.npz", "summary.json") + (("overlay",) if overlay else ()))
+    with stage(progress, "frames") as step:
+        return preprocess_recording(frames_at(path, table, no_contact), spec, out, form=form, overlay=overlay, progress=step)
 
 
 HELP_GRAPH = """Build the graphs of frames or of found pins.
@@ -96,36 +98,23 @@ Example:
 """
 
 
-class Kind(StrEnum):
-    """Kinds of graphs."""
-
-    KNN = "knn"
-    DELAUNAY = "delaunay"
-    VORONOI = "voronoi"
-
-
 @app.command("graph", help=HELP_GRAPH)
 def graph(
     path: Annotated[Path, typer.Argument(help="frame, folder of frames, or pins.npz")],
     sensor: Sensor,
     out: Out,
-    kind: Annotated[Kind, typer.Option("--kind", help="kind of graph")] = Kind.VORONOI,
+    kind: Annotated[Literal["knn", "delaunay", "voronoi"], typer.Option("--kind", help="kind of graph")] = "voronoi",
     form: FormOrAuto = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="the published release's own method and boundary, to compare with")] = False,
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
-    force: Force = False,
-) -> None:
-    from twin.cli.progress import shown
+) -> "Graphs":
     from twin.frames import frames_at
     from twin.pins.graph_files import write_graphs_of
-    from twin.store import overwriting
 
     spec, at = sensor_with(sensor, pipeline), frames_at(path, table, no_contact)
-    with overwriting(force), shown():
-        made = write_graphs_of(at, spec, out, kind=kind.value, form=form, legacy=legacy)
-    tell(made)
+    return write_graphs_of(at, spec, out, kind=kind, form=form, legacy=legacy)
 
 
 HELP_TUNE = """Find parameters of the pin detection for your own frames.
@@ -146,7 +135,7 @@ Example:
 
 
 @app.command("tune", help=HELP_TUNE)
-def tune_command(
+def tune(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="folder of frames, video or recording")],
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE.toml", help="the file to write")] = None,
@@ -157,18 +146,15 @@ def tune_command(
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = 12,
     table: Table = None,
     no_contact: NoContact = None,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "TunedOnFrames":
     from scenes import load_sensor
-    from twin.cli.progress import shown
     from twin.frames import frames_at
     from twin.pins.tune_files import tune_on_frames
-    from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
-        at = frames_at(frames, table, no_contact)
-        found = tune_on_frames(at, load_sensor(sensor), out=out, method=method, form=form, limit=limit, progress=progress)
-    tell(found)
+    at = frames_at(frames, table, no_contact)
+    return tune_on_frames(at, load_sensor(sensor), out=out, method=method, form=form, limit=limit, progress=progress)
 
 
 # Exit code of 'twin check' if the sensor's condition is bad. It differs from those of a failure (1) and of a wrong command line (2).
@@ -195,7 +181,7 @@ Example:
 """
 
 
-@app.command("check", help=HELP_CHECK)
+@app.command("check", help=HELP_CHECK, exit_code=lambda found: BAD if found.bad else 0)
 def check(
     source: Annotated[
         str, typer.Argument(metavar="FRAME", help="image, folder of frames, video, recording, or a camera: 0, /dev/video2, http://...")
@@ -215,27 +201,22 @@ def check(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.toml", help="copy of the specification with the view of --push")
     ] = None,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Examination":
     from hardware.examining import examine_sensor
     from scenes import load_sensor
-    from twin.cli.progress import shown
     from twin.pins import load_detector
-    from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
-        found = examine_sensor(
-            source,
-            load_sensor(sensor),
-            form=form,
-            detector=if_given(load_detector, pipeline),
-            limit=limit,
-            no_contact=no_contact,
-            pushes=push or (),
-            twist=twist,
-            out=out,
-            progress=progress,
-        )
-    say(found.lines())
-    if found.bad:
-        raise SystemExit(BAD)
+    return examine_sensor(
+        source,
+        load_sensor(sensor),
+        form=form,
+        detector=if_given(load_detector, pipeline),
+        limit=limit,
+        no_contact=no_contact,
+        pushes=push or (),
+        twist=twist,
+        out=out,
+        progress=progress,
+    )

@@ -9,9 +9,8 @@
 - ``twin learn``: a policy of a task.
 """
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -23,7 +22,6 @@ from twin.cli.options import (
     Across,
     Also,
     Device,
-    Force,
     FormOrAuto,
     NoContact,
     Out,
@@ -44,9 +42,17 @@ from twin.cli.options import (
     refined_if,
     say,
     sensor_with,
-    tell,
 )
+from twin.progress import Progress
 from twin.types import FINE
+
+if TYPE_CHECKING:
+    from training.environments.learn import Learnt
+    from training.generation.run import Simulated
+    from training.studies.evaluation import Evaluation
+    from training.studies.prediction import Predictions
+    from training.surrogate.fit import Distilled
+    from training.train import Trained
 
 HELP_DATASET = """Simulate a labelled data set with ground truth.
 
@@ -95,33 +101,17 @@ Examples:
 """
 
 
-class Images(StrEnum):
-    """The kinds of pictures in a data set."""
-
-    RAW = "raw"
-    GRAY = "gray"
-    RECORDING = "recording"
-    NONE = "none"
-
-
-class States(StrEnum):
-    """The states of a contact that become frames."""
-
-    ALL = "all"
-    END = "end"
-
-
-@app.command("dataset", help=HELP_DATASET)
-def dataset(
+@app.command("dataset", help=HELP_DATASET, goes_on=True)
+def make_dataset(
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="experiment name ('twin experiments') or file")],
     sensor: Sensor,
     count: Annotated[int, typer.Option("--count", min=1, metavar="N", help="contacts")],
     out: Out,
-    object_: Annotated[
+    obj: Annotated[
         str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
     ] = None,
-    images: Annotated[Images, typer.Option("--images", help="what pictures to make")] = Images.RAW,
-    states: Annotated[States, typer.Option("--states", help="which states of a contact become frames")] = States.END,
+    images: Annotated[Literal["raw", "gray", "recording", "none"], typer.Option("--images", help="what pictures to make")] = "raw",
+    states: Annotated[Literal["all", "end"], typer.Option("--states", help="which states of a contact become frames")] = "end",
     randomise: Annotated[
         str | None, typer.Option("--randomise", metavar="R", help="randomisation name or file; nothing if not given")
     ] = None,
@@ -132,27 +122,24 @@ def dataset(
     residual: Residual = False,
     across: Across = FINE,
     also: Also = None,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Simulated":
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.generation.run import config_for, simulate_dataset
-    from twin.cli.progress import shown
-    from twin.store import overwriting
 
     config = config_for(
         refined_if(residual, load_sensor(sensor)),
         load_experiment(experiment),
-        touched=if_given(load_object, object_),
-        images=images.value,
-        states=states.value,
+        touched=if_given(load_object, obj),
+        images=images,
+        states=states,
         randomisation=if_given(load_randomisation, randomise),
         seed=seed,
         quality=quality,
         across=across,
     )
-    with overwriting(force), shown(goes_on=True) as progress:
-        made = simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, also=tuple(also or ()), progress=progress)
-    tell(made)
+    return simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, also=tuple(also or ()), progress=progress)
 
 
 HELP_TRAIN = """Train a model that tells the pose from a frame.
@@ -201,7 +188,7 @@ Example:
 """
 
 
-@app.command("train", help=HELP_TRAIN)
+@app.command("train", help=HELP_TRAIN, goes_on=True)
 def train(
     model: Annotated[str, typer.Option("--model", help="vgnn, touch, steered, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
     sensor: Sensor,
@@ -227,33 +214,30 @@ def train(
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Trained":
     from training.train import train_model
-    from twin.cli.progress import shown
-    from twin.store import overwriting
 
-    with overwriting(force), shown(goes_on=True) as progress:
-        made = train_model(
-            model,
-            sensor_with(sensor, pipeline),
-            one_recording(data, table, no_contact),
-            out,
-            target=target,
-            labels=labels,
-            seed=seed,
-            split=None if split < 0 else split,
-            epochs=epochs,
-            batch=batch,
-            members=members,
-            kernel=kernel,
-            max_minutes=max_minutes,
-            threads=threads,
-            device=device,
-            form=form,
-            progress=progress,
-        )
-    tell(made)
+    return train_model(
+        model,
+        sensor_with(sensor, pipeline),
+        one_recording(data, table, no_contact),
+        out,
+        target=target,
+        labels=labels,
+        seed=seed,
+        split=None if split < 0 else split,
+        epochs=epochs,
+        batch=batch,
+        members=members,
+        kernel=kernel,
+        max_minutes=max_minutes,
+        threads=threads,
+        device=device,
+        form=form,
+        progress=progress,
+    )
 
 
 HELP_EVALUATE = """Judge a trained model on a labelled recording.
@@ -295,16 +279,13 @@ def evaluate(
     robustness: Annotated[bool, typer.Option("--robustness", help="also judge changed images (five times the frames)")] = False,
     table: Table = None,
     no_contact: NoContact = None,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Evaluation":
     from training.studies.evaluation import evaluate_run
-    from twin.cli.progress import shown
-    from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
-        recordings = one_recording(data, table, no_contact)
-        found = evaluate_run(run, recordings, out, rows=rows, labels=labels, robustness=robustness, progress=progress)
-    tell(found)
+    recordings = one_recording(data, table, no_contact)
+    return evaluate_run(run, recordings, out, rows=rows, labels=labels, robustness=robustness, progress=progress)
 
 
 HELP_PREDICT = """Tell the pose in every frame, with its 90 % interval.
@@ -335,14 +316,11 @@ def predict(
     sequence: Annotated[bool, typer.Option("--sequence", help="the frames follow each other in time: tell slip, too")] = False,
     table: Table = None,
     no_contact: NoContact = None,
-    force: Force = False,
-) -> None:
+) -> "Predictions":
     from training.studies.prediction import predict_frames
     from twin.frames import frames_at
-    from twin.store import overwriting
 
-    with overwriting(force):
-        say(predict_frames(run, frames_at(frame, table, no_contact), maps=maps, sequence=sequence).lines())
+    return predict_frames(run, frames_at(frame, table, no_contact), maps=maps, sequence=sequence)
 
 
 HELP_PACK = """Write a small copy of a finished training run.
@@ -359,14 +337,12 @@ Example:
 
 
 @app.command("pack", help=HELP_PACK)
-def pack(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, touch or steered")], out: Out, force: Force = False) -> None:
+def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, touch or steered")], out: Out) -> None:
     from training.estimator import PoseEstimator
     from training.packed import WEIGHTS, pack
-    from twin.store import overwriting
 
     PoseEstimator.load(run)  # says what is wrong with a folder that holds no run
-    with overwriting(force):
-        size = pack(run, out)
+    size = pack(run, out)
     say([f"wrote {out / WEIGHTS} ({size / 1e3:.0f} kB), {out / 'config.json'}"])
 
 
@@ -386,22 +362,19 @@ Example:
 
 
 @app.command("surrogate", help=HELP_SURROGATE)
-def surrogate(
+def make_surrogate(
     sensor: Sensor,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="file to write, *.safetensors")],
     paths: Annotated[int, typer.Option("--paths", metavar="N", help="solved paths to learn from, about 6 s each on one core")] = 120,
     seed: Annotated[int, typer.Option("--seed", min=0, help="another seed draws other paths")] = 0,
     workers: Workers = CORES,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Distilled":
     from scenes import load_sensor
     from training.surrogate.fit import distil
-    from twin.cli.progress import shown
-    from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
-        made = distil(load_sensor(sensor), out, paths=paths, processes=workers, seed=seed, progress=progress)
-    tell(made)
+    return distil(load_sensor(sensor), out, paths=paths, processes=workers, seed=seed, progress=progress)
 
 
 HELP_LEARN = """Learn a policy of a task, from nothing.
@@ -437,12 +410,11 @@ def learn(
     environments: Annotated[int, typer.Option("--environments", min=2, help="stepped together")] = 32,
     fem: Annotated[int, typer.Option("--fem", min=0, metavar="N", help="episodes on finite elements in which the policy is judged")] = 0,
     seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and episodes")] = 0,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Learnt":
     from training.environments.batch import Options
     from training.environments.learn import LearnPlan, learn_policy
-    from twin.cli.progress import shown
-    from twin.store import overwriting
 
     asked = {
         "sensor": sensor,
@@ -453,6 +425,4 @@ def learn(
         "objects": names_in(objects) if objects else None,
     }
     plan = LearnPlan(task, Options.given(asked), minutes=minutes, environments=environments, fem_episodes=fem, seed=seed, sight=sight)
-    with overwriting(force), shown() as progress:
-        made = learn_policy(plan, out, progress=progress)
-    tell(made)
+    return learn_policy(plan, out, progress=progress)

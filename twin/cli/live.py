@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from twin.cli import FewCommands, app
+from twin.cli.command import App
 from twin.cli.options import (
     SHIPPED_MODEL,
     Also,
@@ -22,7 +23,6 @@ from twin.cli.options import (
     AtRest,
     Camera,
     DryRun,
-    Force,
     FormOrAuto,
     KnownPlace,
     Limits,
@@ -36,12 +36,14 @@ from twin.cli.options import (
     ServoName,
     Steps,
     say,
-    tell,
 )
+from twin.progress import Progress
 from twin.types import FIRST, NONE
 
 if TYPE_CHECKING:
-    from hardware.following import Followed
+    from hardware.collect import Collected
+    from hardware.following import DryRunDone, Followed
+    from hardware.live import Watched
     from twin.estimate import SensorModel
 
 HELP_LIVE = """Show a model's estimates on a camera's frames.
@@ -82,7 +84,7 @@ def live(
     at_rest: AtRest = NONE,
     also: Also = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="port of the page; if it is taken, the next free one")] = 8080,
-) -> None:
+) -> "Watched":
     from hardware.live import WatchPlan, watch
     from hardware.rig import signals_as_ctrl_c
     from training.estimator import load_remembering
@@ -100,8 +102,7 @@ def live(
         also=tuple(also or ()),
     )
     with signals_as_ctrl_c():
-        watched = watch(plan, load_remembering(model), name=str(model), on_shown=tell_view)
-    say(watched.lines())
+        return watch(plan, load_remembering(model), name=str(model), on_shown=tell_view)
 
 
 def tell_view(url: str) -> None:
@@ -133,8 +134,8 @@ Example:
 """
 
 
-@app.command("collect", help=HELP_COLLECT)
-def collect_command(
+@app.command("collect", help=HELP_COLLECT, goes_on=True)
+def collect(
     camera: Camera,
     arm: ArmOption,
     sensor: Sensor,
@@ -143,8 +144,8 @@ def collect_command(
         str, typer.Option("--experiment", metavar="E", help="experiment name ('twin experiments') or file")
     ] = "surface-2d",
     count: Annotated[int, typer.Option("--count", min=1, help="contacts in the folder at the end")] = 100,
-    object_name: Annotated[str | None, typer.Option("--object", metavar="O", help="the experiment's own if not given")] = None,
-    parameters: ServoName = "surface",
+    obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the experiment's own if not given")] = None,
+    servo: ServoName = "surface",
     form: FormOrAuto = None,
     limits: Limits = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of the drawn contacts; the experiment's own if not given")] = None,
@@ -152,21 +153,20 @@ def collect_command(
     plain_light: PlainLight = False,
     also: Also = None,
     dry_run: DryRun = False,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Collected":
     from hardware.collect import CollectPlan, collect_frames
     from hardware.rig import signals_as_ctrl_c
     from scenes import load_experiment, load_object, load_sensor, load_servo
     from training.design import LeastSure
-    from twin.cli.progress import shown
-    from twin.store import overwriting
 
     asked, spec = load_experiment(experiment), load_sensor(sensor)
     plan = CollectPlan(
         sensor=spec,
-        stimulus=load_object(object_name or asked.object),
+        stimulus=load_object(obj or asked.object),
         experiment=asked,
-        servo=load_servo(parameters),
+        servo=load_servo(servo),
         camera=camera,
         arm=arm,
         count=count,
@@ -179,9 +179,13 @@ def collect_command(
         also=tuple(also or ()),
         dry_run=dry_run,
     )
-    with overwriting(force), signals_as_ctrl_c(), shown(goes_on=True) as progress:
-        collected = collect_frames(plan, out, progress=progress)
-    say(collected.lines())
+    with signals_as_ctrl_c():
+        return collect_frames(plan, out, progress=progress)
+
+
+def ended_early(followed: "Followed | DryRunDone") -> int:
+    """Exit code of a command that follows an outline."""
+    return 1 if followed.failure else 0
 
 
 HELP_SERVO = """Follow an object's outline with the sensor.
@@ -220,14 +224,14 @@ The exit code is 1 if it ended early.
 """
 
 
-@app.command("servo", help=HELP_SERVO)
+@app.command("servo", help=HELP_SERVO, exit_code=ended_early)
 def servo(
-    object_name: Annotated[str, typer.Option("--object", metavar="O", help="can, mesh-can, square, prism, tin-box, or another")],
+    obj: Annotated[str, typer.Option("--object", metavar="O", help="can, mesh-can, square, prism, tin-box, or another")],
     out: Out,
     model: Model = SHIPPED_MODEL,
     camera: Camera = "",
     arm: ArmOption = "simulated",
-    parameters: ServoName = "surface",
+    servo: ServoName = "surface",
     steps: Steps = None,
     stream: Annotated[bool, typer.Option("--stream", help="decide at a fixed rate on the newest frame, without waiting for moves")] = False,
     rate: Annotated[float, typer.Option("--rate", min=0.1, help="decisions a second with --stream")] = 10.0,
@@ -239,49 +243,50 @@ def servo(
     at_rest: AtRest = FIRST,
     also: Also = None,
     dry_run: DryRun = False,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Followed | DryRunDone":
     from hardware.following import follow
     from training.estimator import load_remembering
-    from twin.store import overwriting
 
-    with overwriting(force):
-        run_along(
-            follow,
-            load_remembering,
-            model,
-            out,
-            kept_as="model",
-            object_name=object_name,
-            parameters=parameters,
-            also=also,
-            camera=camera,
-            arm=arm,
-            steps=steps,
-            stream_hz=rate if stream else None,
-            limits=limits,
-            record=record,
-            seed=seed,
-            plain_light=plain_light,
-            known_place=known_place,
-            at_rest=at_rest,
-            dry_run=dry_run,
-        )
+    return run_along(
+        follow,
+        load_remembering,
+        model,
+        out,
+        kept_as="model",
+        obj=obj,
+        servo=servo,
+        also=also,
+        camera=camera,
+        arm=arm,
+        steps=steps,
+        stream_hz=rate if stream else None,
+        limits=limits,
+        record=record,
+        seed=seed,
+        plain_light=plain_light,
+        known_place=known_place,
+        at_rest=at_rest,
+        dry_run=dry_run,
+        progress=progress,
+    )
 
 
 def run_along(
-    follow: "Callable[..., Followed]",
+    follow: "Callable[..., Followed | DryRunDone]",
     load: "Callable[[Path], SensorModel]",
     run: Path,
     out: Path,
     *,
     kept_as: str,
-    object_name: str,
-    parameters: str,
+    obj: str,
+    servo: str,
     also: list[AlsoFormat] | None,
+    progress: Progress,
     **options: Any,
-) -> None:
-    """Follow an object's outline with a model or policy, from a command's options to the printed result.
+) -> "Followed | DryRunDone":
+    """Follow an object's outline with a model or policy, from a command's options to the result.
 
     Parameters
     ----------
@@ -293,27 +298,14 @@ def run_along(
         Name of ``run`` in the results.
     **options
         The other fields of ``FollowPlan``.
-
-    Raises
-    ------
-    SystemExit
-        The run ended early.
     """
-    from hardware.following import FollowPlan, PlannedOnly
+    from hardware.following import FollowPlan
     from hardware.rig import signals_as_ctrl_c
     from scenes import load_object, load_servo
-    from twin.cli.progress import shown
 
-    plan = FollowPlan(stimulus=load_object(object_name), servo=load_servo(parameters), also=tuple(also or ()), **options)
-    try:
-        with signals_as_ctrl_c(), shown() as progress:
-            followed = follow(plan, load(run), out, about={kept_as: str(run)}, progress=progress)
-    except PlannedOnly:
-        say(["nothing was moved; leave out --dry-run to begin"])
-        return
-    tell(followed)
-    if followed.failure:
-        raise SystemExit(1)
+    plan = FollowPlan(stimulus=load_object(obj), servo=load_servo(servo), also=tuple(also or ()), **options)
+    with signals_as_ctrl_c():
+        return follow(plan, load(run), out, about={kept_as: str(run)}, progress=progress)
 
 
 HELP_POLICY = """Run a trained policy on a camera and an arm.
@@ -332,14 +324,14 @@ Example:
 """
 
 
-@app.command("policy", help=HELP_POLICY)
-def policy_command(
+@app.command("policy", help=HELP_POLICY, exit_code=ended_early)
+def run_policy(
     policy: Annotated[Path, typer.Argument(help="policy.safetensors of 'twin learn'")],
-    object_name: Annotated[str, typer.Option("--object", metavar="O", help="can, square, prism, tin-box, or another")],
+    obj: Annotated[str, typer.Option("--object", metavar="O", help="can, square, prism, tin-box, or another")],
     out: Out,
     camera: Camera = "",
     arm: ArmOption = "simulated",
-    parameters: ServoName = "surface",
+    servo: ServoName = "surface",
     steps: Steps = None,
     limits: Limits = None,
     record: Record = False,
@@ -348,35 +340,35 @@ def policy_command(
     plain_light: PlainLight = False,
     also: Also = None,
     dry_run: DryRun = False,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Followed | DryRunDone":
     from hardware.following import follow
     from hardware.policy_law import load_for_outlines
-    from twin.store import overwriting
 
-    with overwriting(force):
-        run_along(
-            follow,
-            load_for_outlines,
-            policy,
-            out,
-            kept_as="policy",
-            object_name=object_name,
-            parameters=parameters,
-            also=also,
-            camera=camera,
-            arm=arm,
-            steps=steps,
-            limits=limits,
-            record=record,
-            seed=seed,
-            plain_light=plain_light,
-            known_place=known_place,
-            dry_run=dry_run,
-        )
+    return run_along(
+        follow,
+        load_for_outlines,
+        policy,
+        out,
+        kept_as="policy",
+        obj=obj,
+        servo=servo,
+        also=also,
+        camera=camera,
+        arm=arm,
+        steps=steps,
+        limits=limits,
+        record=record,
+        seed=seed,
+        plain_light=plain_light,
+        known_place=known_place,
+        dry_run=dry_run,
+        progress=progress,
+    )
 
 
-emulate = typer.Typer(
+emulate = App(
     cls=FewCommands,
     help="Emulate a device on this machine.\n\nIt prints 'ready ...' when it listens, and runs until SIGTERM or Ctrl-C.",
     no_args_is_help=True,
@@ -465,11 +457,11 @@ Example:
 def camera(
     arm: Annotated[str, typer.Option("--arm", metavar="A", help="mg400:ADDRESS[:DASHBOARD_PORT]")],
     sensor: Sensor,
-    object_name: Object,
+    obj: Object,
     host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: a free one")] = 8081,
     fps: Annotated[float, typer.Option("--fps", min=0.1, help="largest number of pictures a second")] = 30.0,
-    parameters: ServoName = "surface",
+    servo: ServoName = "surface",
     fault: FaultOption = None,
     plain_light: PlainLight = False,
 ) -> None:
@@ -478,5 +470,5 @@ def camera(
     from scenes import load_object, load_sensor, load_servo
 
     faults = faults_of(fault, FAULTS)
-    things = load_sensor(sensor), load_object(object_name), load_servo(parameters)
+    things = load_sensor(sensor), load_object(obj), load_servo(servo)
     emulate_camera(arm, *things, host=host, port=port, fps=fps, faults=faults, plain_light=plain_light)

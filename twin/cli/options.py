@@ -2,10 +2,11 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+import re
+from collections.abc import Callable, Iterable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -83,14 +84,8 @@ KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stan
 ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS, magician:PORT")]
 
 
-class AlsoFormat(StrEnum):
-    """Further formats in which a record can be kept, as in ``twin.records.ALSO``, whose import would load the pin detection."""
-
-    LEROBOT = "lerobot"
-    HUGGINGFACE = "huggingface"
-    MCAP = "mcap"
-
-
+# Further formats in which a record can be kept, as in ``twin.records.ALSO``, whose import would load the pin detection.
+AlsoFormat = StrEnum("AlsoFormat", {"LEROBOT": "lerobot", "HUGGINGFACE": "huggingface", "MCAP": "mcap"})
 Also = Annotated[
     list[AlsoFormat] | None,
     typer.Option("--also", help="keep it in this format, too, in a subfolder of that name; may be repeated ('twin convert --help')"),
@@ -113,7 +108,7 @@ AtRest = Annotated[
 def _even(value: int) -> int:
     """The number, if it is even."""
     if value % 2:
-        raise OptionError(f"--across {value}: give an even number")
+        raise OptionError(f"`across` {value}: give an even number")
     return value
 
 
@@ -162,28 +157,33 @@ def one_recording(folders: list[Path], table: Path | None, no_contact: Path | No
     from twin.frames import frames_at
 
     if len(folders) > 1 and (table or no_contact):
-        raise OptionError("--table and --no-contact belong to one recording; with several --data put each table beside its frames")
+        raise OptionError("`table` and `no_contact` belong to one recording; with several `data` put each table beside its frames")
     return [frames_at(folder, table, no_contact) for folder in folders]
 
 
-class Result(Protocol):
-    """The result of a function that does a command's work."""
+NAMED_OTHERWISE = {"obj": "object"}
+"""Options whose argument in Python has another name."""
 
-    @property
-    def written(self) -> Sequence[Path]:
-        """The files that were written."""
 
-    def lines(self) -> Iterable[str]:
-        """The result as lines of text."""
+def as_options(text: str) -> str:
+    """A message with the options of the command line in place of the arguments of Python, which stand in it as `name` or `name=value`."""
+
+    def option(found: re.Match[str]) -> str:
+        name, value = found[1], found[2]
+        negation = "no-" if value == "False" else ""
+        named = f"--{negation}{NAMED_OTHERWISE.get(name, name).replace('_', '-')}"
+        return named if value in (None, "True", "False") else f"{named} {value}"
+
+    return re.sub(r"`([a-z][a-z0-9_]*)(?:=([^`]*))?`", option, text)
 
 
 def say(lines: Iterable[str]) -> None:
     """Print each line as soon as it is known."""
     for line in lines:
-        print(line, flush=True)
+        print(as_options(line), flush=True)
 
 
-def tell(result: Result) -> None:
-    """Print a result and the files that were written."""
+def tell(result: Any) -> None:
+    """Print the ``lines()`` of a result, and the files that it names as ``written``, if it does."""
     say(result.lines())
-    say(f"wrote {path}" for path in result.written)
+    say(f"wrote {path}" for path in getattr(result, "written", ()))

@@ -1,13 +1,19 @@
 """The command ``twin convert``: records in the formats of other tools."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from twin.cli import app
-from twin.cli.options import AlsoFormat, Force, Out, if_given, tell
+from twin.cli.options import Out, if_given
+from twin.progress import Progress
 
+if TYPE_CHECKING:
+    from twin.records import Converted
+
+# Formats that can be written, as in ``twin.records.FORMATS``, whose import would load the pin detection.
+Format = Literal["recording", "lerobot", "huggingface", "mcap"]
 HELP_CONVERT = """Translate records to other tools' formats, and back.
 
 A SOURCE is a recording, a simulated data set, a collection, the session of 'twin live --record' or 'twin servo --record', or what this
@@ -34,34 +40,20 @@ Examples:
 """
 
 
-# Formats that can be written, as in ``twin.records.FORMATS``, whose import would load the pin detection.
-FORMATS = ("recording", *AlsoFormat)
-
-
-def known_format(text: str) -> str:
-    """The format, if there is one of that name."""
-    if text not in FORMATS:
-        raise typer.BadParameter(f"expected {', '.join(FORMATS)}, got {text!r}")
-    return text
-
-
 @app.command("convert", help=HELP_CONVERT)
 def convert_command(
     sources: Annotated[list[Path], typer.Argument(metavar="SOURCE...", help="recordings, sessions, or translated records")],
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", callback=known_format, help="recording, lerobot, huggingface or mcap")],
+    to: Annotated[Format, typer.Option("--to", metavar="FORMAT", help="recording, lerobot, huggingface or mcap")],
     out: Out,
     sensor: Annotated[
         str | None, typer.Option("--sensor", metavar="S", help="sensor whose pins are found; a source's own if not given")
     ] = None,
     task: Annotated[str, typer.Option("--task", metavar="TEXT", help="what the episodes do; by default what each source says")] = "",
     video: Annotated[bool, typer.Option("--video", help="with lerobot: pictures as video, which loses detail")] = False,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "Converted":
     from scenes import load_sensor
-    from twin.cli.progress import shown
     from twin.records import convert
-    from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
-        done = convert(sources, out, to, sensor=if_given(load_sensor, sensor), task=task, video=video, progress=progress)
-    tell(done)
+    return convert(sources, out, to, sensor=if_given(load_sensor, sensor), task=task, video=video, progress=progress)

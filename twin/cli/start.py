@@ -7,13 +7,19 @@
 """
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from twin.cli import app
-from twin.cli.options import QUALITY, Force, Object, Out, Pair, Quality, Sensor, say, tell
+from twin.cli.options import QUALITY, Object, Out, Pair, Quality, Sensor, say
+from twin.progress import Progress
 from twin.types import Form
+
+if TYPE_CHECKING:
+    from hardware.doctor import Machine
+    from twin.demo.make_demo import Demo
+    from twin.one_contact import RenderedContact
 
 
 @app.command("sensors")
@@ -72,8 +78,8 @@ def randomisations() -> None:
     say(catalog.randomisations().lines())
 
 
-@app.command("doctor")
-def doctor() -> None:
+@app.command("doctor", exit_code=lambda machine: 0 if machine.can_render else 1)
+def doctor() -> "Machine":
     """Say what is there and what is missing, with the remedy.
 
     It looks at packages, Mitsuba's variants (and which one is used, and why), LLVM, GPU, offscreen 3D, cameras and serial ports. The
@@ -85,14 +91,11 @@ def doctor() -> None:
     """
     from hardware.doctor import examine_machine
 
-    machine = examine_machine()
-    say(machine.lines())
-    if not machine.can_render:
-        raise SystemExit(1)
+    return examine_machine()
 
 
 @app.command("demo")
-def demo(out: Out = Path("out/demo"), force: Force = False) -> None:
+def demo(out: Out = Path("out/demo"), *, progress: Progress) -> "Demo":
     """Run the whole chain on shipped sensors, as one page.
 
     It presses, renders, finds pins and builds graphs for several sensors and objects. It writes pictures and a page (index.html).
@@ -101,14 +104,9 @@ def demo(out: Out = Path("out/demo"), force: Force = False) -> None:
     Example:
       twin demo --out out/demo
     """
-    from twin.cli.progress import shown
     from twin.demo.make_demo import run_demo
-    from twin.store import overwriting
 
-    with overwriting(force), shown() as progress:
-        made = run_demo(out, progress=progress)
-    tell(made)
-    say([f"open {out / 'index.html'} in a browser"])
+    return run_demo(out, progress=progress)
 
 
 HELP_RENDER = """Press an object against a sensor and render the frame.
@@ -157,9 +155,9 @@ Example:
 
 
 @app.command("render", help=HELP_RENDER)
-def render(
+def render_contact_command(
     sensor: Sensor,
-    object_: Object,
+    obj: Object,
     indent_mm: Annotated[float, typer.Option("--indent-mm", metavar="D", help="indentation from first touch; 0: no contact")],
     out: Out,
     tilt_deg: Annotated[Pair, typer.Option("--tilt-deg", metavar="RX RY", help="turn of the object about x, then y")] = (0.0, 0.0),
@@ -172,16 +170,13 @@ def render(
     form: Annotated[Form, typer.Option(help="the camera's frame, or the cropped and thresholded form of the recordings")] = Form.RAW,
     quality: Annotated[Quality, typer.Option(help=QUALITY)] = "standard",
     seed: Annotated[int, typer.Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "RenderedContact":
     from scenes import load_object, load_sensor
-    from twin.cli.progress import shown
     from twin.mechanics.path import ContactPose
     from twin.one_contact import render_contact
-    from twin.store import overwriting
 
-    spec, stimulus = load_sensor(sensor), load_object(object_)
+    spec, stimulus = load_sensor(sensor), load_object(obj)
     pose = ContactPose(indent_mm=indent_mm, tilt_deg=tilt_deg, shear_mm=shear_mm, twist_deg=twist_deg, offset_mm=offset_mm)
-    with overwriting(force), shown() as progress:
-        made = render_contact(spec, stimulus, pose, out, form=form, quality=quality, seed=seed, progress=progress)
-    tell(made)
+    return render_contact(spec, stimulus, pose, out, form=form, quality=quality, seed=seed, progress=progress)

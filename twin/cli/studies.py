@@ -7,17 +7,17 @@
 """
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from twin.cli import FewCommands, app
+from twin.cli.command import App
 from twin.cli.options import (
     CORES,
     MOST_SEED,
     Across,
     Device,
-    Force,
     FormOrAuto,
     Out,
     PlainLight,
@@ -31,11 +31,15 @@ from twin.cli.options import (
     if_given,
     names_in,
     numbers_in,
-    tell,
 )
+from twin.progress import Progress
 from twin.types import FINE
 
-study = typer.Typer(cls=FewCommands, help="Experiments that compare models.", no_args_is_help=True, rich_markup_mode=None)
+if TYPE_CHECKING:
+    from hardware.servo_study import ServoStudy
+    from training.studies import objects, sim_to_real, tac_vgnn
+
+study = App(cls=FewCommands, help="Experiments that compare models.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(study, name="study")
 
 # The objects of the Tac-VGNN paper.
@@ -53,33 +57,30 @@ Writes to --out: a folder for each model and object as 'twin servo' writes it, s
 
 
 @study.command("servo", help=HELP_STUDY_SERVO)
-def servo_command(
+def study_servo_command(
     models: Annotated[list[Path], typer.Option("--model", metavar="RUN", help="folder of a training run; give it once for each model")],
     out: Out,
     objects: Annotated[str, typer.Option("--objects", callback=each_once, help="names with commas between")] = OBJECTS,
-    parameters: ServoName = "surface",
+    servo: ServoName = "surface",
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="steps on each object, instead of once around it")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")] = 0,
     plain_light: PlainLight = False,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "ServoStudy":
     from hardware.servo_study import ServoStudyPlan, study_servo
     from scenes import load_object, load_servo
     from training.estimator import load_by_name
-    from twin.cli.progress import shown
-    from twin.store import overwriting
 
     plan = ServoStudyPlan(
         models=load_by_name(models),
         objects=tuple(map(load_object, names_in(objects))),
-        servo=load_servo(parameters),
+        servo=load_servo(servo),
         steps=steps,
         seed=seed,
         plain_light=plain_light,
     )
-    with overwriting(force), shown() as progress:
-        found = study_servo(plan, out, progress=progress)
-    tell(found)
+    return study_servo(plan, out, progress=progress)
 
 
 TRAIN = "plane,ball-10,sphere,ball-40,ball-80,hexagon-rod,square-rod,round-bar,triangle-rod"
@@ -112,7 +113,7 @@ objects.csv, index.html.
 """
 
 
-@study.command("objects", help=HELP_STUDY_OBJECTS)
+@study.command("objects", help=HELP_STUDY_OBJECTS, goes_on=True)
 def study_objects(
     sensor: Sensor,
     out: Out,
@@ -126,12 +127,11 @@ def study_objects(
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of both trainings, instead of the study's own")] = None,
     workers: Workers = CORES,
     across: Across = FINE,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "objects.Result":
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.studies import objects
-    from twin.cli.progress import shown
-    from twin.store import overwriting
 
     plan = objects.Plan(
         sensor=load_sensor(sensor),
@@ -146,9 +146,7 @@ def study_objects(
         epochs=epochs,
         workers=workers,
     )
-    with overwriting(force), shown(goes_on=True) as progress:
-        found = objects.run(plan, out, progress=progress)
-    tell(found)
+    return objects.run(plan, out, progress=progress)
 
 
 HELP_STUDY_SIM_TO_REAL = """Train in the twin or on real frames, test on real ones.
@@ -194,7 +192,7 @@ Writes to --out: sim_only/, sim_plus_real/, sim_taught/ and real_N/, each a RUN;
 """
 
 
-@study.command("sim-to-real", help=HELP_STUDY_SIM_TO_REAL)
+@study.command("sim-to-real", help=HELP_STUDY_SIM_TO_REAL, goes_on=True)
 def study_sim_to_real(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled real recording")],
@@ -217,12 +215,11 @@ def study_sim_to_real(
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of every training, instead of the model's own")] = None,
     workers: Workers = CORES,
     across: Across = FINE,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "sim_to_real.Result":
     from scenes import load_experiment, load_sensor
     from training.studies import sim_to_real
-    from twin.cli.progress import shown
-    from twin.store import overwriting
 
     plan = sim_to_real.Plan(
         sensor=load_sensor(sensor),
@@ -240,9 +237,7 @@ def study_sim_to_real(
         workers=workers,
         across=across,
     )
-    with overwriting(force), shown(goes_on=True) as progress:
-        found = sim_to_real.run(plan, out, progress=progress)
-    tell(found)
+    return sim_to_real.run(plan, out, progress=progress)
 
 
 MODELS = "gnn,tac-vgnn,vgnn,cnn-v2,cnn-v1"
@@ -268,7 +263,7 @@ curves.png, efficiency.png, contacts.png, index.html, runs/.
 """
 
 
-@study.command("tac-vgnn", help=HELP_STUDY_TAC_VGNN)
+@study.command("tac-vgnn", help=HELP_STUDY_TAC_VGNN, goes_on=True)
 def study_tac_vgnn(
     data: Annotated[Path, typer.Option("--data", metavar="DIR", help="labelled recording")],
     sensor: Sensor,
@@ -289,13 +284,12 @@ def study_tac_vgnn(
     device: Device = "auto",
     threads: Threads = None,
     form: FormOrAuto = None,
-    force: Force = False,
-) -> None:
+    *,
+    progress: Progress,
+) -> "tac_vgnn.Result":
     from scenes import load_sensor
     from training.studies import tac_vgnn
     from training.train import columns_of
-    from twin.cli.progress import shown
-    from twin.store import overwriting
 
     plan = tac_vgnn.Plan(
         data=data,
@@ -313,6 +307,4 @@ def study_tac_vgnn(
         threads=threads,
         form=form,
     )
-    with overwriting(force), shown(goes_on=True) as progress:
-        found = tac_vgnn.run(plan, out, progress=progress)
-    tell(found)
+    return tac_vgnn.run(plan, out, progress=progress)

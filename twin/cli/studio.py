@@ -41,9 +41,7 @@ Example:
 @app.command("studio", help=HELP_STUDIO)
 def studio(
     sensor: Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")] = "mg400-331",
-    object_name: Annotated[
-        str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")
-    ] = "sphere",
+    obj: Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")] = "sphere",
     state: Annotated[
         str | None, typer.Option("--state", metavar="FILE", help="a state that the page has saved, or a link to one, instead of both")
     ] = None,
@@ -65,7 +63,7 @@ def studio(
     from twin.studio.state import first_state
     from twin.studio.studio import StudioPlan, run_studio
 
-    first = first_state(state, sensor, object_name)
+    first = first_state(state, sensor, obj)
     shown = load_sensor(first.sensor)
     require_feed(camera, arm, recording, shown)
     plan = StudioPlan(first, saves, host=host, port=port, traces=not plain, recording=recording, camera=camera, arm=arm, seconds=seconds)

@@ -20,11 +20,11 @@ from twin.report.charts import write_chart
 from twin.report.skin3d import draw_contact_skin
 from twin.simulator import Simulator
 from twin.store import writes
-from twin.types import Form
+from twin.types import Form, Readable
 
 
-@dataclass(frozen=True)
-class Demo:
+@dataclass(frozen=True, repr=False)
+class Demo(Readable):
     """The result of the demo.
 
     Attributes
@@ -49,7 +49,7 @@ class Demo:
                 "  simulated, px    " + "".join(f"{row.simulated_px:8.1f}" for row in rows),
                 "  area at contact %" + "".join(f"{row.contact_area_change_percent:+8.1f}" for row in rows),
             ]
-        return lines
+        return [*lines, f"open {self.written[0]} in a browser"]
 
 
 @writes("index.html", "pictures")

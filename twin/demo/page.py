@@ -67,7 +67,7 @@ def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
         "areas": write_chart(folder / f"{stem}-areas.png", lambda: _areas_figure(look)),
         "surfaces": write_chart(folder / f"{stem}-surfaces.png", lambda: area_surface_figure(rest, graph)),
     }
-    if look.frame.form == Form.RECORDING:
+    if look.frame.form == Form.PROCESSED:
         written["recorded"] = write_image(folder / f"{stem}-recorded.png", look.frame.image)
     return written
 

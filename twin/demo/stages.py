@@ -16,7 +16,7 @@ from twin.pins.graph import make_graph
 from twin.pins.reference import nominal_reference
 from twin.progress import Step
 from twin.report.plots import Look
-from twin.simulator import Shot, Simulator
+from twin.simulator import RenderedFrame, Simulator
 from twin.types import ContactState, Form
 
 Result = TypeVar("Result")
@@ -24,8 +24,8 @@ Result = TypeVar("Result")
 # Contacts of the demo: sensor, object, pose, and the form of the frames in which the pins are found.
 CONTACTS = (
     ("ur5-331", "edge", ContactPose(indent_mm=3.5), Form.RAW),
-    ("mg400-331", "plane", ContactPose(indent_mm=4.0, tilt_deg=(0.0, 8.0)), Form.RECORDING),
-    ("mg400-127", "sphere", ContactPose(indent_mm=4.0, offset_mm=(3.0, -2.0)), Form.RECORDING),
+    ("mg400-331", "plane", ContactPose(indent_mm=4.0, tilt_deg=(0.0, 8.0)), Form.PROCESSED),
+    ("mg400-127", "sphere", ContactPose(indent_mm=4.0, offset_mm=(3.0, -2.0)), Form.PROCESSED),
 )
 # The three motions of the paper's figure 1(d).
 MOTIONS = (
@@ -62,7 +62,7 @@ class ContactResult:
     object_name: str
     pose: ContactPose
     state: ContactState
-    raw: Shot
+    raw: RenderedFrame
     look: Look
     seconds: dict[str, float]
 
@@ -71,9 +71,9 @@ def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form:
     """Press, render, capture, detect, and build the graph, for one contact and for no contact."""
     form, timed = form_named(form), Timed()
     state = timed.run("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
-    raw = timed.run("render", lambda: simulator.shoot(state))
-    shot = raw if form == Form.RAW else timed.run("capture", lambda: simulator.as_recorded(raw, state))
-    look = look_at(simulator, shot)
+    raw = timed.run("render", lambda: simulator.render(state))
+    rendered = raw if form == Form.RAW else timed.run("capture", lambda: simulator.as_processed(raw, state))
+    look = look_at(simulator, rendered)
     seconds = timed.seconds | {"pins and graph": look.observation.ms["total"] / 1e3}
     return ContactResult(simulator.spec.name, object_name, pose, state, raw, look, seconds)
 

@@ -61,10 +61,10 @@ def registered_view(
     """
     axes = {side.removeprefix("-") for side in pushes}
     if unknown := set(pushes) - set(SIDES):
-        raise FrameError(f"--push {min(unknown)}: must be {', '.join(SIDES)}, as x:FRAME")
+        raise FrameError(f"`push` {min(unknown)}: must be {', '.join(SIDES)}, as x:FRAME")
     if not axes or (len(axes) < 2 and twist is None):
         raise FrameError(
-            "turn and mirror need two pushes, or one and a twist: --push x:FRAME --push y:FRAME, or --push x:FRAME --twist FRAME"
+            "turn and mirror need two pushes, or one and a twist: `push` x:FRAME `push` y:FRAME, or `push` x:FRAME `twist` FRAME"
         )
     form = rest.form
     shown = judge_layout(spec.pins, [gray_levels(rest.image)])

@@ -17,7 +17,7 @@ from twin.fit.optics import OpticsCalibration, calibrate_optics
 from twin.frames import frames_at, open_recording
 from twin.frames.tables import numbers
 from twin.progress import Progress, silent
-from twin.types import FINE, Form
+from twin.types import FINE, Form, Readable
 
 ALIKE = 0.6
 """Least share of varying labels that a table and an experiment have in common, of the labels that vary in either of them."""
@@ -25,8 +25,8 @@ VARIES = 1e-6
 """Least change, mm or deg, of a label that counts as varying."""
 
 
-@dataclass(frozen=True)
-class WholeSensor:
+@dataclass(frozen=True, repr=False)
+class WholeSensor(Readable):
     """A specification made from frames, and what was fitted to it afterwards.
 
     Attributes
@@ -101,8 +101,8 @@ def whole_sensor(
         As ``new_sensor``, ``calibrate_optics`` and ``calibrate_to_file``; or the labels of no experiment vary like the table's.
     """
     at = frames_at(frames, labels or table, no_contact)
-    if optics and open_recording(at, form=form).form == Form.RECORDING:
-        raise OptionError(f"{frames}: thresholded frames tell nothing of light and colours; leave out --optics, or give raw camera frames")
+    if optics and open_recording(at, form=form).form == Form.PROCESSED:
+        raise OptionError(f"{frames}: thresholded frames tell nothing of light and colours; leave out `optics`, or give raw camera frames")
     if labels is not None and experiment is None:
         experiment = experiment_like(open_recording(at, form=form).labels)
     made = new_sensor(
@@ -154,7 +154,7 @@ def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
     share, *_, name = max(found, key=lambda each: each[:3])
     if share < ALIKE:
         raise OptionError(
-            f"no experiment has contacts whose labels vary like the table's ({', '.join(sorted(varying))}); name one with --experiment "
+            f"no experiment has contacts whose labels vary like the table's ({', '.join(sorted(varying))}); name one with `experiment` "
             f"('twin experiments' lists them)"
         )
     return load_experiment(name)

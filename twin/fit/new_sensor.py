@@ -228,7 +228,7 @@ def new_sensor(
                 raise
             raise FrameError(
                 f"the layout is not recognised: the likeliest, {best.line()}, and {known_name} does not show it. If {known_name} shows no "
-                "contact, give the layout with --layout; one of no known kind as --layout positions:FILE.csv"
+                "contact, give the layout with `layout`; one of no known kind as `layout` positions:FILE.csv"
             ) from error
         start = _started(out.stem, looked[0], best.pins, rest, frames.name, polarity)
         start = start if radius_mm is None else of_radius(start, radius_mm)
@@ -283,15 +283,15 @@ def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
         places = (
             "compare the places with the picture: one that is missing or wrong hides the others"
             if layout.layout == "positions"
-            else "give each pin's place, --layout positions:FILE.csv"
+            else "give each pin's place, `layout` positions:FILE.csv"
         )
         raise FrameError(
-            f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave --layout out to have it identified, or {places}"
+            f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave `layout` out to have it identified, or {places}"
         )
     doubt = f"{layout.in_words()} were given, and explain only {100 * shown.explained:.1f} % of what is there"
     if other is None or other.explained <= shown.explained:
         return Identified((shown,), False, (f"{doubt}; look at the overlay: are these all pins?",), 0.0, polarity)
-    doubt += f"; {other.pins.in_words()} explain {100 * other.explained:.1f} %: leave --layout out, or correct it"
+    doubt += f"; {other.pins.in_words()} explain {100 * other.explained:.1f} %: leave `layout` out, or correct it"
     return Identified((shown, other), False, (doubt,), 0.0, polarity)
 
 
@@ -321,7 +321,7 @@ def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str, p
         mask_center_px=(x, y),
         mask_radius_px=1.1 * radius,
     )
-    thresholded = frame.form == Form.RECORDING
+    thresholded = frame.form == Form.PROCESSED
     return SensorSpec(
         name=name,
         description=f"Made by 'twin new' from frames of {source}",
@@ -556,7 +556,7 @@ def _told(
             f"decide between the layouts: {found.best.pins.in_words()}, or {found.candidates[1].pins.in_words()}; count them in the overlay"
         )
     if rest.source != "given":
-        steps.append("record a frame without contact and run this again with --no-contact FRAME")
+        steps.append("record a frame without contact and run this again with `no_contact` FRAME")
     if health.all_pins < FAIR_SHARE:
         steps.append("look at the overlay pictures: better light, focus or exposure helps most; then run this again")
     files = f"--sensor {out} --frames {recording.path} --out {out.with_stem(f'{out.stem}-2')}"
@@ -575,7 +575,7 @@ def _size(sensor: SensorSpec, *, given: bool) -> str:
     if given:
         return f"{size}: the radius as given, all other lengths in proportion to a printed TacTip's"
     return (
-        f"assumed: {size}, as a printed TacTip. Frames do not tell lengths in mm. If your tip differs, give its radius (--radius-mm): "
+        f"assumed: {size}, as a printed TacTip. Frames do not tell lengths in mm. If your tip differs, give its radius (`radius_mm`): "
         "otherwise lengths, forces and poses are wrong"
     )
 
@@ -583,7 +583,7 @@ def _size(sensor: SensorSpec, *, given: bool) -> str:
 def sensor_blob(sensor: SensorSpec, tuned: Tuned) -> BlobSpec:
     """The pin detection's settings for the form of frames on which they were tuned."""
     form = tuned.detector.form
-    return sensor.pipeline.recording if form == Form.RECORDING and sensor.pipeline.recording else sensor.pipeline.raw
+    return sensor.pipeline.recording if form == Form.PROCESSED and sensor.pipeline.recording else sensor.pipeline.raw
 
 
 def _comment(source: str, found: Identified, rest: Rest) -> str:

@@ -38,7 +38,7 @@ from twin.progress import Bar, Progress, Step, silent, stage
 from twin.report.page import Page, Picture, code
 from twin.report.table import Column
 from twin.store import KEPT, Item, inputs_digest, kept_arrays, kept_json, output, writes_file
-from twin.types import Form, Frame
+from twin.types import Form, Frame, Readable
 
 FRAMES = 6
 """Number of frames that are fitted, spread evenly over the folder."""
@@ -70,7 +70,7 @@ RING_HELD = "ring, LEDs' places and reflections: held; the frames show no bright
 """Note for frames that show no ring."""
 REST_MADE = (
     "the camera's kind, focal length and distance: held as 'twin new' chose them without a frame without contact; pictures of the same "
-    "contact are alike, depths in mm may not be; give --no-contact FRAME"
+    "contact are alike, depths in mm may not be; give `no_contact` FRAME"
 )
 """Note for a camera that was fitted to rest places estimated from contacts."""
 Stage = Callable[[SensorSpec], SensorSpec]
@@ -113,8 +113,8 @@ class Calibration:
         ]
 
 
-@dataclass(frozen=True)
-class OpticsCalibration:
+@dataclass(frozen=True, repr=False)
+class OpticsCalibration(Readable):
     """A fitted specification and its files, the ``.toml`` file first."""
 
     found: Calibration

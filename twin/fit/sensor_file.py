@@ -32,5 +32,5 @@ def folder_beside(out: Path, kind: str) -> Path:
         ``out`` is not the name of a ``.toml`` file.
     """
     if out.suffix != ".toml":
-        raise OptionError(f"--out {out}: give the name of a .toml file")
+        raise OptionError(f"`out` {out}: give the name of a .toml file")
     return out.with_name(f"{out.stem}-{kind}")

@@ -27,7 +27,7 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 def pictures_folder(form: str) -> str:
     """Name of the subfolder that a written recording has for its pictures, by their form."""
-    return "frames_bw" if form == Form.RECORDING else "images"
+    return "frames_bw" if form == Form.PROCESSED else "images"
 
 
 def distinct_stems(names: list[str]) -> list[str]:
@@ -79,7 +79,7 @@ def image_folders(path: Path, form: Form | None) -> list[Path]:
         There are several folders that aren't parts of one recording.
     """
     known = [path / name for name in IMAGE_FOLDERS if (path / name).is_dir() and frames_in(path / name)]
-    if form == Form.RECORDING:  # if both folders exist, processed_images holds the thresholded pictures
+    if form == Form.PROCESSED:  # if both folders exist, processed_images holds the thresholded pictures
         known.sort(key=lambda folder: folder.name != "processed_images")
     if frames_in(path):
         known.append(path)

@@ -63,7 +63,7 @@ def recording_to_raw(recording: RecordingSpec | None, recording_px: np.ndarray) 
 
 def from_raw(recording: RecordingSpec | None, form: Form, raw_px: np.ndarray) -> np.ndarray:
     """Pixels (..., 2) of the camera's frame to pixels of the given form; raises as ``raw_to_recording``, or if there is no such form."""
-    return raw_to_recording(recording, raw_px) if form_named(form) == Form.RECORDING else np.asarray(raw_px, float)
+    return raw_to_recording(recording, raw_px) if form_named(form) == Form.PROCESSED else np.asarray(raw_px, float)
 
 
 def form_named(name: str) -> Form:
@@ -130,7 +130,7 @@ def levels_at(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
 
 def polarity_of(pipeline: PipelineSpec, form: Form) -> Polarity:
     """Whether pins are bright or dark in frames of a form; if the sensor has no such form, as in raw frames."""
-    blob = pipeline.recording if form == Form.RECORDING else None
+    blob = pipeline.recording if form == Form.PROCESSED else None
     return (blob or pipeline.raw).polarity
 
 
@@ -146,7 +146,7 @@ def known_frames(spec: SensorSpec) -> KnownFrames:
     """Name and frame sizes of the sensor that a specification describes."""
     sizes = {Form.RAW: (spec.camera.width_px, spec.camera.height_px)}
     if spec.recording:
-        sizes[Form.RECORDING] = (spec.recording.width_px, spec.recording.height_px)
+        sizes[Form.PROCESSED] = (spec.recording.width_px, spec.recording.height_px)
     return KnownFrames(spec.name, sizes)
 
 
@@ -202,10 +202,10 @@ def tell_form(known: KnownFrames, image: np.ndarray) -> Form:
     fitting = [form for form, expected in known.size_px.items() if expected == size]
     if not fitting:
         expected = " or ".join(f"{times(expected)} ({form})" for form, expected in known.size_px.items())
-        raise FrameError(f"expected {expected} for {known.sensor}, got {times(size)}; use the matching --sensor or the unresized frame")
+        raise FrameError(f"expected {expected} for {known.sensor}, got {times(size)}; use the matching `sensor` or the unresized frame")
     if len(fitting) == 1:
         return fitting[0]
-    return Form.RECORDING if is_two_level(image) else Form.RAW
+    return Form.PROCESSED if is_two_level(image) else Form.RAW
 
 
 def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form | None) -> Form:
@@ -219,7 +219,7 @@ def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form 
     if form is not None:
         form = form_named(form)
     if known is None:
-        return form or (Form.RECORDING if is_two_level(image) else Form.RAW)
+        return form or (Form.PROCESSED if is_two_level(image) else Form.RAW)
     try:
         told = tell_form(known, image)
     except FrameError as error:

@@ -211,12 +211,12 @@ class Recording:
             The picture cannot be read, or its size differs from the frames'.
         """
         if not file.is_file():
-            raise FrameError(f"{file}: no such no-contact frame; give the path of a picture with --no-contact")
+            raise FrameError(f"{file}: no such no-contact frame; give the path of a picture with `no_contact`")
         before = len(self.problems)
         self.reference = None
         self.take_reference([file])
         if self.reference is None:
-            raise FrameError(f"{'; '.join(self.problems[before:])}; give another one with --no-contact")
+            raise FrameError(f"{'; '.join(self.problems[before:])}; give another one with `no_contact`")
 
     def take_metadata(self, homes: list[Path]) -> None:
         """Read the JSON files of these folders."""
@@ -279,7 +279,7 @@ def _open_folder(path: Path, known: KnownFrames | None, form: Form | None, table
         tables = [home / name for home in homes for name in TABLES if (home / name).is_file()] if table is None else [table]
         files, labels = order_by_table(tables, files, problems)
         if table is not None and not labels:
-            raise FrameError(f"{'; '.join(problems)}; give a table of these frames with --table")
+            raise FrameError(f"{'; '.join(problems)}; give a table of these frames with `table`")
         names = [p.name for p in files]
         recording = Recording(path, kind.form, names, kind.size_px, labels, problems=problems, _files=files, _bits=kind.bits)
     else:
@@ -316,7 +316,7 @@ def open_recording(
     table, no_contact = (path.table, path.no_contact) if isinstance(path, FramesAt) else (None, None)
     path = Path(path)
     if table is not None and not table.is_file() and not is_lerobot(table):
-        raise FrameError(f"{shown(table, LONGEST_PATH)}: no such table; give the path of a CSV file (--table or --labels)")
+        raise FrameError(f"{shown(table, LONGEST_PATH)}: no such table; give the path of a CSV file (`table` or `labels`)")
     recording = _opened(path, None if spec is None else known_frames(spec), form, table)
     if no_contact is not None:
         recording.must_take_reference(no_contact)
@@ -336,7 +336,7 @@ def _opened(path: Path, known: KnownFrames | None, form: Form | None, table: Pat
     if not path.is_file():
         raise FrameError(f"{path}: a named pipe or a device, not a file; give a picture, a folder of frames, a recording or a video")
     if table is not None:
-        raise FrameError(f"{path}: a table needs a folder of frames; give the folder, or leave out --table")
+        raise FrameError(f"{path}: a table needs a folder of frames; give the folder, or leave out `table`")
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return _open_video(path, known, form)
     kind = common_kind([path], known, form)

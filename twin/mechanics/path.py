@@ -47,6 +47,11 @@ class ContactPose:
         Tilt about the sensor's x and y; shear and offset along x and y.
     twist_deg : float
         Rotation about the sensor's z.
+
+    Raises
+    ------
+    ContactError
+        An attribute is no number, or no pair of numbers.
     """
 
     indent_mm: float
@@ -54,6 +59,14 @@ class ContactPose:
     shear_mm: tuple[float, float] = (0.0, 0.0)
     twist_deg: float = 0.0
     offset_mm: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            shape, expected = ((), "a number") if name in ("indent_mm", "twist_deg") else ((2,), "two numbers")
+            if np.shape(value) != shape or np.asarray(value).dtype.kind not in "iuf":
+                raise ContactError(f"`{name}`: expected {expected}, got {value!r}")
+            if shape and not isinstance(value, tuple):
+                object.__setattr__(self, name, tuple(map(float, value)))
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ def load_mesh_field(shape: MeshShape) -> MeshField:
         raise MeshError(f"{path}: not readable ({error.strerror}); give a file that may be read") from error
     if shape.sha256 not in ("", digest):
         raise MeshError(
-            f"{path}: has changed since it was loaded or simulated; put the former file back, or give the object and --out anew"
+            f"{path}: has changed since it was loaded or simulated; put the former file back, or give the object and `out` anew"
         )
     return _sampled(str(path), digest, shape.unit, shape.rotation_deg)
 

@@ -7,7 +7,7 @@ the condition of a sensor from a few of its frames.
 from twin.pins.check import Finding, Grade, examine
 from twin.pins.detector import Detector, Found, make_detector
 from twin.pins.detector_spec import METHODS, DetectorSpec, load_detector, shipped_detector, with_detector, write_detector
-from twin.pins.graph import features, make_graph
+from twin.pins.graph import make_graph, node_features
 from twin.pins.pipeline import Pipeline, measure_reference
 from twin.pins.reference import Reference, make_reference, nominal_reference
 from twin.pins.tune import Tuned, tune
@@ -25,12 +25,12 @@ __all__ = [
     "Tuned",
     "View",
     "examine",
-    "features",
     "load_detector",
     "make_detector",
     "make_graph",
     "make_reference",
     "measure_reference",
+    "node_features",
     "nominal_reference",
     "shipped_detector",
     "tune",

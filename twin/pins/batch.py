@@ -1,6 +1,7 @@
 """The pipeline applied to a whole recording. The results are files in a folder: pins, a summary, and pictures of the found pins."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from twin.pins.pipeline import Pipeline, measure_reference
 from twin.pins.reference import Reference, nominal_reference
 from twin.pins.view import view_of
 from twin.store import made_by, write_json, write_npz, writes
-from twin.types import Form, Frame, Observation
+from twin.types import Form, Frame, Observation, Readable
 
 EDGE_RGB = (90, 110, 160)
 """Colour of a graph's edges in a picture."""
@@ -34,17 +35,17 @@ FULL_CHANGE = 0.3
 """Relative change of a cell's area at both ends of the colour scale."""
 NO_REFERENCE = (
     "no frame without contact was used: the pins at rest are those of the specification, which makes errors of a pose up to four times "
-    "larger; record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+    "larger; record one frame without contact (init_0.png beside the frames, or `no_contact` FRAME)"
 )
 """Note for a recording without a usable no-contact frame."""
 NO_OWN_REFERENCE = (
     "no frame without contact was used: the pins at rest are those that were measured before on this unit; if the camera or the tip was "
-    "touched since, record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+    "touched since, record one frame without contact (init_0.png beside the frames, or `no_contact` FRAME)"
 )
 """Note for a specification that holds the pins' measured places at rest."""
 MADE_FROM_CONTACTS = (
     "no frame without contact was used, and none when the specification was made: the pins' rest places were made from contacts; expect "
-    "errors of a tenth of a spacing or so; record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+    "errors of a tenth of a spacing or so; record one frame without contact (init_0.png beside the frames, or `no_contact` FRAME)"
 )
 """Note for a specification whose places at rest were estimated from contacts."""
 MEASURED_BEFORE = "measured before"
@@ -60,6 +61,44 @@ UNMEASURED = "specification"
 """Text instead of the name of a no-contact frame if the reference is the specification's layout."""
 
 
+@dataclass(frozen=True, repr=False)
+class Preprocessed(Readable):
+    """The pins of all frames of a recording.
+
+    Attributes
+    ----------
+    summary : dict
+        Content of ``summary.json``. ``invalid`` lists the frames whose pins were not found, ``failed`` those that could not be read.
+    arrays : dict of str to array
+        Content of ``pins.npz``, one row for each readable frame in the recording's order: ``image_name``, ``pins_px`` and ``predicted_px``
+        (M, N, 2), ``area_px2`` (M, N), ``found`` and ``valid`` (M,).
+    written : list of Path
+    """
+
+    summary: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    written: list[Path]
+
+    def lines(self) -> Iterator[str]:
+        """The summary in words."""
+        summary, pins = self.summary, self.arrays["pins_px"].shape[1]
+        in_view = summary["in_view"]
+        which = (
+            f"all {pins} pins" if in_view == pins else f"all pins in view ({in_view:g} of {pins}; the picture's border cuts the others off)"
+        )
+        yield (
+            f"{summary['frames']} frames, {which} found in {100 * summary['exact_fraction']:.2f} %, "
+            f"{summary['ms']['total']['p50']:.2f} ms per frame (median)"
+        )
+        yield from (f"not valid {invalid['image_name']}: {invalid['reason']}" for invalid in summary["invalid"])
+        yield from (f"note: {problem}" for problem in summary["problems"])
+        yield from (f"skipped {failed['image_name']}: {failed['reason']}" for failed in summary["failed"])
+
+    def to_table(self) -> dict[str, np.ndarray]:
+        """The arrays with one number a frame, by column: for ``pandas.DataFrame``, say."""
+        return {name: values for name, values in self.arrays.items() if values.ndim == 1}
+
+
 @writes("pins.npz", "summary.json", "overlay", to="out_dir")
 def preprocess_recording(
     path: str | Path,
@@ -68,7 +107,7 @@ def preprocess_recording(
     form: Form | None = None,
     overlay: bool = False,
     progress: Callable[[int, int], None] | None = None,
-) -> dict:
+) -> Preprocessed:
     """Observe every frame of a recording and write ``pins.npz``, ``summary.json`` and, with ``overlay``, the pictures ``overlay/``.
 
     A frame is valid if its pins were found. Irregularities are listed in the summary.
@@ -81,13 +120,6 @@ def preprocess_recording(
         Recognised by size and content if not given.
     progress : callable, optional
         Called with (done, total).
-
-    Returns
-    -------
-    dict
-        The summary; ``invalid`` lists the frames whose pins were not found, ``failed`` those that could not be read.
-        ``pins.npz`` has one row per readable frame, in the recording's order: ``image_name``, ``pins_px`` and
-        ``predicted_px`` (M, N, 2), ``area_px2`` (M, N), ``found`` and ``valid`` (M,).
 
     Raises
     ------
@@ -131,20 +163,7 @@ def preprocess_recording(
     write_json(out_dir / "summary.json", summary)
     if not arrays["valid"].any():
         raise FrameError(_nothing_found(path, summary, out_dir / "summary.json"))
-    return summary
-
-
-def summary_lines(summary: dict[str, Any], pins: int) -> Iterator[str]:
-    """The content of ``summary.json`` in words, for a sensor with this number of ``pins``."""
-    in_view = summary["in_view"]
-    which = f"all {pins} pins" if in_view == pins else f"all pins in view ({in_view:g} of {pins}; the picture's border cuts the others off)"
-    yield (
-        f"{summary['frames']} frames, {which} found in {100 * summary['exact_fraction']:.2f} %, "
-        f"{summary['ms']['total']['p50']:.2f} ms per frame (median)"
-    )
-    yield from (f"not valid {invalid['image_name']}: {invalid['reason']}" for invalid in summary["invalid"])
-    yield from (f"note: {problem}" for problem in summary["problems"])
-    yield from (f"skipped {failed['image_name']}: {failed['reason']}" for failed in summary["failed"])
+    return Preprocessed(summary, arrays, [out_dir / name for name in ("pins.npz", "summary.json", "overlay")[: 3 if overlay else 2]])
 
 
 def _observed(
@@ -280,5 +299,5 @@ def _nothing_found(path: str | Path, summary: dict, summary_path: Path) -> str:
     bad = summary["invalid"] + summary["failed"]
     return (
         f"{path}: the pins were found in none of {len(bad)} frames; the first, {bad[0]['image_name']}: {bad[0]['reason']}; "
-        f"check --sensor, --form and the [pipeline] section of the specification (details in {summary_path})"
+        f"check `sensor`, `form` and the [pipeline] section of the specification (details in {summary_path})"
     )

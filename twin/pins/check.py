@@ -126,7 +126,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
         *_twin(spec, form, nominal),
     ]
     return (
-        findings if form == Form.RECORDING else [*_light(frames, seen, spec.pipeline.usual_caps or drawn_caps(spec), pipeline), *findings]
+        findings if form == Form.PROCESSED else [*_light(frames, seen, spec.pipeline.usual_caps or drawn_caps(spec), pipeline), *findings]
     )
 
 
@@ -199,7 +199,7 @@ def _layout(frames: list[Frame], spec: SensorSpec, polarity: Polarity) -> Findin
     doubts = [f"the frames do not show {spec.pins.in_words()}"] if layout is None else other_layout(layout, images)
     text = f"of the pins in view and the pin-like spots, {100 * share:.1f} % belong together" + (f"; {doubts[0]}" if doubts else "")
     wrong = bool(doubts) and "rather than" in doubts[0]
-    remedy = "give the --sensor that these frames are of, or make one with 'twin new'; look for stray light"
+    remedy = "give the `sensor` that these frames are of, or make one with 'twin new'; look for stray light"
     return _finding("layout", 0.0 if wrong else share, (0.9, 0.75), text, remedy)
 
 
@@ -282,7 +282,7 @@ def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> lis
             f"stretched by {view.stretch:.1%}",
             "give frames as the camera took them",
         ),
-        _finding("mirror", float(view.mirrored), (0.0, 0.5), mirror, "turn mirroring off where the frames are taken, or see --push"),
+        _finding("mirror", float(view.mirrored), (0.0, 0.5), mirror, "turn mirroring off where the frames are taken, or see `push`"),
     ]
 
 
@@ -300,7 +300,7 @@ def _twin(spec: SensorSpec, form: Form, nominal: Reference) -> list[Finding]:
     text = f"the specification's camera sees its pins at rest {rms:.1f} px (rms), {rms / pitch:.2f} pitches, from where they were measured"
     remedy = (
         "lengths in mm, camera and rest_px do not belong together: the twin's pictures are not of this sensor; make the specification anew "
-        "('twin new', with --radius-mm for a tip of another size)"
+        "('twin new', with `radius_mm` for a tip of another size)"
     )
     return [_finding("twin", rms / pitch, (0.2, 0.5), text, remedy)]
 

@@ -185,14 +185,14 @@ class LegacyDetector:
     def __call__(self, frame: Frame) -> Found:
         raw = frame.form == Form.RAW
         if raw:
-            frame = Frame(record(frame.image, self._recording), Form.RECORDING, frame.name)
+            frame = Frame(record(frame.image, self._recording), Form.PROCESSED, frame.name)
         seen = self._pipeline(frame)
         px = recording_to_raw(self._recording, seen.nodes_px) if raw else seen.nodes_px
         return Found(px, None, seen.graph, self._pipeline.count, seen.valid, seen.reason)
 
     def graph_of(self, nodes_px: np.ndarray) -> PinGraph | None:
         size = self._pipeline.parameters.size_px
-        recorded = from_raw(self._recording, Form.RECORDING, nodes_px) if self.spec.form == Form.RAW else nodes_px
+        recorded = from_raw(self._recording, Form.PROCESSED, nodes_px) if self.spec.form == Form.RAW else nodes_px
         nodes = (recorded + 0.5) * size / np.array(self._pipeline.size_px) - 0.5
         try:
             return legacy_graph(nodes - np.median(nodes), self._pipeline.parameters)

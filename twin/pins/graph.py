@@ -51,7 +51,7 @@ def make_graph(kind: GraphKind, nodes_px: np.ndarray, *, outmost: np.ndarray | N
     raise ValueError(f"kind must be knn, delaunay or voronoi, not {kind!r}")
 
 
-def features(graph: PinGraph, reference: Reference, kind: Literal["relative", "pixels"] = "relative") -> np.ndarray:
+def node_features(graph: PinGraph, reference: Reference, kind: Literal["relative", "pixels"] = "relative") -> np.ndarray:
     """Node features (N, F) of a graph.
 
     ``relative``: columns x, y, dx, dy[, area], independent of the image's scale. x and y are centred on their medians, dx and dy are the

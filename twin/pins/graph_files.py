@@ -20,7 +20,7 @@ from twin.pins.reference import Reference, nominal_reference, spread_out
 from twin.report.charts import new_figure, save_figure
 from twin.report.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes
 from twin.store import write_npz, writes
-from twin.types import Form, PinGraph
+from twin.types import Form, PinGraph, Readable
 
 PINS = ".npz"
 """Suffix of a file of found pins."""
@@ -32,8 +32,8 @@ PICTURE_DPI = 120
 """Resolution of a graph's picture, dots per inch."""
 
 
-@dataclass(frozen=True)
-class Graphs:
+@dataclass(frozen=True, repr=False)
+class Graphs(Readable):
     """Graphs of many frames and the files they were written to.
 
     Attributes
@@ -84,7 +84,7 @@ def write_graphs_of(
         No frame has a graph, or the file is not a ``pins.npz`` of this sensor.
     """
     if legacy and (kind != "voronoi" or path.suffix == PINS):
-        raise OptionError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")
+        raise OptionError("`legacy` makes Voronoi graphs of frames; leave `kind` out and give frames")
     if path.suffix == PINS:
         found, nodes_px = read_pins(path, sensor.pins.count)
         names = list(found)
@@ -173,7 +173,7 @@ def read_pins(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
     if pins.ndim != 3 or pins.shape[2] != 2 or predicted.shape != pins.shape or valid.shape != (frames,) or len(pins) != frames:
         raise FrameError(f"{path}: its arrays do not fit each other; write it anew with 'twin preprocess'")
     if pins.shape[1] != count:
-        raise FrameError(f"{path}: holds {pins.shape[1]} pins a frame, the sensor has {count}; give the right --sensor")
+        raise FrameError(f"{path}: holds {pins.shape[1]} pins a frame, the sensor has {count}; give the right `sensor`")
     if not valid.any():
         raise FrameError(f"{path}: no valid frame in it; look at summary.json beside it for the reasons")
     nodes_px = np.where(np.isnan(pins), predicted, pins)[valid]

@@ -68,7 +68,7 @@ def legacy_parameters(layout: Layout) -> LegacyParameters:
         The release has none for it.
     """
     if layout not in LEGACY:
-        raise FrameError(f"the published method knows only layouts of rings and hexagons, not '{layout}'; use another --method")
+        raise FrameError(f"the published method knows only layouts of rings and hexagons, not '{layout}'; use another `method`")
     return LEGACY[layout]
 
 
@@ -177,7 +177,7 @@ class LegacyPipeline:
 
     def __call__(self, frame: Frame) -> LegacyObservation:
         """Observe a recorded frame."""
-        if frame.form != Form.RECORDING or frame.image.shape[1::-1] != self.size_px:
+        if frame.form != Form.PROCESSED or frame.image.shape[1::-1] != self.size_px:
             raise FrameError(f"{frame.name or 'frame'}: the published method takes recordings of {self.size_px[0]}x{self.size_px[1]} only")
         n, size = self.count, self.parameters.size_px
         started = perf_counter()

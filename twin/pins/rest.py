@@ -47,7 +47,7 @@ class Rest:
             return f"no contact: no frame is named as such; {self.frame} shows no contact as far as its pins tell"
         return (
             "no contact: no frame shows it. The pins' rest places were made from contacts; expect errors of a tenth of a spacing or so. "
-            "Record one frame without contact and give it with --no-contact"
+            "Record one frame without contact and give it with `no_contact`"
         )
 
 

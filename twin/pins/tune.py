@@ -135,7 +135,7 @@ def tune(
     if layout is None or layout.explained < LEAST_SHOWN:
         raise FrameError(
             f"none of {len(frames)} frames shows {sensor.pins.in_words()}{_shown_instead(images)}; "
-            "check --sensor, focus and light, or give frames with less contact"
+            "check `sensor`, focus and light, or give frames with less contact"
         )
     if known is None:
         doubts = other_layout(layout, images)
@@ -153,7 +153,7 @@ def tune(
     area, contrast = (float(np.nanmedian(values)) for values in zip(*caps, strict=True))
     start = _start(size_px, reference, layout, area, method, form, sensor.pins.layout, polarity)
     sensor = with_detector(sensor, start)
-    tried, judged = list(_settings(start, reference, contrast, form == Form.RECORDING)), frames
+    tried, judged = list(_settings(start, reference, contrast, form == Form.PROCESSED)), frames
     if method in SLOW:
         judged = frames[:: max(len(frames) // SLOW_TUNED_ON, 1)][:SLOW_TUNED_ON]
     rates = [_rate(make_detector(sensor, detector, second_look=False), judged[::GLANCE]) for detector in tried]
@@ -214,7 +214,7 @@ def other_layout(layout: Candidate, images: list[np.ndarray]) -> list[str]:
     if not same and (more or smoother):
         return [
             f"these frames show {_in_words(found)} rather than {layout.pins.in_words()}: {layout.left_over:g} pin-like spots of a "
-            f"frame are none of these pins, and {layout.not_seen:g} of the pins are not seen; give the right --sensor, or make one with "
+            f"frame are none of these pins, and {layout.not_seen:g} of the pins are not seen; give the right `sensor`, or make one with "
             "'twin new'"
         ]
     if layout.explained < SURE_EXPLAINED:

@@ -12,14 +12,14 @@ from twin.pins.pipeline import Pipeline
 from twin.pins.tune import Tuned, tune
 from twin.progress import Progress, silent, stage
 from twin.store import writes_file
-from twin.types import Form, Frame
+from twin.types import Form, Frame, Readable
 
 # Most frames that are used if no other number is given.
 LIMIT = 12
 
 
-@dataclass(frozen=True)
-class TunedOnFrames:
+@dataclass(frozen=True, repr=False)
+class TunedOnFrames(Readable):
     """The result of a tuning on a user's frames.
 
     Attributes
@@ -89,7 +89,7 @@ def tune_on_frames(
         No frame shows the layout, or the frame without contact does not, or ``out`` is not the name of a ``.toml`` file.
     """
     if out is not None and out.suffix != ".toml":
-        raise OptionError(f"--out {out}: give the name of a .toml file")
+        raise OptionError(f"`out` {out}: give the name of a .toml file")
     recording = open_recording(path, None, form or (Form.RAW if sensor.recording is None else None))
     frames = evenly_read(recording, limit)
     odd = recording.notes() + _of_another_size(recording, sensor)
@@ -116,8 +116,8 @@ def _worse(evidence: Evidence, recording: Recording, frames: list[Frame], sensor
     if rate <= evidence.exact_rate:
         return []
     return [
-        f"the detection of the specification itself finds all pins in {rate:.0%} of these frames: keep it, or tune with --method, other "
-        "frames or a frame without contact (--no-contact)"
+        f"the detection of the specification itself finds all pins in {rate:.0%} of these frames: keep it, or tune with `method`, other "
+        "frames or a frame without contact (`no_contact`)"
     ]
 
 

@@ -159,7 +159,7 @@ class View:
 
 
 NO_CONTACT_REMEDY = (
-    "move it clear of everything and take a frame without contact (init_0.png beside the frames, --no-contact FRAME, --at-rest FRAME), or "
+    "move it clear of everything and take a frame without contact (init_0.png beside the frames, `no_contact` FRAME, `at_rest` FRAME), or "
     "leave this one out"
 )
 """What to do if a frame is refused as one without contact."""

@@ -23,7 +23,7 @@ from twin.records.recording import RecordingWriter, recording_records
 from twin.records.ros2 import Ros2Writer, ros2_records
 from twin.records.session import is_session, session_records
 from twin.store import writes
-from twin.types import Frame
+from twin.types import Frame, Readable
 
 READERS: dict[str, Callable[[Path], Records]] = {
     RecordingWriter.FORMAT: recording_records,
@@ -90,11 +90,11 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
         except SpecError:
             spec = None
     if spec is None:
-        note = "no pins: the record does not name a sensor that is known here; give --sensor to have them found"
+        note = "no pins: the record does not name a sensor that is known here; give `sensor` to have them found"
         return replace(records, notes=[*records.notes, note])
     if (expected := frame_size(spec, records.about.form)) != records.about.size_px:
         got = f"{records.episodes[0].key if records.episodes else 'the record'}: frames of {times(records.about.size_px)}"
-        raise FrameError(f"{got}, those of {spec.name} are {times(expected)}; give the matching --sensor, or another recording or session")
+        raise FrameError(f"{got}, those of {spec.name} are {times(expected)}; give the matching `sensor`, or another recording or session")
     numbers = {"pins": 2 * spec.pins.count, **records.about.numbers}
     about = replace(records.about, sensor=spec.name, numbers=numbers)
     found = [replace(episode, steps=partial(_seen, episode, about, spec)) for episode in records.episodes]
@@ -109,7 +109,7 @@ def _require_pins_of(spec: SensorSpec, about: About) -> None:
         return
     owner = f"of the sensor '{name}' ({count} pins)" if name else f"of a sensor with {count} pins"
     told = f"the record holds pins {owner}, the given sensor is '{spec.name}' ({spec.pins.count} pins)"
-    raise FrameError(f"{told}; leave --sensor out, or give the matching one")
+    raise FrameError(f"{told}; leave `sensor` out, or give the matching one")
 
 
 def _seen(episode: Episode, about: About, spec: SensorSpec) -> Iterator[Step]:
@@ -142,7 +142,7 @@ def open_writer(folder: Path, to: str, about: About, rate_hz: int, *, video: boo
     if to not in FORMATS:
         raise RecordError(f"no format {shown(to)}; there are {', '.join(FORMATS)}")
     if video and to != LeRobotWriter.FORMAT:
-        raise RecordError(f"--video goes with the format {LeRobotWriter.FORMAT}; {to} keeps every picture as it is")
+        raise RecordError(f"`video` goes with the format {LeRobotWriter.FORMAT}; {to} keeps every picture as it is")
     if to == LeRobotWriter.FORMAT:
         return LeRobotWriter(folder, about, rate_hz, video=video, held_mb=0.0 if at_once else DATA_MB)
     if to == Ros2Writer.FORMAT:
@@ -151,8 +151,8 @@ def open_writer(folder: Path, to: str, about: About, rate_hz: int, *, video: boo
     return pictures(folder, about, rate_hz, held_steps=0 if at_once else HELD_STEPS)
 
 
-@dataclass(frozen=True)
-class Converted:
+@dataclass(frozen=True, repr=False)
+class Converted(Readable):
     """The result of ``convert``.
 
     Attributes
@@ -231,7 +231,7 @@ def convert(
     first = opened[0]
     for source, records in zip(sources, opened, strict=True):
         if wrong := first.about.differs(records.about):
-            raise RecordError(f"{source}: does not fit to {sources[0]} ({'; '.join(wrong)}); translate it into another --out")
+            raise RecordError(f"{source}: does not fit to {sources[0]} ({'; '.join(wrong)}); translate it into another `out`")
     with open_writer(out, to, first.about, first.rate_hz(), video=video) as writer, stage(progress, "episodes") as step:
         before, total = len(writer.facts), sum(len(records.episodes) for records in opened)
         writer.write(_missing(opened, writer, lambda done: step(done, total)))

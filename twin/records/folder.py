@@ -116,7 +116,7 @@ class FolderWriter(ABC):
     def _go_on(self) -> None:
         about, said = read_sidecar(self.folder, self.FORMAT)
         if wrong := about.differs(self.about):
-            raise RecordError(f"{self.folder}: the new episodes do not fit to those in it ({'; '.join(wrong)}); give another --out")
+            raise RecordError(f"{self.folder}: the new episodes do not fit to those in it ({'; '.join(wrong)}); give another `out`")
         self.about, self.rate_hz = about, int(said["rate_hz"])
         self.facts = self._find()
         self.keys = {facts["key"] for facts in self.facts}
@@ -162,7 +162,7 @@ def read_sidecar(folder: Path, form: str = "") -> tuple[About, dict[str, Any]]:
     if version != VERSION:
         raise RecordError(f"{folder / SIDECAR}: of version {version!r}, expected {VERSION}; read it with the program that wrote it")
     if form and found != form:
-        raise RecordError(f"{folder}: holds a record of the format {found}, not {form}; give another --out")
+        raise RecordError(f"{folder}: holds a record of the format {found}, not {form}; give another `out`")
     return about, said
 
 

@@ -381,7 +381,7 @@ class _Film:
     def __init__(self, path: Path, rate_hz: int, size_px: tuple[int, int]) -> None:
         self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*FOURCC), float(rate_hz), size_px)
         if not self._writer.isOpened():
-            raise RecordError(f"this OpenCV can't write {FOURCC} videos; leave out --video")
+            raise RecordError(f"this OpenCV can't write {FOURCC} videos; leave out `video`")
 
     def add(self, image: np.ndarray) -> None:
         self._writer.write(np.ascontiguousarray(_colour(image)[..., ::-1]))

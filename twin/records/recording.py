@@ -58,7 +58,7 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
         The folder holds only pins, or is damaged.
     """
     if path.is_dir() and (path / TRUTH).is_dir() and not any((path / name).is_dir() for name in ("images", "frames_bw")):
-        raise RecordError(f"{path}: holds pins without pictures; make the data set with --images raw, gray or recording")
+        raise RecordError(f"{path}: holds pins without pictures; make the data set with `images` raw, gray or recording")
     own = format_of(path) == RecordingWriter.FORMAT if path.is_dir() else False
     if own and not (path / EPISODES).is_file():
         return Records(read_sidecar(path)[0], [])

@@ -68,7 +68,7 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
     if experiment is not None and (missing := [name for name in varied if name not in recording.labels]):
         raise FrameError(
             f"{recording.path}: no label {', '.join(missing)}, which the experiment {experiment.name} varies ({recording.labels_found()}); "
-            "add the column, or give the experiment that the frames were recorded with (--experiment)"
+            "add the column, or give the experiment that the frames were recorded with (`experiment`)"
         )
     values = {kind: np.zeros((len(recording), 6)) for kind in columns}
     for kind, named in columns.items():

@@ -175,7 +175,7 @@ def locked(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     except Timeout as error:
         if not (folder / LOCK).is_file():  # the lock's own file could not be made
             raise StoreError(f"{folder}: no file can be made there; give another folder") from error
-        raise StoreError(f"{folder}: another run is at work there; wait until it has ended, or give another --out") from error
+        raise StoreError(f"{folder}: another run is at work there; wait until it has ended, or give another `out`") from error
     except OSError as error:
         raise unwritten(folder, error) from error
     try:

@@ -176,7 +176,7 @@ def _require_ours(folder: Path, names: Iterable[str]) -> dict[str, str]:
         shown = ", ".join(foreign[:_MOST_NAMED]) + (f" and {len(foreign) - _MOST_NAMED} more" if len(foreign) > _MOST_NAMED else "")
         raise StoreError(
             f"{folder}: holds files that this program did not write, or that were changed since ({shown}); "
-            "give another --out, or --force to write over them"
+            "give another `out`, or `force=True` to write over them"
         )
     return known
 

@@ -35,7 +35,7 @@ def dome_window(spec: SensorSpec) -> tuple[int, int, int, int]:
 
 def dome_part(spec: SensorSpec, image: ImageArray, form: Form) -> ImageArray:
     """The dome's part of a raw frame. A recording's frame is returned whole, because it shows nothing else."""
-    if form == Form.RECORDING:
+    if form == Form.PROCESSED:
         return image
     x0, y0, x1, y1 = dome_window(spec)
     return image[y0:y1, x0:x1]
@@ -112,7 +112,7 @@ class DomeCamera:
         """
         if self.spec.recording is None:
             raise FrameError(f"{self.spec.name} has no recordings' form; show raw frames")
-        return replace(raw, image=record(raw.image, self.spec.recording), form=Form.RECORDING)
+        return replace(raw, image=record(raw.image, self.spec.recording), form=Form.PROCESSED)
 
     def crop(self, image: ImageArray, form: Form) -> ImageArray:
         """The dome's part of a frame, for the page."""

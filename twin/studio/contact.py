@@ -212,7 +212,7 @@ class MovingContact:
             setup = replace(setup, friction=friction)
         if form is not None:
             setup = replace(setup, form=form)
-        if setup.form is Form.RECORDING and setup.sensor.recording is None:
+        if setup.form is Form.PROCESSED and setup.sensor.recording is None:
             self.camera.recorded(Frame(np.zeros((1, 1), np.uint8), Form.RAW))  # raises the error that there is no such form
         pressed_anew = setup.touched != self.setup.touched or setup.friction != self.setup.friction
         if pressed_anew:
@@ -405,8 +405,8 @@ class MovingContact:
         light, lit = traced or (self.camera.draw(state), Light.DRAWN)
         raw = self.camera.raw(light, seed=self._count)
         now = time.perf_counter()
-        needs_recorded = self.setup.form is Form.RECORDING or (self.model is not None and self.model.form is Form.RECORDING)
-        frames = {Form.RAW: raw} | ({Form.RECORDING: self.camera.recorded(raw)} if needs_recorded else {})
+        needs_recorded = self.setup.form is Form.PROCESSED or (self.model is not None and self.model.form is Form.PROCESSED)
+        frames = {Form.RAW: raw} | ({Form.PROCESSED: self.camera.recorded(raw)} if needs_recorded else {})
         frame = frames[self.setup.form]
         estimate = None if self.model is None else self.model(frames[self.model.form])
         estimated = time.perf_counter()

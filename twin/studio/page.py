@@ -242,7 +242,7 @@ class Page:
             with redirect_stdout(StringIO()), guarded_server(hosts, lambda address: self.on_address(address)):  # viser prints its addresses
                 self.server = _Server(host=host, port=port, label=title, verbose=False)
         except (OSError, RuntimeError) as error:
-            raise TwinError(f"--host {host} --port {port}: can't listen there ({error}); give another --host or --port") from error
+            raise TwinError(f"`host` {host} `port` {port}: can't listen there ({error}); give another `host` or `port`") from error
         self._host = host
         gui = self.gui = self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)

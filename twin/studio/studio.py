@@ -58,7 +58,7 @@ class StudioPlan:
             return []
         return [
             f"warning: the page listens on {self.host}. Everyone who reaches this address can use it, move an armed arm and write to "
-            f"{self.out}; there is no password. Give no --host to serve this machine alone"
+            f"{self.out}; there is no password. Give no `host` to serve this machine alone"
         ]
 
 

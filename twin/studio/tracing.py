@@ -233,8 +233,8 @@ class _Maker:
 
         if self._simulator is None:
             self._simulator = Simulator(self._spec)
-        shot = self._simulator.shoot(job.state, form=job.form)
-        yield Saved(write_contact(job.out, self._simulator, job.touched, job.pose, job.state, shot)[0])
+        rendered = self._simulator.render(job.state, form=job.form)
+        yield Saved(write_contact(job.out, self._simulator, job.touched, job.pose, job.state, rendered)[0])
 
 
 def _tried(make: Callable[[], Iterator[Outcome]], *, tracing: bool = False) -> Iterator[Outcome]:

@@ -59,7 +59,7 @@ class Plan:
         if len(self.train) < 2 or not self.unseen:
             raise TrainingError("give at least two objects to train on and one never seen")
         require_count(self.count)
-        require_count(self.tests, "--tests")
+        require_count(self.tests, "`tests`")
 
     @property
     def wider(self) -> ExperimentSpec:

@@ -23,10 +23,11 @@ from training.studies.sim_to_real.twins import contact_of
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
+from twin.types import Readable
 
 
-@dataclass(frozen=True)
-class Result:
+@dataclass(frozen=True, repr=False)
+class Result(Readable):
     """The result of the study.
 
     Attributes
@@ -107,7 +108,7 @@ def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[d
             chosen = rows_in_range(data, plan.experiment)
             if not len(chosen):
                 raise TrainingError(
-                    f"{thing.name}: none of its contacts has labels within the ranges of {plan.experiment.name}; give more --tests"
+                    f"{thing.name}: none of its contacts has labels within the ranges of {plan.experiment.name}; give more `tests`"
                 )
             off = label_error(estimator.predict_rows(data, chosen).mean, data.targets.corrected[chosen], data.targets.units)
             error, bias = np.abs(off).mean(axis=0), off.mean(axis=0)

@@ -128,7 +128,7 @@ def measure_residuals(
     good = np.flatnonzero(np.isfinite(moved).all(axis=(1, 2, 3)) & (weights.trust > TRUSTED))
     if len(good) < FEWEST:
         raise TrainingError(
-            f"{len(good)} of {len(labels)} labelled frames fit the twin, at least {FEWEST} are needed; give more --labels, or --calibrate"
+            f"{len(good)} of {len(labels)} labelled frames fit the twin, at least {FEWEST} are needed; give more `labels`, or `calibrate`"
         )
     executed = weights.executed[good] > 0.5
     told = [replace(labels[k], executed=bool(done)) for k, done in zip(good, executed, strict=True)]

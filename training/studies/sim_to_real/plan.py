@@ -82,10 +82,10 @@ class Plan:
     def __post_init__(self) -> None:
         require_count(self.count)
         if not 1 <= self.draws <= MOST_DRAWS:
-            raise DatasetError(f"--draws {self.draws}: expected 1 to {MOST_DRAWS} for each contact")
+            raise DatasetError(f"`draws` {self.draws}: expected 1 to {MOST_DRAWS} for each contact")
         for folder in self.simulated:
             if not is_simulated(folder):
-                raise TrainingError(f"--sim {folder}: no simulated data set; give the folder of one that 'twin dataset' has finished")
+                raise TrainingError(f"`sim` {folder}: no simulated data set; give the folder of one that 'twin dataset' has finished")
 
     @property
     def touched(self) -> ObjectSpec:

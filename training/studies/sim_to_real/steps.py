@@ -82,7 +82,7 @@ def choose_frames(count: int, labels: int, seed: int) -> Frames:
     """
     rest, test = split_rows(count, seed)
     if labels > len(rest):
-        raise TrainingError(f"--labels {labels}: the recording has {len(rest)} frames beside those that are judged on")
+        raise TrainingError(f"`labels` {labels}: the recording has {len(rest)} frames beside those that are judged on")
     order = np.random.default_rng([seed, labels]).permutation(rest)
     trained = {str(n): np.sort(order[:n]) for n in (labels, MANY) if n < len(rest)}
     nested = [np.sort(order[:n]) for n in sorted({*COUNTS, labels, MANY}) if n < len(rest)]
@@ -199,8 +199,8 @@ def states_within(simulated: Dataset, low: np.ndarray, high: np.ndarray, least: 
     found = np.flatnonzero(((told >= low - margin) & (told <= high + margin)).all(axis=1))
     if len(found) < least:
         raise TrainingError(
-            f"{len(found)} simulated states have labels {meant}; simulate the experiment that the frames come from (--contacts, or another "
-            "--sim), or more of it (--count)"
+            f"{len(found)} simulated states have labels {meant}; simulate the experiment that the frames come from (`contacts`, or another "
+            "`sim`), or more of it (`count`)"
         )
     return found
 

@@ -38,14 +38,15 @@ from twin.judge.labelled.model import MeasuredFrames
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
+from twin.types import Readable
 
 SEEDS_APART = 1000  # between the draws of one study, so that those of seeds 0, 1, 2... differ
 BESIDE, TAUGHT = "sim_plus_real", "sim_taught"  # folders of the run with labelled frames beside it, and of the one that the twin taught
 SHOWN_MODES = 4  # of what the twin misses, that the page names
 
 
-@dataclass(frozen=True)
-class Result:
+@dataclass(frozen=True, repr=False)
+class Result(Readable):
     """The result of the study.
 
     Attributes

@@ -140,7 +140,7 @@ def twin_contacts(
         The pins of a rendered frame can't be found.
     """
     simulator, pipeline = Simulator(spec), Pipeline(spec, form)
-    rest = pipeline(simulator.shoot_rest(form).frame)
+    rest = pipeline(simulator.render_rest(form).frame)
     if not rest.valid or rest.graph is None:
         raise TwinError(f"{spec.name}: pins of the rendered frame without contact not found: {rest.reason}")
     found = []
@@ -150,7 +150,7 @@ def twin_contacts(
         for depth in depths_mm:
             poses = plan_path(spec.geometry, build_field(thing), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
             state = [state for _, state in simulator.solver.path(thing, ContactPath(_turned(turn_deg) @ poses))][-1]
-            seen = pipeline(simulator.shoot(state, form=form).frame)
+            seen = pipeline(simulator.render(state, form=form).frame)
             if not seen.valid or seen.graph is None:
                 raise TwinError(f"{spec.name}, {name}, {depth:g} mm: {seen.reason}")
             found.append(AreaChange(name, depth, seen.graph, rest.graph.area_px2))

@@ -18,7 +18,7 @@ from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
-from twin.types import Form
+from twin.types import Form, Readable
 
 MODELS = ("gnn", "tac-vgnn", "vgnn", "cnn-v2", "cnn-v1")
 # Batch sizes of the efficiency figure.
@@ -81,11 +81,11 @@ class Plan:
 
     def __post_init__(self) -> None:
         if self.labels not in ("corrected", "raw"):
-            raise OptionError(f"--labels must be corrected or raw, got {self.labels!r}")
+            raise OptionError(f"`labels` must be corrected or raw, got {self.labels!r}")
         if not self.models or not self.seeds:
-            raise OptionError("nothing to compare: give at least one of --models and of --seeds")
+            raise OptionError("nothing to compare: give at least one of `models` and of `seeds`")
         if any(batch < 1 for batch in self.batches):
-            raise OptionError(f"--batches {','.join(map(str, self.batches))}: a batch has at least 1 frame")
+            raise OptionError(f"`batches` {','.join(map(str, self.batches))}: a batch has at least 1 frame")
 
     def runs(self) -> list[PlannedRun]:
         """Every run of the study."""
@@ -96,8 +96,8 @@ class Plan:
         ]
 
 
-@dataclass(frozen=True)
-class Result:
+@dataclass(frozen=True, repr=False)
+class Result(Readable):
     """The result of the comparison.
 
     Attributes

@@ -24,7 +24,7 @@ from twin.progress import Progress, Step, silent, stage
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import read_arm_labels
 from twin.store import output, writes_file
-from twin.types import FINE, Form
+from twin.types import FINE, Form, Readable
 
 LABELS = 20
 """Number of frames to which the contact is fitted."""
@@ -100,8 +100,8 @@ def _part(measured: MeasuredFrames, rows: np.ndarray) -> MeasuredFrames:
     return replace(measured, names=names, labels=labels, pins_px=measured.pins_px[rows])
 
 
-@dataclass(frozen=True)
-class ContactCalibration:
+@dataclass(frozen=True, repr=False)
+class ContactCalibration(Readable):
     """A fitted contact and its files.
 
     Attributes
@@ -177,7 +177,7 @@ def calibrate_to_file(
     """
     names = [parameter.name for parameter in PARAMETERS]
     if unknown := set(hold) - set(names):
-        raise OptionError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
+        raise OptionError(f"`hold` {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
     folder = folder_beside(out, "contact")
     parameters = tuple(parameter for parameter in PARAMETERS if parameter.name not in hold)
     with output(folder, "index.html", "calibration.json", "*.png", "contacts"), stage(progress, "contacts") as step:

@@ -114,7 +114,7 @@ def fit_contact(setup: Setup, measured: MeasuredFrames, *, progress: Step | None
         There are too few frames, or none of their contacts can be simulated.
     """
     if len(measured) < FEWEST:
-        raise FrameError(f"{len(measured)} frames with pins are too few; give --labels {FEWEST} or more")
+        raise FrameError(f"{len(measured)} frames with pins are too few; give `labels` {FEWEST} or more")
     target = measured.pins_px - measured.no_contact_px
     start, sign = _start(setup, measured, target, progress)
     prior = np.array([p.prior for p in setup.parameters])
@@ -232,7 +232,7 @@ def _start(setup: Setup, measured: MeasuredFrames, target: np.ndarray, progress:
     moved = setup.displacements(jobs, measured.labels, progress).reshape(len(tries), len(telling), 2, -1, 2)
     errors = [np.mean(likelier_px(each, target[telling])) for each in moved]
     if not np.isfinite(errors).any():
-        raise FrameError("none of the first contacts can be simulated; are --experiment and --sensor those of the frames?")
+        raise FrameError("none of the first contacts can be simulated; are `experiment` and `sensor` those of the frames?")
     return tries[int(np.nanargmin(errors))]
 
 

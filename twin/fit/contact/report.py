@@ -66,7 +66,7 @@ def warnings_of(fit: ContactFit, held_out: tuple | None, held_frames: int) -> li
     found = []
     if not held_out:
         found.append(
-            "no frame was left to keep out of the fit: how well it does on other frames is not known; give more frames, or less --labels"
+            "no frame was left to keep out of the fit: how well it does on other frames is not known; give more frames, or less `labels`"
         )
     pairs = {"the fitted frames": (float(np.nanmean(fit.before_px)), float(np.nanmean(fit.after_px)))}
     if held_out:

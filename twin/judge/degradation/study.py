@@ -85,7 +85,7 @@ def real_study(
     notes += recording.notes()
     usable = tuple(c for c in cases if c.image_level and (recording.form == Form.RAW or _on_frames(c)))
     if not usable:
-        raise TwinError("none of the conditions can be applied to frames that are already there; without --frames they are rendered")
+        raise TwinError("none of the conditions can be applied to frames that are already there; without `frames` they are rendered")
     if left := [c.name for c in cases if c not in usable]:
         notes.append(f"left out, because they cannot be applied to frames that are already there: {', '.join(left)}")
     rendered = RenderedSource(spec, CONTACTS) if beside and recording.form == Form.RAW else None
@@ -146,14 +146,14 @@ def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
     for name in names:
         if name not in METHODS and Path(name).suffix != ".toml" and not is_own(name):
             raise OptionError(
-                f"--pipeline {name}: give one of {', '.join(METHODS)}, a .toml file written by 'twin tune', or a function of yours as "
+                f"`pipeline` {name}: give one of {', '.join(METHODS)}, a .toml file written by 'twin tune', or a function of yours as "
                 "FILE.py:FUNCTION"
             )
     called = [_name_of(name) for name in names]
     if len(set(called)) < len(called):
-        raise OptionError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files or functions")
+        raise OptionError(f"`pipeline`: each needs a name of its own, got {', '.join(called)}; rename the files or functions")
     if len({*called, *models}) < len(called) + len(models):
-        raise OptionError(f"--model: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
+        raise OptionError(f"`model`: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
 
 
 def _name_of(name: str) -> str:
@@ -199,7 +199,7 @@ def _tried(detector: DetectorSpec, frame: Frame) -> DetectorSpec:
     try:
         own_places(detector, frame)
     except FrameError as error:
-        raise OptionError(f"--pipeline {detector.finder}, on the undegraded frame {frame.name}: {error}") from error
+        raise OptionError(f"`pipeline` {detector.finder}, on the undegraded frame {frame.name}: {error}") from error
     return detector
 
 

@@ -96,7 +96,7 @@ def measure_frames(
         if progress:
             progress(done + 1, len(chosen))
     if not kept:
-        raise FrameError(f"{folder}: no frame with pins among {len(chosen)}; {problems[-1] if problems else 'is it the right --sensor?'}")
+        raise FrameError(f"{folder}: no frame with pins among {len(chosen)}; {problems[-1] if problems else 'is it the right `sensor`?'}")
     names, told = [recording.names[row] for row in kept], [labels[row] for row in kept]
     return MeasuredFrames(recording.form, names, told, np.stack(pins), reference.pins_px, problems, named != UNMEASURED)
 

@@ -134,5 +134,5 @@ def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc, lost: float = 0.0)
     if observation.found < least or not observation.valid:
         needed = f"{least} are needed" if lost else "all are needed"
         why = observation.reason or f"{observation.found} of {observation.expected} pins found, {needed}"
-        raise FrameError(f"{frame.name}: {why}; leave it out, or give the right --sensor")
+        raise FrameError(f"{frame.name}: {why}; leave it out, or give the right `sensor`")
     return observation

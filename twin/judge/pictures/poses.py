@@ -61,7 +61,7 @@ def labels_of_rows(rows: list[dict[str, float]], experiment: ExperimentSpec) -> 
     """
     missing = [name for name in label_columns(experiment) if any(not np.isfinite(row.get(name, np.nan)) for row in rows)]
     if missing:
-        raise FrameError(f"targets.csv: no number in column {', '.join(missing)} for some frames; without it leave out --pose-aligned")
+        raise FrameError(f"targets.csv: no number in column {', '.join(missing)} for some frames; without it leave out `pose_aligned`")
     poses, moves = (np.array([[row.get(f"{kind}_{k}", 0.0) for k in range(1, 7)] for row in rows]) for kind in ("pose", "move"))
     return [ArmLabel(pose, move) for pose, move in zip(poses, moves, strict=True)]
 

@@ -3,12 +3,14 @@
 import difflib
 
 from scenes.files import shown
+from scenes.plugins import others
 from twin.errors import TwinError
 from twin.judge.degradation.condition import Condition
 from twin.judge.degradation.conditions import electronics, gel, lighting, optics, picture, placement, settings, skin
 
 FAMILIES = (lighting, optics, gel, skin, placement, picture, electronics, settings)
 CONDITIONS: dict[str, Condition] = {c.name: c for family in FAMILIES for c in family.CONDITIONS}
+CONDITIONS |= {c.name: c for c in others("conditions", CONDITIONS, is_one=lambda part: isinstance(part, Condition)).values()}
 
 
 def condition(name: str) -> Condition:

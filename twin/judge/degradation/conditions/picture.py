@@ -67,5 +67,7 @@ CONDITIONS = (
         image_level=True,
     ),
     Condition("picture-turned", "turned picture", "picture", "angle", "deg", 180.0, frame=turned, moves=turned_points, image_level=True),
-    Condition("picture-mirrored", "mirrored picture", "picture", "mirrored", "", 1.0, frame=mirrored, moves=mirrored_points, image_level=True),
+    Condition(
+        "picture-mirrored", "mirrored picture", "picture", "mirrored", "", 1.0, frame=mirrored, moves=mirrored_points, image_level=True
+    ),
 )  # fmt: skip

@@ -1,0 +1,82 @@
+"""Parts of other packages, which offer them by entry points ``tactip_twin.KIND``.
+
+A sensor, object, experiment, randomisation, servo or limits is the path of a TOML file. An arm is a function of the text after the colon in
+``NAME:REST``, and a camera a function of this text, the sensor and the form. A condition, model or task is the object itself. A part that
+raises, that is of another kind or that has the name of another one is left out, and a warning names it.
+"""
+
+import os
+import sys
+import warnings
+from collections.abc import Callable, Container
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+KINDS = ("sensors", "objects", "experiments", "randomisations", "servos", "limits", "arms", "cameras", "conditions", "models", "tasks")
+_found: dict[str, dict[str, Any]] = {}  # the parts of each kind, by name
+_judged: dict[EntryPoint, str] = {}  # of each entry point that was looked at: why its part is left out, "" if it is not
+
+
+def others(kind: str, own: Container[str] = (), *, is_one: Callable[[Any], bool] = callable) -> dict[str, Any]:
+    """The parts of a kind that other packages offer, by name.
+
+    Parameters
+    ----------
+    kind : str
+        One of ``KINDS``.
+    own : container of str
+        Names that are taken.
+    is_one : callable
+        Whether an object is a part of this kind.
+    """
+    found = _found.setdefault(kind, {})
+    for entry in _entries(kind):
+        begun = getattr(getattr(sys.modules.get(entry.module), "__spec__", None), "_initializing", False)
+        if entry in _judged or begun:  # a package that is being imported asks for a part of ours; the next call finds its own
+            continue
+        part, why = _loaded(entry)
+        if entry.name in own or entry.name in found:
+            why = f"there is another '{entry.name}'"
+        elif not why and not is_one(part):
+            why = f"{part!r} is none"
+        _judged[entry] = why
+        if why:
+            warnings.warn(f"{kind} of {_package(entry)}: '{entry.name}' is left out ({why})", RuntimeWarning, stacklevel=2)
+        else:
+            found[entry.name] = part
+    return found
+
+
+def _loaded(entry: EntryPoint) -> tuple[Any, str]:
+    """A part, and why it can't be loaded."""
+    try:
+        return entry.load(), ""
+    except (Exception, SystemExit) as error:
+        return None, f"{type(error).__name__}: {error}"
+
+
+def other_files(kind: str, own: Container[str]) -> dict[str, Path]:
+    """The files of a kind that other packages offer, by name; as `others`."""
+    files = others(kind, own, is_one=lambda part: isinstance(part, str | os.PathLike) and os.path.isfile(part))
+    return {name: Path(path) for name, path in files.items()}
+
+
+def plugin_lines() -> list[str]:
+    """A line for each part that another package offers: its kind, name and package, and why it is left out if it is."""
+    lines = []
+    for kind in KINDS:
+        for entry in _entries(kind):
+            why = _judged[entry] if entry in _judged else _loaded(entry)[1]
+            lines.append(f"{kind}: {entry.name} of {_package(entry)}{f'; LEFT OUT: {why}' if why else ''}")
+    return lines
+
+
+@cache
+def _entries(kind: str) -> tuple[EntryPoint, ...]:
+    return tuple(sorted(entry_points(group=f"tactip_twin.{kind}"), key=lambda entry: (entry.name, _package(entry))))
+
+
+def _package(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value

@@ -1,0 +1,94 @@
+"""A package of someone else adds a part of each kind by its entry points: built as a wheel, installed into a folder, and used."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import twin
+from hardware.rig import build_rig
+from scenes import load_servo
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "tests" / "helpers" / "example_parts"
+PARTS = 10  # that the package offers; one raises, and one has the name of another
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """The folder into which the wheel is installed."""
+    work = tmp_path_factory.mktemp("plugin")
+    shutil.copytree(EXAMPLE, work / "source")  # a build leaves files beside its sources
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", work, work / "source"], check=True)
+    (wheel,) = work.glob("*.whl")
+    subprocess.run([*pip, "install", "--no-deps", "--no-index", "--target", work / "site", wheel], check=True)
+    return work / "site"
+
+
+def run(installed: Path, *arguments: str, cwd: Path) -> subprocess.CompletedProcess:
+    path = os.pathsep.join(map(str, (installed, ROOT)))
+    return subprocess.run([sys.executable, *arguments], cwd=cwd, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)
+
+
+CODE = """
+import numpy as np, twin
+simulator = twin.Simulator(twin.load_sensor("example-tip"), quality="drawn")
+state = simulator.press(twin.load_object("example-ball"), twin.ContactPose(1.0))
+simulator.render(state).save("frames")
+print("force", state.force_n[2] > 0)
+camera = twin.open_camera("example:frames", simulator.spec, twin.Form.RAW)
+with camera: print("camera", camera.read().image.shape)
+
+from hardware.rig import build_rig
+from scenes import load_servo
+plane, placement, how = twin.load_object("plane"), load_servo("surface").placement, twin.load_experiment("surface-2d")
+rig = build_rig(simulator.spec, plane, placement, how, camera="example:frames", arm="example:here", form=twin.Form.RAW)
+print("guard", type(rig.arm).__name__, rig.arm.name)
+try: twin.open_arm("nobody:")
+except twin.errors.TwinError as error: print("arms", "example" in str(error))
+
+made = twin.make_dataset(experiment="surface-2d", sensor="mg400-127", count=8, images="none", states="all", across=8, workers=1, out="sim")
+print("model", twin.train(model="example-mean", sensor="mg400-127", data="sim", split=-1, out="run").finished)
+
+twin.register_environments()
+import gymnasium
+print("task", gymnasium.make("tactip/ExamplePress-v0", sensor="mg400-127", observation="oracle").reset(seed=0)[0]["goal"].shape)
+"""
+
+
+@pytest.mark.parametrize("first", ["", "import tactip_example.task, tactip_example.model, tactip_example.condition, tactip_example.arm"])
+def test_each_part_is_used_whatever_is_imported_first(first, installed, tmp_path):
+    done = run(installed, "-c", first + CODE, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        "force True",
+        "camera (320, 320)",
+        "guard SafeArm example arm at here",
+        "arms True",
+        "model True",
+        "task (1,)",
+    ]
+    assert "objects of tactip-example 0.1: 'ball-10' is left out (there is another 'ball-10')" in done.stderr
+    assert "'broken' is left out (RuntimeError: its maker has left)" in done.stderr
+
+
+def test_commands_know_the_parts_and_the_doctor_names_the_broken_one(installed, tmp_path):
+    doctor = run(installed, "-m", "twin", "doctor", cwd=tmp_path).stdout.split("Parts of other packages\n")[1].split("\n\n")[0].splitlines()
+    assert len(doctor) == PARTS and sum("LEFT OUT" in line for line in doctor) == 2
+    assert "  arms: broken of tactip-example 0.1; LEFT OUT: RuntimeError: its maker has left" in doctor
+    assert "example-tip" in run(installed, "-m", "twin", "sensors", cwd=tmp_path).stdout
+    assert "example-haze" in run(installed, "-m", "twin", "robustness", "--list", cwd=tmp_path).stdout
+
+
+def test_an_arm_without_limits_is_refused(monkeypatch):
+    """An arm of another package is always behind the guard, even one that is a simulated arm."""
+    monkeypatch.setattr("scenes.plugins._found", {"arms": {"bare": lambda rest: twin.open_arm("simulated")}})
+    how = twin.load_experiment("surface-2d")
+    with pytest.raises(twin.errors.TwinError, match="no limits are called 'bare'"):
+        build_rig(
+            twin.load_sensor("mg400-127"), twin.load_object("plane"), load_servo("surface").placement, how, camera="twin", arm="bare:here"
+        )

@@ -1,0 +1,366 @@
+"""Digital twin of the TacTip, a soft tactile sensor with a camera inside. Made by docs/generators/stubs.py."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from hardware.arms.open_arm import open_arm as open_arm
+from hardware.cameras.choose import open_camera as open_camera
+from hardware.collect import Collected as Collected
+from hardware.examining import Examination as Examination
+from hardware.following import Followed as Followed
+from hardware.safe_arm import SafeArm as SafeArm
+from hardware.safety import load_limits as load_limits
+from scenes import ExperimentSpec as ExperimentSpec
+from scenes import ObjectSpec as ObjectSpec
+from scenes import SensorSpec as SensorSpec
+from scenes import ServoSpec as ServoSpec
+from scenes import load_experiment as load_experiment
+from scenes import load_object as load_object
+from scenes import load_sensor as load_sensor
+from training.environments import register_all as register_all
+from training.environments.learn import Learnt as Learnt
+from training.estimator import load_remembering as load_remembering
+from training.generation.run import Simulated as Simulated
+from training.studies.degradation import Result as Result
+from training.studies.evaluation import Evaluation as Evaluation
+from training.studies.label_audit import LabelAudit as LabelAudit
+from training.studies.prediction import Predictions as Predictions
+from training.studies.realism import Realism as Realism
+from training.studies.validation import Validation as Validation
+from training.train import Trained as Trained
+from twin.fit.contact.calibrate import ContactCalibration as ContactCalibration
+from twin.fit.go_on import WholeSensor as WholeSensor
+from twin.fit.optics import OpticsCalibration as OpticsCalibration
+from twin.mechanics.path import ContactPose as ContactPose
+from twin.pins.batch import Preprocessed as Preprocessed
+from twin.pins.graph import node_features as node_features
+from twin.pins.pipeline import Pipeline as Pipeline
+from twin.pins.tune_files import TunedOnFrames as TunedOnFrames
+from twin.progress import Progress as Progress
+from twin.simulator import Simulator as Simulator
+from twin.types import Form as Form
+from twin.types import Frame as Frame
+from twin.types import Observation as Observation
+from twin import errors as errors
+from twin import extend as extend
+
+load_model = load_remembering
+register_environments = register_all
+
+__version__: str
+
+def require_own(*names: str) -> None: ...
+
+def audit(
+    data: Path | str,
+    *,
+    sensor: str | Path | SensorSpec,
+    out: Path | str,
+    form: Form | str | None = ...,
+    table: Path | str | None = ...,
+    no_contact: Path | str | None = ...,
+    pipeline: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> LabelAudit: ...
+
+def calibrate_contact(
+    *,
+    sensor: str | Path | SensorSpec,
+    frames: Path | str,
+    out: Path | str,
+    labels: int = ...,
+    seed: int = ...,
+    experiment: str | Path | ExperimentSpec = ...,
+    obj: str | Path | ObjectSpec | None = ...,
+    hold: str | Sequence[str] | None = ...,
+    workers: int = ...,
+    across: int = ...,
+    form: Form | str | None = ...,
+    table: Path | str | None = ...,
+    no_contact: Path | str | None = ...,
+    pipeline: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> ContactCalibration: ...
+
+def calibrate_optics(
+    *,
+    sensor: str | Path | SensorSpec,
+    frames: Path | str,
+    out: Path | str,
+    no_contact: Path | str | None = ...,
+    limit: int = ...,
+    pipeline: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> OpticsCalibration: ...
+
+def check(
+    source: str | Path,
+    *,
+    sensor: str | Path | SensorSpec,
+    form: Form | str | None = ...,
+    pipeline: Path | str | None = ...,
+    limit: int = ...,
+    no_contact: Path | str | None = ...,
+    push: str | Sequence[str] | None = ...,
+    twist: Path | str | None = ...,
+    out: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Examination: ...
+
+def collect(
+    *,
+    camera: str | Path,
+    arm: str,
+    sensor: str | Path | SensorSpec,
+    out: Path | str,
+    experiment: str | Path | ExperimentSpec = ...,
+    count: int = ...,
+    obj: str | Path | ObjectSpec | None = ...,
+    servo: str | Path | ServoSpec = ...,
+    form: Form | str | None = ...,
+    limits: str | None = ...,
+    seed: int | None = ...,
+    design: str = ...,
+    plain_light: bool = ...,
+    also: str | Sequence[str] | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Collected: ...
+
+def evaluate(
+    run: Path | str,
+    *,
+    data: Path | str | Sequence[Path | str],
+    out: Path | str,
+    rows: str = ...,
+    labels: str = ...,
+    robustness: bool = ...,
+    table: Path | str | None = ...,
+    no_contact: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Evaluation: ...
+
+def learn(
+    *,
+    task: str,
+    sensor: str | Path | SensorSpec,
+    out: Path | str,
+    observation: str = ...,
+    randomise: str | None = ...,
+    surrogate: Path | str | None = ...,
+    objects: str | Sequence[str] | None = ...,
+    memory: bool = ...,
+    sight: bool = ...,
+    minutes: float = ...,
+    environments: int = ...,
+    fem: int = ...,
+    seed: int = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Learnt: ...
+
+def make_dataset(
+    *,
+    experiment: str | Path | ExperimentSpec,
+    sensor: str | Path | SensorSpec,
+    count: int,
+    out: Path | str,
+    obj: str | Path | ObjectSpec | None = ...,
+    images: Literal['raw', 'gray', 'recording', 'none'] = ...,
+    states: Literal['all', 'end'] = ...,
+    randomise: str | None = ...,
+    seed: int | None = ...,
+    workers: int = ...,
+    scheduler: str = ...,
+    quality: Literal['drawn', 'preview', 'standard', 'high'] | None = ...,
+    residual: bool = ...,
+    across: int = ...,
+    also: str | Sequence[str] | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Simulated: ...
+
+def new_sensor(
+    frames: Path | str | None = ...,
+    *,
+    out: Path | str,
+    camera: str | Path = ...,
+    labels: Path | str | None = ...,
+    experiment: str | Path | ExperimentSpec | None = ...,
+    contacts: int = ...,
+    optics: bool = ...,
+    workers: int = ...,
+    across: int = ...,
+    layout: str | None = ...,
+    radius_mm: float | None = ...,
+    no_contact: Path | str | None = ...,
+    table: Path | str | None = ...,
+    form: Form | str | None = ...,
+    limit: int = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> WholeSensor: ...
+
+def predict(
+    run: Path | str,
+    frame: Path | str,
+    *,
+    maps: Path | str | None = ...,
+    sequence: bool = ...,
+    table: Path | str | None = ...,
+    no_contact: Path | str | None = ...,
+    force: bool = ...,
+) -> Predictions: ...
+
+def preprocess(
+    path: Path | str,
+    *,
+    sensor: str | Path | SensorSpec,
+    out: Path | str,
+    form: Form | str | None = ...,
+    overlay: bool = ...,
+    table: Path | str | None = ...,
+    no_contact: Path | str | None = ...,
+    pipeline: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Preprocessed: ...
+
+def realism(
+    path: Path | str,
+    *,
+    sensor: str | Path | SensorSpec,
+    out: Path | str,
+    pose_aligned: bool = ...,
+    limit: int | None = ...,
+    fitted: int = ...,
+    without: str | Sequence[str] | None = ...,
+    residual: bool = ...,
+    quality: Literal['drawn', 'preview', 'standard', 'high'] = ...,
+    two_sample: bool = ...,
+    thorough: bool = ...,
+    table: Path | str | None = ...,
+    pipeline: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Realism: ...
+
+def robustness(
+    *,
+    sensor: str | Path | SensorSpec,
+    out: Path | str,
+    pipeline: str | Sequence[str] | None = ...,
+    model: Path | str | Sequence[Path | str] | None = ...,
+    conditions: Path | str | None = ...,
+    frames: Path | str | None = ...,
+    limit: int = ...,
+    rendered: bool = ...,
+    jobs: int = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Result: ...
+
+def run_policy(
+    policy: Path | str,
+    *,
+    obj: str | Path | ObjectSpec,
+    out: Path | str,
+    camera: str | Path = ...,
+    arm: str = ...,
+    servo: str | Path | ServoSpec = ...,
+    steps: int | None = ...,
+    limits: str | None = ...,
+    record: bool = ...,
+    seed: int = ...,
+    known_place: bool = ...,
+    plain_light: bool = ...,
+    also: str | Sequence[str] | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Followed: ...
+
+def servo(
+    *,
+    obj: str | Path | ObjectSpec,
+    out: Path | str,
+    model: Path | str = ...,
+    camera: str | Path = ...,
+    arm: str = ...,
+    servo: str | Path | ServoSpec = ...,
+    steps: int | None = ...,
+    stream: bool = ...,
+    rate: float = ...,
+    limits: str | None = ...,
+    record: bool = ...,
+    seed: int = ...,
+    known_place: bool = ...,
+    plain_light: bool = ...,
+    at_rest: str = ...,
+    also: str | Sequence[str] | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Followed: ...
+
+def train(
+    *,
+    model: str,
+    sensor: str | Path | SensorSpec,
+    data: Path | str | Sequence[Path | str],
+    out: Path | str,
+    target: str | Sequence[str] = ...,
+    labels: str = ...,
+    seed: int = ...,
+    split: int = ...,
+    epochs: int | None = ...,
+    batch: int | None = ...,
+    members: int | None = ...,
+    kernel: bool | None = ...,
+    max_minutes: float | None = ...,
+    threads: int | None = ...,
+    device: str = ...,
+    form: Form | str | None = ...,
+    table: Path | str | None = ...,
+    no_contact: Path | str | None = ...,
+    pipeline: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Trained: ...
+
+def tune(
+    *,
+    sensor: str | Path | SensorSpec,
+    frames: Path | str,
+    out: Path | str | None = ...,
+    method: Literal['twin', 'legacy', 'adaptive', 'fixed', 'simple', 'log', 'dog', 'doh'] = ...,
+    form: Form | str | None = ...,
+    limit: int = ...,
+    table: Path | str | None = ...,
+    no_contact: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> TunedOnFrames: ...
+
+def validate(
+    *,
+    sensor: str | Path | SensorSpec,
+    frames: Path | str,
+    out: Path | str,
+    experiment: str | Path | ExperimentSpec = ...,
+    obj: str | Path | ObjectSpec | None = ...,
+    limit: int | None = ...,
+    friction_frames: int = ...,
+    seed: int = ...,
+    across: int = ...,
+    form: Form | str | None = ...,
+    table: Path | str | None = ...,
+    no_contact: Path | str | None = ...,
+    pipeline: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Validation: ...

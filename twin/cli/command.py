@@ -1,0 +1,217 @@
+"""Commands that are functions of Python, too.
+
+A command is declared once: as a function that returns a result, and whose parameters carry help, range and default (``Annotated``).
+``App.command`` registers it on the command line. It returns the function that ``import twin`` offers, which takes the same options as
+keyword arguments, checks them in the same way, and prints nothing.
+"""
+
+import inspect
+import math
+import os
+import re
+from collections.abc import Callable
+from enum import Enum
+from functools import wraps
+from inspect import Parameter
+from numbers import Integral, Real
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+import typer
+from typer.models import ArgumentInfo, ParameterInfo
+
+from twin.cli.options import Force, tell
+from twin.errors import OptionError
+from twin.progress import Progress, silent
+
+Made = TypeVar("Made")
+
+
+class App(typer.Typer):
+    """A group of commands."""
+
+    def command(  # type: ignore[override]
+        self, name: str, *, help: str | None = None, goes_on: bool = False, exit_code: Callable[[Any], int] = lambda made: 0
+    ) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
+        """Decorator of the function behind a command. It prints the result, and gives a command that writes files the option ``--force``.
+
+        Parameters
+        ----------
+        name : str
+            Name of the command.
+        help : str, optional
+            Help of the command; the docstring by default.
+        goes_on : bool
+            The same command continues interrupted work.
+        exit_code : callable
+            Exit code of the command for its result.
+        """
+
+        def register(work: Callable[..., Made]) -> Callable[..., Made]:
+            options = inspect.signature(work).parameters
+            forced = [Parameter("force", Parameter.KEYWORD_ONLY, default=False, annotation=Force)] if writes(options) else []
+            known = [*(each for each in options.values() if each.name != "progress"), *forced]
+
+            @wraps(work)
+            def command(*, force: bool = False, **given: Any) -> None:
+                from twin.store import overwriting
+
+                with overwriting(force):
+                    made = _done(work, given, progress=True, goes_on=goes_on)
+                    if made is not None:
+                        tell(made)
+                if code := exit_code(made):
+                    raise SystemExit(code)
+
+            command.__signature__ = inspect.Signature(known)  # type: ignore[attr-defined]
+            command.__annotations__ = {each.name: each.annotation for each in known}
+            super(App, self).command(name, help=help)(command)
+            return as_function(work, help or inspect.getdoc(work) or "")
+
+        return register
+
+
+def _done(work: Callable[..., Made], given: dict[str, Any], *, progress: Progress | bool | None, goes_on: bool = False) -> Made:
+    """Do the work, which reports to ``progress`` if it reports at all: True shows bars."""
+    if "progress" not in inspect.signature(work).parameters:
+        return work(**given)
+    if progress is not True:
+        return work(**given, progress=progress or silent)
+    from twin.cli.progress import shown
+
+    with shown(goes_on=goes_on) as bars:
+        return work(**given, progress=bars)
+
+
+def writes(options: Any) -> bool:
+    """Whether a command with these options writes files that may be there already."""
+    return "out" in options or "maps" in options
+
+
+def as_function(work: Callable[..., Made], help: str) -> Callable[..., Made]:
+    """The function of Python for the work of a command.
+
+    The command's arguments come first, the options are keyword arguments. ``force`` and ``progress`` (a ``Progress``, or True for bars) are
+    added where the command has them.
+    """
+    options = inspect.signature(work).parameters
+    marks = {
+        name: mark
+        for name, each in options.items()
+        for mark in getattr(each.annotation, "__metadata__", ())
+        if isinstance(mark, ParameterInfo)
+    }
+    kinds = {
+        name: Parameter.POSITIONAL_OR_KEYWORD if isinstance(mark, ArgumentInfo) else Parameter.KEYWORD_ONLY
+        for name, mark in marks.items()
+        if not mark.is_eager
+    }
+    public = [
+        options[name].replace(kind=kinds[name], annotation=_plain(options[name])) for name in sorted(kinds, key=lambda name: kinds[name])
+    ]
+    added = {"force": (writes(options), False, bool), "progress": ("progress" in options, None, Progress | bool | None)}
+    public += [Parameter(name, Parameter.KEYWORD_ONLY, default=d, annotation=kind) for name, (has, d, kind) in added.items() if has]
+    signature = inspect.Signature(public, return_annotation=inspect.signature(work).return_annotation)
+
+    @wraps(work)
+    def function(*arguments: Any, **given: Any) -> Made:
+        from twin.store import overwriting
+
+        bound = signature.bind(*arguments, **given).arguments
+        force, progress = bound.pop("force", False), bound.pop("progress", None)
+        try:
+            taken = {name: taken_as(name, _plain(options[name]), marks[name], value) for name, value in bound.items()}
+            with overwriting(force):
+                return _done(work, taken, progress=progress)
+        except typer.BadParameter as error:
+            raise OptionError(f"{error.param_hint or ''} {error.message}".strip()) from error
+
+    function.__signature__ = signature  # type: ignore[attr-defined]
+    function.__doc__ = docstring(help, public, marks)
+    return function
+
+
+def _plain(option: Parameter) -> Any:
+    """The type of an option without its help."""
+    return get_args(option.annotation)[0]
+
+
+def docstring(help: str, parameters: list[Parameter], marks: dict[str, ParameterInfo]) -> str:
+    """The help of a command as a docstring of Python: without its example, and with each parameter."""
+    text = re.split(r"^(?:\x08\n)?Examples?[^\n]*:[ \t]*\n", help, flags=re.MULTILINE)[0].replace("\b\n", "")
+    rows = [
+        f"{each.name} : {inspect.formatannotation(each.annotation)}\n    {marks[each.name].help if each.name in marks else ''}".rstrip()
+        for each in parameters
+    ]
+    return "\n".join([text.rstrip(), "", "Parameters", "----------", *rows, ""])
+
+
+def taken_as(name: str, kind: Any, mark: ParameterInfo, value: Any) -> Any:
+    """The value of an argument as the command line would hand it on.
+
+    Raises
+    ------
+    OptionError
+        It has another type, or is out of the option's range.
+    """
+    value = converted(name, kind, value)
+    if value is not None:
+        if mark.min is not None and value < mark.min or mark.max is not None and value > mark.max:
+            raise OptionError(f"`{name}={value}`: expected {' and '.join(_range(mark))}")
+        if mark.callback is not None:
+            try:
+                return mark.callback(value)
+            except typer.BadParameter as error:
+                raise OptionError(f"`{name}={value}`: {error.message}") from error
+    return value
+
+
+def _range(mark: ParameterInfo) -> list[str]:
+    return [f"{words} {limit}" for words, limit in (("at least", mark.min), ("at most", mark.max)) if limit is not None]
+
+
+def converted(name: str, kind: Any, value: Any) -> Any:
+    """The value as an instance of the type of an option.
+
+    A path may be a text, a list may be one value or any sequence, names with commas between may be a list, and a specification may stand
+    where the command line takes its name.
+
+    Raises
+    ------
+    OptionError
+        The value has another type.
+    """
+    parts = [part for part in get_args(kind) if part is not NoneType]
+    if NoneType in get_args(kind):
+        return None if value is None else converted(name, parts[0], value)
+    if get_origin(kind) is list:
+        many = isinstance(value, list | tuple | set | range)
+        return [converted(name, parts[0], each) for each in (value if many else [value])]
+    if get_origin(kind) is tuple:
+        if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != len(parts):
+            raise OptionError(f"`{name}`: expected {len(parts)} numbers, got {value!r}")
+        return tuple(converted(name, part, each) for part, each in zip(parts, value, strict=True))
+    if get_origin(kind) is Literal or isinstance(kind, type) and issubclass(kind, Enum):
+        allowed = parts or list(kind)
+        if value not in allowed:
+            raise OptionError(f"`{name}`: expected {' or '.join(map(str, allowed))}, got {value!r}")
+        return value if parts else kind(value)
+    if kind is Path and isinstance(value, str | os.PathLike):
+        return Path(value)
+    if kind is str and isinstance(value, list | tuple):
+        return ",".join(map(str, value))
+    if kind is str and isinstance(value, str | os.PathLike):
+        return os.fspath(value)
+    if kind is str and hasattr(value, "model_dump"):  # a specification in place of its name
+        return value
+    if kind is bool and value in (True, False):
+        return bool(value)
+    if kind is int and isinstance(value, Integral) and not isinstance(value, bool):
+        return int(value)
+    if kind is float and isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value):
+        return float(value)
+    raise OptionError(f"`{name}`: expected {NAMES[kind]}, got {value!r}")
+
+
+NAMES = {Path: "a path", str: "a name", bool: "True or False", int: "a whole number", float: "a number"}

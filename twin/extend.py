@@ -1,0 +1,60 @@
+"""What authors of new parts need: protocols and base classes of arms, cameras, models, tasks, degradations and detectors.
+
+arms          Arm ArmState BaseArm FEEDBACK_AGE_S MG400 Mg400Ports Mg400Emulator
+cameras       FrameSource LiveSource Picture ReadFailed capture
+devices       DeviceError Connection
+models        Estimate SensorModel Model PinModel Recipe register_model refuse_sizes
+tasks         Task
+degradations  Condition View over_channels
+detectors     Detector DetectorSpec
+sensors       PinsSpec
+mechanics     SkinSolver
+optics        Preview project rest_pins
+
+The pages below `docs/how-to` show how to add each of them. Each name is imported when it is first used.
+"""
+
+from typing import Any
+
+from twin.lazy import named
+
+_PLACES = {
+    "Arm": "hardware.arms.arm",
+    "ArmState": "hardware.arms.arm",
+    "BaseArm": "hardware.arms.arm",
+    "Condition": "twin.judge.degradation.condition",
+    "Connection": "hardware.errors",
+    "Detector": "twin.pins.detector",
+    "DetectorSpec": "twin.pins.detector_spec",
+    "DeviceError": "hardware.errors",
+    "Estimate": "twin.estimate",
+    "FEEDBACK_AGE_S": "hardware.arms.arm",
+    "FrameSource": "hardware.cameras.source",
+    "LiveSource": "hardware.cameras.reader",
+    "MG400": "hardware.arms.mg400",
+    "Mg400Emulator": "hardware.emulators.mg400",
+    "Mg400Ports": "hardware.arms.mg400",
+    "Model": "training.models.part",
+    "Picture": "hardware.cameras.reader",
+    "PinModel": "training.models.part",
+    "PinsSpec": "scenes.pins",
+    "Preview": "twin.optics.preview",
+    "ReadFailed": "hardware.cameras.reader",
+    "Recipe": "training.recipes",
+    "SensorModel": "twin.estimate",
+    "SkinSolver": "twin.mechanics",
+    "Task": "training.environments.tasks",
+    "View": "twin.judge.degradation.condition",
+    "capture": "hardware.cameras.reader",
+    "over_channels": "twin.judge.degradation.condition",
+    "project": "twin.camera.projection",
+    "refuse_sizes": "training.models.part",
+    "register_model": "training.models:register",
+    "rest_pins": "twin.geometry.pins",
+}
+"""By public name: its module, and its name there if that is another."""
+__all__ = sorted(_PLACES)
+
+
+def __getattr__(name: str) -> Any:
+    return named(_PLACES, "twin.extend", name)

@@ -121,8 +121,10 @@ class ContactEstimator:
         best = max(self.parts.values(), key=lambda part: part.usual_share(nodes_px))
         found, other = best.told_rest(nodes_px)
         rest = found.pipeline.reference if other else None
-        best.require_view_of_contacts(nodes_px, rest, "these contacts")
+        undecided = best.require_view_of_contacts(nodes_px, rest, "these contacts")
         parts = {name: part.at_known_rest() if rest is None else part.counted_from(rest) for name, part in self.parts.items()}
+        for part in parts.values():
+            part._undecided = undecided
         return self._with(parts), other
 
     def _with(self, parts: dict[str, PoseEstimator]) -> "ContactEstimator":
@@ -147,14 +149,13 @@ class ContactEstimator:
         if isinstance(seen, Unseen):
             return self._any.unseen(seen, started)
         kind = str(self.contacts.likeliest(seen.pins, tuple(self.parts))[0])
-        if self.parts[kind].domain is None and not str(self.contacts.tell(seen.pins)[0]):
-            return self._any.unseen(Unseen(f"no contact that the weights know ({', '.join(self.parts)})", seen.touched), started)
         return self.parts[kind].estimate_one(seen, started, kind)
 
     def taken_for(self, pins: PinTable) -> dict[str, float]:
-        """Shares of a table's valid frames that are classified as each kind, and as "none"."""
-        told = self.contacts.tell(pins)
-        return {name or "none": float(np.mean(told == name)) for name in (*self.parts, "")}
+        """Shares of a table's valid frames that are classified as each kind, and as "none": those that the kind's model refuses."""
+        kinds = self.contacts.likeliest(pins, tuple(self.parts))
+        known = np.array([self.parts[str(kind)].knows(pins, row) for row, kind in enumerate(kinds)])
+        return {name: float(np.mean(known & (kinds == name))) for name in self.parts} | {"none": float(np.mean(~known))}
 
     def for_labels(self, recording: Recording) -> list[str]:
         """The kinds whose labels all vary in a recording; of these, the kinds with the most labels.

@@ -73,7 +73,7 @@ NEIGHBOURS = 10
 """Number of nearest known frames between which the rate of a label is measured."""
 SURE_RATE = 0.9
 """Share of pairs of neighbouring frames whose labels differ by at most the rate."""
-REFUSED = np.array([2.0, 2.0, 2.0, 1.1])
+REFUSED = np.array([2.0, 2.0, 2.0, 1.0])
 """Distances outside, misfit, beyond and halves, in limits, above which a frame gets no estimate. Between 1 and this the intervals grow."""
 GROWS = 2.0
 """Growth of the intervals for each limit of distance beyond the first."""
@@ -192,6 +192,8 @@ class Domain:
         Usual rms difference of a frame from its nearest known one.
     blind : float
         Usual rms of what is not known of lost pins.
+    simulated : bool
+        Whether all training frames with labels are simulated.
     """
 
     motions: np.ndarray
@@ -210,6 +212,7 @@ class Domain:
     lighter: int
     near: float
     blind: float
+    simulated: bool = False
     _project: np.ndarray = field(init=False, repr=False, compare=False)
     _modes: np.ndarray = field(init=False, repr=False, compare=False)
     _halves: np.ndarray = field(init=False, repr=False, compare=False)
@@ -456,9 +459,10 @@ def learn_domain(
     least: np.ndarray,
     lost: np.ndarray | None = None,
     group: np.ndarray | None = None,
+    simulated: bool = False,
     seed: int = 0,
 ) -> Domain | None:
-    """Learn the domain from a model's training frames; None for fewer than ``FEWEST`` frames with labels.
+    """Learn the domain from a model's training frames; None for fewer than ``FEWEST`` frames with labels, or fewer than 6 groups of them.
 
     Parameters
     ----------
@@ -476,13 +480,15 @@ def learn_domain(
         Pins that were not found.
     group : (M,) array, optional
         Frames with the same value are left out of a fit together.
+    simulated : bool
+        See ``Domain``.
     """
     labelled = np.isfinite(labels).all(axis=1)
-    if labelled.sum() < FEWEST:
+    names, of_row = np.unique(np.arange(len(moved)) if group is None else group, return_inverse=True)
+    if labelled.sum() < FEWEST or len(np.unique(of_row.ravel()[labelled])) <= FOLDS:
         return None
     rng = np.random.default_rng([seed, 7])
     flat = moved.reshape(len(moved), -1)
-    names, of_row = np.unique(np.arange(len(flat)) if group is None else group, return_inverse=True)
     part = rng.permutation(np.arange(len(names)) % FOLDS)[of_row.ravel()]
     motions = _motions(reference)
     measures = np.full((len(flat), 9), np.nan)
@@ -507,6 +513,7 @@ def learn_domain(
         low=low,
         high=high,
         blind=float(np.quantile(blind, USUAL_DISTANCE)),
+        simulated=simulated,
     )
 
 
@@ -594,7 +601,7 @@ def _rates(found: Domain, flat: np.ndarray, labels: np.ndarray, units: Sequence[
 def write_domain(path: Path, domain: Domain) -> None:
     """Write a domain in the form that ``read_domain`` reads; components and known frames in half precision."""
     arrays = {each.name: getattr(domain, each.name) for each in fields(Domain) if each.init}
-    about = {name: arrays.pop(name) for name in ("lighter", "near", "blind")}
+    about = {name: arrays.pop(name) for name in ("lighter", "near", "blind", "simulated")}
     half = ("components", "known", "weight", "whiten")
     FILE.write(path, {key: array.astype(np.float16 if key in half else np.float32) for key, array in arrays.items()}, about)
 
@@ -613,6 +620,7 @@ def read_domain(path: Path, pins: int, labels: int) -> Domain:
             lighter=int(about["lighter"]),
             near=float(about["near"]),
             blind=float(about["blind"]),
+            simulated=bool(about.get("simulated", False)),
         )
         if found.mean.shape != (2 * pins,) or found.rate.shape != (labels,):
             raise ValueError("of other pins or labels")

@@ -47,6 +47,10 @@ factor of 1.2 or 1.6."""
 USUAL_FRAME = Verdict("")
 """Verdict on a frame about which nothing strange is known."""
 FEWEST_VIEWED = 8
+ASSUMED_RADIUS, ASSUMED_MM, ASSUMED_DEG = 0.1, 0.015, 1.0
+"""Half widths for what a specification only assumes: share of a length, because all lengths are proportional to the radius; share of the
+radius; and angle. Simulated taps on a plate with a skin thinner by 0.3 or thicker by 0.4 mm, or a gel 2.5 times softer or stiffer, come out
+0.11 to 0.21 mm and 0.1 to 0.35 deg off (radius 20 mm)."""
 MOST_USUAL = 0.6
 """Least share of contacts that must be usual but for a motion of the camera, for this motion to be estimated from them."""
 """Least number of contacts whose median pins show the camera's view."""
@@ -218,22 +222,30 @@ class PoseEstimator:
         known = self._known_rest_px
         return self._trained.reference if known is None else make_reference(known, self.sensor.pins)
 
-    def require_view_of_contacts(self, nodes_px: np.ndarray, rest: Reference | None, name: str) -> None:
-        """As ``require_view``, from the pins (M, N, 2) of contacts, and from the places at ``rest`` that were estimated from them."""
+    def require_view_of_contacts(self, nodes_px: np.ndarray, rest: Reference | None, name: str) -> str:
+        """As ``require_view``, from the pins (M, N, 2) of contacts, and from the places at ``rest`` that were estimated from them.
+
+        Returns
+        -------
+        str
+            What these places do not decide about the view; "" if nothing.
+        """
         if len(nodes_px) >= FEWEST_VIEWED:
             self.require_view(np.median(nodes_px, axis=0), name, contacts=True)
-            motions, usual = self._common_camera(self._known_rest, nodes_px)
-            if rest is None and motions.any() and usual < MOST_USUAL:
+            motions, usual = self._common_camera(rest or self._known_rest, nodes_px)
+            if usual < MOST_USUAL and (rest is not None or motions.any()):
                 raise FrameError(
                     f"{name}: {1 - usual:.0%} of them are no contacts that the weights of {self.sensor.name} know, and the camera is "
                     "displaced: its picture may be turned, mirrored or stretched; give a frame without contact (init_0.png beside the "
                     "frames, --no-contact FRAME)"
                 )
-        if rest is not None and self.require_view(rest.pins_px, name).pressed:
+        view = None if rest is None else self.require_view(rest.pins_px, name)
+        if view is not None and view.pressed:
             raise FrameError(
                 f"{name}: no pins at rest of {self.sensor.name} explain them: the camera's picture may be turned or mirrored, or they are "
                 "of a kind that the weights do not know; give a frame without contact (init_0.png beside the frames, --no-contact FRAME)"
             )
+        return "" if view is None else view.undecided()
 
     def require_view(self, pins_px: np.ndarray, name: str, *, contacts: bool = False) -> View:
         """The camera's view of pins at rest (N, 2), or of the median of ``contacts``, against the unit of the weights.
@@ -316,7 +328,7 @@ class PoseEstimator:
         """
         nodes_px = self.at_known_rest().nodes_in(frames)
         found, other = self.told_rest(nodes_px)
-        self.require_view_of_contacts(nodes_px, found.pipeline.reference if other else None, "these contacts")
+        found._undecided = self.require_view_of_contacts(nodes_px, found.pipeline.reference if other else None, "these contacts")
         return found, other
 
     def nodes_in(self, frames: Iterable[Frame]) -> np.ndarray:
@@ -399,6 +411,13 @@ class PoseEstimator:
                 f"no frame without contact shows where the camera sits: all intervals are {self._unmeasured:g} times wider; give one "
                 "(--no-contact, --at-rest)"
             )
+        if self._assumes:
+            mm = ASSUMED_MM * self.sensor.skin.outer_radius_mm
+            found.append(
+                "the model was trained on simulated contacts of a sensor whose contacts were never calibrated: radius, skin and gel are "
+                f"assumed; for that the intervals hold {ASSUMED_RADIUS:.0%} of each length, {mm:.2g} mm and {ASSUMED_DEG:g} deg; "
+                "'twin calibrate contact' with labelled contacts knows it better"
+            )
         if self._force.any() and self._stiffness > 1:
             skin, gel = self.sensor.skin.young_modulus_mpa, self.sensor.gel.young_modulus_mpa
             found.append(
@@ -411,6 +430,17 @@ class PoseEstimator:
     def label_range(self) -> np.ndarray:
         """Extent (K,) of the labels that the model was trained on; infinite if the run holds no domain."""
         return np.full(len(self.units), np.inf) if self.domain is None else self.domain.high - self.domain.low
+
+    @property
+    def _assumes(self) -> bool:
+        """Whether the model was trained on simulated contacts of a sensor whose contacts were never calibrated."""
+        return self.domain is not None and self.domain.simulated and self.sensor.rig is None
+
+    def _assumed(self, value: np.ndarray) -> np.ndarray:
+        """Half widths (K,) that are due to what is only assumed of the sensor, for estimates (K,)."""
+        length = np.array([unit == "mm" for unit in self.units[: len(value)]])
+        lengths = ASSUMED_MM * self.sensor.skin.outer_radius_mm + ASSUMED_RADIUS * np.abs(value)
+        return float(self._assumes) * np.where(length, lengths, np.where(self._force, 0.0, ASSUMED_DEG))
 
     @property
     def _unmeasured(self) -> float:
@@ -435,7 +465,7 @@ class PoseEstimator:
         lost = 1.0 + LOST_WIDENS * lost_share if lost_share > LOST_USUAL else 1.0
         if verdict.notes and self.domain is not None:
             half = np.maximum(half, self.domain.least) * verdict.factor + verdict.added
-        half = half * lost * self._unmeasured + excess
+        half = half * lost * self._unmeasured + excess + self._assumed(value)
         more, less = value * (self._stiffness - 1), value * (1 / self._stiffness - 1)
         low = value - half + np.where(self._force, np.minimum(more, less), 0.0)
         high = value + half + np.where(self._force, np.maximum(more, less), 0.0)
@@ -539,6 +569,11 @@ class PoseEstimator:
             seen = replace(seen, pins=replace(pins, nodes_px=places[0][None], area_px2=places[1][None]))
         slip = None if self._tracker is None else self._tracker(self.modes_of(seen.pins)[0])
         return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip, seen.lost_share, verdict)
+
+    def knows(self, pins: PinTable, row: int) -> bool:
+        """Whether the pins of a table's row are a pattern that the model was trained on."""
+        known = pins.rows(np.array([row])).seen_from(self._trained.reference)
+        return not self._verdict(known.nodes_px[0], known.lost[0]).reason
 
     def _verdict(self, nodes_px: np.ndarray, lost: np.ndarray) -> Verdict:
         """Whether pins (N, 2), as seen by the camera of the training, some of them ``lost`` (N,), are a pattern that was trained on."""

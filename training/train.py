@@ -197,7 +197,10 @@ def add_domain(run: Path, config: RunConfig, data: Dataset) -> None:
     apart = np.array([touched(nodes_px, lost) < LIKELY for nodes_px, lost in zip(pins.nodes_px, pins.lost, strict=True)])
     labels = np.where(apart[:, None], np.nan, labels)  # a state before first touch has a label, but no pattern of its own
     group = None if data.group is None else data.group[rows]
-    known = learn_domain(moved, labels, pins.reference, targets.units, least=least, lost=pins.lost, group=group, seed=config.seed)
+    simulated = not config.labelled and all(is_simulated(folder) for folder in data.folders)
+    known = learn_domain(
+        moved, labels, pins.reference, targets.units, least=least, lost=pins.lost, group=group, simulated=simulated, seed=config.seed
+    )
     if known is not None:
         write_domain(run / DOMAIN, known)
 

@@ -128,6 +128,7 @@ def collect(
     design: str = ...,
     plain_light: bool = ...,
     also: str | Sequence[str] | None = ...,
+    dry_run: bool = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
 ) -> Collected: ...
@@ -281,6 +282,7 @@ def run_policy(
     known_place: bool = ...,
     plain_light: bool = ...,
     also: str | Sequence[str] | None = ...,
+    dry_run: bool = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
 ) -> Followed: ...
@@ -303,6 +305,7 @@ def servo(
     plain_light: bool = ...,
     at_rest: str = ...,
     also: str | Sequence[str] | None = ...,
+    dry_run: bool = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
 ) -> Followed: ...

@@ -221,7 +221,7 @@ def test_every_command_option_and_argument_that_a_text_names_exists(package):
 def test_a_name_that_is_not_known_names_commands_that_exist(load, name):
     with pytest.raises(SpecError) as error:
         load(name)
-    assert not wrong_hints(str(error.value)) and ("lists them" in str(error.value) or "known: surface" in str(error.value))
+    assert not wrong_hints(str(error.value)) and ("lists them" in str(error.value) or "known: magician, surface" in str(error.value))
 
 
 def test_what_could_not_be_let_go_of_is_printed_after_ctrl_c(monkeypatch, tmp_path):

@@ -11,7 +11,7 @@ from drawn_frames import drawn_frame
 from drawn_recording import config_of
 
 from training.contact_estimator import ContactEstimator, KindOfContact, contacts_folder, put_together
-from training.contacts import CONTACTS, Kind, fit_contacts, groups_of, moved_of, read_contacts, write_contacts
+from training.contacts import CONTACTS, fit_contacts, read_contacts, write_contacts
 from training.dataset import joined
 from training.estimator import PoseEstimator
 from training.evaluate import intervals_on, judge
@@ -20,6 +20,7 @@ from training.recipes import TrainingError
 from training.run import train_run
 from training.studies.sim_to_real.steps import widen_intervals
 from training.targets import Targets
+from training.train import add_domain
 from twin.camera.capture import record
 from twin.frames import open_recording
 from twin.frames.forms import recording_to_raw
@@ -53,49 +54,14 @@ def contacts(data):
 
 @pytest.mark.parametrize("kind", ["bump", "ridge"])
 def test_frames_are_taken_for_what_they_show(data, contacts, kind):
-    told = contacts.tell(drawn_kind(data, kind, 200, 7).pins)
-    assert (told == kind).mean() > 0.95
-
-
-def test_what_no_kind_shows_is_none_of_them(data, contacts):
-    seen = drawn_kind(data, "bump", 50, 8)
-    rest = seen.pins.reference.pins_px
-    rng = np.random.default_rng(0)
-    for nodes in (
-        rest - 1.5 * (seen.pins.nodes_px - rest),  # pulled instead of pressed
-        seen.pins.nodes_px + rng.normal(0, 1.0, seen.pins.nodes_px.shape),  # pins that do not move together
-    ):
-        assert (contacts.tell(replace(seen.pins, nodes_px=nodes)) == "").mean() > 0.95
-
-
-def test_limits_are_from_contacts_none_of_whose_states_was_fitted(data):
-    """States of one contact are alike. Were they divided, its own other states would say how strange an unseen one may be."""
-    seen = drawn_kind(data, "bump", 200, 3)
-    moved = np.repeat(moved_of(seen.pins), 4, axis=0)
-    alike = moved + np.random.default_rng(4).normal(0, 1e-3, moved.shape)
-    together, apart = (Kind.fit(alike, 0, group).limits for group in (np.repeat(np.arange(200), 4), None))
-    assert (together > apart).all()
-
-
-def test_groups_of_several_sets_stay_apart(data):
-    first, second = replace(data.rows(np.arange(4)), group=np.array([5, 5, 9, 9])), data.rows(np.arange(3))
-    assert groups_of([first, second]).tolist() == [0, 0, 1, 1, 2, 3, 4]
-    assert groups_of([second, second]) is None
-
-
-def test_too_few_pins_or_ways_of_moving_make_no_kind():
-    rng = np.random.default_rng(0)
-    with pytest.raises(TrainingError, match="5 pins are too few"):
-        Kind.fit(rng.normal(size=(FRAMES, 5, 2)), 0)
-    with pytest.raises(TrainingError, match="differ in 2 ways"):
-        Kind.fit((rng.normal(size=(FRAMES, 2)) @ rng.normal(size=(2, 60))).reshape(FRAMES, 30, 2), 0)
+    assert (contacts.likeliest(drawn_kind(data, kind, 200, 7).pins, ("bump", "ridge")) == kind).mean() > 0.95
 
 
 def test_kinds_are_the_same_when_read_again(data, contacts, tmp_path):
     write_contacts(tmp_path / CONTACTS, contacts)
     again, pins = read_contacts(tmp_path / CONTACTS), drawn_kind(data, "ridge", 100, 9).pins
-    assert list(again.kinds) == ["bump", "ridge"]
-    assert (again.tell(pins) == contacts.tell(pins)).mean() > 0.97  # half precision
+    assert again.kinds == ("bump", "ridge")
+    assert (again.likeliest(pins, again.kinds) == contacts.likeliest(pins, again.kinds)).mean() > 0.97  # half precision
     (tmp_path / "cut").write_bytes((tmp_path / CONTACTS).read_bytes()[:200])
     with pytest.raises(TrainingError, match="no file of kinds of contact"):
         read_contacts(tmp_path / "cut")
@@ -103,15 +69,15 @@ def test_kinds_are_the_same_when_read_again(data, contacts, tmp_path):
 
 def test_too_little_to_learn_kinds_from_is_refused(data):
     few = drawn_kind(data, "bump", 60, 0)
-    with pytest.raises(TrainingError, match="60 frames are too few to know a kind"):
-        fit_contacts({"bump": [few], "ridge": [drawn_kind(data, "ridge", FRAMES, 0)]}, seed=0)
     with pytest.raises(TrainingError, match="at least two"):
         fit_contacts({"bump": [few]}, seed=0)
 
 
 def runs_of(folder, kinds):
     for name, kind in kinds.items():
-        train_run(config_of("vgnn", epochs=3, batch=128, members=1, kernel=False), kind, folder / name)
+        config = config_of("vgnn", epochs=3, batch=128, members=1, kernel=False)
+        train_run(config, kind, folder / name)
+        add_domain(folder / name, config, kind)
     return {name: folder / name for name in kinds}
 
 
@@ -134,9 +100,9 @@ def test_several_models_are_one_that_says_the_kind(data, models):
     assert shares["ridge"] > 0.9 and sum(shares.values()) == pytest.approx(1.0)
     spec, rest = data.pins.sensor, data.pins.reference.pins_px
     made = models(drawn_frame(spec, Form.PROCESSED, shown.pins.nodes_px[0]))
-    assert made.valid and made.contact == "ridge" and np.isfinite(made.value).all()
+    assert made.contact == "ridge" and (made.valid or made.reason.startswith("outside the trained range"))  # after three epochs
     still = models(drawn_frame(spec, Form.PROCESSED, rest - 2.0 * (shown.pins.nodes_px[1] - rest)))
-    assert not still.valid and still.contact == "" and "no contact that the weights know (bump, ridge)" in still.reason
+    assert not still.valid and still.contact == "" and still.reason.startswith("not a contact that the model knows")
 
 
 def test_a_raw_frame_is_recorded_before_its_kind_is_told(data, models):

@@ -1,12 +1,15 @@
 """The domain of a model, on made-up contacts whose displacements follow from three numbers."""
 
+from copy import copy
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import pytest
 
 from scenes import load_sensor
-from training.domain import FEWEST, learn_domain, read_domain, write_domain
+from training.domain import FEWEST, Verdict, learn_domain, read_domain, write_domain
+from training.estimator import PoseEstimator
 from training.recipes import TrainingError
 from twin.pins import nominal_reference
 from twin.types import Form
@@ -91,10 +94,11 @@ def test_the_cameras_place_follows_from_contacts_of_which_most_are_known():
 
 def test_intervals_grow_with_the_distance_and_never_shrink_until_there_is_no_estimate():
     straight, strange = contacts(1, 5)[0][0], np.random.default_rng(6).normal(size=(len(PLACES), 2))
-    verdicts = [judged(straight + size * strange) for size in np.linspace(0, 0.2, 41)]
+    loose = replace(domain(), limits=domain().limits * [1, 1, 1, 9, 1, 1, 1, 1])  # the halves alone would refuse before
+    verdicts = [loose.judge(straight + size * strange, NONE_LOST, REFERENCE) for size in np.linspace(0, 0.2, 41)]
     first = next(k for k, each in enumerate(verdicts) if each.reason)
     factors = [each.factor for each in verdicts[:first]]
-    assert factors == sorted(factors) and factors[-1] > 1.05 and all(each.reason for each in verdicts[first:])
+    assert factors == sorted(factors) and factors[-1] > 1.2 and all(each.reason for each in verdicts[first:])
 
 
 def test_lighter_contacts_are_no_strangers_and_their_intervals_reach_no_contact():
@@ -133,3 +137,12 @@ def test_a_written_domain_judges_alike_and_one_of_other_pins_is_refused(tmp_path
 def test_too_few_frames_make_no_domain():
     moved, labels = contacts(FEWEST - 1, 11)
     assert learn_domain(moved, labels, REFERENCE, UNITS, least=np.ones(2)) is None
+
+
+def test_a_model_of_a_sensor_that_was_never_calibrated_says_what_is_assumed():
+    calibrated = PoseEstimator.load("mg400-127")
+    assumed = copy(calibrated)
+    assumed.sensor, assumed.domain = calibrated.sensor.model_copy(update={"rig": None}), replace(calibrated.domain, simulated=True)
+    low, high, _ = assumed._widened(np.array([-3.0, 20.0]), np.array([0.1, 2.0]), 0.0, Verdict(""), np.zeros(2))
+    assert high - low == pytest.approx([2 * (0.1 + 0.015 * 20 + 0.1 * 3), 2 * (2.0 + 1.0)])
+    assert any("never calibrated" in line for line in assumed.caveats) and not any("never" in line for line in calibrated.caveats)

@@ -42,7 +42,7 @@ from twin.types import FIRST, NONE
 
 if TYPE_CHECKING:
     from hardware.collect import Collected
-    from hardware.following import DryRunDone, Followed
+    from hardware.following import Followed
     from hardware.live import Watched
     from twin.estimate import SensorModel
 
@@ -183,7 +183,7 @@ def collect(
         return collect_frames(plan, out, progress=progress)
 
 
-def ended_early(followed: "Followed | DryRunDone") -> int:
+def ended_early(followed: "Followed") -> int:
     """Exit code of a command that follows an outline."""
     return 1 if followed.failure else 0
 
@@ -245,7 +245,7 @@ def servo(
     dry_run: DryRun = False,
     *,
     progress: Progress,
-) -> "Followed | DryRunDone":
+) -> "Followed":
     from hardware.following import follow
     from training.estimator import load_remembering
 
@@ -274,7 +274,7 @@ def servo(
 
 
 def run_along(
-    follow: "Callable[..., Followed | DryRunDone]",
+    follow: "Callable[..., Any]",
     load: "Callable[[Path], SensorModel]",
     run: Path,
     out: Path,
@@ -285,7 +285,7 @@ def run_along(
     also: list[AlsoFormat] | None,
     progress: Progress,
     **options: Any,
-) -> "Followed | DryRunDone":
+) -> "Followed":
     """Follow an object's outline with a model or policy, from a command's options to the result.
 
     Parameters
@@ -342,7 +342,7 @@ def run_policy(
     dry_run: DryRun = False,
     *,
     progress: Progress,
-) -> "Followed | DryRunDone":
+) -> "Followed":
     from hardware.following import follow
     from hardware.policy_law import load_for_outlines
 

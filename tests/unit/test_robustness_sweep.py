@@ -200,7 +200,7 @@ def test_two_processes_find_what_one_does(spec, frames, tmp_path):
     assert rows[0] == rows[1]
 
 
-def levels_of_light():
+def levels_of_light(source):
     """A model in a sweep's hands: says how bright the frame is."""
     return {"meter": measured_light}
 

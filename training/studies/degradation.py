@@ -13,6 +13,7 @@ from twin.camera.capture import record
 from twin.judge.degradation.envelope import Envelope
 from twin.judge.degradation.plan import SweepPlan
 from twin.judge.degradation.report import REPORT_FILES
+from twin.judge.degradation.shots import RealSource, RenderedSource
 from twin.judge.degradation.study import check_pipelines, real_study, rendered_study
 from twin.judge.degradation.sweep import Answer
 from twin.progress import Progress, silent
@@ -95,9 +96,14 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     return Result(*real_study(plan.sensor, plan.frames, plan.limit, pipelines, cases, severities, out, beside=plan.rendered, **options))
 
 
-def load_models(runs: tuple[Path, ...], sensor: SensorSpec) -> dict[str, Callable[[Frame], Answer]]:
-    """Models by name, as a sweep calls them. If a model was trained on recordings, raw frames are converted to that form first."""
-    return {each.name: partial(_estimates, _checked(each, sensor), sensor.recording) for each in runs}
+def load_models(
+    runs: tuple[Path, ...], sensor: SensorSpec, source: RenderedSource | RealSource | None = None
+) -> dict[str, Callable[[Frame], Answer]]:
+    """Models by name, as a sweep calls them. If a model was trained on recordings, raw frames are converted to that form first.
+
+    Models that use a frame without contact take that of the ``source``; without one, its contacts tell the pins at rest.
+    """
+    return {each.name: partial(_estimates, _at_rest(_checked(each, sensor), source), sensor.recording) for each in runs}
 
 
 def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
@@ -106,8 +112,21 @@ def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
     return estimator
 
 
-def _estimates(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Answer:
+def _at_rest(estimator: PoseEstimator, source: RenderedSource | RealSource | None) -> PoseEstimator:
+    if source is None or not estimator.counts_from_rest:
+        return estimator
+    if source.rest_frame is not None:
+        return estimator.at_rest(_as_trained(estimator, source.spec.recording, source.rest_frame))
+    assert isinstance(source, RealSource)
+    return estimator.at_rest_of(_as_trained(estimator, source.spec.recording, frame) for frame in source.frames)[0]
+
+
+def _as_trained(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Frame:
     if frame.form == Form.RAW and estimator.form == Form.PROCESSED and recording is not None:
-        frame = replace(frame, image=record(frame.image, recording), form=Form.PROCESSED)
-    found = estimator(frame)
+        return replace(frame, image=record(frame.image, recording), form=Form.PROCESSED)
+    return frame
+
+
+def _estimates(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Answer:
+    found = estimator(_as_trained(estimator, recording, frame))
     return Answer(found.value, found.low, found.high, found.units, estimator.label_range, found.valid)

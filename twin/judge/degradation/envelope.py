@@ -201,9 +201,11 @@ def _poses_against_nominal(rows: list[dict]) -> list[dict]:
 
     The error is the mean absolute difference of lengths and angles from those of the undegraded frame. A valid pose is confidently wrong if
     one of them differs by more than the interval and its width together, and no interval is wider than ``WIDEST`` of the trained range.
-    Frames without contact have no pose, so both are NaN.
+    Frames without contact have no pose, so all are NaN. A
+    frame whose undegraded contact the model does not know counts for nothing, unless it knows none.
     """
     nominal = {(r["case"], r["pipeline"], r["frame"]): r["pose"] for r in rows if "pose" in r and r["severity"] == 0}
+    known = {pipeline for (_, pipeline, _), first in nominal.items() if first["valid"] and first["touched"]}
     table = []
     for row in rows:
         if "pose" in row:
@@ -213,7 +215,8 @@ def _poses_against_nominal(rows: list[dict]) -> list[dict]:
             narrow = now["valid"] and bool((width <= WIDEST * np.array(now["range"])).all())
             far = bool((np.maximum(low - truth, truth - high) > width).any())
             wrong = float(narrow and far) if now["touched"] and first["valid"] else np.nan
-            row = row | {"pose_valid": float(now["valid"]), "pose_wrong": wrong}
+            counts = now["touched"] and (first["valid"] or row["pipeline"] not in known)
+            row = row | {"pose_valid": float(now["valid"]) if counts else np.nan, "pose_wrong": wrong}
             for unit in ("mm", "deg"):
                 of_unit = [c for c, u in zip(change, now["units"], strict=True) if u == unit and now["touched"]]
                 row[f"pose_{unit}"] = float(np.mean(of_unit)) if of_unit else np.nan

@@ -223,8 +223,9 @@ def _limits_section(page: Page, plan: Plan) -> None:
         sentence(
             "A pipeline fails where the mean over the frames of one of these crosses its limit. Graphs are compared with those that the "
             "same method makes of the true pins.",
-            "A pose's error is its change against the same model's answer for the frame that is not degraded; frames without contact have "
-            "no pose."
+            "A pose's error is its change against the same model's answer for the frame that is not degraded; frames without contact, and "
+            "contacts that the model does not know, do not count. A pose is confidently wrong if it lies farther outside its 90 % interval "
+            "than the interval is wide, and the interval is not wider than a third of the trained range."
             if plan.model_digests
             else "",
         ),

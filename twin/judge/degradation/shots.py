@@ -104,6 +104,11 @@ class RenderedSource:
         """Names of the frames."""
         return [contact.name for contact in self.contacts]
 
+    @property
+    def rest_frame(self) -> Frame:
+        """The frame without contact, not degraded."""
+        return replace(self, contacts=CONTACTS[:1]).shoot(Case(()), 0.0)[0].frame
+
     def shoot(self, case: Case, severity: float) -> list[DegradedShot]:
         """The frames degraded by a case. Contacts that cannot be solved are omitted."""
         spec = case.on_spec(self.spec, severity)
@@ -130,11 +135,14 @@ class RealSource:
     frames : tuple of Frame
     caps_px : (M, N, 2) float
         True places; NaN for pins on which the detectors do not agree.
+    rest_frame : Frame, optional
+        Frame without contact.
     """
 
     spec: SensorSpec
     frames: tuple[Frame, ...]
     caps_px: np.ndarray
+    rest_frame: Frame | None = None
 
     @property
     def form(self) -> Form:

@@ -89,6 +89,7 @@ def real_study(
     if left := [c.name for c in cases if c not in usable]:
         notes.append(f"left out, because they cannot be applied to frames that are already there: {', '.join(left)}")
     rendered = RenderedSource(spec, CONTACTS) if beside and recording.form == Form.RAW else None
+    source = replace(source, rest_frame=recording.reference)
     plan = Plan(source, detectors, usable, severities, models, model_digests or {})
     return study(plan, path.name, out, jobs=jobs, notes=notes, rendered=rendered, progress=progress)
 

@@ -45,8 +45,8 @@ class Answer:
     valid: bool
 
 
-Models = Callable[[], dict[str, Callable[[Frame], Answer]]]
-"""Function that returns models by their names; each process calls it once."""
+Models = Callable[[RenderedSource | RealSource], dict[str, Callable[[Frame], Answer]]]
+"""Function that returns models of a source's sensor by their names; each process calls it once."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def run_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, i
 def _begin(plan: Plan, folder: Path) -> Callable[[Cell], None]:
     """Function that computes and stores a cell."""
     cv2.setNumThreads(1)
-    return partial(_run, plan, folder, plan.models() if plan.models else {})
+    return partial(_run, plan, folder, plan.models(plan.source) if plan.models else {})
 
 
 def _run(plan: Plan, folder: Path, models: dict[str, Callable[[Frame], Answer]], cell: Cell) -> None:
@@ -182,4 +182,5 @@ def _inputs(plan: Plan) -> list[object]:
     shared = [source.spec, plan.detectors, plan.model_digests]
     if isinstance(source, RenderedSource):
         return [*shared, [[c.name, load_object(c.object_name), c.pose] for c in source.contacts]]
-    return [*shared, [[frame.name, frame.image] for frame in source.frames], source.caps_px]
+    rest = () if source.rest_frame is None or not plan.model_digests else (source.rest_frame.image,)
+    return [*shared, [[frame.name, frame.image] for frame in source.frames], source.caps_px, *rest]

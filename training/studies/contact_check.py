@@ -1,0 +1,56 @@
+"""Finding of ``twin check`` about the contacts in frames: whether a model knows them, by its domain."""
+
+from pathlib import Path
+
+from training.estimator import PoseEstimator
+from training.packed import shipped_names
+from twin.pins import Finding, Grade
+from twin.types import Frame
+
+MOST_STRANGE = 0.5
+"""Share of the frames with pins above which frames that the model refuses are bad."""
+
+
+def contact_finding(frames: list[Frame], sensor: str, run: Path | None = None) -> Finding | None:
+    """Count the frames that a model refuses, and name them with the model's reasons.
+
+    Parameters
+    ----------
+    frames : list of Frame
+        Frames of one form; those in which the pins are not found do not count.
+    sensor : str
+        Name of the sensor.
+    run : Path, optional
+        Folder of a run; the shipped weights of the sensor by default.
+
+    Returns
+    -------
+    Finding or None
+        None if there are no weights for this sensor and form, or they hold no domain.
+
+    Raises
+    ------
+    TrainingError
+        There is no such run.
+    FrameError
+        The run is of another sensor or form.
+    """
+    if run is None and sensor not in shipped_names():
+        return None
+    model = PoseEstimator.load(run or sensor)
+    if run is not None:
+        model.check(model.sensor.model_copy(update={"name": sensor}), frames[0].form)
+    if model.form != frames[0].form or model.domain is None:
+        return None
+    model, judged, strange = model.at_known_rest(), 0, []
+    for frame in frames:
+        made = model(frame)
+        if made.seen is not None and made.seen.valid:
+            judged += 1
+            strange += [] if made.valid else [f"{frame.name}: {made.reason}"]
+    share = len(strange) / max(judged, 1)
+    text = f"{judged - len(strange)} of {judged} frames with pins are contacts that the weights of {sensor} know"
+    if not strange:
+        return Finding("contacts", Grade.GOOD, share, text, "")
+    verdict = Grade.BAD if share > MOST_STRANGE else Grade.WATCH
+    return Finding("contacts", verdict, share, f"{text}; {'; '.join(strange[:3])}", "see the reasons; leave these frames out")

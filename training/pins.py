@@ -82,11 +82,10 @@ class PinTable:
     def seen_from(self, reference: Reference) -> "PinTable":
         """The table relative to another layout without contact: as its camera would see the displacements.
 
-        The displacements are turned and scaled by the similarity of the two layouts. Ratios of areas do not change.
+        The displacements are turned, scaled and stretched by the linear map of the two layouts. Ratios of areas do not change.
         """
-        own, other = ((rest.pins_px - rest.pins_px.mean(axis=0)) @ [1, 1j] for rest in (self.reference, reference))
-        moved = (self.nodes_px - self.reference.pins_px) @ [1, 1j] * (np.vdot(other, other) / np.vdot(other, own))
-        nodes_px = reference.pins_px + np.stack([moved.real, moved.imag], axis=-1)
+        own, other = (rest.pins_px - rest.pins_px.mean(axis=0) for rest in (self.reference, reference))
+        nodes_px = reference.pins_px + (self.nodes_px - self.reference.pins_px) @ np.linalg.lstsq(own, other, rcond=None)[0]
         area_px2 = reference.area_px2 * (self.area_px2 / self.reference.area_px2)
         return replace(self, reference=reference, nodes_px=nodes_px, area_px2=area_px2)
 

@@ -84,6 +84,8 @@ class PinTable:
 
         The displacements are turned, scaled and stretched by the linear map of the two layouts. Ratios of areas do not change.
         """
+        if np.array_equal(self.reference.pins_px, reference.pins_px):
+            return replace(self, reference=reference)
         own, other = (rest.pins_px - rest.pins_px.mean(axis=0) for rest in (self.reference, reference))
         nodes_px = reference.pins_px + (self.nodes_px - self.reference.pins_px) @ np.linalg.lstsq(own, other, rcond=None)[0]
         area_px2 = reference.area_px2 * (self.area_px2 / self.reference.area_px2)

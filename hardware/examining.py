@@ -1,6 +1,6 @@
 """Check of a sensor's condition from frames of a camera or of a recording."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -53,6 +53,7 @@ def examine_sensor(
     pushes: Sequence[str] = (),
     twist: Path | None = None,
     out: Path | None = None,
+    contacts: Callable[[list[Frame]], Finding | None] | None = None,
     progress: Progress = silent,
 ) -> Examination:
     """Examine at most ``limit`` frames of a camera or a recording.
@@ -68,6 +69,8 @@ def examine_sensor(
     no_contact, pushes, twist, out : optional
         As ``rest``, ``pushes``, ``twist`` and ``out`` of ``twin.fit.camera_view.register_files``: the camera's turn and mirror are found,
         and the frames are compared with the corrected copy of the specification.
+    contacts : callable, optional
+        Further finding about the frames, whether a model knows their contacts (``training.studies.contact_check``).
 
     Raises
     ------
@@ -92,7 +95,9 @@ def examine_sensor(
     seeing = sensor if detector is None else with_detector(sensor, detector)  # frames have the size for which the detector was tuned
     frames, notes = frames_of(source, seeing, form, limit)
     with stage(progress, "frames") as step:
-        return Examination(examine(frames, sensor, detector, progress=step), views + notes)
+        findings = examine(frames, sensor, detector, progress=step)
+    further = contacts(frames) if contacts else None
+    return Examination(findings + ([further] if further else []), views + notes)
 
 
 def frames_of(source: str, sensor: SensorSpec | None, form: Form | None, limit: int) -> tuple[list[Frame], list[str]]:

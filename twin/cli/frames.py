@@ -6,6 +6,7 @@
 - ``twin check``: whether the sensor is well.
 """
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -17,9 +18,11 @@ from twin.progress import Progress
 
 if TYPE_CHECKING:
     from hardware.examining import Examination
+    from twin.pins import Finding
     from twin.pins.batch import Preprocessed
     from twin.pins.graph_files import Graphs
     from twin.pins.tune_files import TunedOnFrames
+    from twin.types import Frame
 
 HELP_PREPROCESS = """Find the pins in every frame.
 
@@ -164,7 +167,8 @@ HELP_CHECK = """Check whether the sensor is well, and say what to do.
 It checks brightness, focus, missing pins, specks, glare, and drift from the calibration. It looks at a frame, a folder of frames, a
 video or a camera, with or without contact, and compares the frames with the one that the twin draws from the sensor's specification.
 Thresholded recordings show pins, specks and place only. A lost pin or a spot counts as a fault of the sensor if it is
-there in half of the frames, so give frames of several contacts.
+there in half of the frames, so give frames of several contacts. If there are weights of the sensor, frames whose contacts they do not know
+(torn, displaced, of no known kind) are named with the reason.
 
 The exit code is 3 if something is bad, else 0.
 
@@ -201,6 +205,9 @@ def check(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.toml", help="copy of the specification with the view of --push")
     ] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", metavar="RUN", help="run that must know the contacts; the sensor's shipped weights by default")
+    ] = None,
     *,
     progress: Progress,
 ) -> "Examination":
@@ -208,9 +215,18 @@ def check(
     from scenes import load_sensor
     from twin.pins import load_detector
 
+    asked = load_sensor(sensor)
+
+    def known_contacts(frames: "list[Frame]") -> "Finding | None":
+        if model is None and find_spec("torch") is None:
+            return None
+        from training.studies.contact_check import contact_finding
+
+        return contact_finding(frames, asked.name, model)
+
     return examine_sensor(
         source,
-        load_sensor(sensor),
+        asked,
         form=form,
         detector=if_given(load_detector, pipeline),
         limit=limit,
@@ -218,5 +234,6 @@ def check(
         pushes=push or (),
         twist=twist,
         out=out,
+        contacts=known_contacts if pipeline is None else None,
         progress=progress,
     )

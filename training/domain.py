@@ -79,7 +79,7 @@ GROWS = 2.0
 """Growth of the intervals for each limit of distance beyond the first."""
 CORRECTED = np.array([0.6, 0.6, np.radians(3.0), 0.05])
 """Largest motions of the camera that are removed from a frame: shift in spacings, turn, change of scale."""
-REMOVED = (1.2, 2.0)
+REMOVED = (1.0, 1.5)
 """Motions of the camera, in limits, from which on a part of them is removed, and from which on all."""
 IN_RANGE = 0.995
 """Quantile of the training labels that is taken as an end of their range. A few states of contacts lie far outside of an experiment."""

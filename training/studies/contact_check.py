@@ -1,9 +1,8 @@
 """Finding of ``twin check`` about the contacts in frames: whether a model knows them, by its domain."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
-from training.estimator import PoseEstimator
-from training.packed import shipped_names
 from twin.pins import Finding, Grade
 from twin.types import Frame
 
@@ -26,7 +25,7 @@ def contact_finding(frames: list[Frame], sensor: str, run: Path | None = None) -
     Returns
     -------
     Finding or None
-        None if there are no weights for this sensor and form, or they hold no domain.
+        None if there are no weights for this sensor and form, they hold no domain, or torch is not installed.
 
     Raises
     ------
@@ -35,6 +34,11 @@ def contact_finding(frames: list[Frame], sensor: str, run: Path | None = None) -
     FrameError
         The run is of another sensor or form.
     """
+    if run is None and find_spec("torch") is None:
+        return None
+    from training.estimator import PoseEstimator  # loads torch
+    from training.packed import shipped_names
+
     if run is None and sensor not in shipped_names():
         return None
     model = PoseEstimator.load(run or sensor)

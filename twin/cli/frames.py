@@ -6,7 +6,7 @@
 - ``twin check``: whether the sensor is well.
 """
 
-from importlib.util import find_spec
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,11 +18,9 @@ from twin.progress import Progress
 
 if TYPE_CHECKING:
     from hardware.examining import Examination
-    from twin.pins import Finding
     from twin.pins.batch import Preprocessed
     from twin.pins.graph_files import Graphs
     from twin.pins.tune_files import TunedOnFrames
-    from twin.types import Frame
 
 HELP_PREPROCESS = """Find the pins in every frame.
 
@@ -213,20 +211,12 @@ def check(
 ) -> "Examination":
     from hardware.examining import examine_sensor
     from scenes import load_sensor
+    from training.studies.contact_check import contact_finding
     from twin.pins import load_detector
-
-    asked = load_sensor(sensor)
-
-    def known_contacts(frames: "list[Frame]") -> "Finding | None":
-        if model is None and find_spec("torch") is None:
-            return None
-        from training.studies.contact_check import contact_finding
-
-        return contact_finding(frames, asked.name, model)
 
     return examine_sensor(
         source,
-        asked,
+        load_sensor(sensor),
         form=form,
         detector=if_given(load_detector, pipeline),
         limit=limit,
@@ -234,6 +224,6 @@ def check(
         pushes=push or (),
         twist=twist,
         out=out,
-        contacts=known_contacts if pipeline is None else None,
+        contacts=partial(contact_finding, run=model),
         progress=progress,
     )

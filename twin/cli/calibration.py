@@ -46,41 +46,8 @@ if TYPE_CHECKING:
     from twin.fit.go_on import WholeSensor
     from twin.fit.optics import OpticsCalibration
 
-HELP_NEW = """Make a specification of your own sensor from its frames.
 
-Give a folder of frames, a video or a recording, of any size, colour, gray or thresholded. Some should show contacts of different
-kinds, and one no contact. Nothing else need be known: the layout of the pins is identified, their places without contact found (in
-init_0.png or --no-contact, in a frame that shows no contact, or made from many contacts, and it says which), and mask, threshold and
-camera fitted. Where the layout is unsure, the two likeliest are named with what would decide; then give --layout.
-
-With --labels TABLE it goes on to the contact, as 'twin calibrate contact' does; with --optics to light and colours, as 'twin calibrate
-optics' does (raw frames). --table TABLE only names the frames and their order, and fits nothing. With --camera a live camera takes the
-place of the folder: it says when to press.
-
-\b
-Writes:
-  MY.toml             a short, commented specification: --sensor MY.toml
-  MY-new/index.html   what is known, what is assumed, what to do to know more;
-                      pictures of frames with their pins beside it
-  MY-contact/, MY-calibration/, MY-frames/   with --labels, --optics, --camera
-
-\b
---layout rings:10         331 pins in 10 rings
-         hexagon:6        127 pins in a hexagon
-         grid:9x7         9 columns, 7 rows
-         positions:F.csv  x,y of each pin from the sensor's axis, a line each,
-                          in any unit; y down as in the picture
-
-\b
-Example:
-  twin new recordings/mine --out mine.toml
-  twin new recordings/mine --labels recordings/mine/targets.csv \\
-      --out mine.toml
-  twin new --camera /dev/video0 --out mine.toml
-"""
-
-
-@app.command("new", help=HELP_NEW)
+@app.command("new")
 def new_sensor(
     out: Annotated[Path, typer.Option("--out", metavar="MY.toml", help="the specification to write")],
     frames: Annotated[Path | None, typer.Argument(help="folder of frames, video or recording")] = None,
@@ -102,6 +69,38 @@ def new_sensor(
     *,
     progress: Progress,
 ) -> "WholeSensor":
+    """Make a specification of your own sensor from its frames.
+
+    Give a folder of frames, a video or a recording, of any size, colour, gray or thresholded. Some should show contacts of different
+    kinds, and one no contact. Nothing else need be known: the layout of the pins is identified, their places without contact found (in
+    init_0.png or --no-contact, in a frame that shows no contact, or made from many contacts, and it says which), and mask, threshold and
+    camera fitted. Where the layout is unsure, the two likeliest are named with what would decide; then give --layout.
+
+    With --labels TABLE it goes on to the contact, as 'twin calibrate contact' does; with --optics to light and colours, as 'twin calibrate
+    optics' does (raw frames). --table TABLE only names the frames and their order, and fits nothing. With --camera a live camera takes the
+    place of the folder: it says when to press.
+
+    \b
+    Writes:
+      MY.toml             a short, commented specification: --sensor MY.toml
+      MY-new/index.html   what is known, what is assumed, what to do to know more;
+                          pictures of frames with their pins beside it
+      MY-contact/, MY-calibration/, MY-frames/   with --labels, --optics, --camera
+
+    \b
+    --layout rings:10         331 pins in 10 rings
+             hexagon:6        127 pins in a hexagon
+             grid:9x7         9 columns, 7 rows
+             positions:F.csv  x,y of each pin from the sensor's axis, a line each,
+                              in any unit; y down as in the picture
+
+    \b
+    Example:
+      twin new recordings/mine --out mine.toml
+      twin new recordings/mine --labels recordings/mine/targets.csv \\
+          --out mine.toml
+      twin new --camera /dev/video0 --out mine.toml
+    """
     from hardware.cameras.choose import open_camera
     from hardware.gather import gather_frames
     from scenes import load_experiment
@@ -136,33 +135,8 @@ calibrate_app = App(
 )
 app.add_typer(calibrate_app, name="calibrate")
 
-HELP_CALIBRATE_OPTICS = """Fit light, colours, sharpness and noise to raw frames.
 
-Start from your sensor's specification ('twin new'), or from the shipped one that is most like it. The frames may show any contact:
-their pins are found (a few may be lost), the skin is fitted to them, the twin renders the same state, and its parameters are moved
-until both agree, by differentiating the path tracer (LEDs, reflectances, haze) and by least squares (ring, reflections, specks, each
-cap's own reflectance and outline, blur, aperture, sharpening, colour fringes, compression, noise). What is left then is measured: a
-tile of light and colour that moves with each cap and the skin around it, and a background that stays in place. With
---no-contact one frame without contact fits the camera first.
-
-\b
-Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it its measured
-tables and pictures (SPEC.*.csv, SPEC.*.uri), and SPEC-calibration/ with
-index.html (before, after, what is left, changes) and the stages' results.
-
-An interrupted run continues where it ended.
-
-What frames cannot tell is kept at the starting values, and named: the response curve (gamma) and the product of LED power and
-exposure in any case; distance and focal length if all frames are without contact.
-
-\b
-Example:
-  twin calibrate optics --sensor ur5-331 --frames recordings/my-tactip \\
-      --out my-tactip.toml
-"""
-
-
-@calibrate_app.command("optics", help=HELP_CALIBRATE_OPTICS)
+@calibrate_app.command("optics")
 def calibrate_optics(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="folder of raw frames, in contact or not")],
@@ -175,41 +149,36 @@ def calibrate_optics(
     *,
     progress: Progress,
 ) -> "OpticsCalibration":
+    """Fit light, colours, sharpness and noise to raw frames.
+
+    Start from your sensor's specification ('twin new'), or from the shipped one that is most like it. The frames may show any contact:
+    their pins are found (a few may be lost), the skin is fitted to them, the twin renders the same state, and its parameters are moved
+    until both agree, by differentiating the path tracer (LEDs, reflectances, haze) and by least squares (ring, reflections, specks, each
+    cap's own reflectance and outline, blur, aperture, sharpening, colour fringes, compression, noise). What is left then is measured: a
+    tile of light and colour that moves with each cap and the skin around it, and a background that stays in place. With
+    --no-contact one frame without contact fits the camera first.
+
+    \b
+    Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it its measured
+    tables and pictures (SPEC.*.csv, SPEC.*.uri), and SPEC-calibration/ with
+    index.html (before, after, what is left, changes) and the stages' results.
+
+    An interrupted run continues where it ended.
+
+    What frames cannot tell is kept at the starting values, and named: the response curve (gamma) and the product of LED power and
+    exposure in any case; distance and focal length if all frames are without contact.
+
+    \b
+    Example:
+      twin calibrate optics --sensor ur5-331 --frames recordings/my-tactip \\
+          --out my-tactip.toml
+    """
     from twin.fit.optics import calibrate_optics
 
     return calibrate_optics(frames, sensor_with(sensor, pipeline), out, limit=limit, no_contact=no_contact, progress=progress)
 
 
-HELP_CALIBRATE_CONTACT = """Fit the contact to labelled frames of the real sensor.
-
-From the no-contact frame (init_0.png) and N labelled frames: contact offset, tool point, angle offset and sign, tilt of the
-surface, direction of the robot's axes in the image, friction, how far the arm gives way and turns, stiffness of the gel relative to
-the skin and how much its volume yields, thickness of the skin, length of the pins. Whether each frame's move had been executed
-when it was taken is found along with them. A frame that fits neither case gets a small weight. As many other frames, at most 20,
-are kept out of the fit, and the error is stated on them.
-
-Pins do not tell newtons. Where the table has a column of forces along the approach (N; Fz, or the one that rig.force_sensor names) with 3
-presses or more, weighed with a kitchen scale for example, the stiffness of skin and gel is scaled to them; other rows may be empty. It
-says how far forces may still be off (skin.stiffness_factor), or which stiffness is assumed.
-
-\b
-Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/
-with index.html (parameters with their uncertainty and what the frames tell of
-them, frames with their probabilities, before and after), calibration.json and
-contacts/. An interrupted run continues where it ended.
-
-\b
-It simulates about 50 + 60 N contacts. Each takes 1 to 3 s on one core;
---workers shares them among processes.
-
-\b
-Example:
-  twin calibrate contact --sensor mg400-331 --frames recordings/my-surface \\
-      --labels 20 --out my-tactip.toml
-"""
-
-
-@calibrate_app.command("contact", help=HELP_CALIBRATE_CONTACT, goes_on=True)
+@calibrate_app.command("contact", goes_on=True)
 def calibrate_contact(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording with its no-contact frame")],
@@ -232,6 +201,33 @@ def calibrate_contact(
     *,
     progress: Progress,
 ) -> "ContactCalibration":
+    """Fit the contact to labelled frames of the real sensor.
+
+    From the no-contact frame (init_0.png) and N labelled frames: contact offset, tool point, angle offset and sign, tilt of the
+    surface, direction of the robot's axes in the image, friction, how far the arm gives way and turns, stiffness of the gel relative to
+    the skin and how much its volume yields, thickness of the skin, length of the pins. Whether each frame's move had been executed
+    when it was taken is found along with them. A frame that fits neither case gets a small weight. As many other frames, at most 20,
+    are kept out of the fit, and the error is stated on them.
+
+    Pins do not tell newtons. Where the table has a column of forces along the approach (N; Fz, or the one that rig.force_sensor names)
+    with 3 presses or more, weighed with a kitchen scale for example, the stiffness of skin and gel is scaled to them; other rows may be
+    empty. It says how far forces may still be off (skin.stiffness_factor), or which stiffness is assumed.
+
+    \b
+    Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/
+    with index.html (parameters with their uncertainty and what the frames tell of
+    them, frames with their probabilities, before and after), calibration.json and
+    contacts/. An interrupted run continues where it ended.
+
+    \b
+    It simulates about 50 + 60 N contacts. Each takes 1 to 3 s on one core;
+    --workers shares them among processes.
+
+    \b
+    Example:
+      twin calibrate contact --sensor mg400-331 --frames recordings/my-surface \\
+          --labels 20 --out my-tactip.toml
+    """
     from scenes import load_experiment, load_object
     from twin.fit.contact.calibrate import calibrate_to_file
     from twin.frames import frames_at
@@ -252,25 +248,7 @@ def calibrate_contact(
     )
 
 
-HELP_VALIDATE = """Compare the twin's pins with those of real frames.
-
-The contact of each labelled frame is simulated along the arm's way, from the frame's label and the sensor's [rig] alone ('twin
-calibrate contact' fits a [rig]). The simulated displacement is added to the recorded pins without contact (init_0.png). If
-move_executed.csv or labels_corrected.csv ('twin audit') says that a move was not executed, this move is not simulated. Errors are
-stated separately for executed and not executed moves, by depth, angle and shear. For some frames with an executed move the errors
-are also stated with the friction that fits the frame best.
-
-\b
-Writes index.html, frames.csv (a row a frame), validation.json.
-
-\b
-Example:
-  twin validate --sensor mg400-331 --frames recordings/surface --limit 40 \\
-      --out out/validate
-"""
-
-
-@app.command("validate", help=HELP_VALIDATE)
+@app.command("validate")
 def validate(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording")],
@@ -290,6 +268,22 @@ def validate(
     *,
     progress: Progress,
 ) -> "Validation":
+    """Compare the twin's pins with those of real frames.
+
+    The contact of each labelled frame is simulated along the arm's way, from the frame's label and the sensor's [rig] alone ('twin
+    calibrate contact' fits a [rig]). The simulated displacement is added to the recorded pins without contact (init_0.png). If
+    move_executed.csv or labels_corrected.csv ('twin audit') says that a move was not executed, this move is not simulated. Errors are
+    stated separately for executed and not executed moves, by depth, angle and shear. For some frames with an executed move the errors
+    are also stated with the friction that fits the frame best.
+
+    \b
+    Writes index.html, frames.csv (a row a frame), validation.json.
+
+    \b
+    Example:
+      twin validate --sensor mg400-331 --frames recordings/surface --limit 40 \\
+          --out out/validate
+    """
     from scenes import load_experiment, load_object
     from training.studies.validation import validate_contacts
     from twin.frames import frames_at
@@ -309,49 +303,7 @@ def validate(
     )
 
 
-HELP_REALISM = """Compare real raw frames with their renders.
-
-They are compared pair by pair, and as two sets. Each real frame's pins are found, the skin is fitted to them, and the sensor in
-that state is rendered and captured. Every cap stands where it stood in the real frame, so the differences come from camera and
-light. With --pose-aligned the whole twin is judged as well: the labels in targets.csv (pose_3 depth in mm, pose_4 and pose_5
-turns in deg, a tap on a flat plate) become contacts. The arm's kinematics is fitted to the pins of one half of the frames, and
-the error is stated on the other half.
-
-It reads a folder of raw colour or gray frames of one size (images/ with targets.csv, or any folder). Frames that are black,
-saturated, of another size or without all their pins are refused by name. The exit code is 0 if at least one frame was good.
-
-\b
-Writes:
-  index.html      pictures side by side, all figures, plots
-  metrics.json    every figure: PSNR, SSIM, FLIP over the lens disc; what is
-                  missed on the caps, and how much of it is fixed to each cap;
-                  differences by radius; spots; spectra; two-sample accuracy;
-                  pin errors
-  frames.csv      figures of each frame
-  radial.csv      caps in 8 bins of the distance from the disc's centre
-  spectrum.csv    radial power spectra
-  spots.csv       bright spots that stay in place (LED reflections, bubbles)
-  pictures/       real, rendered and difference of each frame
-
-\b
-How to read it: no render can do better than PSNR and SSIM of two real frames
-with the same contact. Two-sample accuracy is the share of patches of unseen
-frames that a small network puts into the right set: at 100 % it always tells
-real from rendered, at 50 % never. --thorough trains a stronger network, too,
-and both on two halves of the real frames, which should give 50 %. What is
-missed on the caps and fixed to each of them is what a better relief could
-hold. --without shows what a measured detail is worth: the caps' relief, the
-skin's grain, the background. --residual adds the sensor's residual network;
-judge it on frames that it was not taught on.
-
-\b
-Example:
-  twin realism recordings/my-tactip --sensor ur5-331 --limit 10 \\
-      --out out/realism
-"""
-
-
-@app.command("realism", help=HELP_REALISM)
+@app.command("realism")
 def realism(
     path: Annotated[Path, typer.Argument(help="folder of real raw frames")],
     sensor: Sensor,
@@ -375,6 +327,46 @@ def realism(
     *,
     progress: Progress,
 ) -> "Realism":
+    """Compare real raw frames with their renders.
+
+    They are compared pair by pair, and as two sets. Each real frame's pins are found, the skin is fitted to them, and the sensor in
+    that state is rendered and captured. Every cap stands where it stood in the real frame, so the differences come from camera and
+    light. With --pose-aligned the whole twin is judged as well: the labels in targets.csv (pose_3 depth in mm, pose_4 and pose_5
+    turns in deg, a tap on a flat plate) become contacts. The arm's kinematics is fitted to the pins of one half of the frames, and
+    the error is stated on the other half.
+
+    It reads a folder of raw colour or gray frames of one size (images/ with targets.csv, or any folder). Frames that are black,
+    saturated, of another size or without all their pins are refused by name. The exit code is 0 if at least one frame was good.
+
+    \b
+    Writes:
+      index.html      pictures side by side, all figures, plots
+      metrics.json    every figure: PSNR, SSIM, FLIP over the lens disc; what is
+                      missed on the caps, and how much of it is fixed to each cap;
+                      differences by radius; spots; spectra; two-sample accuracy;
+                      pin errors
+      frames.csv      figures of each frame
+      radial.csv      caps in 8 bins of the distance from the disc's centre
+      spectrum.csv    radial power spectra
+      spots.csv       bright spots that stay in place (LED reflections, bubbles)
+      pictures/       real, rendered and difference of each frame
+
+    \b
+    How to read it: no render can do better than PSNR and SSIM of two real frames
+    with the same contact. Two-sample accuracy is the share of patches of unseen
+    frames that a small network puts into the right set: at 100 % it always tells
+    real from rendered, at 50 % never. --thorough trains a stronger network, too,
+    and both on two halves of the real frames, which should give 50 %. What is
+    missed on the caps and fixed to each of them is what a better relief could
+    hold. --without shows what a measured detail is worth: the caps' relief, the
+    skin's grain, the background. --residual adds the sensor's residual network;
+    judge it on frames that it was not taught on.
+
+    \b
+    Example:
+      twin realism recordings/my-tactip --sensor ur5-331 --limit 10 \\
+          --out out/realism
+    """
     from training.studies.realism import compare_with_renders
     from twin.frames import frames_at
 
@@ -393,56 +385,6 @@ def realism(
     )
 
 
-HELP_ROBUSTNESS = """How far may the sensor degrade before preprocessing fails?
-
-Sweeps each condition (dim or dead LEDs, room light, glare, defocus, motion, dirt, scratches, bubbles, haze, lost and faded
-caps, torn skin, a displaced camera, noise, JPEG, lost rows, wrong settings, ...; --list names them) from nothing to severe
-over a set of contacts, runs pipelines and models on every frame, and compares with where the pins truly are.
-
-\b
-Writes:
-  index.html      envelope (where each pipeline fails), ranking, plots, worst
-                  frames
-  envelope.csv    severity and parameter at which each measure's limit is
-                  crossed
-  curves.csv      every measure against severity, with its 90 % interval
-  frames.csv      every frame
-  real-on-rendered.csv  with --frames: where real and rendered frames fail,
-                        and their ratio
-  cells/          finished work: an interrupted run continues where it ended;
-                  work of another sensor, other weights or another version is
-                  not used
-
-\b
-With --frames DIR real frames take the place of rendered ones. Then only
-conditions that act on a frame are swept, and the truth is the pins on which
-several detectors agree. Raw frames are compared with the envelope of rendered
-ones, which tells how much of a sound sensor's margin this sensor has left.
-Rendered frames are swept for that, too; --no-rendered leaves this out.
-
-\b
-Code of your own that finds pins is judged, too: --pipeline mine.py:my_pins
-takes the function my_pins of the file. It is given the picture of a frame
-(uint8, gray or RGB) and returns the places (n, 2) of the pins it finds, x and
-y in px, in any order.
-
-\b
-A file for --conditions:
-  steps = [0.1, 0.3, 1.0]               # severities
-  pairs = [["leds-dim", "noise"]]       # conditions that grow together
-  [[condition]]
-  name = "noise"
-  severe = 0.2                          # the parameter at severity 1
-
-\b
-Examples:
-  twin robustness --sensor ur5-331 --pipeline twin --pipeline legacy \\
-      --out out/robustness
-  twin robustness --sensor ur5-331 --frames recordings/mine \\
-      --pipeline mine.toml --pipeline mine.py:my_pins --out out/mine
-"""
-
-
 def _list_conditions(asked: bool) -> None:
     from twin.judge.degradation.conditions import condition_lines
 
@@ -451,7 +393,7 @@ def _list_conditions(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.command("robustness", help=HELP_ROBUSTNESS, goes_on=True)
+@app.command("robustness", goes_on=True)
 def robustness(
     sensor: Sensor,
     out: Out,
@@ -475,6 +417,54 @@ def robustness(
     *,
     progress: Progress,
 ) -> "Result":
+    """How far may the sensor degrade before preprocessing fails?
+
+    Sweeps each condition (dim or dead LEDs, room light, glare, defocus, motion, dirt, scratches, bubbles, haze, lost and faded
+    caps, torn skin, a displaced camera, noise, JPEG, lost rows, wrong settings, ...; --list names them) from nothing to severe
+    over a set of contacts, runs pipelines and models on every frame, and compares with where the pins truly are.
+
+    \b
+    Writes:
+      index.html      envelope (where each pipeline fails), ranking, plots, worst
+                      frames
+      envelope.csv    severity and parameter at which each measure's limit is
+                      crossed
+      curves.csv      every measure against severity, with its 90 % interval
+      frames.csv      every frame
+      real-on-rendered.csv  with --frames: where real and rendered frames fail,
+                            and their ratio
+      cells/          finished work: an interrupted run continues where it ended;
+                      work of another sensor, other weights or another version is
+                      not used
+
+    \b
+    With --frames DIR real frames take the place of rendered ones. Then only
+    conditions that act on a frame are swept, and the truth is the pins on which
+    several detectors agree. Raw frames are compared with the envelope of rendered
+    ones, which tells how much of a sound sensor's margin this sensor has left.
+    Rendered frames are swept for that, too; --no-rendered leaves this out.
+
+    \b
+    Code of your own that finds pins is judged, too: --pipeline mine.py:my_pins
+    takes the function my_pins of the file. It is given the picture of a frame
+    (uint8, gray or RGB) and returns the places (n, 2) of the pins it finds, x and
+    y in px, in any order.
+
+    \b
+    A file for --conditions:
+      steps = [0.1, 0.3, 1.0]               # severities
+      pairs = [["leds-dim", "noise"]]       # conditions that grow together
+      [[condition]]
+      name = "noise"
+      severe = 0.2                          # the parameter at severity 1
+
+    \b
+    Examples:
+      twin robustness --sensor ur5-331 --pipeline twin --pipeline legacy \\
+          --out out/robustness
+      twin robustness --sensor ur5-331 --frames recordings/mine \\
+          --pipeline mine.toml --pipeline mine.py:my_pins --out out/mine
+    """
     from scenes import load_sensor
     from training.studies import degradation
     from twin.judge.degradation.plan import SweepPlan, load_plan
@@ -492,27 +482,7 @@ def robustness(
     return degradation.run(plan, out, progress=progress)
 
 
-HELP_AUDIT = """Find what is wrong with the labels of a recording.
-
-It needs a recording of one object (a plate, an edge) with labels pose_1..6 and move_1..6, of which some vary, and uses its pins and
-targets.csv alone. It looks for moves that were not executed when the frame was taken, sign errors, frames without contact, frames
-that fit no label, frames that occur twice, drift along the table, and faults of the files.
-
-\b
-Writes:
-  labels_corrected.csv  image_name, executed, the corrected labels, the
-                        misfit to each explanation, findings
-  audit.json, audit.png, audit.html
-
-Copy labels_corrected.csv beside targets.csv, and 'twin train' corrects the labels with it.
-
-\b
-Example:
-  twin audit recordings/mine --sensor mg400-331 --out out/audit
-"""
-
-
-@app.command("audit", help=HELP_AUDIT)
+@app.command("audit")
 def audit(
     data: Annotated[Path, typer.Argument(help="labelled recording")],
     sensor: Sensor,
@@ -524,6 +494,24 @@ def audit(
     *,
     progress: Progress,
 ) -> "LabelAudit":
+    """Find what is wrong with the labels of a recording.
+
+    It needs a recording of one object (a plate, an edge) with labels pose_1..6 and move_1..6, of which some vary, and uses its pins and
+    targets.csv alone. It looks for moves that were not executed when the frame was taken, sign errors, frames without contact, frames
+    that fit no label, frames that occur twice, drift along the table, and faults of the files.
+
+    \b
+    Writes:
+      labels_corrected.csv  image_name, executed, the corrected labels, the
+                            misfit to each explanation, findings
+      audit.json, audit.png, audit.html
+
+    Copy labels_corrected.csv beside targets.csv, and 'twin train' corrects the labels with it.
+
+    \b
+    Example:
+      twin audit recordings/mine --sensor mg400-331 --out out/audit
+    """
     from training.studies.label_audit import audit_recording
     from twin.frames import frames_at
 

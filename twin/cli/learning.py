@@ -54,54 +54,8 @@ if TYPE_CHECKING:
     from training.surrogate.fit import Distilled
     from training.train import Trained
 
-HELP_DATASET = """Simulate a labelled data set with ground truth.
 
-It simulates the contacts of an experiment and writes them in the recordings' own format. For each contact a pose and a move are drawn
-from the experiment's ranges, in robot coordinates ('twin experiments' lists them). Finite elements follow the arm's way, and the last
-state, or every converged state, becomes a frame. A contact that does not converge is listed, and drawn again.
-
-\b
---images raw        the camera's frames
-         gray       their luminance
-         recording  cropped and thresholded, as the recordings are
-         none       pins alone, without rendering (vgnn and the other graph
-                    networks train on them; 'twin train' reads them like
-                    frames)
---states all        also the states on the way, labelled by how far tap and
-                    move have gone. All states of a contact share a path_id,
-                    and they all go either into the training or into the
-                    validation part
---randomise R       what differs from contact to contact: a name ('twin
-                    randomisations') or a file
-
-\b
-Writes:
-  images/ or frames_bw/, init_0.png, targets.csv, meta.json: as in a recording
-  move_executed.csv   whether each frame's move had been made
-  truth.zarr          caps (mm, px), pins with noise, forces, torque, areas in
-                      contact and sliding, the object's pose: one row a frame
-  draws.csv           what was drawn for each contact; failures.csv: draws
-                      that failed
-  generation.json     all resolved specifications and options
-  made_by.json        the code that made it; a version whose code for contacts
-                      differs does not continue the data set, because its
-                      frames would differ
-  records/            one for each finished contact; with them the same
-                      command continues after any end, or to a larger --count
-  lerobot/, huggingface/, mcap/: with --also, when the data set is finished
-
-The result depends on the options alone. Every byte is the same with any number of workers and after any interruption.
-
-\b
-Examples:
-  twin dataset --experiment surface-2d --sensor mg400-331 --count 1000 \\
-      --images none --randomise contact --workers 8 --out sim/surface
-  twin dataset --experiment edge-2d --sensor ur5-331 --count 200 \\
-      --out sim/edge --scheduler tcp://192.168.0.10:8786
-"""
-
-
-@app.command("dataset", help=HELP_DATASET, goes_on=True)
+@app.command("dataset", goes_on=True)
 def make_dataset(
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="experiment name ('twin experiments') or file")],
     sensor: Sensor,
@@ -125,6 +79,51 @@ def make_dataset(
     *,
     progress: Progress,
 ) -> "Simulated":
+    """Simulate a labelled data set with ground truth.
+
+    It simulates the contacts of an experiment and writes them in the recordings' own format. For each contact a pose and a move are drawn
+    from the experiment's ranges, in robot coordinates ('twin experiments' lists them). Finite elements follow the arm's way, and the last
+    state, or every converged state, becomes a frame. A contact that does not converge is listed, and drawn again.
+
+    \b
+    --images raw        the camera's frames
+             gray       their luminance
+             recording  cropped and thresholded, as the recordings are
+             none       pins alone, without rendering (vgnn and the other graph
+                        networks train on them; 'twin train' reads them like
+                        frames)
+    --states all        also the states on the way, labelled by how far tap and
+                        move have gone. All states of a contact share a path_id,
+                        and they all go either into the training or into the
+                        validation part
+    --randomise R       what differs from contact to contact: a name ('twin
+                        randomisations') or a file
+
+    \b
+    Writes:
+      images/ or frames_bw/, init_0.png, targets.csv, meta.json: as in a recording
+      move_executed.csv   whether each frame's move had been made
+      truth.zarr          caps (mm, px), pins with noise, forces, torque, areas in
+                          contact and sliding, the object's pose: one row a frame
+      draws.csv           what was drawn for each contact; failures.csv: draws
+                          that failed
+      generation.json     all resolved specifications and options
+      made_by.json        the code that made it; a version whose code for contacts
+                          differs does not continue the data set, because its
+                          frames would differ
+      records/            one for each finished contact; with them the same
+                          command continues after any end, or to a larger --count
+      lerobot/, huggingface/, mcap/: with --also, when the data set is finished
+
+    The result depends on the options alone. Every byte is the same with any number of workers and after any interruption.
+
+    \b
+    Examples:
+      twin dataset --experiment surface-2d --sensor mg400-331 --count 1000 \\
+          --images none --randomise contact --workers 8 --out sim/surface
+      twin dataset --experiment edge-2d --sensor ur5-331 --count 200 \\
+          --out sim/edge --scheduler tcp://192.168.0.10:8786
+    """
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.generation.run import config_for, simulate_dataset
 
@@ -142,53 +141,7 @@ def make_dataset(
     return simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, also=tuple(also or ()), progress=progress)
 
 
-HELP_TRAIN = """Train a model that tells the pose from a frame.
-
-\b
-vgnn              ours: Voronoi graph network on matched pins, ensemble,
-                  calibrated 90 % intervals
-steered           ours for an edge whose direction goes round the whole circle
-touch             ours for forces: modes of the pins and light of the caps,
-                  ensemble and Gaussian process; needs a few hundred frames.
-                  Of simulated contacts it also learns contact maps,
-                  and slip over time of simulated drags
-tac-vgnn          the paper's network: Delaunay graph, Voronoi areas; dense
-                  layers 96, 64
-tac-vgnn-release  the same with the published code's dense layers: 128, 96
-gnn               the paper's graph network: 6 nearest neighbours, no areas
-cnn-v1, cnn-v2    convolutional networks of 5 x 256 and 5 x 48 filters, on
-                  128 x 128 px
-
---target selects the labels, which are columns of the recording's table. It is a preset (surface-2d: pose_2 pose_6; surface-2d-shear:
-also move_1 move_6; surface-3d: pose_3 pose_4 pose_5; edge-2d; edge-3d; edge-circle; contact) or names with commas between. With --labels
-corrected, a move that was not executed is taken out of the labels, if move_executed.csv or labels_corrected.csv beside the table says so.
-
-contact is everything that the table tells of a contact: poses and moves that vary, measured forces (Fx, Fy, Fz in N). Of simulated
-contacts it is also force_x, force_y, force_z (N, of the skin on the object, sensor frame), torque_z (N mm, about the sensor's axis),
-contact_area (mm2), slip_share (0 to 1) and contact (0 or 1).
-
-Depth and angle of simulated contacts are relative to the touched surface, whatever its shape: the indentation along the normal at
-the nearest place, and the angle from this normal. So data sets of several objects can be joined: give --data once for each.
-
-A random fifth of the rows is kept out of training for 'twin evaluate'. Of simulated data it is a fifth of the contacts, with all
-their states. --split gives the seed of this choice; with --split -1 all rows are trained on. The choice goes by the frames' names: the
-order of the table does not matter.
-
-\b
-Writes to --out: config.json (resolved, with the sensor and the parameters of
-the pipeline), curves.csv, weights.pt, maps.safetensors and slip.safetensors
-(touch, simulated contacts and drags), and checkpoint.pt while it runs. The
-same command continues a run that was interrupted, if frames and labels are
-still the same.
-
-\b
-Example:
-  twin train --model vgnn --sensor mg400-331 --data recordings/mine \\
-      --target surface-2d --out runs/mine
-"""
-
-
-@app.command("train", help=HELP_TRAIN, goes_on=True)
+@app.command("train", goes_on=True)
 def train(
     model: Annotated[str, typer.Option("--model", help="vgnn, touch, steered, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
     sensor: Sensor,
@@ -217,6 +170,51 @@ def train(
     *,
     progress: Progress,
 ) -> "Trained":
+    """Train a model that tells the pose from a frame.
+
+    \b
+    vgnn              ours: Voronoi graph network on matched pins, ensemble,
+                      calibrated 90 % intervals
+    steered           ours for an edge whose direction goes round the whole circle
+    touch             ours for forces: modes of the pins and light of the caps,
+                      ensemble and Gaussian process; needs a few hundred frames.
+                      Of simulated contacts it also learns contact maps,
+                      and slip over time of simulated drags
+    tac-vgnn          the paper's network: Delaunay graph, Voronoi areas; dense
+                      layers 96, 64
+    tac-vgnn-release  the same with the published code's dense layers: 128, 96
+    gnn               the paper's graph network: 6 nearest neighbours, no areas
+    cnn-v1, cnn-v2    convolutional networks of 5 x 256 and 5 x 48 filters, on
+                      128 x 128 px
+
+    --target selects the labels, which are columns of the recording's table. It is a preset (surface-2d: pose_2 pose_6; surface-2d-shear:
+    also move_1 move_6; surface-3d: pose_3 pose_4 pose_5; edge-2d; edge-3d; edge-circle; contact) or names with commas between. With
+    --labels corrected, a move that was not executed is taken out of the labels, if move_executed.csv or labels_corrected.csv beside the
+    table says so.
+
+    contact is everything that the table tells of a contact: poses and moves that vary, measured forces (Fx, Fy, Fz in N). Of simulated
+    contacts it is also force_x, force_y, force_z (N, of the skin on the object, sensor frame), torque_z (N mm, about the sensor's axis),
+    contact_area (mm2), slip_share (0 to 1) and contact (0 or 1).
+
+    Depth and angle of simulated contacts are relative to the touched surface, whatever its shape: the indentation along the normal at
+    the nearest place, and the angle from this normal. So data sets of several objects can be joined: give --data once for each.
+
+    A random fifth of the rows is kept out of training for 'twin evaluate'. Of simulated data it is a fifth of the contacts, with all
+    their states. --split gives the seed of this choice; with --split -1 all rows are trained on. The choice goes by the frames' names: the
+    order of the table does not matter.
+
+    \b
+    Writes to --out: config.json (resolved, with the sensor and the parameters of
+    the pipeline), curves.csv, weights.pt, maps.safetensors and slip.safetensors
+    (touch, simulated contacts and drags), and checkpoint.pt while it runs. The
+    same command continues a run that was interrupted, if frames and labels are
+    still the same.
+
+    \b
+    Example:
+      twin train --model vgnn --sensor mg400-331 --data recordings/mine \\
+          --target surface-2d --out runs/mine
+    """
     from training.train import train_model
 
     return train_model(
@@ -240,36 +238,7 @@ def train(
     )
 
 
-HELP_EVALUATE = """Judge a trained model on a labelled recording.
-
-\b
---rows validation  the fifth of the run's own recording that was kept out of
-                   its training, by the frames' names
---rows all         every row, for a recording that the model has not seen
-
-Weights for several kinds of contact, such as those of ur5-331 for its binary pictures, are judged with --rows all by the labels that the
-recording varies. The share of frames that they take for each kind is told.
-
-\b
-Writes:
-  predictions.csv  image_name; <label>_true, _pred, _lo90, _hi90 of every
-                   label; executed_probability, valid
-  metrics.json     mean absolute errors against raw and corrected labels,
-                   overall and by depth, angle and shear; coverage of the 90 %
-                   intervals; slope of the angle's error on move_6 over frames
-                   whose move was not executed; ms per frame
-  errors.png
-
-With --robustness it also writes robustness.csv: errors on frames whose image is changed (1 % scale, 2 px shift, 1 deg turn, 5 pins
-erased, each in a random direction), and how much larger they are than the errors on the unchanged frames.
-
-\b
-Example:
-  twin evaluate runs/mine --data recordings/mine --out out/errors
-"""
-
-
-@app.command("evaluate", help=HELP_EVALUATE)
+@app.command("evaluate")
 def evaluate(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
     data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give all that the run was trained on")],
@@ -282,33 +251,40 @@ def evaluate(
     *,
     progress: Progress,
 ) -> "Evaluation":
+    """Judge a trained model on a labelled recording.
+
+    \b
+    --rows validation  the fifth of the run's own recording that was kept out of
+                       its training, by the frames' names
+    --rows all         every row, for a recording that the model has not seen
+
+    Weights for several kinds of contact, such as those of ur5-331 for its binary pictures, are judged with --rows all by the labels that
+    the recording varies. The share of frames that they take for each kind is told.
+
+    \b
+    Writes:
+      predictions.csv  image_name; <label>_true, _pred, _lo90, _hi90 of every
+                       label; executed_probability, valid
+      metrics.json     mean absolute errors against raw and corrected labels,
+                       overall and by depth, angle and shear; coverage of the 90 %
+                       intervals; slope of the angle's error on move_6 over frames
+                       whose move was not executed; ms per frame
+      errors.png
+
+    With --robustness it also writes robustness.csv: errors on frames whose image is changed (1 % scale, 2 px shift, 1 deg turn, 5 pins
+    erased, each in a random direction), and how much larger they are than the errors on the unchanged frames.
+
+    \b
+    Example:
+      twin evaluate runs/mine --data recordings/mine --out out/errors
+    """
     from training.studies.evaluation import evaluate_run
 
     recordings = one_recording(data, table, no_contact)
     return evaluate_run(run, recordings, out, rows=rows, labels=labels, robustness=robustness, progress=progress)
 
 
-HELP_PREDICT = """Tell the pose in every frame, with its 90 % interval.
-
-The model contains its sensor and pipeline, and a frame of another sensor is refused. If there is a frame without contact (init_0.png) in
-the recording or beside a single picture, the pins are counted from that frame. The exit code is 0 if at least one frame gave a pose.
-
-With --maps DIR it also writes, for each frame, the pressure and the shear over the skin, the contact patch and the deformed skin: arrays
-(NAME.npz) and a picture (NAME.png). The model must be touch and have learnt from simulated contacts.
-
-With --sequence the frames follow each other in time, as those of a video, and a model that learnt from simulated drags also tells slip:
-slip_begins and slip_whole (probabilities that a tenth of the contact, and that all of it, slides), slip_sliding (share of the contact that
-slides under the drag, 0 to 1), slip_left (drag in mm until all slides) and slip_direction (deg, sensor frame, of the object over the skin).
-
-\b
-Examples:
-  twin predict runs/mine frame.png
-  twin predict runs/forces recordings/mine --maps out/maps
-  twin predict runs/forces drag.mp4 --sequence
-"""
-
-
-@app.command("predict", help=HELP_PREDICT)
+@app.command("predict")
 def predict(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
@@ -317,27 +293,44 @@ def predict(
     table: Table = None,
     no_contact: NoContact = None,
 ) -> "Predictions":
+    """Tell the pose in every frame, with its 90 % interval.
+
+    The model contains its sensor and pipeline, and a frame of another sensor is refused. If there is a frame without contact (init_0.png)
+    in the recording or beside a single picture, the pins are counted from that frame. The exit code is 0 if at least one frame gave a pose.
+
+    With --maps DIR it also writes, for each frame, the pressure and the shear over the skin, the contact patch and the deformed skin:
+    arrays (NAME.npz) and a picture (NAME.png). The model must be touch and have learnt from simulated contacts.
+
+    With --sequence the frames follow each other in time, as those of a video, and a model that learnt from simulated drags also tells slip:
+    slip_begins and slip_whole (probabilities that a tenth of the contact, and that all of it, slides), slip_sliding (share of the contact
+    that slides under the drag, 0 to 1), slip_left (drag in mm until all slides) and slip_direction (deg, sensor frame, of the object over
+    the skin).
+
+    \b
+    Examples:
+      twin predict runs/mine frame.png
+      twin predict runs/forces recordings/mine --maps out/maps
+      twin predict runs/forces drag.mp4 --sequence
+    """
     from training.studies.prediction import predict_frames
     from twin.frames import frames_at
 
     return predict_frames(run, frames_at(frame, table, no_contact), maps=maps, sequence=sequence)
 
 
-HELP_PACK = """Write a small copy of a finished training run.
-
-Its numbers have half the precision, and its size is less than a tenth. It can be given wherever a RUN is asked for. For example,
-the run of a study is packed so:
-
-\b
-Example:
-  twin study sim-to-real --sensor mg400-331 --frames DIR \\
-      --contacts surface-2d-wide --draws 2 --epochs 60 --out study
-  twin pack study/sim_only --out training/weights/mg400-331 --force
-"""
-
-
-@app.command("pack", help=HELP_PACK)
+@app.command("pack")
 def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, touch or steered")], out: Out) -> None:
+    """Write a small copy of a finished training run.
+
+    Its numbers have half the precision, and its size is less than a tenth. It can be given wherever a RUN is asked for. For example,
+    the run of a study is packed so:
+
+    \b
+    Example:
+      twin study sim-to-real --sensor mg400-331 --frames DIR \\
+          --contacts surface-2d-wide --draws 2 --epochs 60 --out study
+      twin pack study/sim_only --out training/weights/mg400-331 --force
+    """
     from training.estimator import PoseEstimator
     from training.packed import WEIGHTS, pack
 
@@ -346,22 +339,7 @@ def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, 
     say([f"wrote {out / WEIGHTS} ({size / 1e3:.0f} kB), {out / 'config.json'}"])
 
 
-HELP_SURROGATE = """Make a fast stand-in for a sensor's finite elements.
-
-Finite elements solve random contacts: plates, balls, cylinders, edges and prisms that press, shear, twist, roll, leave and return. The
-surrogate is the skin at small strain with exact contact and friction at 271 nodes, and a small network for what large deformations
-change. The network begins with that of mg400-331 and learns on. A surrogate takes about a sixtieth of the time, and less where
-many contacts are computed together. Every fifth path is only judged with; the errors are printed and kept in the file.
-
-Surrogates of the shipped sensors go with the package; the environments take others by surrogate=FILE.
-
-\b
-Example:
-  twin surrogate --sensor mg400-331 --out mine.safetensors
-"""
-
-
-@app.command("surrogate", help=HELP_SURROGATE)
+@app.command("surrogate")
 def make_surrogate(
     sensor: Sensor,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="file to write, *.safetensors")],
@@ -371,31 +349,26 @@ def make_surrogate(
     *,
     progress: Progress,
 ) -> "Distilled":
+    """Make a fast stand-in for a sensor's finite elements.
+
+    Finite elements solve random contacts: plates, balls, cylinders, edges and prisms that press, shear, twist, roll, leave and return. The
+    surrogate is the skin at small strain with exact contact and friction at 271 nodes, and a small network for what large deformations
+    change. The network begins with that of mg400-331 and learns on. A surrogate takes about a sixtieth of the time, and less where
+    many contacts are computed together. Every fifth path is only judged with; the errors are printed and kept in the file.
+
+    Surrogates of the shipped sensors go with the package; the environments take others by surrogate=FILE.
+
+    \b
+    Example:
+      twin surrogate --sensor mg400-331 --out mine.safetensors
+    """
     from scenes import load_sensor
     from training.surrogate.fit import distil
 
     return distil(load_sensor(sensor), out, paths=paths, processes=workers, seed=seed, progress=progress)
 
 
-HELP_LEARN = """Learn a policy of a task, from nothing.
-
-The task's environments run together on the surrogate of the sensor's finite elements, and proximal policy optimisation
-(stable-baselines3; pip install 'tactip-twin[rl]') learns from them until 97 % of the newest 100 episodes are solved, or the time is over.
-The policy is then judged on 100 other episodes, and with --fem N on N episodes of finite elements, with drawn frames through the real
-pipeline.
-
-\b
-Writes:
-  policy.safetensors  for 'twin policy'
-  learning.csv, learning.png, result.json
-
-\b
-Example:
-  twin learn --task SurfaceFollow --sensor mg400-331 --out out/learnt
-"""
-
-
-@app.command("learn", help=HELP_LEARN)
+@app.command("learn")
 def learn(
     task: Annotated[str, typer.Option("--task", metavar="T", help="EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ...")],
     sensor: Sensor,
@@ -413,6 +386,22 @@ def learn(
     *,
     progress: Progress,
 ) -> "Learnt":
+    """Learn a policy of a task, from nothing.
+
+    The task's environments run together on the surrogate of the sensor's finite elements, and proximal policy optimisation
+    (stable-baselines3; pip install 'tactip-twin[rl]') learns from them until 97 % of the newest 100 episodes are solved, or the time is
+    over. The policy is then judged on 100 other episodes, and with --fem N on N episodes of finite elements, with drawn frames through
+    the real pipeline.
+
+    \b
+    Writes:
+      policy.safetensors  for 'twin policy'
+      learning.csv, learning.png, result.json
+
+    \b
+    Example:
+      twin learn --task SurfaceFollow --sensor mg400-331 --out out/learnt
+    """
     from training.environments.batch import Options
     from training.environments.learn import LearnPlan, learn_policy
 

@@ -46,30 +46,8 @@ if TYPE_CHECKING:
     from hardware.live import Watched
     from twin.estimate import SensorModel
 
-HELP_LIVE = """Show a model's estimates on a camera's frames.
 
-It shows pins, graph, Voronoi map, the pose with its 90 % interval, and rates on a page for the browser, and prints the page's address.
-With --rerun (package rerun-sdk) they go to Rerun's viewer or to a file: frame, pins, graph and pose on a time line. The studio shows
-the same in its mode 'Live', with an arm and the sensor's health beside it.
-
-With --record DIR every frame is kept, lossless, with its estimate. The folder can be read even if the program was killed. --replay
-DIR runs the model on the same frames again, and says whether the estimates are the same. With --at-rest first there must be no
-contact at the start; the first frame is then kept with the session. Without it pins are counted from where the model knows them to be at
-rest, or, once 40 contacts that differ have told other places, from there, as 'twin predict' does. --also keeps the session in further
-formats when it ends.
-
-A model that learnt from simulated drags remembers the frames and tells slip: see 'twin predict --help', --sequence.
-
-\b
-Example:
-  twin live --camera /dev/video0 --model RUN
-  twin live --camera http://127.0.0.1:8081/stream.mjpg --model RUN \\
-      --record out/session --headless --seconds 60
-  twin live --replay out/session --model RUN --headless
-"""
-
-
-@app.command("live", help=HELP_LIVE)
+@app.command("live")
 def live(
     model: Model = SHIPPED_MODEL,
     camera: Camera = "",
@@ -85,6 +63,27 @@ def live(
     also: Also = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="port of the page; if it is taken, the next free one")] = 8080,
 ) -> "Watched":
+    """Show a model's estimates on a camera's frames.
+
+    It shows pins, graph, Voronoi map, the pose with its 90 % interval, and rates on a page for the browser, and prints the page's address.
+    With --rerun (package rerun-sdk) they go to Rerun's viewer or to a file: frame, pins, graph and pose on a time line. The studio shows
+    the same in its mode 'Live', with an arm and the sensor's health beside it.
+
+    With --record DIR every frame is kept, lossless, with its estimate. The folder can be read even if the program was killed. --replay
+    DIR runs the model on the same frames again, and says whether the estimates are the same. With --at-rest first there must be no
+    contact at the start; the first frame is then kept with the session. Without it pins are counted from where the model knows them to be
+    at rest, or, once 40 contacts that differ have told other places, from there, as 'twin predict' does. --also keeps the session in
+    further formats when it ends.
+
+    A model that learnt from simulated drags remembers the frames and tells slip: see 'twin predict --help', --sequence.
+
+    \b
+    Example:
+      twin live --camera /dev/video0 --model RUN
+      twin live --camera http://127.0.0.1:8081/stream.mjpg --model RUN \\
+          --record out/session --headless --seconds 60
+      twin live --replay out/session --model RUN --headless
+    """
     from hardware.live import WatchPlan, watch
     from hardware.rig import signals_as_ctrl_c
     from training.estimator import load_remembering
@@ -110,31 +109,7 @@ def tell_view(url: str) -> None:
     print(f"showing in {url}; Ctrl-C ends it", flush=True)
 
 
-HELP_COLLECT = """Collect labelled frames with a camera and an arm.
-
-Each contact has a random pose and shear, a tap, and one frame. With --design even the first contacts fill the experiment's ranges evenly,
-however many are made: choose it where each label costs time. With --design unsure the later contacts are made where those so far leave a
-model of the pins least sure. The frame was exposed after the arm reported that it stands at the commanded pose. The label is the
-reported pose.
-
-The arm goes around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm goes straight and
-stays in front of it. It lifts off between contacts; at the end it stands 50 mm away, disabled. The program does not know the arm's
-links and the object's holder: make sure that both have room. The frame without contact is refused if the sensor seems pressed in it.
-
-The folder has the recordings' own format (targets.csv, frames_bw/ or images/, init_0.png without contact, meta.json). The times are in
-contacts.jsonl. The same command continues an interrupted collection. With --also each contact is kept in further formats before the
-next one is made.
-
-\b
-Example:
-  twin collect --camera twin --arm simulated --sensor mg400-331 \\
-      --experiment surface-2d --count 200 --out data/first
-  twin collect --camera /dev/video0 --arm mg400 --sensor mg400-331 \\
-      --experiment surface-2d --count 5000 --out data/real
-"""
-
-
-@app.command("collect", help=HELP_COLLECT, goes_on=True)
+@app.command("collect", goes_on=True)
 def collect(
     camera: Camera,
     arm: ArmOption,
@@ -156,6 +131,28 @@ def collect(
     *,
     progress: Progress,
 ) -> "Collected":
+    """Collect labelled frames with a camera and an arm.
+
+    Each contact has a random pose and shear, a tap, and one frame. With --design even the first contacts fill the experiment's ranges
+    evenly, however many are made: choose it where each label costs time. With --design unsure the later contacts are made where those so
+    far leave a model of the pins least sure. The frame was exposed after the arm reported that it stands at the commanded pose. The label
+    is the reported pose.
+
+    The arm goes around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm goes straight and
+    stays in front of it. It lifts off between contacts; at the end it stands 50 mm away, disabled. The program does not know the arm's
+    links and the object's holder: make sure that both have room. The frame without contact is refused if the sensor seems pressed in it.
+
+    The folder has the recordings' own format (targets.csv, frames_bw/ or images/, init_0.png without contact, meta.json). The times are in
+    contacts.jsonl. The same command continues an interrupted collection. With --also each contact is kept in further formats before the
+    next one is made.
+
+    \b
+    Example:
+      twin collect --camera twin --arm simulated --sensor mg400-331 \\
+          --experiment surface-2d --count 200 --out data/first
+      twin collect --camera /dev/video0 --arm mg400 --sensor mg400-331 \\
+          --experiment surface-2d --count 5000 --out data/real
+    """
     from hardware.collect import CollectPlan, collect_frames
     from hardware.rig import signals_as_ctrl_c
     from scenes import load_experiment, load_object, load_sensor, load_servo
@@ -188,43 +185,7 @@ def ended_early(followed: "Followed") -> int:
     return 1 if followed.failure else 0
 
 
-HELP_SERVO = """Follow an object's outline with the sensor.
-
-This is pose-based tactile servoing, frame by frame. By default it runs in the twin: the arm is simulated, and the frames are drawn
-for the contact at its pose. With --camera and --arm the same loop runs on devices, real or emulated.
-
-The arm goes around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm goes straight and
-stays in front of it. The program does not know the arm's links and the object's holder: make sure that both have room. After any
-end, Ctrl-C included, the arm stops, retreats along the surface's normal and is disabled.
-
-Once on a round the last axis of an MG400 comes to its end. Then the sensor leaves the object by 50 mm, the axis turns back by a full
-turn, and the sensor touches the same place again. The place is said before the arm moves.
-
-Before the arm touches anything, a frame is taken from which the model counts pins. With --at-rest none it counts them from where it
-knows them to be at rest, or where the contacts tell that they are. Models on graphs count them from the specification's layout.
-
-\b
-Example:
-  twin servo --object can --model RUN --out out/servo
-  twin emulate mg400 &  twin emulate camera --arm mg400:127.0.0.1 \\
-      --sensor mg400-331 --object can --port 8081 &
-  twin servo --object can --model RUN \\
-      --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1 \\
-      --stream --steps 60 --out out/live
-
-\b
-Writes to --out:
-  trajectory.csv, trajectory.png
-  measures.json   smoothness S as the Tac-VGNN paper defines it, path, depth
-                  and angle errors, jerk, share of the way, lost contacts;
-                  rate, latency and age of the frames
-  session/        with --record; in further formats with --also
-
-The exit code is 1 if it ended early.
-"""
-
-
-@app.command("servo", help=HELP_SERVO, exit_code=ended_early)
+@app.command("servo", exit_code=ended_early)
 def servo(
     obj: Annotated[str, typer.Option("--object", metavar="O", help="can, mesh-can, square, prism, tin-box, or another")],
     out: Out,
@@ -246,6 +207,40 @@ def servo(
     *,
     progress: Progress,
 ) -> "Followed":
+    """Follow an object's outline with the sensor.
+
+    This is pose-based tactile servoing, frame by frame. By default it runs in the twin: the arm is simulated, and the frames are drawn
+    for the contact at its pose. With --camera and --arm the same loop runs on devices, real or emulated.
+
+    The arm goes around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm goes straight and
+    stays in front of it. The program does not know the arm's links and the object's holder: make sure that both have room. After any
+    end, Ctrl-C included, the arm stops, retreats along the surface's normal and is disabled.
+
+    Once on a round the last axis of an MG400 comes to its end. Then the sensor leaves the object by 50 mm, the axis turns back by a full
+    turn, and the sensor touches the same place again. The place is said before the arm moves.
+
+    Before the arm touches anything, a frame is taken from which the model counts pins. With --at-rest none it counts them from where it
+    knows them to be at rest, or where the contacts tell that they are. Models on graphs count them from the specification's layout.
+
+    \b
+    Example:
+      twin servo --object can --model RUN --out out/servo
+      twin emulate mg400 &  twin emulate camera --arm mg400:127.0.0.1 \\
+          --sensor mg400-331 --object can --port 8081 &
+      twin servo --object can --model RUN \\
+          --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1 \\
+          --stream --steps 60 --out out/live
+
+    \b
+    Writes to --out:
+      trajectory.csv, trajectory.png
+      measures.json   smoothness S as the Tac-VGNN paper defines it, path, depth
+                      and angle errors, jerk, share of the way, lost contacts;
+                      rate, latency and age of the frames
+      session/        with --record; in further formats with --also
+
+    The exit code is 1 if it ended early.
+    """
     from hardware.following import follow
     from training.estimator import load_remembering
 
@@ -308,23 +303,7 @@ def run_along(
         return follow(plan, load(run), out, about={kept_as: str(run)}, progress=progress)
 
 
-HELP_POLICY = """Run a trained policy on a camera and an arm.
-
-The policy of 'twin learn' sees the pins of each frame, found by the live pipeline, and moves the tool. The way to the object, the frame
-without contact, the safety layer, letting go and what is written are those of 'twin servo', and so are the options. It always waits for
-the end of a move (it has no --stream), and counts the pins from its own first frame (it has no --at-rest). By default it runs in the
-twin. The exit code is 1 if it ended early.
-
-\b
-Example:
-  twin learn --task SurfaceFollow --sensor mg400-331 --out out/learnt
-  twin policy out/learnt/policy.safetensors --object can --out out/can
-  twin policy out/learnt/policy.safetensors --object can --out out/live \\
-      --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1
-"""
-
-
-@app.command("policy", help=HELP_POLICY, exit_code=ended_early)
+@app.command("policy", exit_code=ended_early)
 def run_policy(
     policy: Annotated[Path, typer.Argument(help="policy.safetensors of 'twin learn'")],
     obj: Annotated[str, typer.Option("--object", metavar="O", help="can, square, prism, tin-box, or another")],
@@ -343,6 +322,20 @@ def run_policy(
     *,
     progress: Progress,
 ) -> "Followed":
+    """Run a trained policy on a camera and an arm.
+
+    The policy of 'twin learn' sees the pins of each frame, found by the live pipeline, and moves the tool. The way to the object, the frame
+    without contact, the safety layer, letting go and what is written are those of 'twin servo', and so are the options. It always waits for
+    the end of a move (it has no --stream), and counts the pins from its own first frame (it has no --at-rest). By default it runs in the
+    twin. The exit code is 1 if it ended early.
+
+    \b
+    Example:
+      twin learn --task SurfaceFollow --sensor mg400-331 --out out/learnt
+      twin policy out/learnt/policy.safetensors --object can --out out/can
+      twin policy out/learnt/policy.safetensors --object can --out out/live \\
+          --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1
+    """
     from hardware.following import follow
     from hardware.policy_law import load_for_outlines
 
@@ -440,20 +433,7 @@ def magician(
     emulate_magician(link=link, faults=faults, time_scale=time_scale)
 
 
-HELP_EMULATE_CAMERA = """Emulate the sensor's camera as a stream over HTTP.
-
-The stream of JPEGs shows the contact at the pose of an emulated arm. The pose comes from the arm's feedback ports, so camera and arm
-may run in different processes.
-
-\b
-Example:
-  twin emulate mg400 &
-  twin emulate camera --arm mg400:127.0.0.1 --sensor mg400-331 --object can \\
-      --port 8081
-"""
-
-
-@emulate.command("camera", help=HELP_EMULATE_CAMERA)
+@emulate.command("camera")
 def camera(
     arm: Annotated[str, typer.Option("--arm", metavar="A", help="mg400:ADDRESS[:DASHBOARD_PORT]")],
     sensor: Sensor,
@@ -465,6 +445,17 @@ def camera(
     fault: FaultOption = None,
     plain_light: PlainLight = False,
 ) -> None:
+    """Emulate the sensor's camera as a stream over HTTP.
+
+    The stream of JPEGs shows the contact at the pose of an emulated arm. The pose comes from the arm's feedback ports, so camera and arm
+    may run in different processes.
+
+    \b
+    Example:
+      twin emulate mg400 &
+      twin emulate camera --arm mg400:127.0.0.1 --sensor mg400-331 --object can \\
+          --port 8081
+    """
     from hardware.emulators.camera import FAULTS
     from hardware.emulators.twin_camera import emulate_camera
     from scenes import load_object, load_sensor, load_servo

@@ -14,33 +14,9 @@ if TYPE_CHECKING:
 
 # Formats that can be written, as in ``twin.records.FORMATS``, whose import would load the pin detection.
 Format = Literal["recording", "lerobot", "huggingface", "mcap"]
-HELP_CONVERT = """Translate records to other tools' formats, and back.
-
-A SOURCE is a recording, a simulated data set, a collection, the session of 'twin live --record' or 'twin servo --record', or what this
-command wrote. One contact path, or one round of a servo, is one episode.
-
-\b
---to recording    pictures with targets.csv, as this program reads everywhere
-     lerobot      LeRobotDataset v3; pictures lossless (PNG), or with --video
-     huggingface  pictures with metadata, as 'imagefolder' and the viewer read
-     mcap         a file with ROS 2 messages for each episode
-
-Every format holds the picture, the time, and as far as the source knows them pins, pose, move, wrench, estimate and action. Pins are found
-in the pictures if the source has none and its sensor is known. docs/records.md has names, units, frames and axes.
-
-The same command goes on after any end, and adds what is new: several rounds become one data set. Episodes that are there already are not
-written again.
-
-\b
-Examples:
-  twin convert out/servo/session --to lerobot --out out/dataset
-  twin convert sim/surface --to mcap --out out/bags
-  twin convert recordings/mine --sensor mine.toml --to huggingface \\
-      --out out/pictures
-"""
 
 
-@app.command("convert", help=HELP_CONVERT)
+@app.command("convert")
 def convert_command(
     sources: Annotated[list[Path], typer.Argument(metavar="SOURCE...", help="recordings, sessions, or translated records")],
     to: Annotated[Format, typer.Option("--to", metavar="FORMAT", help="recording, lerobot, huggingface or mcap")],
@@ -53,6 +29,30 @@ def convert_command(
     *,
     progress: Progress,
 ) -> "Converted":
+    """Translate records to other tools' formats, and back.
+
+    A SOURCE is a recording, a simulated data set, a collection, the session of 'twin live --record' or 'twin servo --record', or what this
+    command wrote. One contact path, or one round of a servo, is one episode.
+
+    \b
+    --to recording    pictures with targets.csv, as this program reads everywhere
+         lerobot      LeRobotDataset v3; pictures lossless (PNG), or with --video
+         huggingface  pictures with metadata, as 'imagefolder' and the viewer read
+         mcap         a file with ROS 2 messages for each episode
+
+    Every format holds the picture, the time, and as far as the source knows them pins, pose, move, wrench, estimate and action. Pins are
+    found in the pictures if the source has none and its sensor is known. docs/records.md has names, units, frames and axes.
+
+    The same command goes on after any end, and adds what is new: several rounds become one data set. Episodes that are there already are
+    not written again.
+
+    \b
+    Examples:
+      twin convert out/servo/session --to lerobot --out out/dataset
+      twin convert sim/surface --to mcap --out out/bags
+      twin convert recordings/mine --sensor mine.toml --to huggingface \\
+          --out out/pictures
+    """
     from scenes import load_sensor
     from twin.records import convert
 

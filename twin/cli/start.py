@@ -109,52 +109,7 @@ def demo(out: Out = Path("out/demo"), *, progress: Progress) -> "Demo":
     return run_demo(out, progress=progress)
 
 
-HELP_RENDER = """Press an object against a sensor and render the frame.
-
-The pose is the OBJECT's, relative to the sensor. The image shows the sensor's x to the right and y down; z points out of
-the tip at the object. Angles turn right-handed about those axes.
-
-\b
-        image                        side view (y towards you)
-      +----------> x                        camera
-      |   . . .                       ___ (       ) ___  lens
-      |  . . . .                     |     gel         |
-      |   . . .                       \\_             _/   skin, pins inside
-      v                                  '---. .---'        O----> x
-      y  (z into the page,            ========v=========    |
-          towards the object)            object             v z
-
-\b
---indent-mm D     object pushed by D along -z, counted from first touch
---tilt-deg RX RY  object first turned about x by RX, then about y by RY,
-                  through the tip: RX > 0 brings the object closer where
-                  y < 0, RY > 0 where x > 0
---shear-mm X Y    then dragged by X along x and Y along y (+X drags the pins
-                  right, +Y drags them down)
---twist-deg RZ    and turned about z by RZ (RZ > 0 turns the pins from x to y,
-                  clockwise in the image)
---offset-mm X Y   where on the object it is touched: the object is shifted by
-                  this before it approaches
-
-\b
-Writes:
-  frame.png    the frame
-  frame.exr    linear light on the whole raw frame
-  truth.npz    caps_mm, caps_px, rest_px, visible: one row a pin, in the
-               specification's order; places, normals and forces of the
-               contact
-  truth.json   force_n of the skin on the object in the sensor's axes (z > 0
-               when pressed), torque_nmm about the sensor's origin, area_mm2,
-               the pose and all resolved specifications
-  skin.vtp, skin.png, panel.png   the deformed skin, and an overview
-
-\b
-Example:
-  twin render --sensor ur5-331 --object edge --indent-mm 3 --out out/edge
-"""
-
-
-@app.command("render", help=HELP_RENDER)
+@app.command("render")
 def render_contact_command(
     sensor: Sensor,
     obj: Object,
@@ -173,6 +128,49 @@ def render_contact_command(
     *,
     progress: Progress,
 ) -> "RenderedContact":
+    """Press an object against a sensor and render the frame.
+
+    The pose is the OBJECT's, relative to the sensor. The image shows the sensor's x to the right and y down; z points out of
+    the tip at the object. Angles turn right-handed about those axes.
+
+    \b
+            image                        side view (y towards you)
+          +----------> x                        camera
+          |   . . .                       ___ (       ) ___  lens
+          |  . . . .                     |     gel         |
+          |   . . .                       \\_             _/   skin, pins inside
+          v                                  '---. .---'        O----> x
+          y  (z into the page,            ========v=========    |
+              towards the object)            object             v z
+
+    \b
+    --indent-mm D     object pushed by D along -z, counted from first touch
+    --tilt-deg RX RY  object first turned about x by RX, then about y by RY,
+                      through the tip: RX > 0 brings the object closer where
+                      y < 0, RY > 0 where x > 0
+    --shear-mm X Y    then dragged by X along x and Y along y (+X drags the pins
+                      right, +Y drags them down)
+    --twist-deg RZ    and turned about z by RZ (RZ > 0 turns the pins from x to y,
+                      clockwise in the image)
+    --offset-mm X Y   where on the object it is touched: the object is shifted by
+                      this before it approaches
+
+    \b
+    Writes:
+      frame.png    the frame
+      frame.exr    linear light on the whole raw frame
+      truth.npz    caps_mm, caps_px, rest_px, visible: one row a pin, in the
+                   specification's order; places, normals and forces of the
+                   contact
+      truth.json   force_n of the skin on the object in the sensor's axes (z > 0
+                   when pressed), torque_nmm about the sensor's origin, area_mm2,
+                   the pose and all resolved specifications
+      skin.vtp, skin.png, panel.png   the deformed skin, and an overview
+
+    \b
+    Example:
+      twin render --sensor ur5-331 --object edge --indent-mm 3 --out out/edge
+    """
     from scenes import load_object, load_sensor
     from twin.mechanics.path import ContactPose
     from twin.one_contact import render_contact

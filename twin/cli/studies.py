@@ -44,19 +44,9 @@ app.add_typer(study, name="study")
 
 # The objects of the Tac-VGNN paper.
 OBJECTS = "can,mesh-can,square,prism,tin-box"
-HELP_STUDY_SERVO = """Follow the Tac-VGNN paper's five objects with each model.
-
-It runs in the twin, and compares how well the models follow.
-
-\b
-Example:
-  twin study servo --model out/gnn --model out/tac-vgnn --out out/study
-
-Writes to --out: a folder for each model and object as 'twin servo' writes it, study.csv, study.png.
-"""
 
 
-@study.command("servo", help=HELP_STUDY_SERVO)
+@study.command("servo")
 def study_servo_command(
     models: Annotated[list[Path], typer.Option("--model", metavar="RUN", help="folder of a training run; give it once for each model")],
     out: Out,
@@ -68,6 +58,16 @@ def study_servo_command(
     *,
     progress: Progress,
 ) -> "ServoStudy":
+    """Follow the Tac-VGNN paper's five objects with each model.
+
+    It runs in the twin, and compares how well the models follow.
+
+    \b
+    Example:
+      twin study servo --model out/gnn --model out/tac-vgnn --out out/study
+
+    Writes to --out: a folder for each model and object as 'twin servo' writes it, study.csv, study.png.
+    """
     from hardware.servo_study import ServoStudyPlan, study_servo
     from scenes import load_object, load_servo
     from training.estimator import load_by_name
@@ -85,35 +85,9 @@ def study_servo_command(
 
 TRAIN = "plane,ball-10,sphere,ball-40,ball-80,hexagon-rod,square-rod,round-bar,triangle-rod"
 UNSEEN = "cylinder,edge"
-HELP_STUDY_OBJECTS = """Train on several objects, and judge on others.
-
-\b
-Example:
-  twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod \\
-      --unseen cylinder,edge --out out/objects
-
-Two models learn from the same number of contacts that are simulated in the twin (pins alone, every state on their way). 'mixed' learns
-from --count contacts of each object of --train, the other from the first of these objects alone. Both are judged on --tests other
-contacts of every object, including the objects of --unseen.
-
-Labels mean the same on every object. The depth is the indentation along the surface's normal at the place nearest to the dome's
-centre, and the angle is measured from this normal, as if a flat plate were touched there. --experiment gives the ranges in which the
-models are judged; they are trained on the experiment that it names as wider.
-
-The same command continues an interrupted study. The run that learnt several objects can be given wherever a RUN is asked for:
-
-\b
-Example:
-  twin servo --object can --model out/objects/mixed --out out/can
-
-\b
-Writes to --out: mixed/ and one named after the first object, each a RUN; sim/
-and tests/, a data set for each object (as 'twin dataset' writes them);
-objects.csv, index.html.
-"""
 
 
-@study.command("objects", help=HELP_STUDY_OBJECTS, goes_on=True)
+@study.command("objects", goes_on=True)
 def study_objects(
     sensor: Sensor,
     out: Out,
@@ -130,6 +104,32 @@ def study_objects(
     *,
     progress: Progress,
 ) -> "objects.Result":
+    """Train on several objects, and judge on others.
+
+    \b
+    Example:
+      twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod \\
+          --unseen cylinder,edge --out out/objects
+
+    Two models learn from the same number of contacts that are simulated in the twin (pins alone, every state on their way). 'mixed' learns
+    from --count contacts of each object of --train, the other from the first of these objects alone. Both are judged on --tests other
+    contacts of every object, including the objects of --unseen.
+
+    Labels mean the same on every object. The depth is the indentation along the surface's normal at the place nearest to the dome's
+    centre, and the angle is measured from this normal, as if a flat plate were touched there. --experiment gives the ranges in which the
+    models are judged; they are trained on the experiment that it names as wider.
+
+    The same command continues an interrupted study. The run that learnt several objects can be given wherever a RUN is asked for:
+
+    \b
+    Example:
+      twin servo --object can --model out/objects/mixed --out out/can
+
+    \b
+    Writes to --out: mixed/ and one named after the first object, each a RUN; sim/
+    and tests/, a data set for each object (as 'twin dataset' writes them);
+    objects.csv, index.html.
+    """
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.studies import objects
 
@@ -149,50 +149,7 @@ def study_objects(
     return objects.run(plan, out, progress=progress)
 
 
-HELP_STUDY_SIM_TO_REAL = """Train in the twin or on real frames, test on real ones.
-
-\b
-Example:
-  twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 \\
-      --seed 0 --out out/sim-to-real
-
---experiment says how the arm moved in the recording and what is learnt; --contacts is the experiment that is simulated.
-
-First, --labels real frames are drawn at random from four fifths of the recording. The friction of the simulated contacts is drawn
-from the friction found on these frames. The difference between the twin's pins and the real pins on these frames is learnt as a
-Gaussian process of the label, and drawn --draws times for every simulated contact. With --calibrate the specification is fitted to
-these frames first ('twin calibrate contact'; about an hour). All models are judged on the remaining fifth:
-
-\b
-  simulated            vgnn trained on simulated contacts alone (steered, if
-                       a label goes round the whole circle); its 90 %
-                       intervals are calibrated on the labelled frames
-  simulated and real   the same, averaged with a Gaussian process of the pins
-                       of both simulated contacts and labelled frames;
-                       also the twin that is read, with 0 to 500 frames
-  ..., N without labels
-                       vgnn or steered, trained on the labelled frames and on
-                       N others, whose labels the twin that is read tells
-  real                 vgnn or steered, and a quadratic regression, trained on
-                       as many real frames, on 500 and on all
-  ..., even            the same with frames that are nearest to an even
-                       sequence ('twin collect --design even')
-  --ablate             also models trained on simulated contacts with one
-                       change each: without the learnt difference of the pins,
-                       with a fifth of the contacts, a coarse mesh, one
-                       friction, any friction, no moves, drawn tolerances of
-                       skin and gel, and without calibration; this simulates
-                       six more sets of contacts
-
-The contacts are simulated in --out/sim, without pictures. With --sim finished data sets of 'twin dataset' or 'twin study objects'
-are used instead (give it once for each). If a data set has pictures, the pins are those that the pipeline finds in them. The same
-command continues an interrupted study.
-
-Writes to --out: sim_only/, sim_plus_real/, sim_taught/ and real_N/, each a RUN; study.csv and index.html.
-"""
-
-
-@study.command("sim-to-real", help=HELP_STUDY_SIM_TO_REAL, goes_on=True)
+@study.command("sim-to-real", goes_on=True)
 def study_sim_to_real(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled real recording")],
@@ -218,6 +175,47 @@ def study_sim_to_real(
     *,
     progress: Progress,
 ) -> "sim_to_real.Result":
+    """Train in the twin or on real frames, test on real ones.
+
+    \b
+    Example:
+      twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 \\
+          --seed 0 --out out/sim-to-real
+
+    --experiment says how the arm moved in the recording and what is learnt; --contacts is the experiment that is simulated.
+
+    First, --labels real frames are drawn at random from four fifths of the recording. The friction of the simulated contacts is drawn
+    from the friction found on these frames. The difference between the twin's pins and the real pins on these frames is learnt as a
+    Gaussian process of the label, and drawn --draws times for every simulated contact. With --calibrate the specification is fitted to
+    these frames first ('twin calibrate contact'; about an hour). All models are judged on the remaining fifth:
+
+    \b
+      simulated            vgnn trained on simulated contacts alone (steered, if
+                           a label goes round the whole circle); its 90 %
+                           intervals are calibrated on the labelled frames
+      simulated and real   the same, averaged with a Gaussian process of the pins
+                           of both simulated contacts and labelled frames;
+                           also the twin that is read, with 0 to 500 frames
+      ..., N without labels
+                           vgnn or steered, trained on the labelled frames and on
+                           N others, whose labels the twin that is read tells
+      real                 vgnn or steered, and a quadratic regression, trained on
+                           as many real frames, on 500 and on all
+      ..., even            the same with frames that are nearest to an even
+                           sequence ('twin collect --design even')
+      --ablate             also models trained on simulated contacts with one
+                           change each: without the learnt difference of the pins,
+                           with a fifth of the contacts, a coarse mesh, one
+                           friction, any friction, no moves, drawn tolerances of
+                           skin and gel, and without calibration; this simulates
+                           six more sets of contacts
+
+    The contacts are simulated in --out/sim, without pictures. With --sim finished data sets of 'twin dataset' or 'twin study objects'
+    are used instead (give it once for each). If a data set has pictures, the pins are those that the pipeline finds in them. The same
+    command continues an interrupted study.
+
+    Writes to --out: sim_only/, sim_plus_real/, sim_taught/ and real_N/, each a RUN; study.csv and index.html.
+    """
     from scenes import load_experiment, load_sensor
     from training.studies import sim_to_real
 
@@ -241,29 +239,9 @@ def study_sim_to_real(
 
 
 MODELS = "gnn,tac-vgnn,vgnn,cnn-v2,cnn-v1"
-HELP_STUDY_TAC_VGNN = """Repeat the Tac-VGNN paper's comparison on a recording.
-
-It compares graphs, models and training efficiency, and shows how the Voronoi areas tell the depth of a contact.
-
-\b
-Example:
-  twin study tac-vgnn --data DIR --sensor mg400-331 --out out/study \\
-      --max-minutes 120
-
-The models (--models) are gnn, tac-vgnn, tac-vgnn-release, cnn-v1, cnn-v2, and this project's vgnn. vgnn-without-graph,
-vgnn-without-modes and vgnn-without-kernel show what each part of vgnn contributes.
-
-All models are trained on the same rows and labels, and judged on the same fifth. Each run is a folder below --out/runs as 'twin train'
-writes it. The same command continues an interrupted study, so a study may be spread over several days. --max-minutes is shared
-evenly among the runs that are still to do. A run that this time ended is reported as ended early.
-
-\b
-Writes to --out: models.csv, graphs.csv, efficiency.csv, contacts.csv,
-curves.png, efficiency.png, contacts.png, index.html, runs/.
-"""
 
 
-@study.command("tac-vgnn", help=HELP_STUDY_TAC_VGNN, goes_on=True)
+@study.command("tac-vgnn", goes_on=True)
 def study_tac_vgnn(
     data: Annotated[Path, typer.Option("--data", metavar="DIR", help="labelled recording")],
     sensor: Sensor,
@@ -287,6 +265,26 @@ def study_tac_vgnn(
     *,
     progress: Progress,
 ) -> "tac_vgnn.Result":
+    """Repeat the Tac-VGNN paper's comparison on a recording.
+
+    It compares graphs, models and training efficiency, and shows how the Voronoi areas tell the depth of a contact.
+
+    \b
+    Example:
+      twin study tac-vgnn --data DIR --sensor mg400-331 --out out/study \\
+          --max-minutes 120
+
+    The models (--models) are gnn, tac-vgnn, tac-vgnn-release, cnn-v1, cnn-v2, and this project's vgnn. vgnn-without-graph,
+    vgnn-without-modes and vgnn-without-kernel show what each part of vgnn contributes.
+
+    All models are trained on the same rows and labels, and judged on the same fifth. Each run is a folder below --out/runs as 'twin train'
+    writes it. The same command continues an interrupted study, so a study may be spread over several days. --max-minutes is shared
+    evenly among the runs that are still to do. A run that this time ended is reported as ended early.
+
+    \b
+    Writes to --out: models.csv, graphs.csv, efficiency.csv, contacts.csv,
+    curves.png, efficiency.png, contacts.png, index.html, runs/.
+    """
     from scenes import load_sensor
     from training.studies import tac_vgnn
     from training.train import columns_of

@@ -12,33 +12,8 @@ from twin.cli.options import say
 if TYPE_CHECKING:
     from training.estimator import PoseEstimator
 
-HELP_STUDIO = """Move an object over the skin, on a page in the browser.
 
-Drag the object with the arrows and rings of the gizmo, or use sliders, typed numbers or keys (shift and arrows, page up and page down;
-with ctrl they turn it; 'ctrl + K' lists all). At once the page shows the skin with its pins, the camera's picture, the pins found and
-their Voronoi cells, force and torque, and the model's estimate with its 90 % interval beside the truth.
-
-While the object moves, contacts are solved on the usual mesh and pictures are drawn. When it stands still, the picture is path-traced
-and the contact is solved again on a fine mesh. The page says which of them it shows. Where the object may not go, it stops, and the
-page says why.
-
-Other modes: Degrade (what the pipeline and the model bear on this contact), Recording (labels against estimates), Live (camera and arm),
-Your own sensor (a specification from a folder of frames, as 'twin new' makes it, with the layout drawn over them and corrected).
-
-The page's folder 'Save' shows a link that opens the whole state again, in a browser while the studio runs, or with --state.
-
-The page is served for this machine alone, loads nothing from elsewhere, and several browsers see the same state. Ctrl-C ends it.
-
-\b
-Example:
-  twin studio
-  twin studio --sensor ur5-331 --object edge
-  twin studio --state out/studio/state-1.json
-  twin studio --state '?sensor=mg400-331&object=edge&depth_mm=3'
-"""
-
-
-@app.command("studio", help=HELP_STUDIO)
+@app.command("studio")
 def studio(
     sensor: Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")] = "mg400-331",
     obj: Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")] = "sphere",
@@ -57,6 +32,30 @@ def studio(
     plain: Annotated[bool, typer.Option("--plain", help="no path tracing: pictures stay drawn")] = False,
     seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="end after this time")] = None,
 ) -> None:
+    """Move an object over the skin, on a page in the browser.
+
+    Drag the object with the arrows and rings of the gizmo, or use sliders, typed numbers or keys (shift and arrows, page up and page down;
+    with ctrl they turn it; 'ctrl + K' lists all). At once the page shows the skin with its pins, the camera's picture, the pins found and
+    their Voronoi cells, force and torque, and the model's estimate with its 90 % interval beside the truth.
+
+    While the object moves, contacts are solved on the usual mesh and pictures are drawn. When it stands still, the picture is path-traced
+    and the contact is solved again on a fine mesh. The page says which of them it shows. Where the object may not go, it stops, and the
+    page says why.
+
+    Other modes: Degrade (what the pipeline and the model bear on this contact), Recording (labels against estimates), Live (camera and
+    arm), Your own sensor (a specification from a folder of frames, as 'twin new' makes it, with the layout drawn over them and corrected).
+
+    The page's folder 'Save' shows a link that opens the whole state again, in a browser while the studio runs, or with --state.
+
+    The page is served for this machine alone, loads nothing from elsewhere, and several browsers see the same state. Ctrl-C ends it.
+
+    \b
+    Example:
+      twin studio
+      twin studio --sensor ur5-331 --object edge
+      twin studio --state out/studio/state-1.json
+      twin studio --state '?sensor=mg400-331&object=edge&depth_mm=3'
+    """
     from hardware.live_feed import CameraFeed, require_feed
     from hardware.rig import signals_as_ctrl_c
     from scenes import load_sensor

@@ -6,11 +6,11 @@ from typing import Literal
 
 from hardware.arms.open_arm import open_arm as open_arm
 from hardware.cameras.choose import open_camera as open_camera
-from hardware.collect import Collected as Collected
-from hardware.examining import Examination as Examination
-from hardware.following import Followed as Followed
-from hardware.safe_arm import SafeArm as SafeArm
-from hardware.safety import load_limits as load_limits
+from hardware.collect.collect import Collected as Collected
+from hardware.live.examining import Examination as Examination
+from hardware.safety.decide import load_limits as load_limits
+from hardware.safety.safe_arm import SafeArm as SafeArm
+from hardware.servo.following import Followed as Followed
 from scenes import ExperimentSpec as ExperimentSpec
 from scenes import ObjectSpec as ObjectSpec
 from scenes import SensorSpec as SensorSpec
@@ -20,15 +20,15 @@ from scenes import load_object as load_object
 from scenes import load_sensor as load_sensor
 from training.environments import register_all as register_all
 from training.environments.learn import Learnt as Learnt
-from training.estimator import load_remembering as load_remembering
+from training.estimate.estimator import load_remembering as load_remembering
 from training.generation.run import Simulated as Simulated
+from training.runs.train import Trained as Trained
 from training.studies.degradation import Result as Result
 from training.studies.evaluation import Evaluation as Evaluation
 from training.studies.label_audit import LabelAudit as LabelAudit
 from training.studies.prediction import Predictions as Predictions
 from training.studies.realism import Realism as Realism
 from training.studies.validation import Validation as Validation
-from training.train import Trained as Trained
 from twin.fit.contact.calibrate import ContactCalibration as ContactCalibration
 from twin.fit.go_on import WholeSensor as WholeSensor
 from twin.fit.optics import OpticsCalibration as OpticsCalibration

@@ -11,7 +11,7 @@ from twin.types import Form, Frame, Observation
 
 
 class Estimate(Protocol):
-    """An estimator's result on a frame (``training.estimator.PoseEstimate``)."""
+    """An estimator's result on a frame (``training.estimate.estimator.PoseEstimate``)."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -44,7 +44,7 @@ Estimator = Callable[[Frame], Estimate]
 
 
 class SensorModel(Protocol):
-    """A trained model with its sensor and its pipeline: frame in, estimate out (``training.estimator.PoseEstimator``)."""
+    """A trained model with its sensor and its pipeline: frame in, estimate out (``training.estimate.estimator.PoseEstimator``)."""
 
     sensor: SensorSpec
     form: Form

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, MinLen, MultipleOf
 from pydantic.fields import FieldInfo
 
-from hardware.safety import SafetyLimits
+from hardware.safety.decide import SafetyLimits
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, ServoSpec
 from scenes.base import Section
 from twin.judge.degradation.plan import SweepPlan

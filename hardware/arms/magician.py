@@ -16,8 +16,8 @@ from hardware.arms.dobot_alarms import explain
 from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
 from hardware.arms.supervisor import Supervisor
-from hardware.awake import awake_s
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.safety.awake import awake_s
 
 # Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take as long as feedback may be old.
 REPLY_TIMEOUT_S = 0.2

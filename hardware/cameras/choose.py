@@ -7,7 +7,7 @@ from hardware.cameras.recorded import RecordedSource
 from hardware.cameras.source import FrameSource
 from hardware.cameras.uvc import UvcCamera, UvcSettings
 from hardware.errors import DeviceError
-from hardware.session import SessionSource
+from hardware.live.session import SessionSource
 from scenes.files import LONGEST_PATH, shown
 from scenes.plugins import others
 from scenes.sensor import SensorSpec

@@ -10,7 +10,7 @@ import numpy as np
 from hardware.arms.arm import ArmState
 from hardware.cameras.reader import LiveSource, Picture, ReadFailed
 from hardware.errors import DeviceError, DeviceNotConnectedError
-from hardware.rig_geometry import PlacedObject
+from hardware.rig.geometry import PlacedObject
 from scenes.sensor import ResponseSpec, SensorSpec
 from twin.camera.capture import expose, record
 from twin.errors import ContactError

@@ -8,7 +8,7 @@ import sys
 
 from endurance import endure
 
-from training.estimator import PoseEstimator
+from training.estimate.estimator import PoseEstimator
 
 SECONDS = 1800.0
 

@@ -40,11 +40,11 @@ def once() -> dict[str, float]:
     """Run the loop of the version that is on the path."""
     from hardware.arms.mg400 import MG400, Mg400Ports
     from hardware.cameras.mjpeg import MjpegCamera
-    from hardware.rig import Rig, servo_loop
-    from hardware.rig_geometry import PlacedObject
-    from hardware.safe_arm import SafeArm
-    from hardware.safety import load_limits
-    from hardware.step import LoopSettings
+    from hardware.rig.geometry import PlacedObject
+    from hardware.rig.rig import Rig, servo_loop
+    from hardware.safety.decide import load_limits
+    from hardware.safety.safe_arm import SafeArm
+    from hardware.servo.step import LoopSettings
     from scenes import load_experiment, load_object, load_sensor, load_servo
     from twin.rig.mounting import Mounting
     from twin.types import Form

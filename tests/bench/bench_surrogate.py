@@ -11,9 +11,9 @@ import numpy as np
 
 from scenes import load_object, load_sensor
 from scenes.sensor import SensorSpec
+from training.data.pins import PinTable
 from training.environments.observe import Eye, caps_px
-from training.estimator import PoseEstimator
-from training.pins import PinTable
+from training.estimate.estimator import PoseEstimator
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.felt import Contact
 from training.surrogate.model import surrogate_of

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from scenes import load_sensor
+from training.data.pins import PinTable
 from training.models import model_named
 from training.models.cnn.inputs import ImageInputs
 from training.models.part import Inputs, PinModel
-from training.pins import PinTable
 from training.studies.tac_vgnn.models import measure_training
 from twin.pins import make_graph, nominal_reference
 from twin.types import Form

@@ -15,9 +15,9 @@ import numpy as np
 from browser_page import open_page
 from studio_client import StudioClient
 
-from hardware.live_feed import CameraFeed
+from hardware.live.feed import CameraFeed
 from scenes import load_sensor
-from training.estimator import models_by_sensor
+from training.estimate.estimator import models_by_sensor
 from twin.studio.pose import ObjectPose
 from twin.studio.scene import quaternion
 from twin.studio.state import first_state

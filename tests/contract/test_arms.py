@@ -8,8 +8,8 @@ from arms import ARMS, bench
 
 from hardware.arms.open_arm import open_arm
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
-from hardware.safe_arm import SafeArm
-from hardware.safety import load_limits
+from hardware.safety.decide import load_limits
+from hardware.safety.safe_arm import SafeArm
 
 SETTLED_MM = 0.1  # repeatability of the arms is half of it
 SLOW_MM_S, FAST_MM_S = 20.0, 200.0

@@ -23,12 +23,12 @@ from hardware.cameras.reader import FIRST_PERIODS, MOST_FAILED_READS, ReadFailed
 from hardware.cameras.source import FrameSource
 from hardware.cameras.twin import TwinCamera
 from hardware.cameras.uvc import UvcCamera, UvcSettings, apply_settings, exposed_s
-from hardware.doctor import cameras
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
-from hardware.examining import frames_of
-from hardware.lerobot import LeRobotCamera
-from hardware.rig_geometry import PlacedObject
+from hardware.live.doctor import cameras
+from hardware.live.examining import frames_of
+from hardware.live.lerobot import LeRobotCamera
+from hardware.rig.geometry import PlacedObject
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from twin.errors import FrameError
 from twin.frames.images import write_image
@@ -427,7 +427,7 @@ def test_check_says_what_to_do_about_a_camera_that_gives_nothing(monkeypatch):
             self._end.wait()
             raise ReadFailed("ended")
 
-    monkeypatch.setattr("hardware.examining.open_camera", lambda *_: Silent())
+    monkeypatch.setattr("hardware.live.examining.open_camera", lambda *_: Silent())
     monkeypatch.setattr(reader, "START_S", 0.1)
     with pytest.raises(DeviceError, match=r"noisy camera: no new frame within 0\.15 s; check the camera"):
         frames_of("0", None, None, 2)

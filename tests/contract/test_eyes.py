@@ -20,15 +20,15 @@ from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import Picture
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
-from hardware.eyes import NEAR_MM, PIECE_MM, BlindError, Eyes, pieces_to
-from hardware.live_feed import CameraFeed
-from hardware.loop import ServoLoop
-from hardware.plan import check_plan
-from hardware.rig import Rig, servo_loop
-from hardware.rig_geometry import PlacedObject, moved
-from hardware.safe_arm import SafeArm
-from hardware.safety import SafetyLimits, load_limits
-from hardware.step import LoopSettings
+from hardware.live.feed import CameraFeed
+from hardware.rig.geometry import PlacedObject, moved
+from hardware.rig.plan import check_plan
+from hardware.rig.rig import Rig, servo_loop
+from hardware.safety.decide import SafetyLimits, load_limits
+from hardware.safety.eyes import NEAR_MM, PIECE_MM, BlindError, Eyes, pieces_to
+from hardware.safety.safe_arm import SafeArm
+from hardware.servo.loop import ServoLoop
+from hardware.servo.step import LoopSettings
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 from twin.types import Form
@@ -201,7 +201,7 @@ def test_where_the_limits_allow_no_way_back_the_arm_goes_back_the_way_it_came(pl
 
 def test_the_studio_moves_an_arm_only_with_frames_and_back_without(monkeypatch):
     source = Switched()
-    monkeypatch.setattr("hardware.live_feed.open_camera", lambda *_: source)
+    monkeypatch.setattr("hardware.live.feed.open_camera", lambda *_: source)
     model = SimpleNamespace(sensor=load_sensor("mg400-331"), form=Form.RAW, check=lambda *_: None)
     value = np.zeros(1)
 

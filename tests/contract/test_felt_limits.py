@@ -12,11 +12,11 @@ from true_estimator import TrueEstimator
 
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
-from hardware.rig import Rig, servo_loop
-from hardware.rig_geometry import PlacedObject
-from hardware.safe_arm import RefusedMoveError, SafeArm
-from hardware.safety import Code, load_limits
-from hardware.step import LoopSettings
+from hardware.rig.geometry import PlacedObject
+from hardware.rig.rig import Rig, servo_loop
+from hardware.safety.decide import Code, load_limits
+from hardware.safety.safe_arm import RefusedMoveError, SafeArm
+from hardware.servo.step import LoopSettings
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 

@@ -10,12 +10,12 @@ from true_estimator import TrueEstimator
 
 from hardware.arms.kinematics import MG400
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.last_axis import HOLD_DEG, LastAxis, turns_back_mm
-from hardware.rig import Rig, servo_loop, steps_round
-from hardware.rig_geometry import PlacedObject
-from hardware.safe_arm import SafeArm
-from hardware.safety import load_limits
-from hardware.step import LoopSettings
+from hardware.rig.geometry import PlacedObject
+from hardware.rig.last_axis import HOLD_DEG, LastAxis, turns_back_mm
+from hardware.rig.rig import Rig, servo_loop, steps_round
+from hardware.safety.decide import load_limits
+from hardware.safety.safe_arm import SafeArm
+from hardware.servo.step import LoopSettings
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 

@@ -13,17 +13,17 @@ from noisy_camera import NoisyCamera
 from true_estimator import TrueEstimate, TrueEstimator
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
-from hardware.collect import Collection, collect
+from hardware.collect.collect import Collection, collect
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError, DeviceNotConnectedError
-from hardware.lerobot import LeRobotArm
-from hardware.live_feed import CameraFeed
-from hardware.loop import ServoLoop
-from hardware.rig import Rig, servo_loop, signals_as_ctrl_c
-from hardware.rig_geometry import PlacedObject
-from hardware.safe_arm import SafeArm
-from hardware.safety import SafetyLimits
-from hardware.step import LoopSettings
+from hardware.live.feed import CameraFeed
+from hardware.live.lerobot import LeRobotArm
+from hardware.rig.geometry import PlacedObject
+from hardware.rig.rig import Rig, servo_loop, signals_as_ctrl_c
+from hardware.safety.decide import SafetyLimits
+from hardware.safety.safe_arm import SafeArm
+from hardware.servo.loop import ServoLoop
+from hardware.servo.step import LoopSettings
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 from twin.types import Form
@@ -221,7 +221,7 @@ class TestMg400:
 @pytest.fixture
 def feed(monkeypatch):
     """The studio's camera with an armed arm, an emulator of it, and the texts that it ended with."""
-    monkeypatch.setattr("hardware.live_feed.open_camera", lambda *_: NoisyCamera())
+    monkeypatch.setattr("hardware.live.feed.open_camera", lambda *_: NoisyCamera())
     value = np.zeros(1)
     model = SimpleNamespace(sensor=load_sensor("mg400-331"), form=Form.RAW, check=lambda *_: None, counts_from_rest=False)
     offset = free_offset()

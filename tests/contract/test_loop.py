@@ -12,11 +12,11 @@ from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
-from hardware.loop import Decided, ServoLoop
-from hardware.rig_geometry import PlacedObject
-from hardware.session import SessionSource
-from hardware.step import LoopSettings
-from hardware.trajectory import measure, trajectory_of, write_csv
+from hardware.live.session import SessionSource
+from hardware.rig.geometry import PlacedObject
+from hardware.servo.loop import Decided, ServoLoop
+from hardware.servo.step import LoopSettings
+from hardware.servo.trajectory import measure, trajectory_of, write_csv
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.records.session import Session, SessionWriter
 from twin.rig.mounting import Mounting
@@ -199,7 +199,7 @@ def test_after_a_hold_it_goes_on_from_where_the_arm_stands(rig):
 def test_a_long_way_to_the_object_is_given_its_time(rig, monkeypatch):
     placed, _ = rig
     arm = SimulatedArm(axes=6, pose=placed.start_pose(-60.0), time_scale=1.0)
-    monkeypatch.setattr("hardware.loop.MOVE_TIMEOUT_S", 1.0)  # the 50 mm from clear of it take 2.5 s
+    monkeypatch.setattr("hardware.servo.loop.MOVE_TIMEOUT_S", 1.0)  # the 50 mm from clear of it take 2.5 s
     with arm, NoisyCamera() as source:
         assert loop_of((placed, arm), source, 1).run(start((placed, arm))).steps == 1
 
@@ -227,7 +227,7 @@ def test_an_arm_that_is_held_is_not_awaited_for_ever(rig, monkeypatch):
         def hold(record, frame, estimate):
             if record.index == 5:
                 arm.held = record.pose
-                monkeypatch.setattr("hardware.loop.MOVE_TIMEOUT_S", 1.0)
+                monkeypatch.setattr("hardware.servo.loop.MOVE_TIMEOUT_S", 1.0)
 
         loop.on_step = hold
         with pytest.raises(DeviceError, match="look for what holds it"):

@@ -10,16 +10,16 @@ from noisy_camera import NoisyCamera
 from true_estimator import TrueEstimator
 
 from hardware.cameras.twin import TwinCamera
-from hardware.collect import Collection, collect
+from hardware.collect.collect import Collection, collect
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.twin_camera import FeedbackPose
 from hardware.errors import DeviceError
-from hardware.loop import ServoLoop
-from hardware.rig_geometry import PlacedObject
-from hardware.safe_arm import SafeArm
-from hardware.safety import SafetyLimits
-from hardware.step import LoopSettings
-from hardware.watch import ArmWatch
+from hardware.rig.geometry import PlacedObject
+from hardware.safety.decide import SafetyLimits
+from hardware.safety.safe_arm import SafeArm
+from hardware.safety.watch import ArmWatch
+from hardware.servo.loop import ServoLoop
+from hardware.servo.step import LoopSettings
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
@@ -101,7 +101,7 @@ def test_a_lost_arm_is_told_while_a_frame_is_waited_for(emulator, placed, tmp_pa
     clock = Clock(emulator, "frozen=0")
     arm = SafeArm(mg400_of(emulator), FREE)
     with pytest.MonkeyPatch.context() as patch, Blind() as source:
-        patch.setattr("hardware.collect.ArmWatch", lambda arm: ArmWatch(arm, tell=clock.tell))
+        patch.setattr("hardware.collect.collect.ArmWatch", lambda arm: ArmWatch(arm, tell=clock.tell))
         with pytest.raises(DeviceError) as raised, arm:
             about = Collection(tmp_path, {"seed": 1}, Form.RAW)
             collect(source, arm, load_experiment("surface-2d"), placed, about, 3, seed=1, speed=(200.0, 200.0))

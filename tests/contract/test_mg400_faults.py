@@ -17,8 +17,8 @@ from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, newest_pa
 from hardware.emulators.mg400 import FAULTS, Mg400Emulator, feedback_packet
 from hardware.emulators.mg400_grammar import RefusedError
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
-from hardware.safe_arm import SafeArm
-from hardware.safety import load_limits
+from hardware.safety.decide import load_limits
+from hardware.safety.safe_arm import SafeArm
 from twin.errors import TwinError
 
 HOME = np.array([300.0, 0, 0, 0, 0, 10])

@@ -8,10 +8,10 @@ from arms import bench, mg400_of
 
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
-from hardware.lerobot import LeRobotArm
-from hardware.newest import PIECE_S
-from hardware.safe_arm import SafeArm
-from hardware.safety import load_limits
+from hardware.live.lerobot import LeRobotArm
+from hardware.rig.newest import PIECE_S
+from hardware.safety.decide import load_limits
+from hardware.safety.safe_arm import SafeArm
 
 RATE_HZ, ACTIONS = 30.0, 45
 SPEED_MM_S = 60.0

@@ -7,7 +7,7 @@ import pytest
 
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.twin import TwinCamera
-from hardware.rig_geometry import PlacedObject, moved
+from hardware.rig.geometry import PlacedObject, moved
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from twin.mechanics.follow import SETTLED_MM
 from twin.rig.contact import contact_law

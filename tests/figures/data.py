@@ -10,7 +10,7 @@ from fresh_contacts import simulate_contacts
 
 from figures.jobs import NO_PICTURES, Measured, Value, job
 from scenes import load_sensor
-from training.simulated import open_simulated
+from training.data.simulated import open_simulated
 
 SENSOR, CONTACTS, SEED = "mg400-331", 12, 3
 ACROSS = (20, 16, 12)
@@ -20,7 +20,7 @@ ACROSS = (20, 16, 12)
     "data.rates.mg400-331",
     "twin dataset --sensor mg400-331 --experiment surface-2d --images none --states all --across N",
     sensors=(SENSOR,),
-    code=("training.generation", "training.simulated"),
+    code=("training.generation", "training.data.simulated"),
     minutes=3,
     beside=NO_PICTURES,
 )

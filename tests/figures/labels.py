@@ -10,14 +10,14 @@ import numpy as np
 
 from figures.jobs import NO_PICTURES, ROOT, Measured, Value, job, real_folder
 from scenes import load_experiment, load_sensor
-from training.dataset import load_dataset
-from training.estimator import PoseEstimator
-from training.evaluate import judge
+from training.data.dataset import load_dataset
+from training.data.targets import unit_of
+from training.estimate.estimator import PoseEstimator
+from training.runs.evaluate import judge
 from training.studies.evaluation import models_of_kinds
 from training.studies.sim_to_real import Plan
 from training.studies.sim_to_real.page import errors_figure
 from training.studies.sim_to_real.worth import worth
-from training.targets import unit_of
 from twin.frames import open_recording
 from twin.report.charts import write_chart
 from twin.store import write_json

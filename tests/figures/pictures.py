@@ -8,7 +8,7 @@ from bench_render import CHOSEN, DRAWN, Bench
 
 from figures.jobs import NO_RESIDUAL, Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
-from training.residual import calibrate_residual
+from training.runs.residual import calibrate_residual
 from twin.frames import open_recording
 from twin.judge.pictures.images import compare_images
 from twin.optics.relief import DETAILS
@@ -59,9 +59,9 @@ def judged(work: Path, out: Path, *options: str) -> dict:
 
 @job(
     "render.residual.ur5-331",
-    "training.residual.calibrate_residual(DIR, load_sensor('ur5-331'), OUT)",
+    "training.runs.residual.calibrate_residual(DIR, load_sensor('ur5-331'), OUT)",
     sensors=("ur5-331",),
-    code=("training.residual",),
+    code=("training.runs.residual",),
     recordings=("ur5-331-raw",),
     minutes=35,
     beside=NO_RESIDUAL,

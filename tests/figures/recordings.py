@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from figures.jobs import NO_PICTURES, Measured, Value, job, real_folder, run_twin
-from training.dataset import load_dataset
+from training.data.dataset import load_dataset
 from training.studies.evaluation import models_of_kinds
 
 SENSOR, TACPAD = "ur5-331", "ur5-tacpad"

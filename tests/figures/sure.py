@@ -17,7 +17,7 @@ def key_of(change: str) -> str:
     "make figures ONLY=sure.changes",
     sensors=("mg400-331", "mg400-127", "ur5-331"),
     beside=NO_PICTURES,
-    code=("training.estimator", "training.contact_estimator", "training.domain", "changed_views"),
+    code=("training.estimate.estimator", "training.estimate.contact_estimator", "training.estimate.domain", "changed_views"),
     shipped=("training/weights",),
     recordings=tuple(dict.fromkeys(recording for _, recording, _, _ in CASES.values())),
     minutes=20,

@@ -22,16 +22,16 @@ from true_estimator import TrueEstimator
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import Picture
-from hardware.collect import Collection, collect
+from hardware.collect.collect import Collection, collect
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
-from hardware.eyes import NEAR_MM
-from hardware.rig import Rig, servo_loop
-from hardware.rig_geometry import PlacedObject, moved
-from hardware.safe_arm import SafeArm
-from hardware.safety import SafetyLimits
-from hardware.step import LoopSettings
+from hardware.rig.geometry import PlacedObject, moved
+from hardware.rig.rig import Rig, servo_loop
+from hardware.safety.decide import SafetyLimits
+from hardware.safety.eyes import NEAR_MM
+from hardware.safety.safe_arm import SafeArm
+from hardware.servo.step import LoopSettings
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 from twin.types import Form

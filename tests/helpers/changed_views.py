@@ -11,11 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from training.contact_estimator import ContactEstimator, contacts_folder
-from training.displacements import MOST_CONTACTS
-from training.estimator import PoseEstimator
-from training.label_code import label_error
-from training.targets import choose_targets
+from training.data.label_code import label_error
+from training.data.targets import choose_targets
+from training.estimate.contact_estimator import ContactEstimator, contacts_folder
+from training.estimate.displacements import MOST_CONTACTS
+from training.estimate.estimator import PoseEstimator
 from twin.errors import TwinError
 from twin.frames import evenly_read, open_recording
 from twin.rig.labels import label_slope

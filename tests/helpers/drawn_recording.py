@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from scenes import load_sensor
-from training.dataset import Dataset
+from training.data.dataset import Dataset
+from training.data.pins import PinTable
+from training.data.targets import Targets
 from training.models import recipe_of
-from training.pins import PinTable
-from training.run import RunConfig
-from training.targets import Targets
+from training.runs.run import RunConfig
 from twin.pins import make_graph, nominal_reference
 from twin.types import Form
 

@@ -17,9 +17,9 @@ import psutil
 from free_ports import free_offset
 
 from hardware.arms.mg400_wire import DASHBOARD_PORT
-from hardware.loop import Decided, ServoLoop
-from hardware.rig import build_rig, servo_loop
-from hardware.step import LoopSettings
+from hardware.rig.rig import build_rig, servo_loop
+from hardware.servo.loop import Decided, ServoLoop
+from hardware.servo.step import LoopSettings
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.errors import TwinError
 from twin.estimate import SensorModel
@@ -62,8 +62,8 @@ CAMERA = """
 import sys
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.twin_camera import FeedbackPose
-from hardware.rig import twin_camera
-from hardware.rig_geometry import PlacedObject
+from hardware.rig.rig import twin_camera
+from hardware.rig.geometry import PlacedObject
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 from twin.types import Form

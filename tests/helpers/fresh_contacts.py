@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from scenes import load_experiment, load_object, load_randomisation, load_sensor
-from training.dataset import Dataset, load_dataset
-from training.estimator import PoseEstimator
+from training.data.dataset import Dataset, load_dataset
+from training.data.simulated import config_of
+from training.estimate.estimator import PoseEstimator
 from training.generation import GenerationConfig, generate
-from training.simulated import config_of
 from twin.rig.kinematics import rig_of
 
 

@@ -16,13 +16,13 @@ from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.twin_camera import FeedbackPose
 from hardware.errors import DeviceError
-from hardware.policy_law import load_for_outlines, policy_law
-from hardware.rig import Rig, servo_loop
-from hardware.rig_geometry import PlacedObject
-from hardware.safe_arm import SafeArm
-from hardware.safety import load_limits
-from hardware.step import LoopSettings
-from hardware.trajectory import measure, trajectory_of
+from hardware.rig.geometry import PlacedObject
+from hardware.rig.rig import Rig, servo_loop
+from hardware.safety.decide import load_limits
+from hardware.safety.safe_arm import SafeArm
+from hardware.servo.policy_law import load_for_outlines, policy_law
+from hardware.servo.step import LoopSettings
+from hardware.servo.trajectory import measure, trajectory_of
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.pins import Pipeline
 from twin.rig.mounting import Mounting

@@ -8,8 +8,8 @@ import os
 import pytest
 from endurance import LONGEST_ROUND_S, LOUD, endure
 
-from hardware.loop import Decided
-from training.estimator import PoseEstimator
+from hardware.servo.loop import Decided
+from training.estimate.estimator import PoseEstimator
 
 SECONDS = float(os.environ.get("TACTIP_ENDURANCE_S", "90"))
 GROWTH = 1.15  # of the memory, from the third round to the last: allocators keep what they once had

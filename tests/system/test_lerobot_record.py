@@ -27,7 +27,7 @@ import math, time
 from dataclasses import dataclass, field
 from lerobot.robots import RobotConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
-from hardware.lerobot import LeRobotArm, LeRobotArmConfig
+from hardware.live.lerobot import LeRobotArm, LeRobotArmConfig
 
 @RobotConfig.register_subclass("tactip_arm")
 @dataclass(kw_only=True)

@@ -19,7 +19,6 @@ from studio_client import StudioClient
 from true_estimator import TrueEstimate, TrueEstimator
 from typer.testing import CliRunner
 
-from hardware import following
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.reader import LiveSource, Picture
 from hardware.cameras.twin import preview_of
@@ -27,13 +26,14 @@ from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import run_until_told
 from hardware.errors import DeviceError
-from hardware.live import LiveSession, Shower, WatchPlan, watch
-from hardware.rig import build_rig, steps_round
-from hardware.rig_geometry import PlacedObject
-from hardware.session import SessionSource
+from hardware.live.live import LiveSession, Shower, WatchPlan, watch
+from hardware.live.session import SessionSource
+from hardware.rig.geometry import PlacedObject
+from hardware.rig.rig import build_rig, steps_round
+from hardware.servo import following
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from training.displacements import FEWEST_CONTACTS
-from training.estimator import PoseEstimator
+from training.estimate.displacements import FEWEST_CONTACTS
+from training.estimate.estimator import PoseEstimator
 from twin.camera.capture import expose, record
 from twin.cli import command_line
 from twin.errors import OptionError, TwinError

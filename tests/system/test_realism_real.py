@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from scenes import load_sensor
-from training.two_sample import two_sample
+from training.data.two_sample import two_sample
 from twin.camera.projection import lens_disc
 from twin.judge.pictures.frames import read_real
 from twin.judge.pictures.statistics import TARGET, TARGET_MEASURES, compare_statistics, measure_frame

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from fresh_contacts import read_for, simulate_contacts
 
-from training.estimator import PoseEstimator
-from training.evaluate import judge
-from training.packed import shipped_names
+from training.estimate.estimator import PoseEstimator
+from training.runs.evaluate import judge
+from training.runs.packed import shipped_names
 from twin.frames import open_recording
 from twin.types import Form
 

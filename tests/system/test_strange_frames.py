@@ -6,10 +6,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hardware.rig import build_rig, servo_loop
-from hardware.step import LoopSettings
+from hardware.rig.rig import build_rig, servo_loop
+from hardware.servo.step import LoopSettings
 from scenes import load_experiment, load_object, load_servo
-from training.estimator import PoseEstimator
+from training.estimate.estimator import PoseEstimator
 
 STEPS, STRANGE = 6, 4
 

@@ -13,9 +13,9 @@ from small_generation import EXPERIMENT, SENSOR
 from typer.testing import CliRunner
 
 from scenes import load_experiment, load_sensor
-from training.dataset import load_dataset
-from training.estimator import PoseEstimator
-from training.recipes import TrainingError
+from training.data.dataset import load_dataset
+from training.estimate.estimator import PoseEstimator
+from training.runs.recipes import TrainingError
 from training.studies.sim_to_real import Plan
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
 from training.studies.sim_to_real.read import READ, read_twin

@@ -10,8 +10,8 @@ from small_generation import SENSOR, small_config
 
 from scenes import load_experiment, load_sensor
 from training.generation import generate
-from training.run import train_run
-from training.train import train_model
+from training.runs.run import train_run
+from training.runs.train import train_model
 from twin.frames.images import write_image
 
 PRESSES = """

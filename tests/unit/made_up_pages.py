@@ -8,14 +8,14 @@ import numpy as np
 
 from scenes import load_experiment, load_object, load_randomisation, load_sensor
 from scenes.randomisation import FrictionSpread
-from training.audit import STORIES, Audit
-from training.pins import PinTable
+from training.data.audit import STORIES, Audit
+from training.data.pins import PinTable
+from training.data.targets import PRESETS
 from training.studies.label_audit import summary_of, write_audit
 from training.studies.objects import Plan, verdicts
 from training.studies.tac_vgnn import page as study_report
 from training.studies.tac_vgnn.contacts import AreaChange
 from training.studies.tac_vgnn.models import plan_run
-from training.targets import PRESETS
 from twin.demo.page import ContactContent
 from twin.demo.page import write_page as write_demo_page
 from twin.demo.stages import DepthRow

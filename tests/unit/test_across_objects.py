@@ -8,9 +8,9 @@ import pytest
 from small_generation import small_config
 
 from scenes import RandomisationSpec, load_object
-from training.dataset import joined, split_rows, with_common_labels
-from training.recipes import TrainingError
-from training.run import fold_rows
+from training.data.dataset import joined, split_rows, with_common_labels
+from training.runs.recipes import TrainingError
+from training.runs.run import fold_rows
 from training.studies.objects import Plan, rows_in_range, verdicts
 from training.studies.objects.plan import MIXED
 from twin.errors import FrameError

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from hardware.approach import way_around
 from hardware.errors import DeviceError
-from hardware.rig_geometry import PlacedObject, matrix_of, moved
+from hardware.rig.approach import way_around
+from hardware.rig.geometry import PlacedObject, matrix_of, moved
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 

@@ -37,9 +37,9 @@ from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
-from hardware.lerobot import LeRobotArm, LeRobotCamera
-from hardware.safe_arm import SafeArm
-from hardware.safety import load_limits
+from hardware.live.lerobot import LeRobotArm, LeRobotCamera
+from hardware.safety.decide import load_limits
+from hardware.safety.safe_arm import SafeArm
 from scenes import load_sensor
 from twin.types import Form
 

@@ -7,11 +7,11 @@ import pytest
 from drawn_recording import drawn_pins
 
 from scenes import load_sensor
-from training.audit import audit_labels
-from training.dataset import Dataset
-from training.pins import PinTable
+from training.data.audit import audit_labels
+from training.data.dataset import Dataset
+from training.data.pins import PinTable
+from training.data.targets import PRESETS, Targets
 from training.studies.label_audit import LabelAudit, summary_of, write_audit
-from training.targets import PRESETS, Targets
 from twin.pins import nominal_reference
 from twin.rig.labels import read_executed
 from twin.types import Form

@@ -9,11 +9,11 @@ import pytest
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.reader import LiveSource, Picture
-from hardware.collect import COLUMNS, META, Collection, CollectPlan, WorkFrame, _Asked, collect, draw_contact
+from hardware.collect.collect import COLUMNS, META, Collection, CollectPlan, WorkFrame, _Asked, collect, draw_contact
 from hardware.errors import DeviceError
-from hardware.rig_geometry import PlacedObject, matrix_of
+from hardware.rig.geometry import PlacedObject, matrix_of
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
-from training.design import least_sure, nearest_to_even
+from training.data.design import least_sure, nearest_to_even
 from twin.frames import open_recording, read_image
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame

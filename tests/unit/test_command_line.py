@@ -230,7 +230,7 @@ def test_what_could_not_be_let_go_of_is_printed_after_ctrl_c(monkeypatch, tmp_pa
         interrupt.add_note("stop failed: press its emergency stop")
         raise interrupt
 
-    monkeypatch.setattr("hardware.collect.collect_frames", interrupted)
+    monkeypatch.setattr("hardware.collect.collect.collect_frames", interrupted)
     command = ["collect", "--camera", "twin", "--arm", "simulated", "--sensor", "mg400-331", "--out", str(tmp_path)]
     ended = CliRunner().invoke(command_line(), command)
     assert ended.exit_code == 130

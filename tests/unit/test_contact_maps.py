@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from training.contact_maps import MAPS, judge_maps, read_maps, write_maps
-from training.dataset import load_dataset
-from training.estimator import PoseEstimator
+from training.data.dataset import load_dataset
+from training.estimate.estimator import PoseEstimator
 from training.models.part import OneFrame
 from training.models.touch.model import TOUCH
-from training.packed import pack
-from training.recipes import TrainingError
+from training.runs.packed import pack
+from training.runs.recipes import TrainingError
 from training.studies.prediction import Predictions, write_frame_maps
+from training.touch.contact_maps import MAPS, judge_maps, read_maps, write_maps
 from twin.errors import StoreError
 from twin.geometry.mesh import build_mesh
 from twin.mechanics.skin_map import SIDE, ContactMaps, between_nodes, skin_grid

@@ -9,10 +9,10 @@ import pytest
 from drawn_frames import drawn_frame, smooth_warp
 
 from scenes import load_sensor
-from training.dataset import load_dataset, split_rows
+from training.data.dataset import load_dataset, split_rows
+from training.data.pins import pin_table
+from training.data.targets import corrected, unit_of
 from training.models.cnn.inputs import image_inputs
-from training.pins import pin_table
-from training.targets import corrected, unit_of
 from twin.errors import FrameError
 from twin.pins import make_reference, nominal_reference
 from twin.rig.labels import label_slope, plate_slope
@@ -101,7 +101,7 @@ def test_a_missing_column_names_those_that_are_there(tmp_path):
 def test_pins_come_from_the_cache_until_a_frame_changes(tmp_path, monkeypatch):
     spec = write_recording(tmp_path / "r", ["f_0.png,-1,5,1,2"], ["f_0.png"])
     first = load_dataset(tmp_path / "r", spec)
-    monkeypatch.setattr("training.pins.Pipeline", None)  # not callable: a second look would fail
+    monkeypatch.setattr("training.data.pins.Pipeline", None)  # not callable: a second look would fail
     again = load_dataset(tmp_path / "r", spec)
     assert np.array_equal(first.pins.nodes_px, again.pins.nodes_px)
     (tmp_path / "r" / "meta.json").write_text(json.dumps({"new": 1}))

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hardware.doctor import OWN, Device, Machine, _places, cameras, serial_ports
+from hardware.live.doctor import OWN, Device, Machine, _places, cameras, serial_ports
 
 
 def test_cameras_are_read_from_the_kernels_list(tmp_path):

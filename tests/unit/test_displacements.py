@@ -8,8 +8,8 @@ import pytest
 from drawn_frames import drawn_frame
 
 from scenes.pins import PinsSpec
-from training.dataset import load_dataset
-from training.displacements import (
+from training.data.dataset import load_dataset
+from training.estimate.displacements import (
     FEWEST_CONTACTS,
     FEWEST_FRAMES,
     learn_displacements,
@@ -18,9 +18,9 @@ from training.displacements import (
     rest_from_contacts,
     write_displacements,
 )
-from training.estimator import PoseEstimator
-from training.recipes import TrainingError
-from training.rest_seeking import RestSeeker
+from training.estimate.estimator import PoseEstimator
+from training.estimate.rest_seeking import RestSeeker
+from training.runs.recipes import TrainingError
 from training.studies.evaluation import at_own_rest
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice

@@ -7,7 +7,7 @@ import pytest
 from generators import api, commands, specifications
 from generators.specifications import FILES, UNITS, Explained, SpecificationFile
 
-from hardware.safety import SafetyLimits
+from hardware.safety.decide import SafetyLimits
 from scenes import SensorSpec
 from scenes.base import Positive, Section
 

@@ -20,8 +20,8 @@ from training.environments.environment import TactileEnv, TactileVectorEnv
 from training.environments.observe import Eye
 from training.environments.tasks import TASKS, ObjectPush, ObjectRoll, SurfaceFollow
 from training.environments.world import Surfaces, Tool, inverse, motions, standing_on, turn_about, work_frame
-from training.estimator import PoseEstimator
-from training.packed import shipped_names
+from training.estimate.estimator import PoseEstimator
+from training.runs.packed import shipped_names
 from training.surrogate.felt import Felt, FiniteElements
 from twin.errors import ContactError, OptionError
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 
-from training.gaussian_process import (
+from training.runs.gaussian_process import (
     CLIMB_RATE,
     CLIMB_STEPS,
     CONSTANT_AND_SMOOTH,

@@ -13,13 +13,13 @@ import zarr
 from small_generation import contents, small_config
 
 from scenes import load_object, load_sensor
-from training.dataset import load_dataset, split_rows
+from training.data.dataset import load_dataset, split_rows
+from training.data.simulated import open_simulated
+from training.data.targets import corrected
 from training.generation import DatasetError, generate
 from training.generation.config import draw_contact
-from training.run import fold_rows
-from training.simulated import open_simulated
+from training.runs.run import fold_rows
 from training.studies.sim_to_real.steps import arm_labels, with_missing
-from training.targets import corrected
 from twin.camera.projection import project
 from twin.errors import ContactError, MeshError, RenderError, StoreError, TwinError
 from twin.frames.forms import raw_to_recording
@@ -218,7 +218,7 @@ def test_a_data_set_goes_on_only_with_the_same_mesh(tmp_path):
 
 
 def _recording(folder, config):
-    from training.simulated import open_simulated
+    from training.data.simulated import open_simulated
 
     return open_simulated(folder, config.sensor)[0]
 

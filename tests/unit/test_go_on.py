@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from hardware.collect.gather import gather_frames
 from hardware.errors import DeviceError
-from hardware.gather import gather_frames
 from twin.errors import OptionError
 from twin.fit.go_on import experiment_like, whole_sensor
 from twin.frames import open_recording

@@ -8,7 +8,7 @@ import pytest
 from drawn_frames import draw_discs, drawn_frame
 from plain_sensor import changed, plain
 
-from hardware.examining import examine_sensor
+from hardware.live.examining import examine_sensor
 from scenes import load_sensor
 from twin.camera.truth import cap_truth
 from twin.frames.forms import blob_spec, frame_size

@@ -11,21 +11,21 @@ from hypothesis import strategies as st
 from noisy_camera import NoisyCamera
 
 from hardware.cameras.choose import open_camera
-from hardware.collect import CollectPlan
+from hardware.collect.collect import CollectPlan
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import emulate_magician, emulate_mg400
 from hardware.emulators.twin_camera import emulate_camera
 from hardware.errors import DeviceError
-from hardware.following import FollowPlan
-from hardware.live_feed import require_feed
-from hardware.safety import load_limits
-from hardware.servo_study import ServoStudyPlan, folder_name, study_servo
+from hardware.live.feed import require_feed
+from hardware.safety.decide import load_limits
+from hardware.servo.following import FollowPlan
+from hardware.servo.study import ServoStudyPlan, folder_name, study_servo
 from scenes import SpecError, load_experiment, load_object, load_sensor, load_servo
 from scenes.body import MOST_POISSON
 from scenes.load import SHIPPED
-from training.estimator import PoseEstimator
-from training.recipes import TrainingError
+from training.estimate.estimator import PoseEstimator
+from training.runs.recipes import TrainingError
 from twin.errors import ContactError, FrameError, OptionError, TwinError
 from twin.frames import open_recording
 from twin.frames.forms import form_of, known_frames
@@ -172,7 +172,7 @@ def test_a_study_of_servos_in_which_nothing_moved_fails_with_the_first_reason(tm
     def fail(*_, **__):
         raise ContactError("out of reach")
 
-    monkeypatch.setattr("hardware.servo_study.follow", fail)
+    monkeypatch.setattr("hardware.servo.study.follow", fail)
     plan = ServoStudyPlan({"a": None}, (load_object("can"), load_object("square")), load_servo("surface"))
     with pytest.raises(TwinError, match="none of 2 runs made a step; the first: out of reach"):
         study_servo(plan, tmp_path / "out")

@@ -17,10 +17,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save
 
-from hardware.collect import Collection
-from hardware.session import SessionSource
+from hardware.collect.collect import Collection
+from hardware.live.session import SessionSource
 from scenes import SpecError, load_sensor
-from training.packed import unpack
+from training.runs.packed import unpack
 from twin.errors import TwinError
 from twin.frames import open_recording, read_image
 from twin.frames.tables import order_by_table, read_metadata, read_table

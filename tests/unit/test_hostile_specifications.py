@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware.safety import load_limits
+from hardware.safety.decide import load_limits
 from scenes import SpecError, load_experiment, load_object, load_randomisation, load_sensor, load_servo
 from scenes.files import DEEPEST, LARGEST_BYTES
 from scenes.load import SHIPPED

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from drawn_recording import config_of
 
-from training.estimator import PoseEstimator
-from training.evaluate import judge
-from training.label_code import LabelCode, goes_round, label_error
+from training.data.label_code import LabelCode, goes_round, label_error
+from training.data.targets import Targets
+from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
-from training.run import train_run
-from training.targets import Targets
+from training.runs.evaluate import judge
+from training.runs.run import train_run
 
 UNITS = ("mm", "deg")
 

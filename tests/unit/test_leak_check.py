@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from training.evaluate import leak_check
-from training.targets import Targets
+from training.data.targets import Targets
+from training.runs.evaluate import leak_check
 
 FRAMES = 12
 

@@ -13,16 +13,16 @@ from drawn_frames import drawn_frame
 from drawn_recording import config_of, drawn_pins
 from torch import nn
 
-from training.estimator import PoseEstimator
-from training.evaluate import judge, rows_to_judge
+from training.data.pins import PinTable
+from training.estimate.estimator import PoseEstimator
 from training.models import MODELS, model_named, recipe_of, register, variant_named
 from training.models.part import PinModel
 from training.models.vgnn.network import mode_components
 from training.models.vgnn.registration import fit_registration, spanned
-from training.packed import SHIPPED, WEIGHTS, pack, shipped_names
-from training.pins import PinTable
-from training.recipes import Recipe, TrainingError
-from training.run import RunConfig, train_run
+from training.runs.evaluate import judge, rows_to_judge
+from training.runs.packed import SHIPPED, WEIGHTS, pack, shipped_names
+from training.runs.recipes import Recipe, TrainingError
+from training.runs.run import RunConfig, train_run
 from twin.errors import FrameError
 from twin.pins import make_graph
 from twin.types import Form, Frame
@@ -265,7 +265,7 @@ def test_a_small_copy_holds_the_processes_beside_the_networks_up_to_a_number_of_
     rows = np.arange(len(data))
     close = {"rtol": 0, "atol": 0.02}  # of half precision, mm and deg
     np.testing.assert_allclose(small.predict_rows(data, rows).mean, whole.predict_rows(data, rows).mean, **close)
-    monkeypatch.setattr("training.packed.MOST_ROWS", 1)
+    monkeypatch.setattr("training.runs.packed.MOST_ROWS", 1)
     with pytest.raises(TrainingError, match="has Gaussian processes of .* frames beside its networks.*`kernel=False`"):
         pack(tmp_path / "run", tmp_path / "none")
 

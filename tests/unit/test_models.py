@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from training.assemble import conformal_quantile, group_quantiles
-from training.loop import row_loss
 from training.models import MODELS
 from training.models.graphs.inputs import frame_edges
 from training.models.graphs.network import CHANNELS, Gcn, graph_rows
 from training.models.vgnn.network import Vgnn, VgnnSize, mode_components
 from training.models.vgnn.registration import fit_registration
+from training.runs.assemble import conformal_quantile, group_quantiles
+from training.runs.loop import row_loss
 
 PINS, FRAMES = 40, 6
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hardware.policy_law import load_for_outlines, policy_law
-from hardware.rig_geometry import PlacedObject
+from hardware.rig.geometry import PlacedObject
+from hardware.servo.policy_law import load_for_outlines, policy_law
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.environments import learn
 from training.environments.batch import Batch, Options

@@ -14,10 +14,10 @@ from made_records import ABOUT, made_episode
 from PIL import Image
 
 from hardware.cameras.reader import capture
-from hardware.collect import Collection
+from hardware.collect.collect import Collection
 from scenes import load_sensor
-from training.estimator import PoseEstimator
-from training.targets import choose_targets
+from training.data.targets import choose_targets
+from training.estimate.estimator import PoseEstimator
 from twin.errors import FrameError, StoreError
 from twin.frames import evenly_read, natural_key, open_recording, read_image
 from twin.frames.forms import blob_spec, frame_size, from_raw, is_two_level

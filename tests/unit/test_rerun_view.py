@@ -11,9 +11,9 @@ import pytest
 from drawn_frames import drawn_frame
 
 from hardware.errors import DeviceError
-from hardware.rerun_view import RerunView
+from hardware.live.rerun_view import RerunView
 from scenes import load_sensor
-from training.estimator import PoseEstimate
+from training.estimate.estimator import PoseEstimate
 from twin.errors import OptionError
 from twin.pins import Pipeline
 from twin.studio.live_page import LiveShot

@@ -8,8 +8,8 @@ from pydantic import ValidationError
 
 from scenes import load_sensor
 from scenes.sensor import ResidualSpec
-from training import residual as teaching
-from training.residual import ResidualNetwork, spec_of, teach
+from training.runs import residual as teaching
+from training.runs.residual import ResidualNetwork, spec_of, teach
 from twin.camera.capture import before_stream, expose, luma_weights
 from twin.camera.projection import Disc, lens_disc
 from twin.camera.residual import averaged, change, differences, refined, with_residual

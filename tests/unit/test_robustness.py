@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from drawn_frames import drawn_frame
 
-from training.estimator import PoseEstimator
-from training.evaluate import CHANGES, judge_changes
+from training.estimate.estimator import PoseEstimator
+from training.runs.evaluate import CHANGES, judge_changes
 from twin.report.table import write_table
 from twin.types import Form, Frame
 

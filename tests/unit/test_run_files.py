@@ -12,11 +12,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from scenes import SpecError
-from training.estimator import PoseEstimator
-from training.packed import pack
-from training.recipes import TrainingError
-from training.run import train_run
-from training.run_files import read_tensors, write_tensors
+from training.estimate.estimator import PoseEstimator
+from training.runs.packed import pack
+from training.runs.recipes import TrainingError
+from training.runs.run import train_run
+from training.runs.run_files import read_tensors, write_tensors
 from twin.errors import FrameError
 
 CONFIGS = {

@@ -11,8 +11,8 @@ from hardware.arms.arm import ArmState
 from hardware.arms.kinematics import MG400
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.errors import DeviceError
-from hardware.safe_arm import RefusedMoveError, SafeArm
-from hardware.safety import SHIPPED_LIMITS, Action, Code, SafetyLimits, Sensed, clip, decide, decide_joints, load_limits
+from hardware.safety.decide import SHIPPED_LIMITS, Action, Code, SafetyLimits, Sensed, clip, decide, decide_joints, load_limits
+from hardware.safety.safe_arm import RefusedMoveError, SafeArm
 
 NOW_S = 1000.0
 HOME = np.array([300.0, 0, 0, 0, 0, 0])

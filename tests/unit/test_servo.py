@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from hardware.rig_geometry import PlacedObject, matrix_of, moved, pose_of
-from hardware.servo import Memory, Reading, reading_at, servo_step, tangent_of
-from hardware.trajectory import jerk, local_smoothness, lost_contacts, smoothness, way_along
+from hardware.rig.geometry import PlacedObject, matrix_of, moved, pose_of
+from hardware.servo.law import Memory, Reading, reading_at, servo_step, tangent_of
+from hardware.servo.trajectory import jerk, local_smoothness, lost_contacts, smoothness, way_along
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 

@@ -9,12 +9,12 @@ import pytest
 import torch
 from drawn_recording import config_of
 
-from training.estimator import PoseEstimator
-from training.gaussian_process import Points, fit_two_fidelities
+from training.estimate.estimator import PoseEstimator
 from training.models.vgnn import network as vgnn
-from training.packed import pack, shipped_names
-from training.recipes import TrainingError
-from training.run import train_run, write_tensors
+from training.runs.gaussian_process import Points, fit_two_fidelities
+from training.runs.packed import pack, shipped_names
+from training.runs.recipes import TrainingError
+from training.runs.run import train_run, write_tensors
 from training.studies.sim_to_real import inverted
 from training.studies.sim_to_real.inverted import TwinBackwards
 from training.studies.sim_to_real.missed import Left, Missed

@@ -7,18 +7,30 @@ import numpy as np
 import pytest
 
 from scenes import load_sensor
-from training import slip, train
-from training.dataset import load_dataset
-from training.estimator import PoseEstimator
+from training.data.dataset import load_dataset
+from training.estimate.estimator import PoseEstimator
 from training.models import recipe_of
 from training.models.part import OneFrame, Unseen
-from training.packed import pack
-from training.recipes import TrainingError
-from training.run import RunConfig
-from training.slip import NAMES, Drag, SlipTracker, drags_of, gone_through, judge_slip, learn_slip, random_places, read_slip, write_slip
+from training.runs import train
+from training.runs.packed import pack
+from training.runs.recipes import TrainingError
+from training.runs.run import RunConfig
+from training.runs.train import add_slip
 from training.studies.evaluation import evaluate_run
 from training.surrogate.symmetry import symmetries
-from training.train import add_slip
+from training.touch import slip
+from training.touch.slip import (
+    NAMES,
+    Drag,
+    SlipTracker,
+    drags_of,
+    gone_through,
+    judge_slip,
+    learn_slip,
+    random_places,
+    read_slip,
+    write_slip,
+)
 from twin.geometry.pins import rest_pins
 from twin.types import Form, Frame
 

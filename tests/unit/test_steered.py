@@ -8,13 +8,13 @@ import torch
 from drawn_recording import config_of
 
 from scenes import load_sensor
-from training.estimator import PoseEstimator
-from training.label_code import LabelCode, label_error
+from training.data.label_code import LabelCode, label_error
+from training.estimate.estimator import PoseEstimator
 from training.models.steered.field import waves_of
 from training.models.steered.network import Steered, SteeredSize
-from training.packed import pack
-from training.recipes import TrainingError
-from training.run import train_run
+from training.runs.packed import pack
+from training.runs.recipes import TrainingError
+from training.runs.run import train_run
 from training.studies.sim_to_real.steps import model_for, put_beside
 from twin.pins import nominal_reference
 from twin.types import Form

@@ -46,8 +46,8 @@ from twin.store.fingerprint import PACKAGES, ROOT
 SOLVER = "twin/mechanics/solver.py"
 KEEPERS = (  # the module of every function whose results are kept between runs
     "twin.fit.contact.simulate",
-    "training.dataset",
-    "training.estimator",
+    "training.data.dataset",
+    "training.estimate.estimator",
     "training.generation.make",
     "training.models.cnn.inputs",
     "twin.fit.optics",

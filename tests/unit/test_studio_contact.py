@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from scenes import load_experiment, load_object, load_sensor
-from training.estimator import PoseEstimator
+from training.estimate.estimator import PoseEstimator
 from twin.camera.capture import expose
 from twin.errors import ContactError, FrameError
 from twin.mechanics.path import deepest_mm

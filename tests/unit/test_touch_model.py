@@ -7,12 +7,12 @@ import pytest
 import torch
 from drawn_recording import config_of, drawn_dataset
 
-from training.estimator import PoseEstimator
-from training.gaussian_process import fit_smooth_processes
+from training.estimate.estimator import PoseEstimator
 from training.models.touch.features import Bases
 from training.models.touch.model import TOUCH
-from training.recipes import TrainingError
-from training.run import train_run
+from training.runs.gaussian_process import fit_smooth_processes
+from training.runs.recipes import TrainingError
+from training.runs.run import train_run
 
 PINS, MODES = 40, 6
 ALMOST = 1e-9  # rounding

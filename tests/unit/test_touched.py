@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from scenes import load_object, load_sensor
-from training.estimator import PoseEstimator
+from training.estimate.estimator import PoseEstimator
 from training.models import part
 from training.models.part import Unseen
 from training.models.touch.model import TOUCH
-from training.touched import TouchAnswer
+from training.touch.touched import TouchAnswer
 from twin.camera.truth import cap_truth
 from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose

@@ -12,16 +12,16 @@ from drawn_frames import drawn_frame
 from drawn_recording import FRAMES, config_of
 
 from scenes import load_sensor
-from training.dataset import Dataset, joined
-from training.estimator import PoseEstimator, digest_of, folder_of, models_by_sensor
-from training.evaluate import judge, leak_check, rows_to_judge, write_evaluation
-from training.identity import changed_since, learnt_before
+from training.data.dataset import Dataset, joined
+from training.data.identity import changed_since, learnt_before
+from training.data.pins import PinTable
+from training.estimate.estimator import PoseEstimator, digest_of, folder_of, models_by_sensor
 from training.models import recipe_of
 from training.models.part import Prediction
-from training.pins import PinTable
-from training.recipes import TrainingError
-from training.run import fold_rows, is_finished, train_run, training_rows
-from training.run_files import read_tensors
+from training.runs.evaluate import judge, leak_check, rows_to_judge, write_evaluation
+from training.runs.recipes import TrainingError
+from training.runs.run import fold_rows, is_finished, train_run, training_rows
+from training.runs.run_files import read_tensors
 from training.studies.evaluation import Evaluation
 from training.studies.prediction import Predictions
 from twin.errors import FrameError, warn_once
@@ -192,7 +192,7 @@ def test_seeds_out_of_range_are_refused(changes):
 
 def test_a_run_begun_by_other_code_is_not_gone_on_with(data, tmp_path, monkeypatch):
     train_run(config_of("vgnn", epochs=3), data, tmp_path, max_minutes=0)
-    monkeypatch.setattr("training.run.fingerprint", lambda *makers: "of another version")
+    monkeypatch.setattr("training.runs.run.fingerprint", lambda *makers: "of another version")
     with pytest.raises(TrainingError, match="another version of the program"):
         train_run(config_of("vgnn", epochs=3), data, tmp_path)
 
@@ -314,7 +314,7 @@ def test_a_runs_digest_is_that_of_its_weights_and_configuration(tmp_path, monkey
         content[-1] ^= 1
         file.write_bytes(content)
         found.append(digest_of(copy))
-    monkeypatch.setattr("training.estimator.fingerprint", lambda *makers: "of another version")
+    monkeypatch.setattr("training.estimate.estimator.fingerprint", lambda *makers: "of another version")
     found.append(digest_of(copy))
     assert len(set(found)) == 5  # its displacements alone change no estimate with known rest places
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from scenes import load_sensor
-from training import two_sample as module
+from training.data import two_sample as module
+from training.data.two_sample import JUDGES, Judge, accuracy_text, judged, patch_corners, patch_network, real_halves, two_sample
 from training.studies.realism import _verdict, compare_with_renders
-from training.two_sample import JUDGES, Judge, accuracy_text, judged, patch_corners, patch_network, real_halves, two_sample
 from twin.errors import FrameError, OptionError
 
 INSIDE = np.ones((72, 72), bool)

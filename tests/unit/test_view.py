@@ -9,8 +9,8 @@ from drawn_frames import drawn_frame
 
 from scenes import load_object, load_sensor
 from scenes.pins import PinsSpec
-from training.estimator import PoseEstimator
-from training.pins import PinTable
+from training.data.pins import PinTable
+from training.estimate.estimator import PoseEstimator
 from training.studies.prediction import predict_frames
 from twin.camera.projection import pixel_rays, project
 from twin.errors import FrameError

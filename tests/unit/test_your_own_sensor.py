@@ -13,7 +13,7 @@ from unknown_sensor import RADIUS, SIZE, frames_of, rest_of
 
 from scenes import load_sensor
 from scenes.pins import PinsSpec
-from training.estimator import PoseEstimator
+from training.estimate.estimator import PoseEstimator
 from training.studies.prediction import predict_frames
 from twin.camera.projection import project
 from twin.errors import FrameError, OptionError, TwinError

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from training.estimator import PoseEstimator
+from training.data.pins import PinTable, cap_light
+from training.estimate.estimator import PoseEstimator
 from training.models.part import PinModel
-from training.packed import shipped_names
-from training.pins import PinTable, cap_light
+from training.runs.packed import shipped_names
 from training.surrogate.felt import Backend, Felt
 from twin.camera.capture import expose, record
 from twin.camera.projection import project

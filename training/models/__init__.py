@@ -10,7 +10,7 @@ from training.models.part import Model, Variant
 from training.models.steered.model import STEERED
 from training.models.touch.model import TOUCH
 from training.models.vgnn.model import VGNN
-from training.recipes import Recipe, TrainingError
+from training.runs.recipes import Recipe, TrainingError
 
 MODELS: dict[str, Model] = {}
 # Text between a model's name and the name of the ingredient that is left out.

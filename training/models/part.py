@@ -4,7 +4,7 @@ A run calls these methods in this order: ``prepare`` (makes inputs of frames, an
 need), ``build`` (makes a network with random weights), ``initialise`` (sets a network's constants from the training rows before the
 first step), and ``modes`` if a Gaussian process is averaged with the networks (makes that process's inputs). A trained model estimates
 by ``estimate_frame`` and ``estimate_rows``. ``pack`` and ``unpack`` make and read its small copy. Ensembles and intervals are the same
-for all models (``training.assemble``).
+for all models (``training.runs.assemble``).
 """
 
 from abc import ABC, abstractmethod
@@ -17,10 +17,10 @@ import torch
 from torch import nn
 
 from scenes.sensor import SensorSpec
-from training.dataset import Dataset
-from training.label_code import LabelCode
-from training.pins import PinTable, cap_light
-from training.recipes import Recipe, TrainingError
+from training.data.dataset import Dataset
+from training.data.label_code import LabelCode
+from training.data.pins import PinTable, cap_light
+from training.runs.recipes import Recipe, TrainingError
 from twin.pins import Pipeline
 from twin.pins.reference import Reference
 from twin.types import Frame, Observation
@@ -137,7 +137,7 @@ class Trained:
     ensemble : callable
         ``ensemble(inputs, rows)`` gives the labels of rows (B,) of inputs.
     touched : callable, optional
-        ``touched(nodes_px, lost)`` gives the probability that a frame's pins (N, 2) show a contact (``training.touched``). It is None
+        ``touched(nodes_px, lost)`` gives the probability that a frame's pins (N, 2) show a contact (``training.touch.touched``). It is None
         unless the pins at rest were measured in a frame without contact.
     """
 

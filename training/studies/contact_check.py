@@ -36,8 +36,8 @@ def contact_finding(frames: list[Frame], sensor: str, run: Path | None = None) -
     """
     if run is None and find_spec("torch") is None:
         return None
-    from training.estimator import PoseEstimator  # loads torch
-    from training.packed import shipped_names
+    from training.estimate.estimator import PoseEstimator  # loads torch
+    from training.runs.packed import shipped_names
 
     if run is None and sensor not in shipped_names():
         return None

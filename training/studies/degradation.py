@@ -8,7 +8,7 @@ from typing import Any
 
 from scenes import SensorSpec
 from scenes.sensor import RecordingSpec
-from training.estimator import PoseEstimator, digest_of
+from training.estimate.estimator import PoseEstimator, digest_of
 from twin.camera.capture import record
 from twin.judge.degradation.envelope import Envelope
 from twin.judge.degradation.plan import SweepPlan

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from training.contact_estimator import ContactEstimator, contacts_folder
-from training.contact_maps import judge_maps
-from training.dataset import Dataset, joined, load_dataset, told_apart
-from training.displacements import OTHER_UNIT
-from training.estimator import PoseEstimator, folder_of
-from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
-from training.identity import changed_since, learnt_before
-from training.recipes import TrainingError
-from training.simulated import is_simulated
-from training.slip import Eyes, drags_of, gone_through, judge_slip, random_places
+from training.data.dataset import Dataset, joined, load_dataset, told_apart
+from training.data.identity import changed_since, learnt_before
+from training.data.simulated import is_simulated
+from training.estimate.contact_estimator import ContactEstimator, contacts_folder
+from training.estimate.displacements import OTHER_UNIT
+from training.estimate.estimator import PoseEstimator, folder_of
+from training.runs.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
+from training.runs.recipes import TrainingError
+from training.touch.contact_maps import judge_maps
+from training.touch.slip import Eyes, drags_of, gone_through, judge_slip, random_places
 from twin.frames import open_recording
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table

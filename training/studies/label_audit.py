@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from scenes import SensorSpec
-from training.audit import STORIES, Audit, audit_labels
-from training.dataset import Dataset, load_dataset
-from training.targets import CONTACT, UNITS, unit_of
+from training.data.audit import STORIES, Audit, audit_labels
+from training.data.dataset import Dataset, load_dataset
+from training.data.targets import CONTACT, UNITS, unit_of
 from twin.errors import FrameError
 from twin.progress import Progress, silent, stage
 from twin.report.charts import muted, new_figure, write_chart
@@ -148,7 +148,7 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
 
     If there are too few frames, neither corrected labels nor a picture are written.
     """
-    numbers = write_json(out / "audit.json", summary | {"made_by": made_by("training.audit")})
+    numbers = write_json(out / "audit.json", summary | {"made_by": made_by("training.data.audit")})
     page = Page(
         f"Audit of {data.folder.name}",
         "twin audit",

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from scenes import SensorSpec
-from training.two_sample import SMALL, TwoSample, accuracy_text, judged, judged_halves
+from training.data.two_sample import SMALL, TwoSample, accuracy_text, judged, judged_halves
 from twin.errors import OptionError
 from twin.judge.pictures.realism import run_realism
 from twin.optics.render import Quality

@@ -2,8 +2,8 @@
 noise.
 
 The change of each pixel depends on the pixels around it and on random numbers of its own. The network has four convolutions; the middle two
-add to their input. It was trained against judges that distinguish real frames from rendered ones (`training.residual`). It works on luma
-and colour differences before the stream rounds them, within the lens disc, and only if ``response.residual.used`` is set.
+add to their input. It was trained against judges that distinguish real frames from rendered ones (`training.runs.residual`). It works on
+luma and colour differences before the stream rounds them, within the lens disc, and only if ``response.residual.used`` is set.
 """
 
 import numpy as np

@@ -102,7 +102,7 @@ def new_sensor(
       twin new --camera /dev/video0 --out mine.toml
     """
     from hardware.cameras.choose import open_camera
-    from hardware.gather import gather_frames
+    from hardware.collect.gather import gather_frames
     from scenes import load_experiment
     from scenes.pins import layout_from
     from twin.fit.go_on import whole_sensor

@@ -17,7 +17,7 @@ from twin.cli.options import FormOrAuto, NoContact, Out, Sensor, Table, Tuning, 
 from twin.progress import Progress
 
 if TYPE_CHECKING:
-    from hardware.examining import Examination
+    from hardware.live.examining import Examination
     from twin.pins.batch import Preprocessed
     from twin.pins.graph_files import Graphs
     from twin.pins.tune_files import TunedOnFrames
@@ -204,7 +204,7 @@ def check(
       twin check today --sensor mine.toml --no-contact rest.png \\
           --push x:right.png --push y:down.png --out turned.toml
     """
-    from hardware.examining import examine_sensor
+    from hardware.live.examining import examine_sensor
     from scenes import load_sensor
     from training.studies.contact_check import contact_finding
     from twin.pins import load_detector

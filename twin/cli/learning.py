@@ -49,10 +49,10 @@ from twin.types import FINE
 if TYPE_CHECKING:
     from training.environments.learn import Learnt
     from training.generation.run import Simulated
+    from training.runs.train import Trained
     from training.studies.evaluation import Evaluation
     from training.studies.prediction import Predictions
     from training.surrogate.fit import Distilled
-    from training.train import Trained
 
 
 @app.command("dataset", goes_on=True)
@@ -215,7 +215,7 @@ def train(
       twin train --model vgnn --sensor mg400-331 --data recordings/mine \\
           --target surface-2d --out runs/mine
     """
-    from training.train import train_model
+    from training.runs.train import train_model
 
     return train_model(
         model,
@@ -331,8 +331,8 @@ def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, 
           --contacts surface-2d-wide --draws 2 --epochs 60 --out study
       twin pack study/sim_only --out training/weights/mg400-331 --force
     """
-    from training.estimator import PoseEstimator
-    from training.packed import WEIGHTS, pack
+    from training.estimate.estimator import PoseEstimator
+    from training.runs.packed import WEIGHTS, pack
 
     PoseEstimator.load(run)  # says what is wrong with a folder that holds no run
     size = pack(run, out)

@@ -41,9 +41,9 @@ from twin.progress import Progress
 from twin.types import FIRST, NONE
 
 if TYPE_CHECKING:
-    from hardware.collect import Collected
-    from hardware.following import Followed
-    from hardware.live import Watched
+    from hardware.collect.collect import Collected
+    from hardware.live.live import Watched
+    from hardware.servo.following import Followed
     from twin.estimate import SensorModel
 
 
@@ -84,9 +84,9 @@ def live(
           --record out/session --headless --seconds 60
       twin live --replay out/session --model RUN --headless
     """
-    from hardware.live import WatchPlan, watch
-    from hardware.rig import signals_as_ctrl_c
-    from training.estimator import load_remembering
+    from hardware.live.live import WatchPlan, watch
+    from hardware.rig.rig import signals_as_ctrl_c
+    from training.estimate.estimator import load_remembering
 
     plan = WatchPlan(
         camera=camera,
@@ -153,10 +153,10 @@ def collect(
       twin collect --camera /dev/video0 --arm mg400 --sensor mg400-331 \\
           --experiment surface-2d --count 5000 --out data/real
     """
-    from hardware.collect import CollectPlan, collect_frames
-    from hardware.rig import signals_as_ctrl_c
+    from hardware.collect.collect import CollectPlan, collect_frames
+    from hardware.rig.rig import signals_as_ctrl_c
     from scenes import load_experiment, load_object, load_sensor, load_servo
-    from training.design import LeastSure
+    from training.data.design import LeastSure
 
     asked, spec = load_experiment(experiment), load_sensor(sensor)
     plan = CollectPlan(
@@ -241,8 +241,8 @@ def servo(
 
     The exit code is 1 if it ended early.
     """
-    from hardware.following import follow
-    from training.estimator import load_remembering
+    from hardware.servo.following import follow
+    from training.estimate.estimator import load_remembering
 
     return run_along(
         follow,
@@ -286,7 +286,7 @@ def run_along(
     Parameters
     ----------
     follow : callable
-        ``hardware.following.follow``.
+        ``hardware.servo.following.follow``.
     load, run : callable, Path
         Function that loads the model, and its path.
     kept_as : str
@@ -294,8 +294,8 @@ def run_along(
     **options
         The other fields of ``FollowPlan``.
     """
-    from hardware.following import FollowPlan
-    from hardware.rig import signals_as_ctrl_c
+    from hardware.rig.rig import signals_as_ctrl_c
+    from hardware.servo.following import FollowPlan
     from scenes import load_object, load_servo
 
     plan = FollowPlan(stimulus=load_object(obj), servo=load_servo(servo), also=tuple(also or ()), **options)
@@ -336,8 +336,8 @@ def run_policy(
       twin policy out/learnt/policy.safetensors --object can --out out/live \\
           --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1
     """
-    from hardware.following import follow
-    from hardware.policy_law import load_for_outlines
+    from hardware.servo.following import follow
+    from hardware.servo.policy_law import load_for_outlines
 
     return run_along(
         follow,

@@ -26,7 +26,7 @@ def usable_cores() -> int:
 
 
 CORES = usable_cores()
-# The largest seed of weights and splits. It is the constant of training.run, which is not imported because it would load PyTorch.
+# The largest seed of weights and splits. It is the constant of training.runs.run, which is not imported because it would load PyTorch.
 MOST_SEED = 2**32 - 1
 # Largest number of CPU threads. More threads have never made a training faster, and many more can't be started.
 MOST_THREADS = 256

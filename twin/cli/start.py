@@ -17,7 +17,7 @@ from twin.progress import Progress
 from twin.types import Form
 
 if TYPE_CHECKING:
-    from hardware.doctor import Machine
+    from hardware.live.doctor import Machine
     from twin.demo.make_demo import Demo
     from twin.one_contact import RenderedContact
 
@@ -89,7 +89,7 @@ def doctor() -> "Machine":
     Example:
       twin doctor
     """
-    from hardware.doctor import examine_machine
+    from hardware.live.doctor import examine_machine
 
     return examine_machine()
 

@@ -36,7 +36,7 @@ from twin.progress import Progress
 from twin.types import FINE
 
 if TYPE_CHECKING:
-    from hardware.servo_study import ServoStudy
+    from hardware.servo.study import ServoStudy
     from training.studies import objects, sim_to_real, tac_vgnn
 
 study = App(cls=FewCommands, help="Experiments that compare models.", no_args_is_help=True, rich_markup_mode=None)
@@ -68,9 +68,9 @@ def study_servo_command(
 
     Writes to --out: a folder for each model and object as 'twin servo' writes it, study.csv, study.png.
     """
-    from hardware.servo_study import ServoStudyPlan, study_servo
+    from hardware.servo.study import ServoStudyPlan, study_servo
     from scenes import load_object, load_servo
-    from training.estimator import load_by_name
+    from training.estimate.estimator import load_by_name
 
     plan = ServoStudyPlan(
         models=load_by_name(models),
@@ -286,8 +286,8 @@ def study_tac_vgnn(
     curves.png, efficiency.png, contacts.png, index.html, runs/.
     """
     from scenes import load_sensor
+    from training.runs.train import columns_of
     from training.studies import tac_vgnn
-    from training.train import columns_of
 
     plan = tac_vgnn.Plan(
         data=data,

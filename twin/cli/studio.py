@@ -10,7 +10,7 @@ from twin.cli import app
 from twin.cli.options import say
 
 if TYPE_CHECKING:
-    from training.estimator import PoseEstimator
+    from training.estimate.estimator import PoseEstimator
 
 
 @app.command("studio")
@@ -56,8 +56,8 @@ def studio(
       twin studio --state out/studio/state-1.json
       twin studio --state '?sensor=mg400-331&object=edge&depth_mm=3'
     """
-    from hardware.live_feed import CameraFeed, require_feed
-    from hardware.rig import signals_as_ctrl_c
+    from hardware.live.feed import CameraFeed, require_feed
+    from hardware.rig.rig import signals_as_ctrl_c
     from scenes import load_sensor
     from twin.studio.state import first_state
     from twin.studio.studio import StudioPlan, run_studio
@@ -80,12 +80,12 @@ def models_when_asked(run: Path | None, sensor: str) -> Callable[[str], "PoseEst
     """``models_by_sensor``. If no run is given, it loads when the first model is requested, so that the page does not wait for PyTorch."""
 
     def model_of(name: str) -> "PoseEstimator | None":
-        from training.estimator import models_by_sensor
+        from training.estimate.estimator import models_by_sensor
 
         return models_by_sensor()(name)
 
     if run is None:
         return model_of
-    from training.estimator import models_by_sensor
+    from training.estimate.estimator import models_by_sensor
 
     return models_by_sensor(run, sensor)

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import torch
 
-from training.dataset import Dataset
+from training.data.dataset import Dataset
+from training.data.pins import recording_key
 from training.models.cnn.network import INPUT_PX
-from training.pins import recording_key
 from twin.frames import open_recording
 from twin.frames.forms import gray_levels
 from twin.store import cached_arrays

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from training.label_code import LabelCode
+from training.data.label_code import LabelCode
+from training.data.pins import PinTable
 from training.models.part import Inputs, Learnt, Modes, PinModel, Weights, refuse_sizes
 from training.models.steered.field import waves_of
 from training.models.steered.network import Steered, SteeredSize
-from training.pins import PinTable
-from training.recipes import Recipe, TrainingError
+from training.runs.recipes import Recipe, TrainingError
 from twin.pins.reference import Reference
 
 # Buffers that a small copy leaves out, because they follow from the pins at rest.

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from training.label_code import LabelCode
+from training.data.label_code import LabelCode
 from training.models.steered.field import Waves
 
 # Number of turns of a frame over which the first look's answers are averaged in use.

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from training.label_code import LabelCode
+from training.data.label_code import LabelCode
+from training.data.pins import PinTable
 from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Variant, Weights, refuse_sizes
 from training.models.vgnn.inputs import PinInputs, filled, pin_features, seated_inputs
 from training.models.vgnn.network import Vgnn, VgnnSize
 from training.models.vgnn.registration import Registration, fit_registration
-from training.pins import PinTable
-from training.recipes import Recipe, TrainingError
+from training.runs.recipes import Recipe, TrainingError
 from twin.pins.reference import Reference
 from twin.pins.voronoi import directed_edges, triangulate
 

@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from scenes.object import ObjectSpec
+from training.data.targets import unit_of
 from training.studies.objects.plan import MIXED, TIMES, Plan
-from training.targets import unit_of
 from twin.report.charts import muted, sized_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, Picture, sentence, strong

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_experiment
-from training.dataset import Dataset, joined
+from training.data.dataset import Dataset, joined
 from training.generation import GenerationConfig, require_count
-from training.recipes import TrainingError
+from training.runs.recipes import TrainingError
 from training.studies.sim_to_real.twins import contact_of
 from twin.types import FINE
 

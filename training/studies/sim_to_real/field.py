@@ -8,9 +8,9 @@ likelihood of the leading components of the waves.
 
 import numpy as np
 
-from training.audit import LabelColumns
-from training.gaussian_process import SMOOTH_AND_LINEAR, Kernel, Points, climbed
+from training.data.audit import LabelColumns
 from training.models.steered.field import waves_of
+from training.runs.gaussian_process import SMOOTH_AND_LINEAR, Kernel, Points, climbed
 
 MOST_STATES = 5000
 """Simulated states that the process learns from. The cost grows with the third power of their number; a sheared contact needs thousands."""

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from training.label_code import wrapped_deg
+from training.data.label_code import wrapped_deg
 from training.studies.sim_to_real.field import TwinField, parts
 from training.studies.sim_to_real.missed import MOST_FRAMES, Left, Missed, chosen
 from training.studies.sim_to_real.steps import stands_and_moves

@@ -20,8 +20,8 @@ frames. D is estimated from the residuals of the labelled frames, each predicted
 
 import numpy as np
 
-from training.audit import polynomials
-from training.gaussian_process import CONSTANT_AND_SMOOTH, Kernel, Points
+from training.data.audit import polynomials
+from training.runs.gaussian_process import CONSTANT_AND_SMOOTH, Kernel, Points
 from training.studies.sim_to_real.field import TwinField, parts
 
 CONSTANT = 10 / 3

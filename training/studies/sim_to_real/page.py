@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from scenes.randomisation import FrictionSpread
+from training.data.targets import unit_of
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
 from training.studies.sim_to_real.read import READ
-from training.targets import unit_of
 from twin.report.charts import muted, plain_log, sized_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, Picture

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_experiment, load_object
+from training.data.simulated import is_simulated
 from training.generation import require_count
-from training.recipes import TrainingError
-from training.simulated import is_simulated
+from training.runs.recipes import TrainingError
 from twin.errors import DatasetError
 from twin.types import FINE
 

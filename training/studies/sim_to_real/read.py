@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from scenes import ExperimentSpec, ObjectSpec
-from training.dataset import Dataset
-from training.gaussian_process import Kernel, Points, Posterior, Term, fit_processes
-from training.label_code import label_error, wrapped_deg
+from training.data.dataset import Dataset
+from training.data.label_code import label_error, wrapped_deg
+from training.data.targets import unit_of
+from training.runs.gaussian_process import Kernel, Points, Posterior, Term, fit_processes
 from training.studies.sim_to_real.inverted import TwinBackwards
 from training.studies.sim_to_real.missed import MOST_FRAMES, chosen
 from training.studies.sim_to_real.steps import MODES, arm_labels, stands_and_moves, states_touching, states_within
-from training.targets import unit_of
 from twin.rig.labels import ArmLabel
 
 READ = "twin read"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from scenes import SensorSpec, load_randomisation
-from training.dataset import Dataset, joined, load_dataset
+from training.data.dataset import Dataset, joined, load_dataset
 from training.generation import generate
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
 from training.studies.sim_to_real.page import write_page

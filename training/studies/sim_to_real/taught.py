@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from training.assemble import intervals
-from training.dataset import Dataset
-from training.estimator import PoseEstimator
+from training.data.dataset import Dataset
+from training.data.targets import Targets
+from training.estimate.estimator import PoseEstimator
+from training.runs.assemble import intervals
 from training.studies.sim_to_real.read import TwinRead, named_labels
 from training.studies.sim_to_real.steps import train_on_real, widen_intervals
-from training.targets import Targets
 from twin.progress import Step
 from twin.rig.labels import ArmLabel
 

@@ -10,9 +10,9 @@ from scenes.object import ObjectSpec
 from scenes.randomisation import RandomisationSpec
 from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
-from training.dataset import Dataset
+from training.data.dataset import Dataset
 from training.generation import GenerationConfig
-from training.recipes import TrainingError
+from training.runs.recipes import TrainingError
 from training.studies.sim_to_real.discrepancy import FRICTIONS
 from twin.rig.kinematics import rig_of
 

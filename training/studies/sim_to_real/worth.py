@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from scenes import load_randomisation
-from training.dataset import load_dataset
+from training.data.dataset import load_dataset
+from training.data.label_code import goes_round
 from training.generation import generate
-from training.label_code import goes_round
 from training.studies.sim_to_real.plan import BOTH, EVENLY, FULL, REAL, WITHOUT, Plan
 from training.studies.sim_to_real.read import read_row, read_twin
 from training.studies.sim_to_real.steps import arm_labels, choose_frames, designed_frames, quadratic_row

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from scenes import load_object
 from scenes.sensor import SensorSpec
-from training.dataset import Dataset
-from training.pins import PinTable
+from training.data.dataset import Dataset
+from training.data.pins import PinTable
 from twin.errors import TwinError
 from twin.mechanics.path import ContactPath, ContactPose, plan_path
 from twin.objects import build_field

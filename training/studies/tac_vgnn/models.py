@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from training.dataset import Dataset
-from training.estimator import PoseEstimator
-from training.evaluate import judge, rows_to_judge
-from training.label_code import LabelCode
-from training.loop import Loop, Rows, epoch_step
+from training.data.dataset import Dataset
+from training.data.label_code import LabelCode
+from training.data.pins import PinTable
+from training.estimate.estimator import PoseEstimator
 from training.models import model_named, recipe_of, variant_named
 from training.models.part import Inputs
-from training.networks import parameter_count
-from training.pins import PinTable
-from training.run import RunConfig, is_finished, train_run
-from training.run_files import CHECKPOINT, TENSORS, read_config
+from training.runs.evaluate import judge, rows_to_judge
+from training.runs.loop import Loop, Rows, epoch_step
+from training.runs.networks import parameter_count
+from training.runs.run import RunConfig, is_finished, train_run
+from training.runs.run_files import CHECKPOINT, TENSORS, read_config
 from twin.progress import Progress, silent, stage
 
 # Number of rows from which a timed network takes its scales and modes. Its speed does not depend on this number.

@@ -6,10 +6,10 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from training.dataset import Dataset
+from training.data.dataset import Dataset
+from training.data.targets import unit_of
 from training.studies.tac_vgnn.contacts import AreaChange, contacts_figure
 from training.studies.tac_vgnn.models import PlannedRun, error_columns, ordering, read_curves
-from training.targets import unit_of
 from twin.report.charts import new_figure, plain_log, sized_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, Picture

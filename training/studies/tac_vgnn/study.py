@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from scenes import SensorSpec
-from training.dataset import Dataset, load_dataset
+from training.data.dataset import Dataset, load_dataset
 from training.models import model_named
-from training.networks import choose_device
+from training.runs.networks import choose_device
 from training.studies.tac_vgnn.contacts import AreaChange, compare_graphs, recorded_contacts, twin_contacts
 from training.studies.tac_vgnn.models import SHOWN, PlannedRun, error_columns, measure_training, plan_run, table_row, train_all
 from training.studies.tac_vgnn.page import draw_contacts, draw_curves, draw_efficiency, write_page

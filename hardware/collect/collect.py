@@ -1,0 +1,647 @@
+"""Collects labelled frames in the recordings' own format. Each contact consists of a pose, a tap, a shear and one frame.
+
+``collect_frames`` goes from a plan to labelled frames in a folder, and continues an interrupted collection. The arm starts ``CLEAR_MM``
+from the object and lifts off by ``LIFT_MM`` between two contacts. Between two lifted poses it moves around the object on a path of
+``hardware.rig.approach``; in front of an infinite object it moves straight. A frame counts only if it was exposed after the arm reported
+that it stands at the commanded pose. The table holds the reported pose.
+"""
+
+import csv
+import json
+import logging
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats.qmc import Sobol
+
+from hardware.arms.arm import Arm, ArmState
+from hardware.cameras.source import FrameSource
+from hardware.errors import DeviceError
+from hardware.rig.approach import way_around
+from hardware.rig.geometry import PlacedObject, matrix_of, pose_of
+from hardware.rig.plan import check_plan
+from hardware.rig.rig import Rig, build_rig
+from hardware.safety.eyes import Eyes
+from hardware.safety.safe_arm import try_each
+from hardware.safety.watch import ArmWatch
+from hardware.servo.step import Guard
+from scenes import ObjectSpec, SensorSpec, ServoSpec
+from scenes.experiment import LABELS, ExperimentSpec
+from scenes.files import shown
+from twin.errors import FrameError
+from twin.frames.folders import pictures_folder
+from twin.frames.images import write_image
+from twin.pins import measure_reference
+from twin.progress import Progress, Step, silent, stage
+from twin.records import KeptAlso
+from twin.store import contents, made_by, output, write_json, write_text, writes
+from twin.types import Form, Frame
+
+LOGGER = logging.getLogger(__name__)
+# Distance from the object at the start and at the end, in mm.
+CLEAR_MM = 50.0
+# Distance from the object between two contacts, in mm.
+LIFT_MM = 10.0
+# Largest shortening of a move by guards or arm, mm. A larger one is an error.
+NEAR_MM = 0.5
+# Time in s that a move may take in addition to the duration that its path and speed give.
+MOVE_TIMEOUT_S = 30.0
+# Factor on the duration that a move's path and speed give, because arms round their speed to whole percents.
+SPARE = 2.0
+# Longest wait in s for a frame while the arm stands still.
+FRAME_TIMEOUT_S = 5.0
+# Largest number of contacts that are checked before anything moves, and the usual time of a contact in s.
+CHECKED_CONTACTS, CONTACT_S = 100, 4.0
+# Most contacts of a collection. At a few seconds each, they take an arm months.
+MOST_CONTACTS = 1_000_000
+# Files of a collection, as in the published recordings: labels, description, times, and the frame without contact.
+TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
+# Distributions of contacts over an experiment's ranges: each at random; evenly, even for the first contacts alone; or evenly at first, and
+# then at the contacts that reduce a model's uncertainty most.
+DESIGNS = ("random", "even", "unsure")
+# Number of contacts of the design "unsure" that fill the ranges evenly, per label that varies.
+EVEN_AT_FIRST = 2
+# Function that chooses such a contact: from the collection's folder, the experiment, a seed and the contact's number to pose and move
+# (12,).
+Chooser = Callable[[Path, ExperimentSpec, int, int], np.ndarray]
+COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One contact to make: the label of the pose after the move (6,), and the move (6,), in mm and deg."""
+
+    pose: np.ndarray
+    move: np.ndarray
+
+
+@dataclass
+class Collection:
+    """A folder into which labelled frames are collected.
+
+    Parameters
+    ----------
+    folder : Path
+        A new or empty folder, or the folder of a collection with the same ``about``, which is continued. A folder in which a start failed
+        before the first frame counts as empty.
+    about : dict
+        Everything that the frames depend on, in types that JSON can hold.
+    form : Form
+        Form of the frames.
+    """
+
+    folder: Path
+    about: dict[str, Any]
+    form: Form
+
+    def __post_init__(self) -> None:
+        """Open the folder: check its content, and drop an unfinished line.
+
+        Raises
+        ------
+        DeviceError
+            The folder holds something else, or a collection with other settings.
+        """
+        self.pictures = self.folder / pictures_folder(self.form)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        meta, about = self.folder / META, json.loads(json.dumps(self.about))
+        if meta.is_file():
+            try:
+                before = json.loads(meta.read_text(encoding="utf-8"))
+                if not isinstance(before, dict):
+                    raise ValueError("expected keys and values")
+            except (ValueError, RecursionError) as error:
+                raise DeviceError(f"{meta}: is damaged ({shown(error)}); remove it if the folder holds no contacts yet") from error
+            other = [key for key in about if before.get(key) != about[key]]
+            if other and not (self.has_rest or self._has_contacts()):  # a start that failed; nothing is lost
+                write_json(meta, about | {"made_by": made_by(collect, inputs=about)})
+            elif other:
+                raise DeviceError(
+                    f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another --out"
+                )
+        elif contents(self.folder):
+            raise DeviceError(f"{self.folder}: holds something else; give an empty or a new folder")
+        else:
+            write_json(meta, about | {"made_by": made_by(collect, inputs=about)})
+        self.pictures.mkdir(exist_ok=True)
+        table, log = self.folder / TABLE, self.folder / LOG
+        for lines in (table, log):
+            if lines.is_file():
+                self._drop_torn_line(lines)
+        if not table.is_file() or not table.read_text(encoding="utf-8"):
+            write_text(table, ",".join(COLUMNS) + "\n")
+
+    def _has_contacts(self) -> bool:
+        """Whether the table holds more than its header, whatever that is."""
+        table = self.folder / TABLE
+        return table.is_file() and table.read_bytes().count(b"\n") > 1
+
+    @property
+    def count(self) -> int:
+        """Number of contacts collected so far.
+
+        Raises
+        ------
+        DeviceError
+            The table is damaged.
+        """
+        table = self.folder / TABLE
+        try:
+            with table.open(newline="", encoding="utf-8") as file:
+                rows = list(csv.reader(file))
+        except (ValueError, csv.Error) as error:
+            raise DeviceError(f"{table}: is damaged ({shown(error)}); give another --out") from error
+        if rows[:1] != [list(COLUMNS)] or any(len(row) != len(COLUMNS) for row in rows):
+            raise DeviceError(f"{table}: is not the table of a collection; give another --out")
+        return len(rows) - 1
+
+    @property
+    def has_rest(self) -> bool:
+        """Whether the frame without contact has been taken."""
+        return self.rest.is_file()
+
+    @property
+    def rest(self) -> Path:
+        """Path of the frame without contact, once it has been taken."""
+        return self.pictures / REST
+
+    def keep_rest(self, frame: Frame) -> None:
+        """Keep the frame without contact."""
+        write_image(self.rest, frame.image)
+
+    def keep(self, index: int, frame: Frame, label: np.ndarray, move: np.ndarray, log: dict[str, Any]) -> None:
+        """Write a contact in this order: picture, line of the log, row of the table. Therefore the picture of every row exists."""
+        name = f"frame_{index}_0.png"
+        write_image(self.pictures / name, frame.image)
+        with (self.folder / LOG).open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"image_name": name, **log}) + "\n")
+        row = [name, f"frame_{index}", 1, index + 1, *(f"{value:.9g}" for value in (*label, *move))]
+        with (self.folder / TABLE).open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerow(row)
+            file.flush()
+            os.fsync(file.fileno())
+
+    @staticmethod
+    def _drop_torn_line(lines: Path) -> None:
+        try:
+            text = lines.read_text(encoding="utf-8")
+        except ValueError as error:
+            raise DeviceError(f"{lines}: is damaged ({shown(error)}); give another --out") from error
+        if not text.endswith("\n"):
+            write_text(lines, text[: text.rfind("\n") + 1])
+
+
+def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str = "random") -> Contact:
+    """Pose and move of contact ``index`` within the experiment's ranges. They depend only on these arguments.
+
+    With the design "even", the first contacts fill the ranges evenly, whatever their number is: they are a scrambled Sobol sequence (Sobol
+    1967; scrambled by Owen 1998). In recordings of a plate, a model from 10 such contacts has the same error in depth as one from nearly 20
+    random contacts. The design "unsure" begins with the same contacts.
+    """
+    low, high = np.array(list(experiment.ranges().values())).T
+    if design == "random":
+        numbers = np.random.default_rng([seed, index]).uniform(low, high)
+        return Contact(numbers[:6], numbers[6:])
+    varied = high > low
+    sequence = Sobol(int(varied.sum()), scramble=True, rng=np.random.default_rng(seed))
+    shares = sequence.fast_forward(index).random(1)[0] if index else sequence.random(1)[0]
+    numbers = low.copy()
+    numbers[varied] += shares * (high - low)[varied]
+    return Contact(numbers[:6], numbers[6:])
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """Chooses the next contact of a collection."""
+
+    experiment: ExperimentSpec
+    seed: int
+    design: str
+    folder: Path
+    chooser: Chooser | None
+
+    def __call__(self, index: int) -> Contact:
+        varied = sum(high > low for low, high in self.experiment.ranges().values())
+        if self.chooser is None or self.design != "unsure" or index < EVEN_AT_FIRST * varied:
+            return draw_contact(self.experiment, self.seed, index, self.design)
+        numbers = self.chooser(self.folder, self.experiment, self.seed, index)
+        return Contact(numbers[:6], numbers[6:])
+
+
+class WorkFrame:
+    """The robot's coordinates of an experiment in front of an object (the work frame).
+
+    Labels are those of the mounting: after ``clear`` and ``tap``, the pose with labels of 0 has the depth and the angle from the surface's
+    normal that labels of 0 mean.
+
+    Parameters
+    ----------
+    experiment : ExperimentSpec
+    placed : PlacedObject
+    """
+
+    def __init__(self, experiment: ExperimentSpec, placed: PlacedObject) -> None:
+        self._offset = np.array(experiment.clear) + np.array(experiment.tap)
+        mounting = placed.mounting
+        self._T = matrix_of(placed.start_pose(mounting.depth_mm(0.0)))
+        turn = np.radians(mounting.angle_deg(0.0)) * mounting.out_of_plane
+        self._T[:3, :3] = self._T[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
+        self._T[:3, 3] -= self._T[:3, :3] @ self._offset[:3]
+        self._toward = mounting.axis
+
+    def base_pose(self, label: np.ndarray, near: np.ndarray, *, away_mm: float = 0.0) -> np.ndarray:
+        """The arm's pose (6,) at work coordinates (6,), ``away_mm`` back along the approach. ``near`` (6,) selects the turn about z."""
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("xyz", label[3:], degrees=True).as_matrix()
+        T[:3, 3] = label[:3] - away_mm * self._toward
+        return pose_of(self._T @ T, near)
+
+    def label(self, base_pose: np.ndarray) -> np.ndarray:
+        """The label (6,) of the arm's pose (6,) after the tap."""
+        return pose_of(np.linalg.inv(self._T) @ matrix_of(base_pose), np.zeros(6)) - self._offset
+
+
+def collect(
+    source: FrameSource,
+    arm: Arm,
+    experiment: ExperimentSpec,
+    placed: PlacedObject,
+    collection: Collection,
+    count: int,
+    *,
+    seed: int,
+    design: str = "random",
+    chooser: Chooser | None = None,
+    speed: tuple[float, float],
+    guards: tuple[Guard, ...] = (),
+    frame_timeout_s: float = FRAME_TIMEOUT_S,
+    on_rest: Callable[[Frame], None] | None = None,
+    progress: Step | None = None,
+) -> int:
+    """Collect contacts until the collection holds ``count``. Contacts that it already holds are not made again.
+
+    At every end, Ctrl-C included, the arm is stopped, withdrawn (if it has come to the object) and disabled.
+
+    Parameters
+    ----------
+    count : int
+        Number of contacts in the collection at the end.
+    seed : int
+        Seed of the drawn contacts.
+    design : {"random", "even", "unsure"}
+        See ``draw_contact``.
+    chooser : callable, optional
+        Chooses the contacts of the design "unsure" after the first ones.
+    speed : (float, float)
+        Speed of the arm in mm/s and deg/s.
+    guards : tuple of Guard
+        Called before every move, in this order. Each may change the target or refuse it.
+    frame_timeout_s : float
+        Longest wait in s for a frame while the arm stands still.
+    on_rest : callable, optional
+        Called with the frame without contact after it was kept.
+    progress : Step, optional
+
+    Returns
+    -------
+    int
+        Number of contacts in the collection.
+
+    Raises
+    ------
+    DeviceError
+        The source is not live, no path leads to the object, the arm did not reach its target, the release of the arm failed, or no frame
+        came.
+    StoreError
+        Another run collects into the folder, or the folder can't be written to.
+    """
+    if experiment.tap_frame != "work":
+        raise DeviceError(f"{experiment.name}: its tap follows the tool's axes; the arm taps along those of the work frame here")
+    if not source.is_live:
+        raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
+    rig = _Stops(source, arm, placed, WorkFrame(experiment, placed), speed, guards, frame_timeout_s, ArmWatch(arm))
+    with output(collection.folder), rig.watch.watched(), rig.eyes.watched():
+        ask = _Asked(experiment, seed, design, collection.folder, chooser)
+        failed = _collect_all(rig, experiment, collection, ask=ask, count=count, progress=progress, on_rest=on_rest, speed=speed)
+    if failed:
+        raise DeviceError("; ".join(failed))
+    return collection.count
+
+
+def _collect_all(
+    rig: "_Stops",
+    experiment: ExperimentSpec,
+    collection: Collection,
+    *,
+    ask: Callable[[int], Contact],
+    count: int,
+    speed: tuple[float, float],
+    on_rest: Callable[[Frame], None] | None,
+    progress: Step | None,
+) -> list[str]:
+    """Go to the object, make the missing contacts, and release the arm. Returns the failures of the release."""
+    try:
+        with rig.watch.alert():
+            rig.eyes.await_sight(timeout_s=rig.source.first_frame_s)
+            rig.arm.enable()
+            rig.arm.set_speed(*speed)
+            state = rig.go_around(rig.label, CLEAR_MM)
+            rig.at_object = True
+            if not collection.has_rest:
+                rest = rig.frame_after(state)
+                collection.keep_rest(rest)
+                if on_rest is not None:
+                    on_rest(rest)
+            for index in range(collection.count, count):
+                _collect_one(rig, experiment, collection, index, ask(index))
+                if progress is not None:
+                    progress(index + 1, count)
+    finally:
+        back = {"retreat": rig.withdraw} if rig.at_object else {}
+        with rig.watch.doing("letting go"):
+            failed = try_each(stop=rig.arm.stop, **back, disable=rig.arm.disable)
+    return failed
+
+
+def _collect_one(rig: "_Stops", experiment: ExperimentSpec, collection: Collection, index: int, asked: Contact) -> None:
+    """Make one contact and keep its frame: go above the place, tap, move along the surface, take the frame, lift off.
+
+    A frame is awaited at every stop, because the skin's state depends on where the arm has been.
+    """
+    clear, tap = np.array(experiment.clear), np.array(experiment.tap)
+    before = asked.pose - asked.move + clear
+    rig.go_around(before, LIFT_MM)
+    rig.label = before
+    rig.frame_after(rig.go(before))
+    rig.frame_after(rig.go(before + tap))
+    rig.label = asked.pose + clear + tap
+    confirmed = rig.go(rig.label)
+    frame = rig.frame_after(confirmed)
+    after = rig.arm.state()
+    log = {
+        "asked": [*asked.pose.tolist(), *asked.move.tolist()],
+        "confirmed_pose": confirmed.pose.tolist(),
+        "confirmed_s": confirmed.time_s,
+        "frame_s": frame.time_s,
+        "sequence": frame.sequence,
+        "moved_meanwhile_mm": float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3])),
+    }
+    collection.keep(index, frame, rig.work.label(confirmed.pose), asked.move, log)
+    rig.frame_after(rig.go(rig.label, LIFT_MM))
+
+
+@dataclass
+class _Stops:
+    """Moves an arm from stop to stop in its work frame, and takes frames while it stands still.
+
+    Attributes
+    ----------
+    label : (6,) float
+        Work coordinates of the contact at which the arm is, or to which it moves. From there the arm is withdrawn.
+    at_object : bool
+        Whether the arm has come around the object. From then on a straight path leads back from ``label``.
+    """
+
+    source: FrameSource
+    arm: Arm
+    placed: PlacedObject
+    work: WorkFrame
+    speed: tuple[float, float]
+    guards: tuple[Guard, ...]
+    frame_timeout_s: float
+    watch: ArmWatch
+    label: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    at_object: bool = False
+
+    def __post_init__(self) -> None:
+        self.eyes = Eyes(self.arm, self.source, self.watch.pose_at, lambda pose: float(self.placed.touch(pose).indent_mm))
+
+    def go(self, label: np.ndarray, away_mm: float = 0.0) -> ArmState:
+        """Move straight to work coordinates (6,), ``away_mm`` back along the approach. Returns the state there."""
+        return self._go_to(self.work.base_pose(label, self.arm.state().pose, away_mm=away_mm))
+
+    def go_around(self, label: np.ndarray, away_mm: float) -> ArmState:
+        """As ``go``, but on a path around the object."""
+        start = self.arm.state().pose
+        for pose in way_around(self.placed, start, self.work.base_pose(label, start, away_mm=away_mm)):
+            state = self._go_to(pose)
+        return state
+
+    def withdraw(self) -> ArmState:
+        """Move clear of the object. This needs no frames."""
+        return self._go_to(self.work.base_pose(self.label, self.arm.state().pose, away_mm=CLEAR_MM), sees=False)
+
+    def frame_after(self, state: ArmState) -> Frame:
+        """The first frame exposed after a state."""
+        try:
+            return self.watch.frame_after(self.source, state.time_s, timeout_s=self.frame_timeout_s)
+        except TimeoutError as error:
+            raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
+
+    def _go_to(self, target: np.ndarray, *, sees: bool = True) -> ArmState:
+        """Move straight to a pose (6,), if the camera ``sees`` only while its frames are fresh. Returns the state that confirms it."""
+        self.watch.require()
+        if sees:
+            self.eyes.await_sight(timeout_s=self.frame_timeout_s)
+        state = self.arm.state()
+        for guard in self.guards:
+            target = guard(state, target)
+        timeout_s = MOVE_TIMEOUT_S + SPARE * float(np.linalg.norm(target[:3] - state.pose[:3])) / self.speed[0]
+        move = partial(self.arm.move_linear, target, wait=False, timeout_s=timeout_s)
+        sent = self.eyes.move(move, ends=False) if sees else move()
+        if (short_mm := float(np.linalg.norm(sent[:3] - target[:3]))) > NEAR_MM:
+            raise DeviceError(
+                f"{self.arm.name}: a move ends {short_mm:.1f} mm from where it should; give --limits without step_mm and step_deg"
+            )
+        settle = partial(self.arm.wait_settled, sent, timeout_s=timeout_s)
+        with self.watch.doing("moving"):
+            return self.eyes.move(settle) if sees else settle()
+
+
+@dataclass(frozen=True)
+class CollectPlan:
+    """Settings of a collection, and its devices.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    stimulus : ObjectSpec
+        The object that is touched.
+    experiment : ExperimentSpec
+        Experiment that defines the contacts.
+    servo : ServoSpec
+        The arm's speeds, and the object's place.
+    camera, arm : str
+        As for ``build_rig``.
+    count : int
+        Number of contacts in the folder at the end.
+    seed : int or None
+        Seed of the drawn contacts. None: the experiment's own seed.
+    design : {"random", "even", "unsure"}
+        Distribution of the contacts over the experiment's ranges.
+    chooser : callable or None
+        Chooses the contacts of the design "unsure" after the first ones: ``training.data.design.LeastSure(sensor)``.
+    form : Form or None
+        Form of the frames. None: the form of the sensor's recordings if it has one.
+    limits : str or None
+        Safety limits, by name or file. None: those of the arm's kind.
+    plain_light : bool
+        Draw the twin's frames without path tracing; see ``build_rig``.
+    also : tuple of str
+        Further formats in which each contact is kept as soon as it is made, each in a subfolder.
+    dry_run : bool
+        End after the check of the plan, before anything moves.
+    """
+
+    sensor: SensorSpec
+    stimulus: ObjectSpec
+    experiment: ExperimentSpec
+    servo: ServoSpec
+    camera: str
+    arm: str
+    count: int
+    seed: int | None = None
+    design: str = "random"
+    chooser: Chooser | None = None
+    form: Form | None = None
+    limits: str | None = None
+    plain_light: bool = False
+    also: tuple[str, ...] = ()
+    dry_run: bool = False
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= MOST_CONTACTS:
+            raise DeviceError(f"--count {self.count}: a collection has 1 to {MOST_CONTACTS} contacts")
+        if self.design not in DESIGNS:
+            raise DeviceError(f"--design {self.design}: must be {' or '.join(DESIGNS)}")
+        if self.design == "unsure" and self.chooser is None:
+            raise DeviceError('the design "unsure" needs a chooser, as training.data.design.LeastSure(sensor) is one')
+
+    @property
+    def drawn_with(self) -> int:
+        """The seed of the drawn contacts: the plan's, else the experiment's."""
+        return self.experiment.seed if self.seed is None else self.seed
+
+
+@dataclass(frozen=True)
+class Collected:
+    """Number of contacts in the folder, and the number that was there before."""
+
+    folder: Path
+    count: int
+    before: int
+
+    def lines(self) -> list[str]:
+        """The result as lines of text."""
+        return [f"{self.count} contacts in {self.folder} ({self.count - self.before} new)"]
+
+
+@writes("images", "frames_bw", gone_on=(TABLE, META, LOG))
+def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent) -> Collected:
+    """Collect labelled frames into a folder, or continue a collection that was made with the same plan.
+
+    Raises
+    ------
+    DeviceError
+        The folder holds something else, or one of the reasons of ``collect``.
+    FrameError
+        The frame without contact shows a contact, or not this sensor.
+    """
+    kept = KeptAlso(out, plan.also, plan.sensor)
+    rig = build_rig(
+        plan.sensor,
+        plan.stimulus,
+        plan.servo.placement,
+        plan.experiment,
+        camera=plan.camera,
+        arm=plan.arm,
+        form=plan.form,
+        limits=plan.limits,
+        seed=plan.drawn_with,
+        plain_light=plan.plain_light,
+        at_once=True,
+    )
+    collection = Collection(out, _about(plan, rig), rig.source.form)
+    before = collection.count
+
+    def require_rest(frame: Frame) -> None:
+        try:
+            measure_reference(plan.sensor, rig.source.form, frame)
+        except FrameError as error:
+            raise FrameError(f"{error}; remove {collection.rest} and give the same command again, which takes it anew") from error
+
+    with kept:
+        if before < plan.count:
+            _collect_on_rig(plan, rig, collection, kept, require_rest, progress)
+        kept.catch_up()
+    return Collected(out, collection.count, before)
+
+
+def _collect_on_rig(
+    plan: CollectPlan, rig: Rig, collection: Collection, kept: KeptAlso, require_rest: Callable[[Frame], None], progress: Progress
+) -> None:
+    """Make the missing contacts. Each is kept in the further formats before the next one is made."""
+    with rig, stage(progress, "contacts") as step:
+
+        def made(done: float, total: float = 1.0, note: str = "") -> None:
+            kept.catch_up()
+            step(done, total, note)
+
+        _say_plan(plan, rig, collection.count)
+        if plan.dry_run:
+            return
+        collect(
+            rig.source,
+            rig.arm,
+            plan.experiment,
+            rig.placed,
+            collection,
+            plan.count,
+            seed=plan.drawn_with,
+            design=plan.design,
+            chooser=plan.chooser,
+            speed=(plan.servo.linear_mm_s, plan.servo.angular_deg_s),
+            frame_timeout_s=rig.frame_timeout_s,
+            on_rest=require_rest,
+            progress=made,
+        )
+
+
+def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
+    """Check the plan and report it. Of the contacts the next ``CHECKED_CONTACTS`` are checked."""
+    work, near = WorkFrame(plan.experiment, rig.placed), rig.arm.state().pose
+    design = "random" if plan.design == "random" else "even"
+    pressed = np.array(plan.experiment.clear) + np.array(plan.experiment.tap)
+    asked = [draw_contact(plan.experiment, plan.drawn_with, n, design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))]
+    planned = [work.base_pose(one.pose + pressed, near) for one in asked]
+    clear = work.base_pose(np.zeros(6), near, away_mm=CLEAR_MM)
+    spent_s = (plan.count - made) * CONTACT_S
+    for line in check_plan(rig, clear, planned, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s):
+        LOGGER.warning("%s", line)
+
+
+def _about(plan: CollectPlan, rig: Rig) -> dict[str, Any]:
+    """Everything that the frames depend on. A collection is continued only if all of this is the same."""
+    low, high = zip(*plan.experiment.ranges().values(), strict=True)
+    return {
+        "comments": f"collected: {plan.experiment.name}, {plan.sensor.name}, {plan.stimulus.name}",
+        "camera": plan.camera,
+        "arm": plan.arm,
+        "sensor": plan.sensor.name,
+        "form": str(rig.source.form),
+        "seed": plan.drawn_with,
+        "experiment": plan.experiment.model_dump(mode="json"),
+        "placement": plan.servo.placement.model_dump(mode="json"),
+        "tap_move": plan.experiment.tap,
+        "poses_rng": [high[:6], low[:6]],
+        "moves_rng": [high[6:], low[6:]],
+        "linear_speed": plan.servo.linear_mm_s,
+        "angular_speed": plan.servo.angular_deg_s,
+        **({} if plan.design == "random" else {"design": plan.design}),  # left out for "random", so that older collections can be continued
+    }

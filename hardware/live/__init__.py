@@ -1,0 +1,1 @@
+"""Live frames: watching, recording, checking."""

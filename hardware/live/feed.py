@@ -1,0 +1,266 @@
+"""Devices for the studio's mode 'Live': a camera with its estimates, and an arm that is only read until it is armed."""
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from hardware.arms.open_arm import kind_of, open_arm
+from hardware.cameras.choose import open_camera
+from hardware.cameras.source import FrameSource
+from hardware.errors import DeviceError
+from hardware.live.live import LiveSession, estimate_line
+from hardware.safety.decide import SHIPPED_LIMITS, load_limits
+from hardware.safety.eyes import Eyes
+from hardware.safety.safe_arm import SafeArm, try_each
+from scenes.files import shown
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError, TwinError
+from twin.estimate import Estimate, SensorModel
+from twin.records.session import SessionWriter
+from twin.studio.live_page import LiveShot
+from twin.types import Frame
+
+# Speed, mm/s and deg/s, of an arm that the page moves. It is slow, so that a person can watch it.
+SLOW_MM_S, SLOW_DEG_S = 10.0, 10.0
+# Longest wait, s, for the last frame at the end of a feed.
+END_S = 10.0
+
+
+class WatchedArm:
+    """An arm that is shown. It moves only while it is armed, within its limits, slowly, and while the camera gives fresh frames.
+
+    Without frames it makes its last steps again, backwards.
+
+    Parameters
+    ----------
+    text : str
+        Text for ``open_arm``.
+    source : FrameSource, optional
+        The camera. Without one the arm does not move.
+
+    Raises
+    ------
+    DeviceError
+        There is no such arm, or no limits are known for its kind.
+    """
+
+    def __init__(self, text: str, source: FrameSource | None = None) -> None:
+        arm, kind = open_arm(text), kind_of(text)
+        if not (SHIPPED_LIMITS / f"{kind}.toml").is_file():
+            raise DeviceError(
+                f"--arm {shown(text)}: no limits are known for '{shown(kind)}', so the page may not move it; write {shown(kind)}.toml"
+            )
+        self._arm = SafeArm(arm, load_limits(kind))
+        self.name = self._arm.name
+        self._armed = False
+        self._moves = threading.Lock()
+        self._eyes = Eyes(self._arm, source) if source is not None else None
+        self._steps: list[tuple[int, float]] = []  # axis and length of the steps from the pose at which it was armed
+
+    @property
+    def armed(self) -> bool:
+        """Whether the page may move the arm."""
+        return self._armed
+
+    def connect(self) -> None:
+        """Open the connection. Nothing moves."""
+        self._arm.connect()
+
+    def words(self) -> str:
+        """The arm's pose and state, as text."""
+        try:
+            state = self._arm.state()
+        except DeviceError as error:
+            return str(error)
+        pose = " ".join(f"{value:+.1f}" for value in state.pose)
+        kind = state.error or ("moving" if state.moving else "enabled" if state.enabled else "disabled")
+        return f"{self.name}: {kind}, at {pose} (mm, deg)"
+
+    def limits(self) -> str:
+        """The arm's limits once it is armed, as text."""
+        limits = self._arm.limits
+        box = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in zip("xyz", limits.box_mm, strict=True))
+        slow = min(SLOW_MM_S, limits.linear_mm_s)
+        return f"tool within {box} mm, {slow:g} mm/s, one step at a time; it is disabled when the studio ends"
+
+    def arm(self) -> None:
+        """Enable the arm, and set a low speed."""
+        self._steps.clear()
+        self._arm.enable()
+        self._arm.set_speed(SLOW_MM_S, SLOW_DEG_S)
+        self._armed = True
+
+    def disarm(self) -> None:
+        """Stop and disable the arm. Both are tried."""
+        self._armed = False
+        if failed := try_each(stop=self._arm.stop, disable=self._arm.disable):
+            raise DeviceError(f"{self.name}: {'; '.join(failed)}; use its own stop button")
+
+    def nudge(self, axis: int, by_mm: float) -> None:
+        """Move the tool along an axis of the base frame.
+
+        Raises
+        ------
+        DeviceError
+            The arm is not armed, is already moving, its limits forbid the move, or the camera gives no fresh frame.
+        """
+        if not self._armed:
+            raise DeviceError(f"{self.name}: read only; arm it first")
+        if not self._moves.acquire(blocking=False):
+            raise DeviceError(f"{self.name}: moves already; wait for its end")
+        try:
+            target = np.array(self._arm.state().pose, float)
+            target[axis] += by_mm
+            move = partial(self._arm.move_linear, target)
+            if self._steps and self._steps[-1] == (axis, -by_mm):  # the way it came needs no frame
+                move()
+                self._steps.pop()
+            elif self._eyes is None:
+                raise DeviceError(f"{self.name}: moves only with a camera; connect one")
+            else:
+                with self._eyes.watched():
+                    self._eyes.stand()
+                    self._eyes.move(move)
+                self._steps.append((axis, by_mm))
+        finally:
+            self._moves.release()
+
+    def emergency_stop(self) -> None:
+        """Stop the arm and cut its power."""
+        self._armed = False
+        self._arm.emergency_stop()
+
+    def close(self) -> None:
+        """Disarm the arm if it is armed, and close the connection."""
+        if self._armed:
+            with suppress(DeviceError):
+                self.disarm()
+        self._arm.disconnect()
+
+
+def require_feed(camera: str, arm: str, recording: str, sensor: SensorSpec) -> None:
+    """Refuse texts for camera, arm or recording that can't be valid; "" stands for none. Nothing is connected.
+
+    Raises
+    ------
+    DeviceError, FrameError
+        There is no such device or recording, or its frames are not the sensor's.
+    """
+    if camera:
+        open_camera(camera, sensor)
+    if arm:
+        WatchedArm(arm)
+    if recording and not os.path.exists(recording):  # its content is checked when it is opened
+        raise FrameError(f"--recording {recording}: no such folder; give a recording")
+
+
+class CameraFeed:
+    """A camera, its estimates, and an arm; a ``twin.studio.live_mode.LiveFeed``.
+
+    Parameters
+    ----------
+    camera : str
+        Text for ``open_camera``.
+    arm : str
+        Text for ``open_arm``; "" for none.
+    model : SensorModel
+
+    Raises
+    ------
+    TwinError
+        There is no such camera or arm, or the frames are not the model's.
+    """
+
+    def __init__(self, camera: str, arm: str, model: SensorModel) -> None:
+        self.model = model = model.seeking_rest()
+        self._source = open_camera(camera, model.sensor, model.form)
+        model.check(model.sensor, self._source.form)
+        self.robot = WatchedArm(arm, self._source) if arm else None
+        self.name = self._source.name + (f" and {self.robot.name}" if self.robot else "")
+        self._session = LiveSession(self._source, model)
+        self._writer: SessionWriter | None = None
+        self._writing = threading.Lock()
+        self._end = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self, on_shot: Callable[[LiveShot], None], on_end: Callable[[str], None]) -> None:
+        """Connect camera and arm, and deliver frames from a thread.
+
+        Raises
+        ------
+        TwinError
+            The camera or the arm can't be connected; then neither stays connected.
+        """
+        if self.robot is not None:
+            self.robot.connect()
+        try:
+            self._source.connect()
+        except BaseException:
+            self._close_arm()
+            raise
+
+        def deliver(frame: Frame, estimate: Estimate) -> None:
+            with self._writing:
+                if self._writer is not None:
+                    self._writer.append(frame, estimate_line(estimate) | {"time_s": time.monotonic()})
+            on_shot(LiveShot(frame, estimate, tuple(self._session.lines(estimate)[1:])))
+
+        def run() -> None:
+            try:
+                self._session.on_estimate = deliver
+                self._session.run(going=lambda: not self._end.is_set())
+                if not self._end.is_set():
+                    on_end(f"{self.name}: at its end")
+            except Exception as error:  # any error must be reported, because otherwise the picture would just stand still
+                on_end(str(error) if isinstance(error, TwinError) else f"{self.name}: ended by a fault of this program ({error!r})")
+
+        self._thread = threading.Thread(target=run, name="studio-camera", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End. The arm is released first. All parts are released, even if one fails.
+
+        Raises
+        ------
+        DeviceError
+            A part failed.
+        """
+        self._end.set()
+        failed = try_each(arm=self._close_arm, frames=self._join, recording=self.end_record, camera=self._source.disconnect)
+        if failed:
+            raise DeviceError(f"{self.name}: {'; '.join(failed)}")
+
+    def record(self, folder: Path) -> None:
+        """Store every frame and estimate from now on, as ``twin live --record`` does.
+
+        Raises
+        ------
+        DeviceError
+            The folder is not empty.
+        """
+        about = {"sensor": self.model.sensor.name, "form": str(self._source.form), "camera": self._source.name, "model": "studio"}
+        with self._writing:
+            self._writer = SessionWriter(folder, about)
+
+    def end_record(self) -> str:
+        """End the recording; returns what was written, in words."""
+        with self._writing:
+            writer, self._writer = self._writer, None
+        if writer is None:
+            return "nothing was recorded"
+        writer.__exit__(None, None, None)
+        return f"wrote {writer.folder} ({writer.count} frames)"
+
+    def _join(self) -> None:
+        if self._thread is not None:
+            self._thread.join(END_S)
+
+    def _close_arm(self) -> None:
+        if self.robot is not None:
+            self.robot.close()

@@ -1,0 +1,408 @@
+"""Watches a camera, or replays a session: from a plan to estimates, figures and, if requested, a recorded session.
+
+``watch`` runs the model on every frame. ``LiveSession`` is its loop; ``Shower`` shows the newest frame from its own thread.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from hardware.cameras.choose import open_camera
+from hardware.cameras.source import FrameSource, await_frame
+from hardware.errors import DeviceError
+from hardware.live.rerun_view import RerunView
+from hardware.live.session import SessionSource
+from hardware.rig.rig import given_frame
+from hardware.servo.timing import Spread, Timing
+from twin.errors import FrameError, OptionError, TwinError
+from twin.estimate import Estimate, Estimator, SensorModel, seen_in
+from twin.pins import Pipeline
+from twin.records import KeptAlso
+from twin.records.session import SESSION_FILES, SessionWriter
+from twin.store import output
+from twin.studio.live_page import LivePage, LiveShot
+from twin.types import FIRST, NONE, Frame
+
+# Number of newest times of each kind from which the figures are computed.
+KEPT_TIMES = 10_000
+# Number of newest frames from which the present frame rate is computed.
+RATE_SPAN = 30
+# Interval in s between two pictures of the view.
+SHOW_S = 0.1
+# Time, s, that a view has at the end to write or send its data.
+CLOSE_S = 20.0
+# Longest wait for a frame, in s.
+FRAME_TIMEOUT_S = 5.0
+# Port of the page that shows the frames.
+PORT = 8080
+
+View = RerunView | LivePage
+
+
+@dataclass
+class LiveSession:
+    """Estimates the pose in every frame that a source delivers.
+
+    Parameters
+    ----------
+    source : FrameSource
+        Connected source.
+    estimator : Estimator
+    record : SessionWriter, optional
+    on_estimate : callable, optional
+        Called with each frame and its estimate.
+    """
+
+    source: FrameSource
+    estimator: Estimator
+    record: SessionWriter | None = None
+    on_estimate: Callable[[Frame, Estimate], None] | None = None
+    newest: tuple[Frame, Estimate] | None = None
+    count: int = 0
+    valid: int = 0
+    invalid: str = ""
+    _ages: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
+    _late: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
+    _spent: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
+    _done: deque[float] = field(default_factory=lambda: deque(maxlen=RATE_SPAN))
+    _begun_s: float = field(default_factory=time.monotonic)
+
+    def run(self, *, most: int | None = None, seconds: float | None = None, going: Callable[[], bool] = lambda: True) -> Timing:
+        """Run until the recording ends, ``most`` frames were read, ``seconds`` have passed, or ``going()`` is false.
+
+        Raises
+        ------
+        DeviceError
+            The camera has ended, or delivers no frame.
+        FrameError
+            A frame does not belong to the model's sensor.
+        """
+        self._begun_s = time.monotonic()
+        while going() and (most is None or self.count < most) and (seconds is None or time.monotonic() - self._begun_s < seconds):
+            try:
+                frame = self.source.read(timeout_s=FRAME_TIMEOUT_S)
+            except EOFError:
+                break
+            except TimeoutError as error:
+                raise DeviceError(f"{error}; check the camera") from error
+            taken_s = time.monotonic()
+            try:
+                estimate = self.estimator(frame)
+            except FrameError as error:
+                raise FrameError(f"{self.source.name}: {error}") from error
+            now_s = time.monotonic()
+            if self.source.is_live:
+                self._ages.append(taken_s - frame.time_s)
+                self._late.append(now_s - frame.time_s)
+            self._spent.append(now_s - taken_s)
+            self._done.append(now_s)
+            self.count += 1
+            self.valid += estimate.valid
+            self.invalid = self.invalid if estimate.valid else estimate.reason
+            self.newest = (frame, estimate)
+            if self.record is not None:
+                self.record.append(frame, estimate_line(estimate) | {"time_s": now_s})
+            if self.on_estimate is not None:
+                self.on_estimate(frame, estimate)
+        return self.timing()
+
+    def timing(self) -> Timing:
+        """The figures so far."""
+        rate_hz = self.count / max(time.monotonic() - self._begun_s, 1e-9)
+        late, ages, spent = (Spread.of(list(times)) for times in (self._late, self._ages, self._spent))
+        return Timing(self.count, rate_hz, rate_hz, late, ages, spent, self.source.dropped)
+
+    def lines(self, estimate: Estimate) -> list[str]:
+        """Lines of text: pose with its interval, rates and losses."""
+        if estimate.valid:
+            rows = zip(estimate.names, estimate.value, estimate.low, estimate.high, strict=True)
+            pose = [f"{name} {value:+.2f} [{low:+.2f}, {high:+.2f}]" for name, value, low, high in rows]
+        else:
+            pose = [f"not valid: {estimate.reason}"]
+        done = list(self._done)
+        now_hz = (len(done) - 1) / (done[-1] - done[0]) if len(done) > 1 and done[-1] > done[0] else 0.0
+        late = f", exposure to pose {1e3 * float(np.median(self._late)):.0f} ms" if self._late else ""
+        return ["   ".join(pose), f"{now_hz:.1f} frames/s, {self.count} frames, {self.source.dropped} dropped{late}"]
+
+
+def estimate_line(estimate: Estimate) -> dict:
+    """An estimate in the form in which a session stores it."""
+    return {
+        "names": list(estimate.names),
+        "value": np.asarray(estimate.value),
+        "low": np.asarray(estimate.low),
+        "high": np.asarray(estimate.high),
+        "valid": bool(estimate.valid),
+        "reason": estimate.reason,
+    }
+
+
+def same_estimates(steps: list[dict], values: list[np.ndarray]) -> int:
+    """Number of steps of a session whose stored estimates equal exactly the present ones (K,)."""
+    same = 0
+    for step, value_now in zip(steps, values, strict=False):
+        kept = np.array([np.nan if value is None else value for value in step.get("value", [])], float)
+        same += np.array_equal(kept, value_now, equal_nan=True)
+    return same
+
+
+class Shower:
+    """Shows the newest frame from its own thread, so that drawing does not delay the session. A context manager.
+
+    Parameters
+    ----------
+    session : LiveSession
+    pipeline : Pipeline
+        Pipeline that finds the pins that are drawn over a frame.
+    view : View
+
+    Raises
+    ------
+    DeviceError
+        When the context is entered, if the view can't be opened; when it is left, if the view has failed.
+    """
+
+    def __init__(self, session: LiveSession, pipeline: Pipeline, view: View) -> None:
+        self._session, self._pipeline, self._view = session, pipeline, view
+        self._opened, self._end = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="view", daemon=True)
+        self._error: Exception | None = None
+
+    @property
+    def open(self) -> bool:
+        """Whether the view still works."""
+        return not self._end.is_set()
+
+    def __enter__(self) -> "Shower":
+        self._thread.start()
+        self._opened.wait()
+        self._tell()
+        return self
+
+    def __exit__(self, kind: type | None, *_: object) -> None:
+        self._end.set()
+        self._thread.join(timeout=CLOSE_S)
+        if kind is None:
+            self._tell()
+
+    def _tell(self) -> None:
+        """Raise the error with which the view ended, if there is one."""
+        if isinstance(self._error, TwinError):
+            raise self._error
+        if self._error is not None:
+            raise DeviceError(f"the view broke ({self._error}); without --rerun, --headless shows nothing") from self._error
+
+    def _run(self) -> None:
+        try:
+            self._show()
+        except Exception as error:
+            self._error = error
+            self._end.set()
+        finally:
+            self._opened.set()
+
+    def _show(self) -> None:
+        shown = None
+        with self._view as view:
+            self._opened.set()
+            while not self._end.wait(SHOW_S):
+                newest = self._session.newest
+                if newest is None or newest is shown:
+                    continue
+                try:
+                    lines = self._session.lines(newest[1])
+                except RuntimeError:  # the session added a time while the times were read
+                    continue
+                shown = newest
+                view.show(LiveShot(*newest, tuple(lines[1:])), seen_in(*newest, self._pipeline))
+
+
+@dataclass(frozen=True)
+class WatchPlan:
+    """Settings of watching: source, view and recording.
+
+    Attributes
+    ----------
+    camera : str
+        Text for ``open_camera``; "" with ``replay``.
+    replay : Path or None
+        A recorded session instead of a camera.
+    record : Path or None
+        New folder for a session.
+    shown : bool
+        Show the frames on a page for the browser.
+    rerun : str or None
+        A target of ``RerunView``. The frames are then shown there, whatever ``shown`` is.
+    seconds, count : float or None, int or None
+        Stop after this time in s, or after this number of frames.
+    at_rest : str
+        The pins at rest: ``first`` (from the first frame), ``none`` (those that the model knows, or that follow from the contacts), or a
+        file.
+    port : int
+        Port of the page; 0 for a free one.
+    also : tuple of str
+        Further formats in which the session is kept at its end, each in a subfolder of ``record``.
+    """
+
+    camera: str = ""
+    replay: Path | None = None
+    record: Path | None = None
+    shown: bool = True
+    rerun: str | None = None
+    seconds: float | None = None
+    count: int | None = None
+    at_rest: str = NONE
+    port: int = PORT
+    also: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.also and self.record is None:
+            raise OptionError("--also goes with --record: it keeps that session in a further format")
+        if bool(self.camera) == (self.replay is not None):
+            raise OptionError("give either --camera or --replay")
+        if self.replay is not None and self.at_rest != NONE:
+            raise OptionError(
+                "--at-rest goes with --camera: a replay counts pins from the frame that was kept with its session; leave --at-rest out"
+            )
+
+
+@dataclass(frozen=True)
+class Watched:
+    """The result of ``watch``.
+
+    Attributes
+    ----------
+    timing : Timing
+    interrupted : bool
+        Whether Ctrl-C ended it.
+    same : (int, int) or None
+        For a replay: the number of estimates that equal the recorded ones, and the number of all estimates.
+    record : Path or None
+        Folder of the recorded session.
+    frames : int
+        Number of frames.
+    notes : list of str
+        Irregularities of the recording, the session, or the camera's frames.
+    valid : int
+        Number of frames with a valid estimate.
+    invalid : str
+        Reason why the last frame without a valid estimate had none.
+    """
+
+    timing: Timing
+    interrupted: bool
+    same: tuple[int, int] | None
+    record: Path | None
+    frames: int
+    notes: list[str] = field(default_factory=list)
+    valid: int = 0
+    invalid: str = ""
+
+    def lines(self) -> list[str]:
+        """The result as lines of text."""
+        lines = ["ended"] if self.interrupted else []
+        lines += [f"note: {note}" for note in self.notes]
+        lines += self.timing.lines()
+        if self.frames:
+            why = "" if self.valid == self.frames or not self.invalid else f"; the last that was not: {self.invalid}"
+            lines.append(f"{self.valid} of {self.frames} frames valid{why}")
+        if self.same is not None:
+            lines.append(f"{self.same[0]} of {self.same[1]} estimates are those that were recorded")
+        if self.record is not None:
+            lines.append(f"wrote {self.record} ({self.frames} frames)")
+        return lines
+
+
+def watch(
+    plan: WatchPlan,
+    model: SensorModel,
+    *,
+    name: str = "",
+    on_shown: Callable[[str], None] | None = None,
+    on_estimate: Callable[[Frame, Estimate], None] | None = None,
+) -> Watched:
+    """Estimate the pose in every frame that the camera or the session delivers, until the plan's end or Ctrl-C.
+
+    Parameters
+    ----------
+    plan : WatchPlan
+    model : SensorModel
+    name : str
+        The model's name, which is stored with the session.
+    on_shown : callable, optional
+        Called with the address of the view once it is open.
+    on_estimate : callable, optional
+        Called with each frame and its estimate.
+
+    Raises
+    ------
+    TwinError
+        There is no such camera or session, its sensor is not the model's, or the view can't be opened or fails.
+    """
+    kept = KeptAlso(plan.record or Path(), plan.also, model.sensor)
+    source = SessionSource(plan.replay) if plan.replay is not None else open_camera(plan.camera, model.sensor, model.form)
+    model.check(model.sensor, source.form)
+    rest = source.rest if isinstance(source, SessionSource) else given_frame(plan.at_rest, model)
+    found: list[np.ndarray] = []
+
+    def keep(frame: Frame, estimate: Estimate) -> None:
+        if plan.replay is not None:
+            found.append(np.asarray(estimate.value, float))
+        if on_estimate is not None:
+            on_estimate(frame, estimate)
+
+    with ExitStack() as stack:
+        stack.enter_context(source)
+        model, rest = _at_rest(plan, model, source, rest)
+        session, shower = LiveSession(source, model, on_estimate=keep), None
+        pipeline = Pipeline(model.sensor, model.form, model.pipeline.reference)  # a separate one for the view's thread
+        view = _view(plan, f"{model.sensor.name}, {source.name}", pipeline)
+        if view is not None:
+            shower = stack.enter_context(Shower(session, pipeline, view))
+            if on_shown is not None:
+                on_shown(view.url)
+        if plan.record is not None:  # last, so that no folder is made if an earlier step fails
+            about = {"sensor": model.sensor.name, "form": str(source.form), "camera": source.name, "model": name}
+            stack.enter_context(output(plan.record, *SESSION_FILES))
+            stack.enter_context(kept)
+            stack.callback(_catch_up, session, kept)
+            session.record = stack.enter_context(SessionWriter(plan.record, about))
+            if rest is not None:
+                session.record.keep_rest(rest)
+        interrupted = False
+        try:
+            session.run(most=plan.count, seconds=plan.seconds, going=lambda: shower is None or shower.open)
+        except KeyboardInterrupt:
+            interrupted = True
+        same = (same_estimates(source.steps, found), len(found)) if isinstance(source, SessionSource) else None
+        return Watched(session.timing(), interrupted, same, plan.record, session.count, source.notes(), session.valid, session.invalid)
+
+
+def _catch_up(session: LiveSession, kept: KeptAlso) -> None:
+    """Write a session with at least one step in the further formats, however it ended."""
+    if session.count:
+        kept.catch_up()
+
+
+def _at_rest(plan: WatchPlan, model: SensorModel, source: FrameSource, rest: Frame | None) -> tuple[SensorModel, Frame | None]:
+    """The model with the pins at rest from the frame without contact, or from the contacts, and that frame."""
+    if plan.at_rest == FIRST:
+        rest = await_frame(source)
+        return model.at_rest(rest), rest
+    # A session may be replayed with another model, which may not use displacements from rest.
+    if rest is not None and (model.counts_from_rest or plan.replay is None):
+        return model.at_rest(rest), rest
+    return model.seeking_rest(), rest
+
+
+def _view(plan: WatchPlan, title: str, pipeline: Pipeline) -> View | None:
+    """The view of the plan, not yet open; None if nothing is shown."""
+    if plan.rerun is not None:
+        return RerunView(title, plan.rerun)
+    return LivePage(title, pipeline.spec, pipeline.reference, port=plan.port) if plan.shown else None

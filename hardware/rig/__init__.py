@@ -1,0 +1,1 @@
+"""A rig: camera, arm and object, and the ways between their poses."""

@@ -1,0 +1,88 @@
+"""Looks at the whole way before the first motion: the camera, the path to the object, and a way back from every planned pose."""
+
+import time
+
+import numpy as np
+
+from hardware.arms.arm import ArmState
+from hardware.errors import DeviceError
+from hardware.rig.approach import way_around
+from hardware.rig.geometry import matrix_of
+from hardware.rig.rig import Rig
+from hardware.safety.decide import Action, decide
+from hardware.safety.safe_arm import RETREAT_SHARES, SafeArm
+
+# Time, s, in which the camera's frames are counted.
+COUNT_S = 0.5
+
+
+def check_plan(rig: Rig, clear: np.ndarray, planned: list[np.ndarray], *, linear_mm_s: float, spent_s: float) -> list[str]:
+    """Check a plan on a connected rig. Nothing moves.
+
+    Parameters
+    ----------
+    clear : (6,) float
+        The pose clear of the object to which the arm goes first.
+    planned : list of (6,) float
+        The poses in contact, as far as they are known; the first one is the start.
+    linear_mm_s : float
+        Speed of the arm.
+    spent_s : float
+        Time of the work at the object, as far as it is known.
+
+    Returns
+    -------
+    list of str
+        The plan, one line for each part.
+
+    Raises
+    ------
+    DeviceError
+        The limits forbid the way to the object, the start, or the way back from the start; or the camera gives no frames.
+    """
+    frame, state, before = rig.await_frame(), rig.arm.state(), getattr(rig.source, "arrived", 0)
+    rate = ""
+    if rig.source.streams:
+        time.sleep(COUNT_S)
+        rate = f", {(rig.source.arrived - before) / COUNT_S:.0f} frames/s" if hasattr(rig.source, "arrived") else ""
+    way = [state.pose, *way_around(rig.placed, state.pose, clear), planned[0]]
+    for start, end in zip(way[:-1], way[1:], strict=True):
+        if why := _forbidden(rig, start, end):
+            raise DeviceError(
+                f"{rig.arm.name}: the limits forbid the way to the {rig.placed.spec.name}: {why}; correct 'placement' in the file for "
+                "--servo (a Magician reaches that of --servo magician), or --limits"
+            )
+    blocked = [n for n, pose in enumerate(planned) if not _way_back(rig, pose)]
+    if blocked[:1] == [0]:
+        raise DeviceError(f"{rig.arm.name}: the limits allow no way back from the start; correct 'placement' in the file for --servo")
+    way_mm = sum(float(np.linalg.norm(end[:3] - start[:3])) for start, end in zip(way[:-1], way[1:], strict=True))
+    back = f"a way back from all {len(planned)} planned poses"
+    if blocked:
+        back = f"no straight way back from {len(blocked)} of {len(planned)} planned poses: from there the arm goes back the way it came"
+    return [
+        f"camera: {rig.source.name}, {frame.image.shape[1]} x {frame.image.shape[0]} px{rate}",
+        f"way: {len(way) - 1} moves, {way_mm:.0f} mm, to {' '.join(f'{value:.1f}' for value in planned[0])} (mm, deg)",
+        f"limits: {back}",
+        f"time: about {way_mm / linear_mm_s + spent_s:.0f} s",
+    ]
+
+
+def _forbidden(rig: Rig, start: np.ndarray, end: np.ndarray) -> str:
+    """Why the limits forbid a straight move between poses (6,); "" if they don't, or there are none."""
+    if not isinstance(rig.arm, SafeArm):
+        return ""
+    arm = rig.arm
+    limits = arm.limits.model_copy(update={"step_mm": None, "step_deg": None})
+    near = start if arm.kinematics is None else arm.kinematics.nearest_pose(start)
+    state = ArmState(near, np.zeros(arm.axes), time.monotonic(), True, False)
+    decision = decide(end, state, limits, now_s=state.time_s, kinematics=arm.kinematics)
+    return "" if decision.action is Action.MOVE else decision.reason
+
+
+def _way_back(rig: Rig, pose: np.ndarray) -> bool:
+    """Whether the limits allow a part of the retreat from a pose (6,) in contact."""
+    if not isinstance(rig.arm, SafeArm):
+        return True
+    back = np.zeros(6)
+    back[:3] = -matrix_of(pose)[:3, :3] @ rig.mounting.axis * rig.arm.limits.retreat_mm
+    return any(not _forbidden(rig, pose, pose + share * back) for share in RETREAT_SHARES)

@@ -1,0 +1,1 @@
+"""Safety: limits, decisions, the guarded arm, and the rule of fresh frames."""

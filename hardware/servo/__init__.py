@@ -1,0 +1,1 @@
+"""Tactile servo control: the loop, its law, its figures."""

@@ -1,0 +1,316 @@
+"""One run of surface following, from a plan to results that are also written to disk."""
+
+import logging
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hardware.arms.open_arm import kind_of, open_arm
+from hardware.errors import DeviceError
+from hardware.rig.geometry import moved
+from hardware.rig.last_axis import LastAxis, poses_along, turns_back_mm
+from hardware.rig.plan import check_plan
+from hardware.rig.rig import TWIN, Rig, build_rig, given_frame, servo_loop, steps_round
+from hardware.servo.loop import ServoLoop
+from hardware.servo.policy_law import policy_law
+from hardware.servo.step import LoopSettings, StepRecord
+from hardware.servo.timing import Timing
+from hardware.servo.trajectory import Measures, Trajectory, measure, trajectory_figure, trajectory_of, write_csv
+from scenes import ObjectSpec, ServoSpec, load_experiment
+from scenes.files import shown
+from twin.errors import OptionError, TwinError
+from twin.estimate import Estimate, SensorModel
+from twin.policy import PolicyModel
+from twin.progress import Progress, Step, silent, stage
+from twin.records import KeptAlso
+from twin.records.session import SessionWriter, plain
+from twin.report.charts import save_figure
+from twin.store import write_json, writes
+from twin.types import FIRST, Frame
+
+LOG = logging.getLogger(__name__)
+# Subfolder of the results with the session.
+SESSION = "session"
+# Time, s, without a usable frame after which following ends.
+GIVE_UP_S = 5.0
+# Rate, Hz, that determines the loop's period if no rate is given. Then each decision waits for the move before it, and the period is only
+# the pause after a frame that could not be used.
+STREAM_HZ = 10.0
+# Range of the rate, decisions per second. No camera is faster than the second, and an arm waits too long with a rate below the first.
+SLOWEST_HZ, FASTEST_HZ = 0.1, 1000.0
+# Distance, mm, between the poses along the outline that are checked before anything moves.
+CHECK_MM = 10.0
+# Most steps of a run. They take an arm days.
+MOST_STEPS = 1_000_000
+
+
+@dataclass(frozen=True)
+class FollowPlan:
+    """Settings of a run, and its devices. The sensor and the form of its frames are those of the model.
+
+    Attributes
+    ----------
+    stimulus : ObjectSpec
+        The object.
+    servo : ServoSpec
+        Gains, speeds and the object's place.
+    camera, arm : str
+        As for ``build_rig``. If no camera is given, the twin's frames are drawn. This is allowed for a simulated arm only, because a real
+        arm would follow a contact that does not exist.
+    steps : int or None
+        Number of steps; None: once around the object.
+    stream_hz : float or None
+        Decisions per second; None: each decision waits for the move before it.
+    limits : str or None
+        Safety limits, by name or file; None: those of the arm's kind.
+    record : bool
+        Keep every frame and step in a session.
+    seed : int
+        Seed of the twin's noise.
+    plain_light : bool
+        Draw the twin's frames without path tracing; see ``build_rig``.
+    known_place : bool
+        Whether the object really stands at the servo's placement, so that the results can be compared with the truth. This is always true
+        in the twin.
+    at_rest : str
+        The pins at rest: ``first`` (from the frame that is taken clear of the object), ``none`` (those that the model knows, or that follow
+        from the contacts), or a file.
+    also : tuple of str
+        Further formats in which the session is kept at its end, each in a subfolder of it.
+    dry_run : bool
+        End after the check of the plan, before anything moves.
+    """
+
+    stimulus: ObjectSpec
+    servo: ServoSpec
+    camera: str = ""
+    arm: str = "simulated"
+    steps: int | None = None
+    stream_hz: float | None = None
+    limits: str | None = None
+    record: bool = False
+    seed: int = 0
+    plain_light: bool = False
+    known_place: bool = False
+    at_rest: str = FIRST
+    also: tuple[str, ...] = ()
+    dry_run: bool = False
+
+    def __post_init__(self) -> None:
+        if self.also and not self.record:
+            raise OptionError("--also goes with --record: it keeps that session in a further format")
+        if self.stream_hz is not None and not SLOWEST_HZ <= self.stream_hz <= FASTEST_HZ:
+            raise DeviceError(f"--rate {self.stream_hz:g}: expected {SLOWEST_HZ:g} to {FASTEST_HZ:g} decisions a second")
+        if self.steps is not None and not 1 <= self.steps <= MOST_STEPS:
+            raise DeviceError(f"--steps {self.steps}: expected 1 to {MOST_STEPS}")
+        if not self.camera:
+            if kind_of(self.arm) != "simulated":
+                open_arm(self.arm)  # an arm that does not exist is said first; nothing is opened
+                raise OptionError(
+                    f"--arm {shown(self.arm)} moves by what a camera sees: give the sensor's with --camera; '--camera twin' draws the "
+                    "frames for the pose that the arm reports, and such a loop does not feel what it touches"
+                )
+            object.__setattr__(self, "camera", TWIN)
+
+
+@dataclass(frozen=True)
+class DryRunDone:
+    """The result of a plan that was checked, and not carried out."""
+
+    failure: str = ""
+
+    def lines(self) -> list[str]:
+        """The result as lines of text."""
+        return ["nothing was moved; leave out --dry-run to begin"]
+
+
+@dataclass(frozen=True)
+class Followed:
+    """The result of ``follow``. ``failure`` states why it ended early ("" if it did not); ``outline_mm`` (N, 2) is in the base frame."""
+
+    measures: Measures
+    timing: Timing
+    path: Trajectory
+    outline_mm: np.ndarray
+    failure: str
+    notes: list[str]
+    written: list[Path] = field(default_factory=list)
+
+    def lines(self) -> list[str]:
+        """The result as lines of text, without unknown values."""
+        m = self.measures
+        smooth = {"smoothness S": m.smoothness, "local": m.local_smoothness, "jerk in mm per step^3": m.jerk}
+        out = [
+            f"{m.steps} steps on fresh frames",
+            ", ".join(f"{what} {value:.3f}" for what, value in smooth.items() if np.isfinite(value)),
+            *self.timing.lines(),
+            *(f"note: {note}" for note in self.notes),
+        ]
+        if np.isfinite(m.completed):
+            out[0] += f", {m.completed:.0%} of the way, contact lost {m.lost_contacts:g} times"
+            told = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
+            out[2:2] = [
+                f"{told if np.isfinite(m.path_error_mm) else ''}"  # a policy gives no estimate
+                f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
+            ]
+        else:
+            out[0] += "; where the object truly stands is not known, so nothing is measured against it ('--known-place' says it is)"
+        return out + ([f"ended early: {self.failure}"] if self.failure else [])
+
+
+@writes("trajectory.csv", "trajectory.png", "measures.json", SESSION)
+def follow(
+    plan: FollowPlan, model: SensorModel, out: Path, *, about: dict[str, Any] | None = None, progress: Progress = silent
+) -> Followed | DryRunDone:
+    """Follow an object and write the results to ``out``. A run that ends before its last step also has results.
+
+    Parameters
+    ----------
+    model : SensorModel
+        Model that estimates the pose in each frame.
+    about : dict, optional
+        Further entries for the stored measures, such as the model's name (JSON).
+
+    Raises
+    ------
+    TwinError
+        The run could not begin, or it ended before its first step.
+    """
+    kept = KeptAlso(out / SESSION, plan.also, model.sensor)
+    rest = given_frame(plan.at_rest, model)
+    if rest is not None:
+        model = model.at_rest(rest)
+    elif plan.at_rest != FIRST:
+        model = model.seeking_rest()
+    rig = _rig_of(plan, model)
+    round_steps, wanted_mm = steps_round(rig.placed, plan.servo, 1.0)
+    steps = plan.steps or round_steps
+    if plan.steps:
+        wanted_mm = min(wanted_mm, plan.steps * plan.servo.feed_mm)
+    told = _told(plan, model) | (about or {})
+    failure, followed = "", None
+    with rig, stage(progress, f"following the {plan.stimulus.name}") as step, ExitStack() as stack:
+        _say_plan(plan, rig, wanted_mm, steps)
+        first = rig.await_frame()
+        loop = servo_loop(rig, plan.servo, model, _settings(plan, rig, steps))
+        if isinstance(model, PolicyModel):
+            loop.law = policy_law(model.policy, rig.mounting)
+        else:
+            loop.require_labels(model(first).names)
+        _say_turns(rig, plan.servo, wanted_mm)
+        if plan.dry_run:
+            return DryRunDone()
+        session = stack.enter_context(SessionWriter(out / SESSION, told)) if plan.record else None
+        if session is not None and rest is not None:
+            session.keep_rest(rest)
+        loop.on_step = partial(_note_step, session, step, steps)
+        if plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live:
+            loop.take_rest = partial(_take_rest, session, model)
+        try:
+            loop.run(rig.placed.start_pose(plan.servo.indent_mm))
+        except TwinError as error:
+            if not loop.records:
+                raise
+            failure = str(error)
+        finally:  # also after Ctrl-C, so that the steps so far are stored
+            if loop.records:
+                followed = _results(plan, rig, loop, wanted_mm, failure)
+                followed.written.extend(_write(out, plan, model, followed, told))
+                with kept:
+                    kept.catch_up()
+    if followed is None:
+        raise DeviceError(f"{rig.source.name}: ended before the first step, nothing was followed; give a camera or a longer recording")
+    return followed
+
+
+def _rig_of(plan: FollowPlan, model: SensorModel) -> Rig:
+    return build_rig(
+        model.sensor,
+        plan.stimulus,
+        plan.servo.placement,
+        load_experiment(plan.servo.experiment),
+        camera=plan.camera,
+        arm=plan.arm,
+        form=model.form,
+        limits=plan.limits,
+        seed=plan.seed,
+        plain_light=plan.plain_light,
+        at_once=plan.stream_hz is None,
+    )
+
+
+def _settings(plan: FollowPlan, rig: Rig, steps: int) -> LoopSettings:
+    return LoopSettings(
+        steps,
+        blocking=plan.stream_hz is None,
+        period_s=1.0 / (plan.stream_hz or STREAM_HZ),
+        frame_timeout_s=rig.frame_timeout_s,
+        give_up_s=GIVE_UP_S,
+    )
+
+
+def _told(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
+    """The entries that are stored with the results."""
+    names = {"sensor": model.sensor.name, "object": plan.stimulus.name, "camera": plan.camera, "arm": plan.arm}
+    return names | {"servo": plan.servo.model_dump()}
+
+
+def _say_plan(plan: FollowPlan, rig: Rig, wanted_mm: float, steps: int) -> None:
+    """Check the plan and report it. Of the outline every ``CHECK_MM`` is checked."""
+    planned = [pose for distance, pose in poses_along(rig.placed, plan.servo.indent_mm, wanted_mm)]
+    axis, along, near = LastAxis(getattr(rig.arm, "kinematics", None)), [planned[0]], planned[0]
+    for pose in planned:
+        if np.linalg.norm(pose[:3] - near[:3]) >= CHECK_MM:
+            near = axis.on_turn(pose, near[5])[0]
+            along.append(near)
+    clear = moved(planned[0], -plan.servo.clear_mm * rig.mounting.axis)
+    spent_s = steps / plan.stream_hz if plan.stream_hz else steps * plan.servo.feed_mm / plan.servo.linear_mm_s
+    for line in check_plan(rig, clear, along, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s):
+        LOG.warning("%s", line)
+
+
+def _say_turns(rig: Rig, servo: ServoSpec, wanted_mm: float) -> None:
+    """Report in advance where on its path an arm of four axes will turn back its last axis."""
+    axis = LastAxis(getattr(rig.arm, "kinematics", None), rig.mounting.centre_mm)
+    for distance_mm in turns_back_mm(rig.placed, axis, servo.indent_mm, wanted_mm):
+        LOG.warning("%s: its last axis will turn back by a full turn after about %.0f mm, clear of the object", rig.arm.name, distance_mm)
+
+
+def _note_step(session: SessionWriter | None, step: Step, steps: int, record: StepRecord, frame: Frame, estimate: Estimate) -> None:
+    if session is not None:
+        session.append(frame, record.plain())
+    step(record.index + 1, steps)
+
+
+def _take_rest(session: SessionWriter | None, model: SensorModel, frame: Frame) -> SensorModel:
+    """Store the frame that was taken clear of the object, and use its pins as the pins at rest."""
+    if session is not None:
+        session.keep_rest(frame)
+    return model.at_rest(frame)
+
+
+def _results(plan: FollowPlan, rig: Rig, loop: ServoLoop, wanted_mm: float, failure: str) -> Followed:
+    path = trajectory_of(loop.records, rig.mounting, rig.placed if rig.knows_truth or plan.known_place else None)
+    measures = measure(path, indent_mm=plan.servo.indent_mm, angle_deg=plan.servo.angle_deg, wanted_mm=wanted_mm)
+    flat = rig.placed.outline()
+    turn, origin = rig.placed.T_base_object[:2, [0, 2]], rig.placed.T_base_object[:2, 3]
+    return Followed(measures, loop.timing(), path, flat @ turn.T + origin, failure, loop.notes)
+
+
+def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, told: dict[str, Any]) -> list[Path]:
+    figure = trajectory_figure(
+        followed.path, followed.measures, f"{plan.stimulus.name}, {model.sensor.name}", outline_mm=followed.outline_mm
+    )
+    content = {
+        **told,
+        "measures": asdict(followed.measures),
+        "timing": asdict(followed.timing),
+        "failure": followed.failure,
+        "notes": followed.notes,
+    }
+    measures = write_json(out / "measures.json", plain(content))
+    return [write_csv(out / "trajectory.csv", followed.path), save_figure(out / "trajectory.png", figure), measures]

@@ -1,0 +1,1 @@
+"""Labelled recordings and simulated contacts as data sets."""

@@ -1,0 +1,1 @@
+"""Estimators: pose, interval, domain, pins at rest."""

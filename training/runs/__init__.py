@@ -1,0 +1,1 @@
+"""Runs: training, files, evaluation, packed copies."""

@@ -1,0 +1,210 @@
+"""Training of one network, epoch by epoch. Its state can be stored on disk, and the training continued from it."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import torch
+from torch import nn
+
+from training.models.part import Inputs
+from training.runs.networks import device_of, predict_rows
+from training.runs.recipes import Recipe
+from twin.progress import Step
+
+# Steps at the start in which the cosine schedule's learning rate rises from 0 to its full value.
+RISE_STEPS = 100
+# Epochs without a smaller loss after which the plateau schedule halves the learning rate. The published code uses the same number.
+PLATEAU_PATIENCE = 3
+# Weight of the error scales' loss in the total loss. The labels' loss has the weight 1.
+SCALE_LOSS = 0.05
+# Weight in the total loss of the loss of the prediction that the move was executed. The labels' loss has the weight 1.
+EXECUTED_LOSS = 0.05
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows with which a network is trained and monitored.
+
+    Attributes
+    ----------
+    inputs : Inputs
+    labels : (M, K) float32
+        Scaled labels.
+    weight : (K,) float32
+        Weight of each label in the loss.
+    executed : (M,) float32
+        Whether the move was executed: 1, 0, or NaN if that is not known.
+    train, held : (m,) int64
+        Rows to train on, and rows on which the error is monitored.
+    """
+
+    inputs: Inputs
+    labels: torch.Tensor
+    weight: torch.Tensor
+    executed: torch.Tensor
+    train: torch.Tensor
+    held: torch.Tensor
+
+
+def no_penalty(network: nn.Module) -> None:
+    """The penalty of networks without one: it adds nothing to the loss."""
+
+
+@dataclass
+class Loop:
+    """A network in training. ``epoch()`` runs one epoch; ``state()`` and ``load()`` store and restore the whole state of the training.
+
+    Parameters
+    ----------
+    network : nn.Module
+    recipe : Recipe
+    rows : Rows
+    seed : int
+        Seed of the order of the rows.
+    penalty : callable, optional
+        ``penalty(network)`` is added to the loss of every batch.
+    """
+
+    network: nn.Module
+    recipe: Recipe
+    rows: Rows
+    seed: int
+    penalty: Callable[[nn.Module], torch.Tensor | None] = no_penalty
+    epochs_done: int = 0
+    best: float = math.inf
+    since_best: int = 0
+    curves: list[dict] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        recipe = self.recipe
+        parameters = list(self.network.parameters())
+        self.device = device_of(self.network)
+        self.optimiser: torch.optim.Optimizer
+        if recipe.decay:
+            self.optimiser = torch.optim.AdamW(parameters, lr=recipe.rate, weight_decay=recipe.decay)
+        else:
+            self.optimiser = torch.optim.Adam(parameters, lr=recipe.rate)
+        self.plateau = torch.optim.lr_scheduler.ReduceLROnPlateau(self.optimiser, factor=0.5, patience=PLATEAU_PATIENCE)
+        self.generator = torch.Generator().manual_seed(self.seed)
+        self.averaged = [p.detach().clone() for p in parameters]
+        self.best_weights = {key: value.clone() for key, value in self.network.state_dict().items()}
+        self.steps_of_epoch = max(1, math.ceil(len(self.rows.train) / recipe.batch))
+        self.steps = 0
+
+    @property
+    def finished(self) -> bool:
+        """Whether all epochs are done, or the held-out error has not fallen for as many epochs as the recipe's patience."""
+        return self.epochs_done >= self.recipe.epochs or bool(self.recipe.patience and self.since_best >= self.recipe.patience)
+
+    def epoch(self) -> dict:
+        """Train once on all training rows, and return the new point of the learning curve."""
+        started = perf_counter()
+        self.network.train()
+        total, loss = 0.0, math.nan
+        shuffled = self.rows.train[torch.randperm(len(self.rows.train), generator=self.generator)]
+        for chosen in shuffled.split(self.recipe.batch):
+            loss = self._step(chosen)
+            total += loss * len(chosen)
+        seconds = perf_counter() - started
+        self.epochs_done += 1
+        held = self._watch()
+        rate = self.optimiser.param_groups[0]["lr"]
+        if held < self.best:
+            self.best, self.since_best = held, 0
+            self.best_weights = {key: value.clone() for key, value in self.network.state_dict().items()}
+        else:
+            self.since_best += 1
+        if self.recipe.schedule == "plateau":
+            self.plateau.step(loss)  # the last batch's loss, as in the published code
+        point = {"epoch": self.epochs_done, "loss": total / len(shuffled), "held_out_error": held, "rate": rate, "seconds": seconds}
+        self.curves.append(point)
+        return point
+
+    def result(self) -> nn.Module:
+        """The trained network. Its weights are the best on the held-out rows if the recipe has patience, else the averaged ones."""
+        if self.recipe.patience:
+            self.network.load_state_dict(self.best_weights)
+        elif self.recipe.average:
+            with torch.no_grad():
+                torch._foreach_copy_(list(self.network.parameters()), self.averaged)
+        return self.network.eval()
+
+    def state(self) -> dict:
+        """Everything that is needed to continue the training."""
+        keys = ("averaged", "best_weights", "steps", "epochs_done", "best", "since_best", "curves")
+        return {key: getattr(self, key) for key in keys} | {
+            "network": self.network.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "plateau": self.plateau.state_dict(),
+            "generator": self.generator.get_state(),
+            "torch": torch.get_rng_state(),
+        }
+
+    def load(self, state: dict) -> None:
+        """Continue from a state."""
+        self.network.load_state_dict(state["network"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.plateau.load_state_dict(state["plateau"])
+        self.generator.set_state(state["generator"])
+        torch.set_rng_state(state["torch"])
+        self.averaged = [value.to(self.device) for value in state["averaged"]]
+        for key in ("best_weights", "steps", "epochs_done", "best", "since_best", "curves"):
+            setattr(self, key, state[key])
+
+    def _step(self, chosen: torch.Tensor) -> float:
+        if self.recipe.schedule == "cosine":
+            along = self.steps / (self.recipe.epochs * self.steps_of_epoch)
+            for group in self.optimiser.param_groups:
+                group["lr"] = self.recipe.rate * min(1.0, (self.steps + 1) / RISE_STEPS) * 0.5 * (1 + math.cos(math.pi * along))
+        out = self.network(*(part.to(self.device) for part in self.rows.inputs.batch(chosen)))
+        labels, executed, weight = (
+            part.to(self.device) for part in (self.rows.labels[chosen], self.rows.executed[chosen], self.rows.weight)
+        )
+        loss = row_loss(out, labels, executed, weight, self.recipe.loss)
+        if (penalty := self.penalty(self.network)) is not None:
+            loss = loss + penalty
+        self.optimiser.zero_grad()
+        loss.backward()
+        self.optimiser.step()
+        self.steps += 1
+        if self.recipe.average:
+            share = min(1 - self.recipe.average, 1.0) if self.steps > RISE_STEPS else 1.0
+            with torch.no_grad():
+                torch._foreach_lerp_(self.averaged, [p.detach() for p in self.network.parameters()], share)
+        return float(loss.detach())
+
+    def _watch(self) -> float:
+        """Mean absolute error of the scaled labels on the held-out rows."""
+        if not len(self.rows.held):
+            return math.nan
+        out = predict_rows(self.network, self.rows.inputs, self.rows.held, self.recipe.batch)
+        return float((out["mean"] - self.rows.labels[self.rows.held]).abs().mean())
+
+
+def row_loss(out: dict, labels: torch.Tensor, executed: torch.Tensor, weight: torch.Tensor, kind: str) -> torch.Tensor:
+    """Mean over rows of the labels' weighted error, plus the losses of error scale and executed move if the network gives these.
+
+    The error scale is that of a Laplace distribution around the mean. Its loss has no gradient with respect to the mean.
+    """
+    error = out["mean"] - labels
+    loss = ((error.abs() if kind == "l1" else error.square()) * weight).mean()
+    if "first" in out:  # the first guess of a network that refines it later
+        loss = loss + ((out["first"] - labels).abs() * weight).mean()
+    if "log_scale" in out:
+        scale = out["log_scale"]
+        loss = loss + SCALE_LOSS * (error.detach().abs() * torch.exp(-scale) + scale).mean()
+    if "executed" in out and bool((known := torch.isfinite(executed)).any()):
+        cross = nn.functional.binary_cross_entropy_with_logits(out["executed"][known], executed[known])
+        loss = loss + EXECUTED_LOSS * cross
+    return loss
+
+
+def epoch_step(step: Step) -> Callable[[int, int, Mapping[str, float]], None]:
+    """The callback of ``train_run`` that reports epochs as a ``twin.progress`` step, with the error on held-out rows as the note."""
+
+    def told(done: int, total: int, point: Mapping[str, float]) -> None:
+        step(done, total, f"{point['held_out_error']:.4f}")
+
+    return told

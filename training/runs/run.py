@@ -1,0 +1,355 @@
+"""Training runs. A run's folder holds the following files, so that training can be continued after it was killed:
+
+- ``config.json``: the resolved configuration (model, recipe, sensor, pipeline, labels), the names of the frames that were kept out of
+  training, and digests of names, labels and frames.
+- ``curves.csv``: the learning curves.
+- ``checkpoint.pt``: the state of training while the run is in progress.
+- ``weights.pt``: the trained model, when the run is finished.
+
+Every file is written as a whole or not at all.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic
+
+import numpy as np
+import torch
+
+from training.data.dataset import Dataset, split_rows
+from training.data.identity import ASIDE, difference, frame_marks, identity_of
+from training.data.label_code import LabelCode, goes_round
+from training.models import model_named
+from training.models.part import Prepared
+from training.runs.assemble import calibrate
+from training.runs.loop import Loop, Rows
+from training.runs.networks import parameter_count
+from training.runs.recipes import Recipe, TrainingError, as_dict
+from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, write_tensors
+from twin.frames.forms import blob_spec
+from twin.store import fingerprint, write_text, writes
+
+RUN_FILES = (CONFIG, "curves.csv", TENSORS)
+FOLDS = 10  # parts of the training rows; each network of an ensemble holds out another part
+KEEP_EVERY_S = 20.0  # s between two checkpoints
+FEWEST_PARTS = 3  # least number of rows, or groups of rows: with fewer, almost no rows are left beside the held-out part
+MOST_SEED = 2**32 - 1  # largest seed. PyTorch takes seeds of 64 bits, and each network has its own seed
+BEGIN_ANEW = "remove it to begin anew, or give another `out`"  # remedy for a damaged checkpoint
+EXTRA_WEIGHT = 0.3  # weight of a helper label in the loss; requested labels have the weight 1
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Settings of a run.
+
+    Attributes
+    ----------
+    model : str
+    recipe : Recipe
+    labels : {"corrected", "raw"}
+    seed : int
+        Seed of weights and order. It also shifts which fold is held out.
+    split : int or None
+        Seed of the validation fifth that is kept out of training; None trains on all rows.
+    helpers : tuple of str
+        Label columns that are learnt only because they help to learn the others; they have less weight.
+    size : dict
+        Sizes of the network that differ from the model's own.
+    labelled : dict
+        ``identity_of`` the real frames from which the errors of simulated pins were learnt, and their ``image_names``; empty for other
+        runs.
+    Raises
+    ------
+    TrainingError
+        A seed is out of range.
+    """
+
+    model: str
+    recipe: Recipe
+    labels: str = "corrected"
+    seed: int = 0
+    split: int | None = 0
+    helpers: tuple[str, ...] = ()
+    size: dict[str, int] = field(default_factory=dict)
+    labelled: Mapping[str, object] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, seed in (("seed", self.seed), ("split", self.split)):
+            if seed is not None and not 0 <= seed <= MOST_SEED:
+                raise TrainingError(f"--{name} {seed}: give a whole number from 0 to {MOST_SEED}")
+
+
+@writes(*RUN_FILES, gone_on=(CHECKPOINT,))
+def train_run(
+    config: RunConfig,
+    data: Dataset,
+    out: Path,
+    *,
+    max_minutes: float | None = None,
+    device: str = "cpu",
+    progress: Callable | None = None,
+) -> bool:
+    """Train a run, or continue the one in ``out``. The order of the data set's rows does not matter.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called with (epochs done, epochs of all networks, last row of the learning curve).
+    max_minutes : float, optional
+        Stop after the epoch in which this time has passed. The weights so far are written.
+    device : {"cpu", "cuda"}
+        Device for training. The written weights can be used on any device.
+
+    Returns
+    -------
+    bool
+        Whether training is finished.
+
+    Raises
+    ------
+    TrainingError
+        ``out`` holds another run, there are too few frames, or ``max_minutes`` is not a valid time.
+    """
+    started = monotonic()
+    if max_minutes is not None and not max_minutes >= 0:  # also true for NaN, with which the training would never stop
+        raise TrainingError(f"`max_minutes` {max_minutes}: give a time of 0 or more")
+    data = data.in_order()
+    train = training_rows(config, data)
+    parts = len(train if data.group is None else np.unique(data.group[train]))
+    if parts < FEWEST_PARTS:
+        what = "frames" if data.group is None else "contacts"
+        raise TrainingError(
+            f"{', '.join(map(str, data.folders))}: {len(data)} usable frames, {parts} {what} of them to learn from, are too few; "
+            f"{FEWEST_PARTS} {what} to learn from are needed{_said(data.problems)}"
+        )
+    resolved = resolve(config, data, train)
+    state = _opened(out, resolved)
+    prepared = model_named(config.model).prepare(data, train)
+    code = LabelCode(goes_round(data.targets.units, labels_learnt(data, config)[train]))
+    scaled, shift, scale = scaled_labels(data, config, train, code)
+    done: list = state["done"] if state else []
+    loop = None
+    all_epochs = config.recipe.members * config.recipe.epochs
+    while len(done) < config.recipe.members:
+        member = len(done)
+        loop = _member(config, data, prepared, scaled, code, train, member, device)
+        if state and state["loop"] is not None:
+            loop.load(state["loop"])
+        state, kept, out_of_time = None, monotonic(), False
+        while not loop.finished:
+            point = loop.epoch()
+            if progress:
+                progress(member * config.recipe.epochs + point["epoch"], all_epochs, point)
+            out_of_time = max_minutes is not None and monotonic() - started > 60 * max_minutes
+            if out_of_time or monotonic() - kept > KEEP_EVERY_S:
+                _keep(out, resolved, done, loop)
+                kept = monotonic()
+            if out_of_time and not loop.finished:
+                networks = [*done, _finished(loop)]
+                _assemble(out, resolved, config, data, prepared, train, networks, code, (shift, scale))
+                return False
+        done.append(_finished(loop))
+        _keep(out, resolved, done, None)
+        if out_of_time and len(done) < config.recipe.members:
+            _assemble(out, resolved, config, data, prepared, train, done, code, (shift, scale))
+            return False
+    _assemble(out, resolved, config, data, prepared, train, done, code, (shift, scale))
+    (out / CHECKPOINT).unlink(missing_ok=True)
+    return True
+
+
+def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
+    """Whether a folder holds this run (the same settings, data and code) and the run is finished.
+
+    Raises
+    ------
+    TrainingError
+        The folder holds another run, finished or not.
+    """
+    begun = (out / CHECKPOINT).is_file()
+    if not begun and not (out / TENSORS).is_file():
+        return False
+    data = data.in_order()
+    wanted = resolve(config, data, training_rows(config, data))
+    _require_same(out, wanted, read_config(out), "begun and not finished" if begun else "finished")
+    return not begun
+
+
+def training_rows(config: RunConfig, data: Dataset) -> np.ndarray:
+    """Rows (m,) of a data set in order (``Dataset.in_order``) from which a run learns."""
+    return np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
+
+
+def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
+    """The whole configuration as in ``config.json``; ``data`` are in order, and ``train`` (m,) are the training rows."""
+    pins = data.pins
+    kept_out = np.setdiff1d(np.arange(len(data)), train)
+    return {
+        "model": config.model,
+        "recipe": as_dict(config.recipe),
+        "labels": config.labels,
+        "columns": list(data.targets.names),
+        "units": list(data.targets.units),
+        "helpers": list(config.helpers),
+        "seed": config.seed,
+        "split": config.split,
+        "size": config.size,
+        "rows": {"usable": len(data), "train": len(train)}
+        | identity_of(data, model_named(config.model))
+        | {"kept_out": list(dict.fromkeys(pins.image_name[kept_out].tolist()))},
+        "sensor": pins.sensor.model_dump(mode="json"),
+        "pipeline": {
+            "form": str(pins.form),
+            "graph": "voronoi",
+            "detection": blob_spec(pins.sensor.pipeline, pins.form).model_dump(mode="json"),
+        },
+        "data": ", ".join(map(str, data.folders)),
+        "problems": data.problems,
+        "code": fingerprint(__name__),
+    } | ({"labelled": dict(config.labelled)} if config.labelled else {})
+
+
+def labels_learnt(data: Dataset, config: RunConfig) -> np.ndarray:
+    """Labels (M, K) of the kind that a run learns, mm and deg."""
+    return data.targets.corrected if config.labels == "corrected" else data.targets.raw
+
+
+def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: LabelCode) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
+    """Labels (M, E) as the network learns them, float32, and shift and scale (E,) for the code's numbers: ``number = shift + scale x``."""
+    labels = code.encode(labels_learnt(data, config))
+    known, k = labels[train], labels.shape[1]
+    if config.recipe.scaling == "standard":
+        shift, scale = known.mean(axis=0), known.std(axis=0)
+    elif config.recipe.scaling == "unit":
+        shift, scale = (known.max(axis=0) + known.min(axis=0)) / 2, np.ptp(known, axis=0) / 2
+    else:
+        shift, scale = np.zeros(k), np.ones(k)
+    scale = np.where(scale > 0, scale, 1.0)
+    pair = np.array(code.circular)[code.label_of]
+    shift, scale = np.where(pair, 0.0, shift), np.where(pair, np.sqrt(0.5), scale)  # sine and cosine of a direction need a common scale
+    return torch.from_numpy(((labels - shift) / scale).astype(np.float32)), shift, scale
+
+
+def _member(
+    config: RunConfig,
+    data: Dataset,
+    prepared: Prepared,
+    scaled: torch.Tensor,
+    code: LabelCode,
+    train: np.ndarray,
+    member: int,
+    device: str,
+) -> Loop:
+    seed, model, views = 1000 * config.seed + member, model_named(config.model), prepared.views
+    torch.manual_seed(seed)
+    network = model.build(data.pins.reference, scaled.shape[1], config.size)
+    held, learnt = fold_rows(train, config.seed, member, data.group)
+    model.initialise(network, prepared.inputs, torch.from_numpy(train), scaled, code)
+    network.to(device)
+    weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])[code.label_of]
+    executed = torch.from_numpy(data.targets.executed.astype(np.float32))
+    learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # held-out frames are used in view 0 only
+    rows = Rows(prepared.inputs, scaled.repeat(views, 1), weight, executed.repeat(views), torch.from_numpy(learnt), torch.from_numpy(held))
+    return Loop(network, config.recipe, rows, seed, model.penalty)
+
+
+def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Held-out rows (a tenth) and training rows of a network, from the rows ``train``; ``group`` as in ``Dataset``."""
+    parts = train if group is None else np.unique(group[train])
+    held = np.random.default_rng([seed, 1]).permutation(parts)[member % FOLDS :: FOLDS]
+    if group is not None:
+        held = train[np.isin(group[train], held)]
+    return np.sort(held), np.setdiff1d(train, held)
+
+
+def _finished(loop: Loop) -> dict:
+    network = loop.result()
+    return {
+        "weights": {key: value.cpu().clone() for key, value in network.state_dict().items()},
+        "held": loop.rows.held,
+        "curves": loop.curves,
+    }
+
+
+def _assemble(
+    out: Path,
+    resolved: dict,
+    config: RunConfig,
+    data: Dataset,
+    prepared: Prepared,
+    train: np.ndarray,
+    networks: list[dict],
+    code: LabelCode,
+    scaling: tuple[np.ndarray, np.ndarray],
+) -> None:
+    model = model_named(config.model)
+    content = calibrate(
+        model,
+        data,
+        prepared,
+        train,
+        networks,
+        code,
+        scaling,
+        labels=config.labels,
+        helpers=config.helpers,
+        kernel=config.recipe.kernel,
+        size=config.size,
+        seed=config.seed,
+    )
+    content |= {"aside": dict(prepared.learnt), "reference_px": data.pins.reference.pins_px, "learnt_from": frame_marks(data)[train]}
+    content["parameters"] = parameter_count(model.build(data.pins.reference, len(code.label_of), config.size))
+    write_tensors(out / TENSORS, content)
+    write_text(out / CONFIG, json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
+    write_curves(out, [network["curves"] for network in networks])
+
+
+def _keep(out: Path, resolved: dict, done: list, loop: Loop | None) -> None:
+    write_tensors(out / CHECKPOINT, {"identity": _identity(resolved), "done": done, "loop": None if loop is None else loop.state()})
+    write_curves(out, [network["curves"] for network in done] + ([] if loop is None else [loop.curves]))
+
+
+def _opened(out: Path, resolved: dict) -> dict | None:
+    """The checkpoint of an interrupted run with the same configuration; None if there is nothing to continue."""
+    path = out / CHECKPOINT
+    if not path.is_file():
+        if (out / TENSORS).is_file():
+            raise TrainingError(f"{out}: holds a finished run; give another `out`")
+        write_text(out / CONFIG, json.dumps(resolved, indent=1) + "\n")
+        return None
+    state = read_tensors(path, BEGIN_ANEW)
+    try:
+        before = dict(json.loads(state["identity"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise damaged(path, "it does not say of which run it is", BEGIN_ANEW) from error
+    _require_same(out, resolved, before, "begun and not finished")
+    return state
+
+
+def _require_same(out: Path, wanted: dict, found: Mapping, state: str) -> None:
+    if differs := difference(json.loads(_identity(wanted)), found):
+        raise TrainingError(
+            f"{out}: holds a run with other settings or data, {state} ({differs}); give another `out`, or the same settings and data"
+        )
+
+
+def _said(problems: list[str]) -> str:
+    return f" ({'; '.join(problems[:3])})" if problems else ""
+
+
+def write_curves(out: Path, curves: list[list[dict]]) -> None:
+    """Write ``curves.csv``: the curves of all networks, one network after the other."""
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(["network", "epoch", "loss", "held_out_error", "rate", "seconds"])
+    for k, points in enumerate(curves):
+        writer.writerows([k, *point.values()] for point in points)
+    write_text(out / "curves.csv", text.getvalue())
+
+
+def _identity(resolved: dict) -> str:
+    return json.dumps({key: value for key, value in resolved.items() if key not in ASIDE}, sort_keys=True)

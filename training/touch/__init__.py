@@ -1,0 +1,1 @@
+"""Contact from the pins: whether anything is touched, slip, contact maps."""

@@ -245,6 +245,18 @@ def test_nothing_heavy_is_imported_before_it_is_needed(module, heavy):
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
 
 
+MOST_MODULES = 15
+LARGE = {"twin/pins": 24, "twin/optics": 20, "twin/studio": 19, "twin/mechanics": 18, "twin/fit": 17}  # these may only shrink
+
+
+def test_folders_stay_small_and_top_floors_empty():
+    """A reader finds a module by its room."""
+    folders = {path.parent for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py")}
+    counts = {str(folder.relative_to(ROOT)): len([path for path in folder.glob("*.py") if path.stem != "__init__"]) for folder in folders}
+    assert not {name: count for name, count in counts.items() if count > LARGE.get(name, MOST_MODULES)}
+    assert counts["training"] == 0 and [path.name for path in (ROOT / "hardware").glob("*.py") if path.stem != "__init__"] == ["errors.py"]
+
+
 def test_the_repository_holds_no_foreign_data():
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("no git, or not a git checkout")

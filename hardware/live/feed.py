@@ -15,10 +15,9 @@ from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError
 from hardware.live.live import LiveSession, estimate_line
-from hardware.safety.decide import SHIPPED_LIMITS, load_limits
+from hardware.safety.decide import load_limits
 from hardware.safety.eyes import Eyes
 from hardware.safety.safe_arm import SafeArm, try_each
-from scenes.files import shown
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
 from twin.estimate import Estimate, SensorModel
@@ -52,10 +51,6 @@ class WatchedArm:
 
     def __init__(self, text: str, source: FrameSource | None = None) -> None:
         arm, kind = open_arm(text), kind_of(text)
-        if not (SHIPPED_LIMITS / f"{kind}.toml").is_file():
-            raise DeviceError(
-                f"--arm {shown(text)}: no limits are known for '{shown(kind)}', so the page may not move it; write {shown(kind)}.toml"
-            )
         self._arm = SafeArm(arm, load_limits(kind))
         self.name = self._arm.name
         self._armed = False

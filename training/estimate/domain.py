@@ -69,7 +69,7 @@ SHIFT, TURN_DEG, SCALE = 0.02, 0.1, 0.002
 """Least limits of the camera's motions: shift in spacings, turn, change of scale."""
 EVEN = 1.5
 """Limit of the halves for training frames of one kind. Frames of many kinds have rare ones that are farther off, and contacts that are not
-among them are farther still; their limit is up to twice as large. Two frames in one picture lie at 2 and more, or at 6 and more."""
+among them are farther still; their limit is up to 1.3 times as large. Two frames in one picture lie at 2 and more, or at 6 and more."""
 USUAL_DISTANCE = 0.995
 """Share of left-out training frames whose distance to the nearest known one counts as usual."""
 NEIGHBOURS = 10
@@ -501,7 +501,7 @@ def learn_domain(
         measures[here] = [[*found.parts[:4], *found.usual_camera, found.unknown] for found in map(one, moved[here])]
     fitted = _fit(flat, labelled, motions, rng)
     limits = np.quantile(measures[:, :8], 1 - ALLOWED, axis=0)
-    limits[3] *= np.clip(limits[3] / EVEN, 1.0, 2.0)
+    limits[3] *= np.clip(limits[3] / EVEN, 1.0, 1.3)
     floors = np.array([OUTSIDE, 1.0, 1.0, 1.0, SHIFT, SHIFT, np.radians(TURN_DEG), SCALE])
     blind = [0.0]
     if lost is not None:

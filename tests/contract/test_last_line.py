@@ -63,10 +63,10 @@ def test_a_pulled_cable_is_told_by_every_later_call():
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_during_the_start_ends_with_one_line(number, code):
-    start = "print('begun', flush=True); import time; from twin import cli; cli.command_line = lambda: time.sleep(30); cli.main()"
+    wait = "(print('begun', flush=True), time.sleep(30))"
+    start = f"import time; from twin import cli; cli.command_line = lambda: {wait}; cli.main()"
     with subprocess.Popen([sys.executable, "-c", start], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         process.stdout.readline()
-        time.sleep(2.0)
         process.send_signal(number)
         time.sleep(0.05)
         process.send_signal(number)

@@ -65,9 +65,7 @@ def load_sensor(name_or_path: str | Path | SensorSpec) -> SensorSpec:
     SpecError
         There is no such sensor, or its file is not valid. The message names the file, the key and the remedy.
     """
-    if isinstance(name_or_path, SensorSpec):
-        return name_or_path
-    return read_section(_find(name_or_path, "sensors"), SensorSpec)
+    return _load(name_or_path, "sensors", SensorSpec)
 
 
 def load_object(name_or_path: str | Path | ObjectSpec) -> ObjectSpec:
@@ -120,9 +118,7 @@ def load_experiment(name_or_path: str | Path | ExperimentSpec) -> ExperimentSpec
     SpecError
         There is no such experiment, or its file is not valid. The message names the file, the key and the remedy.
     """
-    if isinstance(name_or_path, ExperimentSpec):
-        return name_or_path
-    return read_section(_find(name_or_path, "experiments"), ExperimentSpec)
+    return _load(name_or_path, "experiments", ExperimentSpec)
 
 
 def load_randomisation(name_or_path: str | Path | RandomisationSpec) -> RandomisationSpec:
@@ -133,16 +129,16 @@ def load_randomisation(name_or_path: str | Path | RandomisationSpec) -> Randomis
     SpecError
         There is no such randomisation, or its file is not valid. The message names the file, the key and the remedy.
     """
-    if isinstance(name_or_path, RandomisationSpec):
-        return name_or_path
-    return read_section(_find(name_or_path, "randomisations"), RandomisationSpec)
+    return _load(name_or_path, "randomisations", RandomisationSpec)
 
 
 def load_servo(name_or_path: str | Path | ServoSpec) -> ServoSpec:
     """Load servo parameters by name or by the path of their TOML file; ``SpecError`` as the others."""
-    if isinstance(name_or_path, ServoSpec):
-        return name_or_path
-    return read_section(_find(name_or_path, "servos"), ServoSpec)
+    return _load(name_or_path, "servos", ServoSpec)
+
+
+def _load(given: str | Path | Spec, kind: str, model: type[Spec]) -> Spec:
+    return given if isinstance(given, model) else read_section(_find(given, kind), model)
 
 
 def _list(kind: str) -> dict[str, Path]:
@@ -150,7 +146,7 @@ def _list(kind: str) -> dict[str, Path]:
     return shipped | other_files(kind, shipped) | own
 
 
-def _find(name_or_path: str | Path, kind: str) -> Path:
+def _find(name_or_path: object, kind: str) -> Path:
     if not isinstance(name_or_path, str | os.PathLike):
         raise SpecError(f"expected a name or a file of {kind}, got {name_or_path!r}")
     path, known = Path(name_or_path), _list(kind)

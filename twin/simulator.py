@@ -11,7 +11,7 @@ import numpy as np
 from scenes.base import SpecError
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.camera.capture import expose, record
+from twin.camera.capture import expose, in_form
 from twin.camera.truth import CapTruth, cap_truth
 from twin.errors import ContactError, FrameError, OptionError
 from twin.frames.forms import form_named, frame_size
@@ -213,8 +213,7 @@ class Simulator:
         """
         if self.spec.recording is None:
             raise FrameError(f"{self.spec.name} has no processed form; give its specification the section 'recording', or use raw frames")
-        image = record(raw.frame.image, self.spec.recording)
-        frame = replace(raw.frame, image=image, form=Form.PROCESSED)
+        frame = in_form(raw.frame, Form.PROCESSED, self.spec.recording)
         return replace(raw, frame=frame, truth=cap_truth(self.spec, self.rest, state, Form.PROCESSED))
 
     def _require_own(self, state: ContactState) -> None:

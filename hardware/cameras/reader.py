@@ -315,9 +315,8 @@ class LiveSource(Connection):
 
     def _look_back(self, picture: Picture) -> None:
         """Count an outage before this picture, and note what is irregular in it."""
-        if (
-            self._still is None or self._still[2] == 1 or self._may_repeat(picture.image)
-        ):  # a server may send its last picture again when it is asked anew
+        # a server may send its last picture again when it is asked anew
+        if self._still is None or self._still[2] == 1 or self._may_repeat(picture.image):
             period_s, self._came_s = time.monotonic() - self._came_s, time.monotonic()
             outage = period_s > max(OUTAGE_S, OUTAGE_PERIODS * self._usual_s())
             if self._sequence:  # the first picture comes when the device is ready

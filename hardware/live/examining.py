@@ -53,7 +53,7 @@ def examine_sensor(
     pushes: Sequence[str] = (),
     twist: Path | None = None,
     out: Path | None = None,
-    contacts: Callable[[list[Frame], str], Finding | None] | None = None,
+    contacts: Callable[[list[Frame], SensorSpec], Finding | None] | None = None,
     progress: Progress = silent,
 ) -> Examination:
     """Examine at most ``limit`` frames of a camera or a recording.
@@ -70,7 +70,7 @@ def examine_sensor(
         As ``rest``, ``pushes``, ``twist`` and ``out`` of ``twin.fit.camera_view.register_files``: the camera's turn and mirror are found,
         and the frames are compared with the corrected copy of the specification.
     contacts : callable, optional
-        Finding whether a model of the sensor (by name) knows the contacts in the frames; for the specification's own detector.
+        Finding whether a model of the sensor knows the contacts in the frames; for the specification's own detector.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def examine_sensor(
     with stage(progress, "frames") as step:
         findings = examine(frames, sensor, detector, progress=step)
     if detector is None and contacts is not None:
-        findings += filter(None, [contacts(frames, sensor.name)])
+        findings += filter(None, [contacts(frames, sensor)])
     return Examination(findings, views + notes)
 
 

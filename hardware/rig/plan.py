@@ -1,6 +1,7 @@
 """Looks at the whole way before the first motion: the camera, the path to the object, and a way back from every planned pose."""
 
 import time
+from itertools import pairwise
 
 import numpy as np
 
@@ -46,7 +47,7 @@ def check_plan(rig: Rig, clear: np.ndarray, planned: list[np.ndarray], *, linear
         time.sleep(COUNT_S)
         rate = f", {(rig.source.arrived - before) / COUNT_S:.0f} frames/s" if hasattr(rig.source, "arrived") else ""
     way = [state.pose, *way_around(rig.placed, state.pose, clear), planned[0]]
-    for start, end in zip(way[:-1], way[1:], strict=True):
+    for start, end in pairwise(way):
         if why := _forbidden(rig, start, end):
             raise DeviceError(
                 f"{rig.arm.name}: the limits forbid the way to the {rig.placed.spec.name}: {why}; correct 'placement' in the file for "
@@ -55,7 +56,7 @@ def check_plan(rig: Rig, clear: np.ndarray, planned: list[np.ndarray], *, linear
     blocked = [n for n, pose in enumerate(planned) if not _way_back(rig, pose)]
     if blocked[:1] == [0]:
         raise DeviceError(f"{rig.arm.name}: the limits allow no way back from the start; correct 'placement' in the file for --servo")
-    way_mm = sum(float(np.linalg.norm(end[:3] - start[:3])) for start, end in zip(way[:-1], way[1:], strict=True))
+    way_mm = sum(float(np.linalg.norm(end[:3] - start[:3])) for start, end in pairwise(way))
     back = f"a way back from all {len(planned)} planned poses"
     if blocked:
         back = f"no straight way back from {len(blocked)} of {len(planned)} planned poses: from there the arm goes back the way it came"

@@ -7,8 +7,8 @@ Therefore no fault leads the sensor farther than one piece, not even the end of 
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import TypeVar
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from hardware.arms.arm import Arm
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError
+from hardware.safety.watch import beside
 
 Result = TypeVar("Result")
 # Interval, s, at which the thread looks at the frames while the arm moves, and at which a wait for a fresh frame looks.
@@ -110,17 +111,9 @@ class Eyes:
         """Note that the arm stands: it was stopped, or came to its end."""
         self._going, self._stopped = False, ""
 
-    @contextmanager
-    def watched(self) -> Iterator[None]:
+    def watched(self) -> AbstractContextManager[None]:
         """Context in which the thread looks at the frames."""
-        end = threading.Event()
-        thread = threading.Thread(target=self._watch, args=(end,), name="eyes", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            end.set()
-            thread.join()
+        return beside(self._watch, "eyes")
 
     def _watch(self, end: threading.Event) -> None:
         while not end.wait(LOOK_S):

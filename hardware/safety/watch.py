@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 import numpy as np
 
@@ -30,6 +30,19 @@ IDLE_SHARE = 2.0
 LOOK_S = 1.0
 # Waiting time in s after which the thread first reports what the program waits for. It reports again whenever that time has doubled.
 WORD_S = 1.5
+
+
+@contextmanager
+def beside(work: Callable[[threading.Event], None], name: str) -> Iterator[None]:
+    """Context in which a thread does ``work``, which ends when the event that it is given is set."""
+    end = threading.Event()
+    thread = threading.Thread(target=work, args=(end,), name=name, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        thread.join()
 
 
 class ArmWatch:
@@ -65,17 +78,9 @@ class ArmWatch:
         if self._lost:
             raise DeviceError(self._lost)
 
-    @contextmanager
-    def watched(self) -> Iterator[None]:
+    def watched(self) -> AbstractContextManager[None]:
         """Context in which the thread runs."""
-        end = threading.Event()
-        thread = threading.Thread(target=self._watch, args=(end,), name="arm watch", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            end.set()
-            thread.join()
+        return beside(self._watch, "arm watch")
 
     @contextmanager
     def alert(self) -> Iterator[None]:

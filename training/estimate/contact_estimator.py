@@ -9,7 +9,7 @@ may have such a folder inside: ``contacts``.
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
 
@@ -24,11 +24,11 @@ from training.models.part import Prediction, Unseen
 from training.runs.packed import pack
 from training.runs.recipes import TrainingError
 from training.runs.run_files import damaged
-from twin.camera.capture import record
+from twin.camera.capture import in_form
 from twin.frames import Recording
 from twin.frames.tables import numbers
 from twin.store import write_json, writes
-from twin.types import Form, Frame
+from twin.types import Frame
 
 # Folder, inside that of a sensor's weights, with the models of several kinds of contact.
 INSIDE = "contacts"
@@ -122,10 +122,8 @@ class ContactEstimator:
         found, other = best.told_rest(nodes_px)
         rest = found.pipeline.reference if other else None
         undecided = best.require_view_of_contacts(nodes_px, rest, "these contacts")
-        parts = {name: part.at_known_rest() if rest is None else part.counted_from(rest) for name, part in self.parts.items()}
-        for part in parts.values():
-            part._undecided = undecided
-        return self._with(parts), other
+        counted = {name: part.at_known_rest() if rest is None else part.counted_from(rest) for name, part in self.parts.items()}
+        return self._with({name: part.noting(undecided) for name, part in counted.items()}), other
 
     def _with(self, parts: dict[str, PoseEstimator]) -> "ContactEstimator":
         found = copy(self)
@@ -143,9 +141,7 @@ class ContactEstimator:
             The frame does not belong to the sensor.
         """
         started = perf_counter()
-        if frame.form == Form.RAW and self.form == Form.PROCESSED and self.sensor.recording is not None:
-            frame = replace(frame, image=record(frame.image, self.sensor.recording), form=Form.PROCESSED)
-        seen = self._any.pins_in(frame)
+        seen = self._any.pins_in(in_form(frame, self.form, self.sensor.recording))
         if isinstance(seen, Unseen):
             return self._any.unseen(seen, started)
         kind = str(self.contacts.likeliest(seen.pins, tuple(self.parts))[0])
@@ -154,7 +150,9 @@ class ContactEstimator:
     def taken_for(self, pins: PinTable) -> dict[str, float]:
         """Shares of a table's valid frames that are classified as each kind, and as "none": those that the kind's model refuses."""
         kinds = self.contacts.likeliest(pins, tuple(self.parts))
-        known = np.array([self.parts[str(kind)].knows(pins, row) for row, kind in enumerate(kinds)])
+        known = np.zeros(len(kinds), bool)
+        for name, part in self.parts.items():
+            known[kinds == name] = part.knows(pins.rows(np.flatnonzero(kinds == name)))
         return {name: float(np.mean(known & (kinds == name))) for name in self.parts} | {"none": float(np.mean(~known))}
 
     def for_labels(self, recording: Recording) -> list[str]:

@@ -89,9 +89,8 @@ IN_RANGE = 0.995
 BEYOND_RANGE = 0.25
 """Share of a label's trained range by which an estimate may leave it."""
 IN_PLACE = np.array([0.95, 0.9, 0.9, 1.0])
-"""As ``REFUSED``: distances above which a frame gets no estimate if a displacement of the camera was removed from
-it: two ways of being strange
-are one too many (a mirrored picture). A picture that was turned or enlarged adds a little noise, which is outside."""
+"""As ``REFUSED``, if a displacement of the camera was removed from the frame: two ways of being strange are one too many (a mirrored
+picture). A picture that was turned or enlarged adds a little noise, which is outside."""
 DOUBT = np.array([0.05, 0.05, 0.25, 0.25])
 """Share of each removed motion of the camera that may be something else: another lens looks like another scale."""
 USUAL = np.array([1.25, 1.0, 1.0, 1.2])
@@ -222,12 +221,12 @@ class Domain:
     _near: "tuple[_Nearest, _Nearest]" = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        camera = np.linalg.pinv(self.motions).T
+        camera, modes = np.linalg.pinv(self.motions).T, self.components * self.deviation[:, None]
         lead, labelled = self.deviation[: self.known.shape[1]], len(self.known) - self.lighter
         for name, value in (
             ("_project", np.concatenate([camera, self.components / self.deviation[:, None]]).T.copy()),
-            ("_modes", np.concatenate([self.motions, self.components * self.deviation[:, None]])),
-            ("_halves", _halves(self.motions, self.components * self.deviation[:, None])),
+            ("_modes", np.concatenate([self.motions, modes])),
+            ("_halves", _halves(self.motions, modes)),
             ("_near", (_Nearest(self.known), _Nearest(self.known[:labelled] * lead))),
         ):
             object.__setattr__(self, name, value)

@@ -213,8 +213,7 @@ class PoseEstimator:
         view = self.require_view(reference.pins_px, frame.name or "frame")
         found = self.counted_from(reference)
         found._trained = replace(found._trained, touched=TouchAnswer(reference))
-        found._undecided = view.undecided()
-        return found
+        return found.noting(view.undecided())
 
     @cached_property
     def _known_rest(self) -> Reference:
@@ -329,8 +328,8 @@ class PoseEstimator:
         """
         nodes_px = self.at_known_rest().nodes_in(frames)
         found, other = self.told_rest(nodes_px)
-        found._undecided = self.require_view_of_contacts(nodes_px, found.pipeline.reference if other else None, "these contacts")
-        return found, other
+        undecided = self.require_view_of_contacts(nodes_px, found.pipeline.reference if other else None, "these contacts")
+        return found.noting(undecided), other
 
     def nodes_in(self, frames: Iterable[Frame]) -> np.ndarray:
         """The pins (M, N, 2), px, in the valid ones of some frames."""
@@ -370,6 +369,12 @@ class PoseEstimator:
         found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
         found._trained = replace(self._trained, pipeline=found.pipeline)
         return found if self._tracker is None else found.remembering()
+
+    def noting(self, undecided: str) -> "PoseEstimator":
+        """The same model; its ``caveats`` say what is ``undecided`` about the camera's view."""
+        found = copy(self)
+        found._undecided = undecided
+        return found
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """Refuse another sensor or form than the model was trained for.
@@ -572,10 +577,10 @@ class PoseEstimator:
         slip = None if self._tracker is None else self._tracker(self.modes_of(seen.pins)[0])
         return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip, seen.lost_share, verdict)
 
-    def knows(self, pins: PinTable, row: int) -> bool:
-        """Whether the pins of a table's row are a pattern that the model was trained on."""
-        known = pins.rows(np.array([row])).seen_from(self._trained.reference)
-        return not self._verdict(known.nodes_px[0], known.lost[0]).reason
+    def knows(self, pins: PinTable) -> np.ndarray:
+        """(M,) bool: whether the pins of each row of a table are a pattern that the model was trained on."""
+        seen = pins.seen_from(self._trained.reference)
+        return np.array([not self._verdict(*each).reason for each in zip(seen.nodes_px, seen.lost, strict=True)], bool)
 
     def _verdict(self, nodes_px: np.ndarray, lost: np.ndarray) -> Verdict:
         """Whether pins (N, 2), as seen by the camera of the training, some of them ``lost`` (N,), are a pattern that was trained on."""

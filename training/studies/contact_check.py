@@ -3,6 +3,7 @@
 from importlib.util import find_spec
 from pathlib import Path
 
+from scenes.sensor import SensorSpec
 from twin.pins import Finding, Grade
 from twin.types import Frame
 
@@ -10,15 +11,14 @@ MOST_STRANGE = 0.5
 """Share of the frames with pins above which frames that the model refuses are bad."""
 
 
-def contact_finding(frames: list[Frame], sensor: str, run: Path | None = None) -> Finding | None:
+def contact_finding(frames: list[Frame], sensor: SensorSpec, run: Path | None = None) -> Finding | None:
     """Count the frames that a model refuses, and name them with the model's reasons.
 
     Parameters
     ----------
     frames : list of Frame
         Frames of one form; those in which the pins are not found do not count.
-    sensor : str
-        Name of the sensor.
+    sensor : SensorSpec
     run : Path, optional
         Folder of a run; the shipped weights of the sensor by default.
 
@@ -39,11 +39,11 @@ def contact_finding(frames: list[Frame], sensor: str, run: Path | None = None) -
     from training.estimate.estimator import PoseEstimator  # loads torch
     from training.runs.packed import shipped_names
 
-    if run is None and sensor not in shipped_names():
+    if run is None and sensor.name not in shipped_names():
         return None
-    model = PoseEstimator.load(run or sensor)
+    model = PoseEstimator.load(run or sensor.name)
     if run is not None:
-        model.check(model.sensor.model_copy(update={"name": sensor}), frames[0].form)
+        model.check(sensor, frames[0].form)
     if model.form != frames[0].form or model.domain is None:
         return None
     model, judged, strange = model.at_known_rest(), 0, []
@@ -53,7 +53,7 @@ def contact_finding(frames: list[Frame], sensor: str, run: Path | None = None) -
             judged += 1
             strange += [] if made.valid else [f"{frame.name}: {made.reason}"]
     share = len(strange) / max(judged, 1)
-    text = f"{judged - len(strange)} of {judged} frames with pins are contacts that the weights of {sensor} know"
+    text = f"{judged - len(strange)} of {judged} frames with pins are contacts that the weights of {sensor.name} know"
     if not strange:
         return Finding("contacts", Grade.GOOD, share, text, "")
     verdict = Grade.BAD if share > MOST_STRANGE else Grade.WATCH

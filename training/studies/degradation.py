@@ -1,7 +1,7 @@
 """Study: how far may a sensor degrade before pipelines lose its pins, and what do trained models estimate then?"""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from typing import Any
 from scenes import SensorSpec
 from scenes.sensor import RecordingSpec
 from training.estimate.estimator import PoseEstimator, digest_of
-from twin.camera.capture import record
+from twin.camera.capture import in_form
 from twin.judge.degradation.envelope import Envelope
 from twin.judge.degradation.plan import SweepPlan
 from twin.judge.degradation.report import REPORT_FILES
@@ -18,7 +18,7 @@ from twin.judge.degradation.study import check_pipelines, real_study, rendered_s
 from twin.judge.degradation.sweep import Answer
 from twin.progress import Progress, silent
 from twin.store import writes
-from twin.types import Form, Frame, Readable
+from twin.types import Frame, Readable
 
 # Pipelines that are judged if none are named.
 PIPELINES = ("twin", "legacy")
@@ -115,18 +115,13 @@ def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
 def _at_rest(estimator: PoseEstimator, source: RenderedSource | RealSource | None) -> PoseEstimator:
     if source is None or not estimator.counts_from_rest:
         return estimator
-    if source.rest_frame is not None:
-        return estimator.at_rest(_as_trained(estimator, source.spec.recording, source.rest_frame))
+    recording, rest = source.spec.recording, source.rest_frame
+    if rest is not None:
+        return estimator.at_rest(in_form(rest, estimator.form, recording))
     assert isinstance(source, RealSource)
-    return estimator.at_rest_of(_as_trained(estimator, source.spec.recording, frame) for frame in source.frames)[0]
-
-
-def _as_trained(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Frame:
-    if frame.form == Form.RAW and estimator.form == Form.PROCESSED and recording is not None:
-        return replace(frame, image=record(frame.image, recording), form=Form.PROCESSED)
-    return frame
+    return estimator.at_rest_of(in_form(frame, estimator.form, recording) for frame in source.frames)[0]
 
 
 def _estimates(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Answer:
-    found = estimator(_as_trained(estimator, recording, frame))
+    found = estimator(in_form(frame, estimator.form, recording))
     return Answer(found.value, found.low, found.high, found.units, estimator.label_range, found.valid)

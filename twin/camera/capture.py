@@ -5,6 +5,7 @@ differences are in 16 to 240. The conversion uses the usual integer arithmetic (
 about 18 % of all 8-bit colours can be the result.
 """
 
+from dataclasses import replace
 from functools import lru_cache
 
 import cv2
@@ -14,7 +15,7 @@ from scenes.body import GelSpec
 from scenes.sensor import CameraSpec, CaptureSpec, RecordingSpec, ResponseSpec
 from twin.camera.residual import refined
 from twin.errors import FrameError
-from twin.types import BoolArray, FloatArray, ImageArray, IntArray
+from twin.types import BoolArray, FloatArray, Form, Frame, ImageArray, IntArray
 
 RED_BLUE = {"rgb": (0.299, 0.114), "bt601": (0.299, 0.114), "bt709": (0.2126, 0.0722)}
 """Shares of red and blue in the luma, by stream (ITU-R BT.601 and BT.709)."""
@@ -220,6 +221,13 @@ def shared(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:
     group = (left_px + np.arange(chroma.shape[1])) // columns
     first = np.searchsorted(group, group)
     return chroma[:, first]
+
+
+def in_form(frame: Frame, form: Form, recording: RecordingSpec | None) -> Frame:
+    """A raw frame as the sensor records it, if the ``form`` asks for that and the recorder is known; other frames as they are."""
+    if frame.form == Form.PROCESSED or form == Form.RAW or recording is None:
+        return frame
+    return replace(frame, image=record(frame.image, recording), form=Form.PROCESSED)
 
 
 def compressed(frame: ImageArray, quality: int, origin_px: tuple[int, int] = (0, 0)) -> ImageArray:

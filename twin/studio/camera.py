@@ -1,11 +1,9 @@
 """Draws or traces the picture of the dome alone, and inserts it into a frame whose other pixels no contact changes."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.camera.capture import expose, record
+from twin.camera.capture import expose, in_form
 from twin.errors import FrameError
 from twin.geometry.mesh import build_mesh
 from twin.optics.preview import Preview, Shading
@@ -112,7 +110,7 @@ class DomeCamera:
         """
         if self.spec.recording is None:
             raise FrameError(f"{self.spec.name} has no recordings' form; show raw frames")
-        return replace(raw, image=record(raw.image, self.spec.recording), form=Form.PROCESSED)
+        return in_form(raw, Form.PROCESSED, self.spec.recording)
 
     def crop(self, image: ImageArray, form: Form) -> ImageArray:
         """The dome's part of a frame, for the page."""

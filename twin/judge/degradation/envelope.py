@@ -201,8 +201,8 @@ def _poses_against_nominal(rows: list[dict]) -> list[dict]:
 
     The error is the mean absolute difference of lengths and angles from those of the undegraded frame. A valid pose is confidently wrong if
     one of them differs by more than the interval and its width together, and no interval is wider than ``WIDEST`` of the trained range.
-    Frames without contact have no pose, so all are NaN. A
-    frame whose undegraded contact the model does not know counts for nothing, unless it knows none.
+    Frames without contact have no pose, so all are NaN. A frame whose undegraded contact the model does not know counts for nothing,
+    unless it knows none.
     """
     nominal = {(r["case"], r["pipeline"], r["frame"]): r["pose"] for r in rows if "pose" in r and r["severity"] == 0}
     known = {pipeline for (_, pipeline, _), first in nominal.items() if first["valid"] and first["touched"]}

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from twin.judge.degradation.condition import Condition, View
+from twin.judge.degradation.conditions.placement import mapped, warped
 
 FARTHEST_PX = 64.0
 """Most severe displacement of rows, px."""
@@ -32,15 +33,12 @@ def torn_points(px: np.ndarray, value: float, view: View) -> np.ndarray:
 
 def turned(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
     """A picture that is turned about its middle."""
-    if not value:
-        return image
-    return cv2.warpAffine(image, _turn(value, image.shape), image.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return warped(image, _turn(value, image.shape)) if value else image
 
 
 def turned_points(px: np.ndarray, value: float, view: View) -> np.ndarray:
     """Positions in a turned picture."""
-    matrix = _turn(value, view.size_px[::-1])
-    return px @ matrix[:, :2].T + matrix[:, 2] if value else px
+    return mapped(px, _turn(value, view.size_px[::-1])) if value else px
 
 
 def _turn(degrees: float, shape: tuple[int, ...]) -> np.ndarray:

@@ -59,6 +59,11 @@ def warped(light: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return cv2.warpAffine(light, matrix, light.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
+def mapped(px: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Positions (n, 2) that a map (2, 3) of pixels moves to."""
+    return px @ matrix[:, :2].T + matrix[:, 2]
+
+
 def rolled(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
     """A camera that is rotated about its axis."""
     return warped(light, roll(value, view)) if value else light
@@ -66,8 +71,7 @@ def rolled(light: np.ndarray, value: float, view: View, rng: np.random.Generator
 
 def rolled_points(px: np.ndarray, value: float, view: View) -> np.ndarray:
     """Positions in the picture of a rolled camera."""
-    matrix = roll(value, view)
-    return px @ matrix[:, :2].T + matrix[:, 2] if value else px
+    return mapped(px, roll(value, view)) if value else px
 
 
 def sheared(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
@@ -77,8 +81,7 @@ def sheared(light: np.ndarray, value: float, view: View, rng: np.random.Generato
 
 def sheared_points(px: np.ndarray, value: float, view: View) -> np.ndarray:
     """Positions in a sheared picture."""
-    matrix = skew(0.5 * value * view.px_per_mm / view.radius_px, view)
-    return px @ matrix[:, :2].T + matrix[:, 2] if value else px
+    return mapped(px, skew(0.5 * value * view.px_per_mm / view.radius_px, view)) if value else px
 
 
 CONDITIONS = (

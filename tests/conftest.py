@@ -1,6 +1,7 @@
 """Shared fixtures: shipped specifications, and the real recordings where this machine has them."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -44,6 +45,15 @@ def own_cache(of_all_workers):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TACTIP_CACHE", str(of_all_workers / "cache"))
         yield
+
+
+@pytest.fixture(autouse=True)
+def own_signals():
+    """A command that is interrupted ignores further signals until its process ends: here the next test must not inherit that."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

@@ -162,8 +162,11 @@ def test_no_process_is_left_when_the_main_one_ends(tmp_path, end, moment):
         assert process.poll() is None, process.stderr.read()
         below = psutil.Process(process.pid).children(recursive=True)
         assert len(below) >= 2
-        (os.killpg if end == signal.SIGINT else os.kill)(process.pid, end)
-        said = process.communicate(timeout=PATIENCE_S)[1]
+        try:
+            (os.killpg if end == signal.SIGINT else os.kill)(process.pid, end)
+            said = process.communicate(timeout=PATIENCE_S)[1]
+        finally:
+            process.kill()
     _, left = psutil.wait_procs(below, timeout=PATIENCE_S)
     assert not left
     assert process.returncode == (1 if end == signal.SIGINT else -end)

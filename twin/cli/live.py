@@ -8,6 +8,7 @@
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -338,10 +339,11 @@ def run_policy(
     """
     from hardware.servo.following import follow
     from hardware.servo.policy_law import load_for_outlines
+    from training.environments.policy_domain import contacts_of
 
     return run_along(
         follow,
-        load_for_outlines,
+        partial(load_for_outlines, contacts_of=contacts_of),
         policy,
         out,
         kept_as="policy",

@@ -37,7 +37,7 @@ from scenes.files import shown
 from twin.errors import FrameError
 from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
-from twin.pins import measure_reference
+from twin.pins import Pipeline, measure_reference
 from twin.progress import Progress, Step, silent, stage
 from twin.records import KeptAlso
 from twin.store import contents, made_by, output, write_json, write_text, writes
@@ -622,7 +622,12 @@ def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
     planned = [work.base_pose(one.pose + pressed, near) for one in asked]
     clear = work.base_pose(np.zeros(6), near, away_mm=CLEAR_MM)
     spent_s = (plan.count - made) * CONTACT_S
-    for line in check_plan(rig, clear, planned, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s):
+    form = rig.source.form
+    at_rest = partial(measure_reference, plan.sensor, form)
+    lines = check_plan(
+        rig, Pipeline(plan.sensor, form), clear, planned, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s, at_rest=at_rest
+    )
+    for line in lines:
         LOGGER.warning("%s", line)
 
 

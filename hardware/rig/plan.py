@@ -1,27 +1,44 @@
 """Looks at the whole way before the first motion: the camera, the path to the object, and a way back from every planned pose."""
 
 import time
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 
-from hardware.arms.arm import ArmState
+from hardware.arms.arm import Arm, ArmState
+from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.rig.approach import way_around
 from hardware.rig.geometry import matrix_of
 from hardware.rig.rig import Rig
 from hardware.safety.decide import Action, decide
+from hardware.safety.eyes import NEAR_MM
 from hardware.safety.safe_arm import RETREAT_SHARES, SafeArm
+from twin.errors import FrameError
+from twin.pins import Pipeline
+from twin.types import Frame
 
 # Time, s, in which the camera's frames are counted.
 COUNT_S = 0.5
 
 
-def check_plan(rig: Rig, clear: np.ndarray, planned: list[np.ndarray], *, linear_mm_s: float, spent_s: float) -> list[str]:
+def check_plan(
+    rig: Rig,
+    pipeline: Pipeline,
+    clear: np.ndarray,
+    planned: list[np.ndarray],
+    *,
+    linear_mm_s: float,
+    spent_s: float,
+    at_rest: Callable[[Frame], object] | None = None,
+) -> list[str]:
     """Check a plan on a connected rig. Nothing moves.
 
     Parameters
     ----------
+    pipeline : Pipeline
+        Finds the sensor's pins.
     clear : (6,) float
         The pose clear of the object to which the arm goes first.
     planned : list of (6,) float
@@ -30,6 +47,9 @@ def check_plan(rig: Rig, clear: np.ndarray, planned: list[np.ndarray], *, linear
         Speed of the arm.
     spent_s : float
         Time of the work at the object, as far as it is known.
+    at_rest : callable, optional
+        Refuses a frame that can't be one without contact with a ``FrameError``. It gets the present frame if the arm stands clear of the
+        object.
 
     Returns
     -------
@@ -39,13 +59,12 @@ def check_plan(rig: Rig, clear: np.ndarray, planned: list[np.ndarray], *, linear
     Raises
     ------
     DeviceError
-        The limits forbid the way to the object, the start, or the way back from the start; or the camera gives no frames.
+        The camera gives no frames, or frames without this sensor's pins; or the limits forbid the way to the object, the start, or the way
+        back from the start.
     """
-    frame, state, before = rig.await_frame(), rig.arm.state(), getattr(rig.source, "arrived", 0)
-    rate = ""
-    if rig.source.streams:
-        time.sleep(COUNT_S)
-        rate = f", {(rig.source.arrived - before) / COUNT_S:.0f} frames/s" if hasattr(rig.source, "arrived") else ""
+    state = rig.arm.state()
+    stands_clear = -rig.placed.touch(state.pose).indent_mm > NEAR_MM
+    seen = check_sight(rig.source, pipeline, at_rest=at_rest if stands_clear else None)
     way = [state.pose, *way_around(rig.placed, state.pose, clear), planned[0]]
     for start, end in pairwise(way):
         if why := _forbidden(rig, start, end):
@@ -61,10 +80,32 @@ def check_plan(rig: Rig, clear: np.ndarray, planned: list[np.ndarray], *, linear
     if blocked:
         back = f"no straight way back from {len(blocked)} of {len(planned)} planned poses: from there the arm goes back the way it came"
     return [
-        f"camera: {rig.source.name}, {frame.image.shape[1]} x {frame.image.shape[0]} px{rate}",
+        *seen,
         f"way: {len(way) - 1} moves, {way_mm:.0f} mm, to {' '.join(f'{value:.1f}' for value in planned[0])} (mm, deg)",
         f"limits: {back}",
         f"time: about {way_mm / linear_mm_s + spent_s:.0f} s",
+    ]
+
+
+def check_sight(source: FrameSource, pipeline: Pipeline, *, at_rest: Callable[[Frame], object] | None = None) -> list[str]:
+    """Check that a connected camera gives frames of the sensor; parameters, lines and errors as for ``check_plan``."""
+    frame, before = await_frame(source, after_s=time.monotonic() if source.is_live else None), getattr(source, "arrived", 0)
+    rate = ""
+    if source.streams:
+        time.sleep(COUNT_S)
+        rate = f", {(source.arrived - before) / COUNT_S:.0f} frames/s" if hasattr(source, "arrived") else ""
+    try:
+        pins = pipeline(frame)
+        if not pins.valid:
+            raise FrameError(f"{pins.reason}; uncover and light the sensor, or give the camera of {pipeline.spec.name}")
+        if at_rest is not None:
+            at_rest(frame)
+    except FrameError as error:
+        raise DeviceError(f"{source.name}: nothing was moved: {error}") from error
+    plain = "" if at_rest is None else ", as without contact"
+    return [
+        f"camera: {source.name}, {frame.image.shape[1]} x {frame.image.shape[0]} px{rate}",
+        f"sensor: {pins.found} of {pins.expected} pins of {pipeline.spec.name} found{plain}",
     ]
 
 

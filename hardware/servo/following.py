@@ -194,7 +194,8 @@ def follow(
     told = _told(plan, model) | (about or {})
     failure, followed = "", None
     with rig, stage(progress, f"following the {plan.stimulus.name}") as step, ExitStack() as stack:
-        _say_plan(plan, rig, wanted_mm, steps)
+        takes_rest = plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live
+        _say_plan(plan, rig, model, wanted_mm, steps, takes_rest)
         first = rig.await_frame()
         loop = servo_loop(rig, plan.servo, model, _settings(plan, rig, steps))
         if isinstance(model, PolicyModel):
@@ -208,7 +209,7 @@ def follow(
         if session is not None and rest is not None:
             session.keep_rest(rest)
         loop.on_step = partial(_note_step, session, step, steps)
-        if plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live:
+        if takes_rest:
             loop.take_rest = partial(_take_rest, session, model)
         try:
             loop.run(rig.placed.start_pose(plan.servo.indent_mm))
@@ -259,7 +260,7 @@ def _told(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
     return names | {"servo": plan.servo.model_dump()}
 
 
-def _say_plan(plan: FollowPlan, rig: Rig, wanted_mm: float, steps: int) -> None:
+def _say_plan(plan: FollowPlan, rig: Rig, model: SensorModel, wanted_mm: float, steps: int, takes_rest: bool) -> None:
     """Check the plan and report it. Of the outline every ``CHECK_MM`` is checked."""
     planned = [pose for distance, pose in poses_along(rig.placed, plan.servo.indent_mm, wanted_mm)]
     axis, along, near = LastAxis(getattr(rig.arm, "kinematics", None)), [planned[0]], planned[0]
@@ -269,7 +270,8 @@ def _say_plan(plan: FollowPlan, rig: Rig, wanted_mm: float, steps: int) -> None:
             along.append(near)
     clear = moved(planned[0], -plan.servo.clear_mm * rig.mounting.axis)
     spent_s = steps / plan.stream_hz if plan.stream_hz else steps * plan.servo.feed_mm / plan.servo.linear_mm_s
-    for line in check_plan(rig, clear, along, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s):
+    at_rest = model.at_rest if takes_rest else None
+    for line in check_plan(rig, model.pipeline, clear, along, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s, at_rest=at_rest):
         LOG.warning("%s", line)
 
 

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from arms import bench
 from blind_runs import CAMERA_FAULTS, COMMANDS, FAULTS, HEALTHY, PHASES, draw, measure, table
+from drawn_frames import cap_radii_px, drawn_frame
 from noisy_camera import NoisyCamera
 from true_estimator import TrueEstimate, TrueEstimator
 
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import Picture
+from hardware.collect.collect import CollectPlan, collect_frames
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
 from hardware.live.feed import CameraFeed
@@ -27,9 +29,11 @@ from hardware.rig.rig import Rig, servo_loop
 from hardware.safety.decide import SafetyLimits, load_limits
 from hardware.safety.eyes import NEAR_MM, PIECE_MM, BlindError, Eyes, pieces_to
 from hardware.safety.safe_arm import SafeArm
+from hardware.servo.following import FollowPlan, follow
 from hardware.servo.loop import ServoLoop
 from hardware.servo.step import LoopSettings
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
+from twin.pins import Pipeline, measure_reference, nominal_reference
 from twin.rig.mounting import Mounting
 from twin.types import Form
 
@@ -233,20 +237,81 @@ def test_the_studio_moves_an_arm_only_with_frames_and_back_without(monkeypatch):
         feed.stop()
 
 
+SENSOR = load_sensor("mg400-331")
+AT_REST = nominal_reference(SENSOR, Form.RAW).pins_px
+
+
+def shows(pins_px):
+    """A camera of frames with pins (N, 2)."""
+    source = Switched(fps=60)
+    source.notices_still = False
+    source.picture = drawn_frame(SENSOR, Form.RAW, pins_px, radius_px=cap_radii_px(SENSOR, Form.RAW)[: len(pins_px)]).image
+    return source
+
+
+def dented():
+    """The pins of a contact at the side."""
+    away = AT_REST - AT_REST.mean(axis=0) - [60.0, 0.0]
+    return AT_REST + 0.25 * away * np.exp(-np.sum(away**2, axis=1, keepdims=True) / 2 / 60.0**2)
+
+
+def other_sensor():
+    """A camera of a sensor with fewer pins in the same picture."""
+    return shows(nominal_reference(load_sensor("mg400-127"), Form.RAW).pins_px)
+
+
 @pytest.mark.parametrize(
-    ("kind", "servo", "refused"), [("mg400", "surface", ""), ("magician", "surface", "--servo magician"), ("magician", "magician", "")]
+    ("kind", "servo", "refused"), [("mg400", "surface", ""), ("magician", "surface", "magician"), ("magician", "magician", "")]
 )
 def test_the_plan_is_checked_before_anything_moves(kind, servo, refused):
     spec = load_servo(servo)
-    placed = PlacedObject(load_object("can"), spec.placement, Mounting.of(load_sensor("mg400-331"), load_experiment(spec.experiment)))
-    with bench(kind) as at, NoisyCamera(fps=60) as source, SafeArm(at.arm, load_limits(kind)) as arm:
+    placed = PlacedObject(load_object("can"), spec.placement, Mounting.of(SENSOR, load_experiment(spec.experiment)))
+    with bench(kind) as at, shows(AT_REST) as source, SafeArm(at.arm, load_limits(kind)) as arm:
         rig, start, before = Rig(source, arm, placed, False), placed.start_pose(spec.indent_mm), at.reads()
         clear = moved(start, -spec.clear_mm * placed.mounting.axis)
-        check = partial(check_plan, rig, clear, [start], linear_mm_s=spec.linear_mm_s, spent_s=1.0)
+        check = partial(check_plan, rig, Pipeline(SENSOR, Form.RAW), clear, [start], linear_mm_s=spec.linear_mm_s, spent_s=1.0)
         if refused:
             with pytest.raises(DeviceError, match=refused):
                 check()
         else:
             lines = check()
-            assert [line.split(":")[0] for line in lines] == ["camera", "way", "limits", "time"] and "frames/s" in lines[0]
+            assert [line.split(":")[0] for line in lines] == ["camera", "sensor", "way", "limits", "time"] and "frames/s" in lines[0]
+            assert "331 of 331 pins of mg400-331" in lines[1]
+        np.testing.assert_array_equal(at.reads(), before)
+
+
+@pytest.mark.parametrize("command", ["servo", "servo without a rest frame", "policy", "collect"])
+@pytest.mark.parametrize(
+    ("make", "refused"),
+    [(NoisyCamera, "expected 640x480"), (lambda: shows(AT_REST[:20]), "no pins"), (other_sensor, "pins"), (lambda: shows(dented()), "pressed")],
+    ids=["other size", "covered", "other sensor", "pressed"],
+)
+def test_nothing_moves_with_a_camera_that_does_not_show_the_sensor(monkeypatch, tmp_path, command, make, refused):
+    class Model(SimpleNamespace):
+        counts_from_rest = True
+        at_rest = partial(measure_reference, SENSOR, Form.RAW)
+
+        def seeking_rest(self):
+            return self
+
+        def __call__(self, frame):
+            return TrueEstimate(("pose_2", "pose_6"), *np.zeros((3, 2)))
+
+    monkeypatch.setattr("hardware.rig.rig.open_camera", lambda *_, **__: make())
+    can, spec = load_object("can"), load_servo("surface")
+    with bench("mg400") as at:
+        monkeypatch.setattr("hardware.rig.rig.open_arm", lambda _: at.arm)
+        arm, before = "mg400:any", at.reads()
+        if command == "collect":
+            plan = CollectPlan(SENSOR, can, load_experiment("surface-2d"), spec, "any", arm, 1, form=Form.RAW, dry_run=True)
+            run = partial(collect_frames, plan, tmp_path)
+        else:
+            at_rest = "none" if "without" in command else "first"
+            plan = FollowPlan(can, spec, camera="any", arm=arm, at_rest=at_rest, dry_run=True)
+            run = partial(follow, plan, Model(sensor=SENSOR, form=Form.RAW, pipeline=Pipeline(SENSOR, Form.RAW)), tmp_path)
+        if refused == "pressed" and "without" in command:
+            run()
+        else:
+            with pytest.raises(DeviceError, match=f"nothing was moved: .*{refused}"):
+                run()
         np.testing.assert_array_equal(at.reads(), before)

@@ -67,7 +67,7 @@ def check_plan(
     seen = check_sight(rig.source, pipeline, at_rest=at_rest if stands_clear else None)
     way = [state.pose, *way_around(rig.placed, state.pose, clear), planned[0]]
     for start, end in pairwise(way):
-        if why := _forbidden(rig, start, end):
+        if why := _forbidden(rig.arm, start, end):
             raise DeviceError(
                 f"{rig.arm.name}: the limits forbid the way to the {rig.placed.spec.name}: {why}; correct 'placement' in the file for "
                 "--servo (a Magician reaches that of --servo magician), or --limits"
@@ -89,7 +89,8 @@ def check_plan(
 
 def check_sight(source: FrameSource, pipeline: Pipeline, *, at_rest: Callable[[Frame], object] | None = None) -> list[str]:
     """Check that a connected camera gives frames of the sensor; parameters, lines and errors as for ``check_plan``."""
-    frame, before = await_frame(source, after_s=time.monotonic() if source.is_live else None), getattr(source, "arrived", 0)
+    frame = await_frame(source, after_s=time.monotonic()) if source.is_live else source.read_latest()
+    before = getattr(source, "arrived", 0)
     rate = ""
     if source.streams:
         time.sleep(COUNT_S)
@@ -109,11 +110,19 @@ def check_sight(source: FrameSource, pipeline: Pipeline, *, at_rest: Callable[[F
     ]
 
 
-def _forbidden(rig: Rig, start: np.ndarray, end: np.ndarray) -> str:
+def check_standing(source: FrameSource, arm: SafeArm, pipeline: Pipeline) -> list[str]:
+    """Check a connected arm that a person will move in small steps from where it stands; parameters, lines and errors as for
+    ``check_plan``."""
+    seen, here = check_sight(source, pipeline), arm.state().pose
+    if why := _forbidden(arm, here, here):
+        raise DeviceError(f"{arm.name}: stands outside its limits, so no step leads back here: {why}; move it inside by hand")
+    return [*seen, "limits: the way back of each step is inside"]
+
+
+def _forbidden(arm: Arm, start: np.ndarray, end: np.ndarray) -> str:
     """Why the limits forbid a straight move between poses (6,); "" if they don't, or there are none."""
-    if not isinstance(rig.arm, SafeArm):
+    if not isinstance(arm, SafeArm):
         return ""
-    arm = rig.arm
     limits = arm.limits.model_copy(update={"step_mm": None, "step_deg": None})
     near = start if arm.kinematics is None else arm.kinematics.nearest_pose(start)
     state = ArmState(near, np.zeros(arm.axes), time.monotonic(), True, False)
@@ -127,4 +136,4 @@ def _way_back(rig: Rig, pose: np.ndarray) -> bool:
         return True
     back = np.zeros(6)
     back[:3] = -matrix_of(pose)[:3, :3] @ rig.mounting.axis * rig.arm.limits.retreat_mm
-    return any(not _forbidden(rig, pose, pose + share * back) for share in RETREAT_SHARES)
+    return any(not _forbidden(rig.arm, pose, pose + share * back) for share in RETREAT_SHARES)

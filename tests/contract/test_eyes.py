@@ -203,40 +203,6 @@ def test_where_the_limits_allow_no_way_back_the_arm_goes_back_the_way_it_came(pl
     assert any("the way it came" in note for note in loop.notes)
 
 
-def test_the_studio_moves_an_arm_only_with_frames_and_back_without(monkeypatch):
-    source = Switched()
-    monkeypatch.setattr("hardware.live.feed.open_camera", lambda *_: source)
-    model = SimpleNamespace(sensor=load_sensor("mg400-331"), form=Form.RAW, check=lambda *_: None)
-    value = np.zeros(1)
-
-    class Model(SimpleNamespace):
-        def seeking_rest(self):
-            return self
-
-        def __call__(self, frame):
-            return TrueEstimate(("pose_2",), value, value, value)
-
-    feed = CameraFeed("any", "simulated", Model(**vars(model)))
-    feed.start(lambda shot: None, lambda why: None)
-    try:
-        robot = feed.robot
-        robot.arm()
-        while source.blind():
-            time.sleep(0.01)
-        robot.nudge(1, 1.0)
-        source.off = True
-        time.sleep(0.4)
-        with pytest.raises(DeviceError, match="fresh frames"):
-            robot.nudge(1, 1.0)
-        robot.nudge(1, -1.0)
-        with pytest.raises(DeviceError, match="fresh frames"):
-            robot.nudge(1, -1.0)
-        np.testing.assert_allclose(robot._arm.state().pose[1], 0.0, atol=1e-6)
-    finally:
-        source.off = False
-        feed.stop()
-
-
 SENSOR = load_sensor("mg400-331")
 AT_REST = nominal_reference(SENSOR, Form.RAW).pins_px
 
@@ -258,6 +224,69 @@ def dented():
 def other_sensor():
     """A camera of a sensor with fewer pins in the same picture."""
     return shows(nominal_reference(load_sensor("mg400-127"), Form.RAW).pins_px)
+
+
+class StudioModel(SimpleNamespace):
+    """A model of the sensor for the studio."""
+
+    sensor, form, check = load_sensor("mg400-331"), Form.RAW, lambda *_: None
+
+    @property
+    def pipeline(self):
+        return Pipeline(self.sensor, self.form)
+
+    def seeking_rest(self):
+        return self
+
+    def __call__(self, frame):
+        return TrueEstimate(("pose_2",), *np.zeros((3, 1)))
+
+
+@pytest.fixture
+def studio_arm(monkeypatch):
+    """Starts the studio's feed with a camera, and gives its arm."""
+    feeds = []
+
+    def start(source):
+        monkeypatch.setattr("hardware.live.feed.open_camera", lambda *_: source)
+        feeds.append(CameraFeed("any", "simulated", StudioModel()))
+        feeds[0].start(lambda shot: None, lambda why: None)
+        return feeds[0].robot
+
+    yield start
+    feeds[0].stop()
+
+
+def test_the_studio_moves_an_arm_only_with_frames_and_back_without(studio_arm):
+    source = shows(AT_REST)
+    robot = studio_arm(source)
+    try:
+        assert [line.split(":")[0] for line in robot.arm()] == ["camera", "sensor", "limits"]
+        robot.nudge(1, 1.0)
+        source.off = True
+        time.sleep(0.4)
+        with pytest.raises(DeviceError, match="fresh frames"):
+            robot.nudge(1, 1.0)
+        robot.nudge(1, -1.0)
+        with pytest.raises(DeviceError, match="fresh frames"):
+            robot.nudge(1, -1.0)
+        np.testing.assert_allclose(robot._arm.state().pose[1], 0.0, atol=1e-6)
+    finally:
+        source.off = False
+
+
+@pytest.mark.parametrize(
+    ("make", "outside", "refused"),
+    [(NoisyCamera, False, "expected 640x480"), (lambda: shows(AT_REST[:20]), False, "no pins"), (lambda: shows(AT_REST), True, "outside")],
+    ids=["other size", "covered", "outside the limits"],
+)
+def test_the_studio_arms_nothing_without_the_sensor_or_outside_the_limits(studio_arm, make, outside, refused):
+    robot = studio_arm(make())
+    if outside:
+        robot._arm.limits = FREE.model_copy(update={"box_mm": ((50.0, 60.0),) * 3})
+    with pytest.raises(DeviceError, match=refused):
+        robot.arm()
+    assert not robot.armed and not robot._arm.state().enabled
 
 
 @pytest.mark.parametrize(
@@ -283,7 +312,12 @@ def test_the_plan_is_checked_before_anything_moves(kind, servo, refused):
 @pytest.mark.parametrize("command", ["servo", "servo without a rest frame", "policy", "collect"])
 @pytest.mark.parametrize(
     ("make", "refused"),
-    [(NoisyCamera, "expected 640x480"), (lambda: shows(AT_REST[:20]), "no pins"), (other_sensor, "pins"), (lambda: shows(dented()), "pressed")],
+    [
+        (NoisyCamera, "expected 640x480"),
+        (lambda: shows(AT_REST[:20]), "no pins"),
+        (other_sensor, "pins"),
+        (lambda: shows(dented()), "pressed"),
+    ],
     ids=["other size", "covered", "other sensor", "pressed"],
 )
 def test_nothing_moves_with_a_camera_that_does_not_show_the_sensor(monkeypatch, tmp_path, command, make, refused):

@@ -12,12 +12,12 @@ import serial
 from serial.tools import list_ports
 
 from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm
+from hardware.arms.awake import awake_s
 from hardware.arms.dobot_alarms import explain
 from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
 from hardware.arms.supervisor import Supervisor
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
-from hardware.safety.awake import awake_s
 
 # Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take as long as feedback may be old.
 REPLY_TIMEOUT_S = 0.2

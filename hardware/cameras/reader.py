@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hardware.arms.awake import awake_s
 from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
-from hardware.safety.awake import awake_s
 from scenes.sensor import SensorSpec
 from twin.camera.capture import record
 from twin.frames.forms import form_named, frame_size, gray_levels

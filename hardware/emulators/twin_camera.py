@@ -13,7 +13,7 @@ from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, require_
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.running import run_until_told, say
 from hardware.rig.geometry import PlacedObject
-from hardware.rig.rig import twin_camera
+from hardware.workcell.build import twin_camera
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
 from twin.errors import OptionError
 from twin.rig.mounting import Mounting
@@ -91,7 +91,7 @@ def emulate_camera(
     faults : tuple of str
         See ``CameraEmulator``.
     plain_light : bool
-        Without path tracing at the start; see ``hardware.rig.rig.drawn``.
+        Without path tracing at the start; see ``hardware.workcell.build.drawn``.
     """
     placed = PlacedObject(stimulus, servo.placement, Mounting.of(sensor, load_experiment(servo.experiment)))
     pose = FeedbackPose.of(arm)

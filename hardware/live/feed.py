@@ -15,10 +15,10 @@ from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError
 from hardware.live.live import LiveSession, estimate_line
-from hardware.rig.plan import check_standing
 from hardware.safety.decide import load_limits
 from hardware.safety.eyes import Eyes
 from hardware.safety.safe_arm import SafeArm, try_each
+from hardware.workcell.plan import check_standing
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
 from twin.estimate import Estimate, SensorModel

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from hardware.cameras.choose import open_camera
+from hardware.cameras.session import SessionSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.live.rerun_view import RerunView
-from hardware.live.session import SessionSource
-from hardware.rig.rig import given_frame
 from hardware.servo.timing import Spread, Timing
+from hardware.workcell.build import given_frame
 from twin.errors import FrameError, OptionError, TwinError
 from twin.estimate import Estimate, Estimator, SensorModel, seen_in
 from twin.pins import Pipeline

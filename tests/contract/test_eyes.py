@@ -12,26 +12,26 @@ import numpy as np
 import pytest
 from arms import bench
 from blind_runs import CAMERA_FAULTS, COMMANDS, FAULTS, HEALTHY, PHASES, draw, measure, table
-from drawn_frames import cap_radii_px, drawn_frame
 from noisy_camera import NoisyCamera
+from pins_camera import AT_REST, SENSOR, StudioModel, Switched, shows
 from true_estimator import TrueEstimate, TrueEstimator
 
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import Picture
-from hardware.collect.collect import CollectPlan, collect_frames
+from hardware.collect.collect import LIFT_MM, Collection, CollectPlan, collect, collect_frames
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
 from hardware.live.feed import CameraFeed
 from hardware.rig.geometry import PlacedObject, moved
-from hardware.rig.plan import check_plan
-from hardware.rig.rig import Rig, servo_loop
 from hardware.safety.decide import SafetyLimits, load_limits
 from hardware.safety.eyes import NEAR_MM, PIECE_MM, BlindError, Eyes, pieces_to
 from hardware.safety.safe_arm import SafeArm
 from hardware.servo.following import FollowPlan, follow
 from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.step import LoopHooks, LoopSettings
+from hardware.workcell.build import Rig
+from hardware.workcell.plan import check_plan
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.pins import Pipeline, measure_reference, nominal_reference
 from twin.rig.mounting import Mounting
@@ -83,18 +83,6 @@ def arm(placed):
     with SimulatedArm(pose=placed.start_pose(-60.0)) as arm:
         arm.enable()
         yield arm
-
-
-class Switched(NoisyCamera):
-    """A camera that can be switched off, or be given one picture to repeat."""
-
-    off, picture = False, None
-
-    def _grab(self):
-        while self.off and not self._end.wait(0.01):
-            pass
-        made = super()._grab()
-        return made if self.picture is None else Picture(self.picture, made.time_s)
 
 
 def test_the_last_millimetres_are_made_in_pieces():
@@ -173,7 +161,7 @@ def test_a_stream_of_thresholded_pictures_is_not_frozen_at_rest():
 def test_an_arm_that_stopped_for_want_of_frames_goes_on_with_them(arm, placed, blocking):
     with Switched(fps=60) as source:
         servo = load_servo("surface").model_copy(update={"clear_mm": 20.0})
-        loop = ServoLoop(source, TrueEstimator(arm, placed), arm, servo, placed.mounting, LoopSettings(6, blocking=blocking))
+        loop = ServoLoop(Rig(source, arm, placed, False), servo, TrueEstimator(arm, placed), LoopSettings(6, blocking=blocking))
         waits = iter((True,))
 
         def step(record, frame, estimate):
@@ -181,38 +169,35 @@ def test_an_arm_that_stopped_for_want_of_frames_goes_on_with_them(arm, placed, b
                 source.off = True
                 Timer(0.6, lambda: setattr(source, "off", False)).start()
 
-        loop.on_step = step
+        loop.hooks = LoopHooks(on_step=step)
         loop.run(placed.start_pose(3.0))
     assert len(loop.records) == 6 and len(loop.notes) == (not blocking) and all("held still" in note for note in loop.notes)
 
 
-def test_where_the_limits_allow_no_way_back_the_arm_goes_back_the_way_it_came(placed):
+@pytest.mark.parametrize("command", ["servo", "collect"])
+def test_where_the_limits_allow_no_way_back_the_arm_goes_back_the_way_it_came(placed, tmp_path, caplog, command):
     arm = SimulatedArm(pose=placed.start_pose(-60.0), time_scale=20.0)
     safe = SafeArm(arm, FREE)
     with NoisyCamera() as source, safe:
-        servo = load_servo("surface")
-        loop = servo_loop(Rig(source, safe, placed, True), servo, TrueEstimator(arm, placed), LoopSettings(3))
-        loop.way = lambda start, clear: [clear]
+        rig, servo = Rig(source, safe, placed, True), load_servo("surface")
 
-        def narrow(record, frame, estimate):
+        def narrow(*_):
             safe.retreat = lambda: None
+            if command == "collect":
+                raise DeviceError("in contact")
 
-        loop.on_step = narrow
-        loop.run(placed.start_pose(servo.indent_mm))
-        assert placed.touch(arm.state().pose).indent_mm < -40.0
-    assert any("the way it came" in note for note in loop.notes)
-
-
-SENSOR = load_sensor("mg400-331")
-AT_REST = nominal_reference(SENSOR, Form.RAW).pins_px
-
-
-def shows(pins_px):
-    """A camera of frames with pins (N, 2)."""
-    source = Switched(fps=60)
-    source.notices_still = False
-    source.picture = drawn_frame(SENSOR, Form.RAW, pins_px, radius_px=cap_radii_px(SENSOR, Form.RAW)[: len(pins_px)]).image
-    return source
+        if command == "servo":
+            loop = ServoLoop(rig, servo, TrueEstimator(arm, placed), LoopSettings(3), LoopHooks(on_step=narrow))
+            loop.run(placed.start_pose(servo.indent_mm))
+            clear_mm, told = 40.0, loop.notes
+        else:
+            contacts = Collection(tmp_path, {"seed": 1}, Form.RAW)
+            contacts.keep = narrow
+            with pytest.raises(DeviceError, match="in contact"):
+                collect(rig, load_experiment("surface-2d"), contacts, 1, seed=1, speed=(200.0, 200.0))
+            clear_mm, told = LIFT_MM - 1.0, [record.getMessage() for record in caplog.records]
+        assert placed.touch(arm.state().pose).indent_mm < -clear_mm
+    assert any("the way it came" in note for note in told)
 
 
 def dented():
@@ -224,22 +209,6 @@ def dented():
 def other_sensor():
     """A camera of a sensor with fewer pins in the same picture."""
     return shows(nominal_reference(load_sensor("mg400-127"), Form.RAW).pins_px)
-
-
-class StudioModel(SimpleNamespace):
-    """A model of the sensor for the studio."""
-
-    sensor, form, check = load_sensor("mg400-331"), Form.RAW, lambda *_: None
-
-    @property
-    def pipeline(self):
-        return Pipeline(self.sensor, self.form)
-
-    def seeking_rest(self):
-        return self
-
-    def __call__(self, frame):
-        return TrueEstimate(("pose_2",), *np.zeros((3, 1)))
 
 
 @pytest.fixture
@@ -331,10 +300,10 @@ def test_nothing_moves_with_a_camera_that_does_not_show_the_sensor(monkeypatch, 
         def __call__(self, frame):
             return TrueEstimate(("pose_2", "pose_6"), *np.zeros((3, 2)))
 
-    monkeypatch.setattr("hardware.rig.rig.open_camera", lambda *_, **__: make())
+    monkeypatch.setattr("hardware.workcell.build.open_camera", lambda *_, **__: make())
     can, spec = load_object("can"), load_servo("surface")
     with bench("mg400") as at:
-        monkeypatch.setattr("hardware.rig.rig.open_arm", lambda _: at.arm)
+        monkeypatch.setattr("hardware.workcell.build.open_arm", lambda _: at.arm)
         arm, before = "mg400:any", at.reads()
         if command == "collect":
             plan = CollectPlan(SENSOR, can, load_experiment("surface-2d"), spec, "any", arm, 1, form=Form.RAW, dry_run=True)

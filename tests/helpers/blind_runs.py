@@ -27,11 +27,12 @@ from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, moved
-from hardware.rig.rig import Rig, servo_loop
 from hardware.safety.decide import SafetyLimits
 from hardware.safety.eyes import NEAR_MM
 from hardware.safety.safe_arm import SafeArm
-from hardware.servo.step import LoopSettings
+from hardware.servo.loop import ServoLoop
+from hardware.servo.step import LoopHooks, LoopSettings
+from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 from twin.types import Form
@@ -146,25 +147,21 @@ def program(command: str, ports: tuple[int, ...], url: str, folder: Path, pose=N
     arm = SafeArm(MG400("127.0.0.1", ports=Mg400Ports(ports[0], ports[1], tuple(ports[2:]))), SafetyLimits(box_mm=((-2000, 2000),) * 3))
     source = MjpegCamera(url, load_sensor("mg400-331"), Form.RAW)
 
+    rig = Rig(source, arm, placed, False)
+
     def run() -> None:
-        with ExitStack() as stack:
-            stack.enter_context(arm)
-            stack.enter_context(source)
+        with rig:
             source.read(timeout_s=5.0)
             if command == "collect":
                 about = Collection(folder, {"seed": 1}, Form.RAW)
                 experiment, speed = load_experiment("surface-2d"), (servo.linear_mm_s, servo.angular_deg_s)
-                collect(
-                    source, arm, experiment, placed, about, 9 if steps == STEPS else 1, seed=1, speed=speed, frame_timeout_s=FRAME_WAIT_S
-                )
+                collect(rig, experiment, about, 9 if steps == STEPS else 1, seed=1, speed=speed, frame_timeout_s=FRAME_WAIT_S)
                 return
             track = SimpleNamespace(pose=pose or (lambda time_s: arm.state().pose))
             truth = TrueEstimator(SimpleNamespace(track=track), placed)
             settings = LoopSettings(steps, blocking=command != "stream", period_s=0.1, frame_timeout_s=FRAME_WAIT_S, give_up_s=WAIT_S)
-            loop = servo_loop(Rig(source, arm, placed, False), servo, truth, settings)
-            if command == "policy":
-                loop.law = lambda here, estimate: moved(here, servo.feed_mm * placed.mounting.across)
-            loop.take_rest = lambda frame: loop.estimator
+            law = (lambda here, estimate: moved(here, servo.feed_mm * placed.mounting.across)) if command == "policy" else None
+            loop = ServoLoop(rig, servo, truth, settings, LoopHooks(law, lambda frame: truth))
             loop.run(placed.start_pose(servo.indent_mm))
             if loop.notes:
                 raise DeviceError("; ".join(loop.notes))

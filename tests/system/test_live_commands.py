@@ -21,16 +21,17 @@ from typer.testing import CliRunner
 
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.reader import LiveSource, Picture
+from hardware.cameras.session import SessionSource
 from hardware.cameras.twin import preview_of
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import run_until_told
 from hardware.errors import DeviceError
 from hardware.live.live import LiveSession, Shower, WatchPlan, watch
-from hardware.live.session import SessionSource
 from hardware.rig.geometry import PlacedObject
-from hardware.rig.rig import build_rig, steps_round
 from hardware.servo import following
+from hardware.servo.following import steps_round
+from hardware.workcell.build import build_rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.estimate.displacements import FEWEST_CONTACTS
 from training.estimate.estimator import PoseEstimator

@@ -11,10 +11,10 @@ from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.rig.approach import way_around
 from hardware.rig.geometry import matrix_of
-from hardware.rig.rig import Rig
 from hardware.safety.decide import Action, decide
 from hardware.safety.eyes import NEAR_MM
 from hardware.safety.safe_arm import RETREAT_SHARES, SafeArm
+from hardware.workcell.build import Rig
 from twin.errors import FrameError
 from twin.pins import Pipeline
 from twin.types import Frame

@@ -1,4 +1,4 @@
-"""Makes a frame source from the text that a user gives with ``--camera``."""
+"""Makes a frame source from the text that a user gives for ``camera``."""
 
 import os
 

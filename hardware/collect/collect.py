@@ -110,7 +110,7 @@ class Collection:
                 write_json(meta, about | {"made_by": made_by(collect, inputs=about)})
             elif other:
                 raise DeviceError(
-                    f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another --out"
+                    f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another `out`"
                 )
         elif contents(self.folder):
             raise DeviceError(f"{self.folder}: holds something else; give an empty or a new folder")
@@ -143,9 +143,9 @@ class Collection:
             with table.open(newline="", encoding="utf-8") as file:
                 rows = list(csv.reader(file))
         except (ValueError, csv.Error) as error:
-            raise DeviceError(f"{table}: is damaged ({shown(error)}); give another --out") from error
+            raise DeviceError(f"{table}: is damaged ({shown(error)}); give another `out`") from error
         if rows[:1] != [list(COLUMNS)] or any(len(row) != len(COLUMNS) for row in rows):
-            raise DeviceError(f"{table}: is not the table of a collection; give another --out")
+            raise DeviceError(f"{table}: is not the table of a collection; give another `out`")
         return len(rows) - 1
 
     @property
@@ -179,7 +179,7 @@ class Collection:
         try:
             text = lines.read_text(encoding="utf-8")
         except ValueError as error:
-            raise DeviceError(f"{lines}: is damaged ({shown(error)}); give another --out") from error
+            raise DeviceError(f"{lines}: is damaged ({shown(error)}); give another `out`") from error
         if not text.endswith("\n"):
             write_text(lines, text[: text.rfind("\n") + 1])
 
@@ -442,9 +442,9 @@ class CollectPlan:
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= MOST_CONTACTS:
-            raise DeviceError(f"--count {self.count}: a collection has 1 to {MOST_CONTACTS} contacts")
+            raise DeviceError(f"`count` {self.count}: a collection has 1 to {MOST_CONTACTS} contacts")
         if self.design not in DESIGNS:
-            raise DeviceError(f"--design {self.design}: must be {' or '.join(DESIGNS)}")
+            raise DeviceError(f"`design` {self.design}: must be {' or '.join(DESIGNS)}")
         if self.design == "unsure" and self.chooser is None:
             raise DeviceError('the design "unsure" needs a chooser, as training.data.design.LeastSure(sensor) is one')
 

@@ -165,7 +165,7 @@ def require_feed(camera: str, arm: str, recording: str, sensor: SensorSpec) -> N
     if arm:
         WatchedArm(arm)
     if recording and not os.path.exists(recording):  # its content is checked when it is opened
-        raise FrameError(f"--recording {recording}: no such folder; give a recording")
+        raise FrameError(f"`recording` {recording}: no such folder; give a recording")
 
 
 class CameraFeed:

@@ -196,7 +196,7 @@ class Shower:
         if isinstance(self._error, TwinError):
             raise self._error
         if self._error is not None:
-            raise DeviceError(f"the view broke ({self._error}); without --rerun, --headless shows nothing") from self._error
+            raise DeviceError(f"the view broke ({self._error}); without `rerun`, `headless` shows nothing") from self._error
 
     def _run(self) -> None:
         try:
@@ -263,12 +263,12 @@ class WatchPlan:
 
     def __post_init__(self) -> None:
         if self.also and self.record is None:
-            raise OptionError("--also goes with --record: it keeps that session in a further format")
+            raise OptionError("`also` goes with `record`: it keeps that session in a further format")
         if bool(self.camera) == (self.replay is not None):
-            raise OptionError("give either --camera or --replay")
+            raise OptionError("give either `camera` or `replay`")
         if self.replay is not None and self.at_rest != NONE:
             raise OptionError(
-                "--at-rest goes with --camera: a replay counts pins from the frame that was kept with its session; leave --at-rest out"
+                "`at_rest` goes with `camera`: a replay counts pins from the frame that was kept with its session; leave `at_rest` out"
             )
 
 

@@ -102,16 +102,16 @@ class FollowPlan:
 
     def __post_init__(self) -> None:
         if self.also and not self.record:
-            raise OptionError("--also goes with --record: it keeps that session in a further format")
+            raise OptionError("`also` goes with `record`: it keeps that session in a further format")
         if self.stream_hz is not None and not SLOWEST_HZ <= self.stream_hz <= FASTEST_HZ:
-            raise DeviceError(f"--rate {self.stream_hz:g}: expected {SLOWEST_HZ:g} to {FASTEST_HZ:g} decisions a second")
+            raise DeviceError(f"`rate` {self.stream_hz:g}: expected {SLOWEST_HZ:g} to {FASTEST_HZ:g} decisions a second")
         if self.steps is not None and not 1 <= self.steps <= MOST_STEPS:
-            raise DeviceError(f"--steps {self.steps}: expected 1 to {MOST_STEPS}")
+            raise DeviceError(f"`steps` {self.steps}: expected 1 to {MOST_STEPS}")
         if not self.camera:
             if kind_of(self.arm) != "simulated":
                 open_arm(self.arm)  # an arm that does not exist is said first; nothing is opened
                 raise OptionError(
-                    f"--arm {shown(self.arm)} moves by what a camera sees: give the sensor's with --camera; '--camera twin' draws the "
+                    f"`arm` {shown(self.arm)} moves by what a camera sees: give the sensor's with `camera`; `camera=twin` draws the "
                     "frames for the pose that the arm reports, and such a loop does not feel what it touches"
                 )
             object.__setattr__(self, "camera", TWIN)
@@ -125,7 +125,7 @@ class DryRunDone:
 
     def lines(self) -> list[str]:
         """The result as lines of text."""
-        return ["nothing was moved; leave out --dry-run to begin"]
+        return ["nothing was moved; leave out `dry_run` to begin"]
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class Followed:
                 f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
             ]
         else:
-            out[0] += "; where the object truly stands is not known, so nothing is measured against it ('--known-place' says it is)"
+            out[0] += "; where the object truly stands is not known, so nothing is measured against it (`known_place` says it is)"
         return out + ([in_short(f"ended early: {self.failure}")] if self.failure else [])
 
 

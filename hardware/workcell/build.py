@@ -30,7 +30,7 @@ from twin.optics.render import traced_shading
 from twin.rig.mounting import Mounting
 from twin.types import FIRST, NONE, Form, Frame
 
-# Value of the option --camera that selects the twin.
+# Value of ``camera`` that selects the twin.
 TWIN = "twin"
 # Longest wait in s for a real camera's frame while the arm stands still.
 FRAME_S = 5.0

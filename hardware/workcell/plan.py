@@ -70,11 +70,11 @@ def check_plan(
         if why := _forbidden(rig.arm, start, end):
             raise DeviceError(
                 f"{rig.arm.name}: the limits forbid the way to the {rig.placed.spec.name}: {why}; correct 'placement' in the file for "
-                "--servo (a Magician reaches that of --servo magician), or --limits"
+                "`servo` (a Magician reaches that of `servo=magician`), or `limits`"
             )
     blocked = [n for n, pose in enumerate(planned) if not _way_back(rig, pose)]
     if blocked[:1] == [0]:
-        raise DeviceError(f"{rig.arm.name}: the limits allow no way back from the start; correct 'placement' in the file for --servo")
+        raise DeviceError(f"{rig.arm.name}: the limits allow no way back from the start; correct 'placement' in the file for `servo`")
     way_mm = sum(float(np.linalg.norm(end[:3] - start[:3])) for start, end in pairwise(way))
     back = f"a way back from all {len(planned)} planned poses"
     if blocked:

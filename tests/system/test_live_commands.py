@@ -199,7 +199,7 @@ def test_collect_in_the_twin_makes_a_recording_that_is_gone_on_with(tmp_path):
 
 
 def test_a_replay_takes_no_other_frame_at_rest(tmp_path):
-    with pytest.raises(OptionError, match="leave --at-rest out"):
+    with pytest.raises(OptionError, match="leave `at_rest` out"):
         run("live", "--replay", tmp_path, "--at-rest", "first", "--headless")
 
 
@@ -212,7 +212,7 @@ def test_live_records_and_replays_the_same(stand_in, tmp_path):
     told = run("live", "--camera", folder, "--model", "any", "--headless", "--record", tmp_path / "s", "--also", "lerobot")
     assert "5 steps" in told and "5 of 5 frames valid" in told
     assert [episode.length for episode in open_records(tmp_path / "s" / "lerobot").episodes] == [5]
-    with pytest.raises(OptionError, match="--also goes with --record"):
+    with pytest.raises(OptionError, match="`also` goes with `record`"):
         run("live", "--camera", folder, "--model", "any", "--headless", "--also", "lerobot")
     assert "5 of 5 estimates" in run("live", "--replay", tmp_path / "s", "--model", "any", "--headless")
 

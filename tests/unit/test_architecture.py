@@ -296,6 +296,31 @@ def test_cycles_are_recognised():
     assert cycles_in({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == {"b", "c"}
 
 
+SPEAK_OF_ARGUMENTS = ("hardware",)
+OPTION = re.compile(r"(?<![\w-])--[a-z]+")
+
+
+def options_in_errors(source: str) -> list[str]:
+    """Options of the command line that errors of a module name. Whole commands in quotes don't count."""
+    raised = [n for n in nodes_of(source) if isinstance(n, ast.Raise)]
+    texts = [n.value for each in raised for n in ast.walk(each) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+    return [found for text in texts for found in OPTION.findall(re.sub(r"'twin [^']*'", "", text))]
+
+
+@pytest.mark.parametrize("package", SPEAK_OF_ARGUMENTS)
+def test_errors_speak_of_arguments_which_the_command_line_translates(package):
+    for path in sorted((ROOT / package).rglob("*.py")):
+        assert not options_in_errors(path.read_text(encoding="utf-8")), path.relative_to(ROOT)
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [("raise E(f'give --out {x}')", ["--out"]), ("raise E('give `out`')", []), ("raise E(\"run 'twin new --out F'\")", [])],
+)
+def test_options_in_errors_are_recognised(source, found):
+    assert options_in_errors(source) == found
+
+
 def test_the_repository_holds_no_foreign_data():
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("no git, or not a git checkout")

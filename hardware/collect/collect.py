@@ -203,24 +203,6 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
     return Contact(numbers[:6], numbers[6:])
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """Chooses the next contact of a collection."""
-
-    experiment: ExperimentSpec
-    seed: int
-    design: str
-    folder: Path
-    chooser: Chooser | None
-
-    def __call__(self, index: int) -> Contact:
-        varied = sum(high > low for low, high in self.experiment.ranges().values())
-        if self.chooser is None or self.design != "unsure" or index < EVEN_AT_FIRST * varied:
-            return draw_contact(self.experiment, self.seed, index, self.design)
-        numbers = self.chooser(self.folder, self.experiment, self.seed, index)
-        return Contact(numbers[:6], numbers[6:])
-
-
 class WorkFrame:
     """The robot's coordinates of an experiment in front of an object (the work frame).
 
@@ -311,7 +293,14 @@ def collect(
         raise DeviceError(f"{rig.source.name}: a recording shows nothing of this arm; give a live `camera`")
     timeout_s = rig.frame_timeout_s if frame_timeout_s is None else frame_timeout_s
     stops = _Stops(Mover(rig, speed, clear_mm=CLEAR_MM, patience_s=timeout_s), WorkFrame(experiment, rig.placed), timeout_s)
-    ask = _Asked(experiment, seed, design, collection.folder, chooser)
+    evenly_n = EVEN_AT_FIRST * sum(high > low for low, high in experiment.ranges().values())
+
+    def ask(index: int) -> Contact:
+        if chooser is None or design != "unsure" or index < evenly_n:
+            return draw_contact(experiment, seed, index, design)
+        numbers = chooser(collection.folder, experiment, seed, index)
+        return Contact(numbers[:6], numbers[6:])
+
     with output(collection.folder), stops.mover.watched():
         at_object = False
         try:

@@ -136,6 +136,16 @@ class MagicianController:
             self.alarms.add(NOT_UNDERSTOOD)
         return Message(message.id, message.ctrl)
 
+    def busy(self) -> bool:
+        """Whether commands are in progress or queued."""
+        with self.lock:
+            return bool(self._queue) or self.track.moving(self.advance())
+
+    @property
+    def takes_moves(self) -> bool:
+        """Whether the queue runs, as ``enable`` of a driver makes it."""
+        return self._running
+
     def advance(self) -> float:
         """Execute the queue up to the present time, which is returned. A command that fails ends with an alarm and is not tried again."""
         now_s = time.monotonic()
@@ -336,6 +346,8 @@ class MagicianController:
         return struct.unpack(STORED[id][0], self._params[id])
 
     def _set_tool(self, x_mm: float, time_s: float) -> None:
+        if x_mm == self.kinematics.r0_mm:  # so that the past poses stay known
+            return
         joints = self.track.joints_deg(time_s)
         self.kinematics = replace(MAGICIAN, r0_mm=x_mm)
         self.track = MotionTrack(self.kinematics, joints)

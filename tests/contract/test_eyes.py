@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from arms import bench
-from blind_runs import CAMERA_FAULTS, COMMANDS, FAULTS, HEALTHY, PHASES, draw, measure, table
+from blind_runs import CAMERA_FAULTS, COMMANDS, FAULTS, HEALTHY, KINDS, PHASES, draw, faults_of, measure, table
 from noisy_camera import NoisyCamera
 from pins_camera import AT_REST, SENSOR, StudioModel, Switched, shows
 from true_estimator import TrueEstimate, TrueEstimator
@@ -48,9 +48,16 @@ def test_a_fault_in_a_phase_stops_the_arm(seed, case):
     assert not found.wrong(), found
 
 
+@pytest.mark.parametrize("seed", range(0, 4 * len(faults_of("magician")), 5))  # each fault, in a phase of its own
+def test_a_fault_in_a_phase_stops_a_magician(seed):
+    found = measure(seed, kind="magician")
+    assert not found.wrong(), found
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_healthy_run_comes_to_its_end(command):
-    found = measure(7, (command, "contact", HEALTHY))
+def test_a_healthy_run_comes_to_its_end(command, kind):
+    found = measure(7, (command, "contact", HEALTHY), kind)
     assert found.safe and not found.told, found
 
 
@@ -61,9 +68,10 @@ def all_of(cases):
 
 
 @pytest.mark.slow
-def test_no_fault_in_any_phase_goes_on():
-    runs = all_of([(seed, draw(seed)) for seed in range(RUNS)])
-    print(f"\n{len(runs)} runs, seeds 0 to {RUNS - 1}\n{table(runs)}")
+@pytest.mark.parametrize(("kind", "count"), [("mg400", RUNS), ("magician", RUNS // 4)])
+def test_no_fault_in_any_phase_goes_on(kind, count):
+    runs = all_of([(seed, draw(seed, kind), kind) for seed in range(count)])
+    print(f"\n{len(runs)} runs with a {kind}, seeds 0 to {count - 1}\n{table(runs)}")
     assert not [run for run in runs if run.wrong()], "\n".join(f"{run}: {run.wrong()}" for run in runs if run.wrong())
 
 

@@ -350,7 +350,7 @@ def test_a_view_that_breaks_ends_the_session_with_its_error():
     camera = NoisyCamera(fps=50, size_px=pipeline.size_px)
     session = LiveSession(camera, lambda frame: TrueEstimate(("pose_2",), *np.zeros((3, 1))))
     shower = Shower(session, pipeline, Broken("live", pipeline.spec, pipeline.reference))
-    with session.source, pytest.raises(DeviceError, match="no such colour.*--headless"), shower:
+    with session.source, pytest.raises(DeviceError, match="no such colour.*`headless`"), shower:
         session.run(seconds=30.0, going=lambda: shower.open)
     assert session.timing().steps < 1000  # it did not go on for half a minute
 

@@ -203,6 +203,15 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
     return Contact(numbers[:6], numbers[6:])
 
 
+def choose_contact(experiment: ExperimentSpec, seed: int, index: int, design: str, folder: Path, chooser: Chooser | None) -> Contact:
+    """Contact ``index`` of the collection in a folder: as by ``draw_contact``, or by the chooser after the first ones of "unsure"."""
+    first_n = EVEN_AT_FIRST * sum(high > low for low, high in experiment.ranges().values())
+    if chooser is None or design != "unsure" or index < first_n:
+        return draw_contact(experiment, seed, index, design)
+    numbers = chooser(folder, experiment, seed, index)
+    return Contact(numbers[:6], numbers[6:])
+
+
 class WorkFrame:
     """The robot's coordinates of an experiment in front of an object (the work frame).
 
@@ -293,14 +302,6 @@ def collect(
         raise DeviceError(f"{rig.source.name}: a recording shows nothing of this arm; give a live `camera`")
     timeout_s = rig.frame_timeout_s if frame_timeout_s is None else frame_timeout_s
     stops = _Stops(Mover(rig, speed, clear_mm=CLEAR_MM, patience_s=timeout_s), WorkFrame(experiment, rig.placed), timeout_s)
-    evenly_n = EVEN_AT_FIRST * sum(high > low for low, high in experiment.ranges().values())
-
-    def ask(index: int) -> Contact:
-        if chooser is None or design != "unsure" or index < evenly_n:
-            return draw_contact(experiment, seed, index, design)
-        numbers = chooser(collection.folder, experiment, seed, index)
-        return Contact(numbers[:6], numbers[6:])
-
     with output(collection.folder), stops.mover.watched():
         at_object = False
         try:
@@ -314,7 +315,9 @@ def collect(
                     if on_rest is not None:
                         on_rest(rest)
                 for index in range(collection.count, count):
-                    _collect_one(stops, experiment, collection, index, ask(index))
+                    _collect_one(
+                        stops, experiment, collection, index, choose_contact(experiment, seed, index, design, collection.folder, chooser)
+                    )
                     if progress is not None:
                         progress(index + 1, count)
         finally:

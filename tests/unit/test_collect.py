@@ -9,7 +9,7 @@ import pytest
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.reader import LiveSource, Picture
-from hardware.collect.collect import COLUMNS, META, Collection, CollectPlan, WorkFrame, _Asked, collect, draw_contact
+from hardware.collect.collect import COLUMNS, META, Collection, CollectPlan, WorkFrame, choose_contact, collect, draw_contact
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, matrix_of
 from hardware.workcell.build import Rig
@@ -298,8 +298,13 @@ def test_the_next_contact_is_made_where_the_contacts_so_far_tell_least(name):
 
 def test_contacts_of_the_design_unsure_are_chosen_after_the_first_ones(tmp_path):
     experiment = load_experiment("surface-3d")
-    asked = _Asked(experiment, 5, "unsure", tmp_path, lambda folder, plan, seed, index: np.full(12, float(index)))
-    even = _Asked(experiment, 5, "even", tmp_path, None)
+
+    def asked(index):
+        return choose_contact(experiment, 5, index, "unsure", tmp_path, lambda folder, plan, seed, index: np.full(12, float(index)))
+
+    def even(index):
+        return choose_contact(experiment, 5, index, "even", tmp_path, None)
+
     assert all(np.array_equal(asked(k).pose, even(k).pose) for k in range(6))
     assert (asked(6).pose == 6).all() and (asked(7).move == 7).all()
     with pytest.raises(DeviceError, match="needs a chooser"):

@@ -19,7 +19,7 @@ WORKING = {
     "new": "new frames/frame.png --layout hexagon:6 --out mine.toml",
     "tune": f"tune --frames frames/frame.png --sensor {SENSOR} --out tuned.toml",
     "check": f"check frames/frame.png --sensor {SENSOR}",
-    "validate": f"validate --sensor {SENSOR} --frames taps --experiment gentle.toml --limit 2 --friction-frames 0 --across {ACROSS} --out judged",
+    "validate": f"validate --sensor {SENSOR} --frames taps --experiment gentle.toml --friction-frames 0 --across {ACROSS} --out fit",
     "robustness": f"robustness --sensor {SENSOR} --pipeline twin --frames taps --conditions torn.toml --no-rendered --jobs 1 --out borne",
 }
 NEEDING = {

@@ -19,10 +19,11 @@ difference from the nearest frame whose label is known, by the rate at which lab
 where the others make them most probable, and what is not known of them counts as such a difference, too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -601,12 +602,37 @@ def _rates(found: Domain, flat: np.ndarray, labels: np.ndarray, units: Sequence[
     return np.quantile(change / np.maximum(apart[i, j], 1e-9)[:, None], SURE_RATE, axis=0)
 
 
-def write_domain(path: Path, domain: Domain) -> None:
-    """Write a domain in the form that ``read_domain`` reads; components and known frames in half precision."""
+def domain_arrays(domain: Domain) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """A domain as arrays and numbers for a file; components and known frames in half precision."""
     arrays = {each.name: getattr(domain, each.name) for each in fields(Domain) if each.init}
     about = {name: arrays.pop(name) for name in ("lighter", "near", "blind", "simulated")}
     half = ("components", "known", "weight", "whiten")
-    FILE.write(path, {key: array.astype(np.float16 if key in half else np.float32) for key, array in arrays.items()}, about)
+    return {key: array.astype(np.float16 if key in half else np.float32) for key, array in arrays.items()}, about
+
+
+def domain_of(arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], pins: int, labels: int) -> Domain:
+    """The domain that ``domain_arrays`` turned into arrays, of a model for so many ``pins`` and ``labels``.
+
+    Raises
+    ------
+    ValueError
+        It belongs to other pins or labels.
+    """
+    found = Domain(
+        **{name: array.astype(float) for name, array in arrays.items()},
+        lighter=int(about["lighter"]),
+        near=float(about["near"]),
+        blind=float(about["blind"]),
+        simulated=bool(about.get("simulated", False)),
+    )
+    if found.mean.shape != (2 * pins,) or found.rate.shape != (labels,):
+        raise ValueError("of other pins or labels")
+    return found
+
+
+def write_domain(path: Path, domain: Domain) -> None:
+    """Write a domain in the form that ``read_domain`` reads."""
+    FILE.write(path, *domain_arrays(domain))
 
 
 def read_domain(path: Path, pins: int, labels: int) -> Domain:
@@ -618,13 +644,4 @@ def read_domain(path: Path, pins: int, labels: int) -> Domain:
         The file can't be read, is damaged, or belongs to another sensor or model.
     """
     with FILE.opened(path) as (about, arrays):
-        found = Domain(
-            **{name: array.astype(float) for name, array in arrays.items()},
-            lighter=int(about["lighter"]),
-            near=float(about["near"]),
-            blind=float(about["blind"]),
-            simulated=bool(about.get("simulated", False)),
-        )
-        if found.mean.shape != (2 * pins,) or found.rate.shape != (labels,):
-            raise ValueError("of other pins or labels")
-        return found
+        return domain_of(arrays, about, pins, labels)

@@ -577,6 +577,11 @@ class PoseEstimator:
         slip = None if self._tracker is None else self._tracker(self.modes_of(seen.pins)[0])
         return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip, seen.lost_share, verdict)
 
+    @property
+    def trained_reference(self) -> Reference:
+        """The pins at rest from which the training counted displacements."""
+        return self._trained.reference
+
     def knows(self, pins: PinTable) -> np.ndarray:
         """(M,) bool: whether the pins of each row of a table are a pattern that the model was trained on."""
         seen = pins.seen_from(self._trained.reference)

@@ -8,6 +8,7 @@
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -38,6 +39,7 @@ from twin.cli.options import (
     say,
 )
 from twin.progress import Progress
+from twin.signals import signals_as_ctrl_c
 from twin.types import FIRST, NONE
 
 if TYPE_CHECKING:
@@ -85,7 +87,6 @@ def live(
       twin live --replay out/session --model RUN --headless
     """
     from hardware.live.live import WatchPlan, watch
-    from hardware.rig.rig import signals_as_ctrl_c
     from training.estimate.estimator import load_remembering
 
     plan = WatchPlan(
@@ -154,7 +155,6 @@ def collect(
           --experiment surface-2d --count 5000 --out data/real
     """
     from hardware.collect.collect import CollectPlan, collect_frames
-    from hardware.rig.rig import signals_as_ctrl_c
     from scenes import load_experiment, load_object, load_sensor, load_servo
     from training.data.design import LeastSure
 
@@ -294,7 +294,6 @@ def run_along(
     **options
         The other fields of ``FollowPlan``.
     """
-    from hardware.rig.rig import signals_as_ctrl_c
     from hardware.servo.following import FollowPlan
     from scenes import load_object, load_servo
 
@@ -338,10 +337,11 @@ def run_policy(
     """
     from hardware.servo.following import follow
     from hardware.servo.policy_law import load_for_outlines
+    from training.environments.policy_domain import contacts_of
 
     return run_along(
         follow,
-        load_for_outlines,
+        partial(load_for_outlines, contacts_of=contacts_of),
         policy,
         out,
         kept_as="policy",

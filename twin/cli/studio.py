@@ -9,6 +9,7 @@ import typer
 from twin.cli import app
 from twin.cli.options import say
 from twin.errors import extras_named
+from twin.signals import signals_as_ctrl_c
 
 if TYPE_CHECKING:
     from training.estimate.estimator import PoseEstimator
@@ -58,7 +59,6 @@ def studio(
       twin studio --state '?sensor=mg400-331&object=edge&depth_mm=3'
     """
     from hardware.live.feed import CameraFeed, require_feed
-    from hardware.rig.rig import signals_as_ctrl_c
     from scenes import load_sensor
     from twin.studio.state import first_state
     from twin.studio.studio import StudioPlan, run_studio

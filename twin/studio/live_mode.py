@@ -38,8 +38,8 @@ class LiveArm(Protocol):
     def limits(self) -> str:
         """The arm's limits once it is armed, as text."""
 
-    def arm(self) -> None:
-        """Enable it. Raises ``TwinError`` if it refuses."""
+    def arm(self) -> list[str]:
+        """Check camera and arm, and enable it. Returns what was checked, as lines of text. Raises ``TwinError`` if a check fails."""
 
     def disarm(self) -> None:
         """Stop and disable it."""
@@ -212,7 +212,10 @@ class LiveMode(PageMode):
     def _toggle_armed(self) -> None:
         robot = self._robot()
         try:
-            robot.arm() if self._armed.value else robot.disarm()
+            if self._armed.value:
+                self._page.say("; ".join(robot.arm()))
+            else:
+                robot.disarm()
         finally:
             put(self._armed, robot.armed)
             self._nudges.visible = robot.armed

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
+from twin.errors import extras_named
+
 
 def named(places: Mapping[str, str], module: str, name: str) -> Any:
     """What a module offers under a name: the work of its ``__getattr__``.
@@ -18,8 +20,11 @@ def named(places: Mapping[str, str], module: str, name: str) -> Any:
     ------
     AttributeError
         The module does not offer this name.
+    ExtraError
+        A library that it needs is not installed.
     """
     if name not in places:
         raise AttributeError(f"'{module}' has no name '{name}'; help({module}) lists its names")
     place, _, other = places[name].partition(":")
-    return getattr(import_module(place), other or name)
+    with extras_named():
+        return getattr(import_module(place), other or name)

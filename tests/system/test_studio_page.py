@@ -200,6 +200,21 @@ def test_an_answer_of_the_sensor_that_is_being_replaced_does_no_harm(studio, cli
     client.wait(lambda u: "of 127" in u.html, WAIT_S, since=since)
 
 
+def test_an_object_that_is_chosen_while_a_sensor_opens_is_kept(studio, client):
+    drag(client, 1.5)
+    since = len(client.updates)
+    client.set("sensor", "mg400-331")
+    client.set("object", "cylinder")
+    client.wait(lambda u: "of 331" in u.html, WAIT_S, since=since)
+    end = time.monotonic() + WAIT_S
+    while studio.twin.contact.setup.touched.name != "cylinder" and time.monotonic() < end:
+        time.sleep(0.02)
+    assert studio.twin.contact.setup.touched.name == client.value("object") == "cylinder"
+    since = len(client.updates)
+    studio.twin.open(StudioState(sensor=SENSOR, object="sphere", pose={"depth_mm": 1.0}))
+    client.wait(lambda u: "of 127" in u.html, WAIT_S, since=since)
+
+
 def test_degrade_shows_the_same_contact_with_its_limits(client):
     drag(client, 2.0)
     since = len(client.updates)

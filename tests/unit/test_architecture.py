@@ -14,6 +14,7 @@ import pytest
 from hostile.forked_program import LIBRARIES as FORKED_LIBRARIES
 
 import twin
+from twin import errors
 from twin.store.fingerprint import LIBRARIES as FINGERPRINTED
 
 ROOT = Path(__file__).parents[2]
@@ -55,6 +56,7 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "extend",
     "__main__",
 )
+EXTRAS = ("cluster", "models", "records", "rl", "studio")  # what the extra `all` brings
 BY_HAND = {"pyoidn"}  # installed by hand for the one measurement that needs it, as its head says
 NAMED_OTHERWISE = {"rerun": "rerun-sdk"}  # imported under another name than it is installed by, and not installed everywhere
 # The outermost layer may join everything, and nothing joins it: the command line (test_command_line), and the names that Python offers.
@@ -342,7 +344,7 @@ def declared(*extras: str) -> frozenset[str]:
 
 @pytest.mark.parametrize(
     ("folders", "extras"),
-    [(tuple(MAY_IMPORT), ("rerun", "rl", "records")), (("tests",), ("rerun", "dev", "browser"))],
+    [(tuple(MAY_IMPORT), ("rerun", *EXTRAS)), (("tests",), ("rerun", "dev", "browser", *EXTRAS))],
     ids=["product", "tests"],
 )
 def test_what_is_imported_is_asked_for(folders, extras):
@@ -361,6 +363,12 @@ def test_what_is_imported_is_asked_for(folders, extras):
 
 
 def test_what_is_named_as_a_library_is_asked_for():
-    assert set(FINGERPRINTED.values()) <= declared()
-    known = {name for name, distributions in metadata.packages_distributions().items() if {d.lower() for d in distributions} & declared()}
+    assert set(FINGERPRINTED.values()) <= declared("models")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for library, extra in errors.EXTRAS.items():
+        assert any(library.replace("_", "-") in line.replace("_", "-") for line in project["optional-dependencies"][extra]), library
+    assert project["optional-dependencies"]["all"] == [f"tactip-twin[{','.join(EXTRAS)}]"]
+    known = {
+        name for name, distributions in metadata.packages_distributions().items() if {d.lower() for d in distributions} & declared("models")
+    }
     assert {name.split(".")[0] for name in FORKED_LIBRARIES} <= known

@@ -8,6 +8,7 @@ import typer
 
 from twin.cli import app
 from twin.cli.options import say
+from twin.errors import extras_named
 from twin.signals import signals_as_ctrl_c
 
 if TYPE_CHECKING:
@@ -80,9 +81,10 @@ def models_when_asked(run: Path | None, sensor: str) -> Callable[[str], "PoseEst
     """``models_by_sensor``. If no run is given, it loads when the first model is requested, so that the page does not wait for PyTorch."""
 
     def model_of(name: str) -> "PoseEstimator | None":
-        from training.estimate.estimator import models_by_sensor
+        with extras_named():  # called in a thread of the page, which shows the error
+            from training.estimate.estimator import models_by_sensor
 
-        return models_by_sensor()(name)
+            return models_by_sensor()(name)
 
     if run is None:
         return model_of

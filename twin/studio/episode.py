@@ -78,9 +78,7 @@ class EpisodeMode(PageMode):
         self._touched: ObjectSpec | None = None
         self._last: EpisodeStep | None = None
         self._steps = self.newest(self._show, "episode")
-        with page.charts_tab:
-            self._rewards = Chart(page.gui, "reward of a step", ("reward",))
-            self._forces = Chart(page.gui, "force on the object, N", ("x", "y", "z"))
+        self._rewards, self._forces = Chart(page, "reward of a step"), Chart(page, "force on the object, N")
 
     def give(self, step: EpisodeStep) -> None:
         """Give the next step to show. Returns at once."""
@@ -112,8 +110,8 @@ class EpisodeMode(PageMode):
             self._scene.show_pins(step.pins, self._skin.vertices(step.pins.base_mm).astype(np.float32), colours(way_mm, Shown.DISPLACEMENT))
             self._scene.show_object(step.T_sensor_object)
             self._scene.show_force(step.foot_mm, step.force_n)
-            self._rewards.add([step.reward])
-            self._forces.add(step.force_n.tolist())
+            self._rewards.add({"reward": step.reward})
+            self._forces.add(dict(zip("xyz", step.force_n.tolist(), strict=True)))
 
         numbers = [f"<span data-number='{step.number}' data-depth='0'></span>", badge("episode", "moving"), number_table(rows | step.told)]
         pictures = shot_pictures(self._sensor, self._reference, step.frame, seen)

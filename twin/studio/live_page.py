@@ -12,7 +12,7 @@ from twin.estimate import Estimate
 from twin.pins.reference import Reference
 from twin.studio.camera import dome_part
 from twin.studio.page import Chart, Page
-from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, paragraph
+from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, label_name, paragraph
 from twin.types import Frame, ImageArray, Observation
 
 CHARTED = 3
@@ -41,16 +41,10 @@ def shot_numbers(shot: LiveShot, seen: Observation) -> list[str]:
     return [estimate_table(shot.estimate, {}), *(paragraph(line, "note") for line in (found, *shot.lines))]
 
 
-def charted(estimate: Estimate) -> list[float]:
-    """The values for the chart; NaN where there is none."""
-    values = [float(value) for value in estimate.value[:CHARTED]] if estimate.valid else []
-    return values + [float("nan")] * (CHARTED - len(values))
-
-
-def live_chart(page: Page) -> Chart:
-    """A chart of the first labels over the last seconds."""
-    with page.charts_tab:
-        return Chart(page.gui, "live estimates", [str(k + 1) for k in range(CHARTED)])
+def charted(estimate: Estimate) -> dict[str, float]:
+    """The values for the chart, by label; none without an estimate."""
+    named = zip(estimate.names[:CHARTED], estimate.value, strict=False)
+    return {label_name(name)[0]: float(value) for name, value in named} if estimate.valid else {}
 
 
 class LivePage:
@@ -79,7 +73,7 @@ class LivePage:
 
     def __enter__(self) -> "LivePage":
         self._page = self._stack.enter_context(Page(self._title, host=self._host, port=self._port))
-        self._chart = live_chart(self._page)
+        self._chart = Chart(self._page, "live estimates")
         self._page.show_nothing("Waiting for the first frame.")
         self.url = self._page.url
         return self

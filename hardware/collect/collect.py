@@ -62,14 +62,8 @@ CHECKED_CONTACTS, CONTACT_S = 100, 4.0
 MOST_CONTACTS = 1_000_000
 # Files of a collection, as in the published recordings: labels, description, times, and the frame without contact.
 TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
-# Distributions of contacts over an experiment's ranges: each at random; evenly, even for the first contacts alone; or evenly at first, and
-# then at the contacts that reduce a model's uncertainty most.
-DESIGNS = ("random", "even", "unsure")
-# Number of contacts of the design "unsure" that fill the ranges evenly, per label that varies.
-EVEN_AT_FIRST = 2
-# Function that chooses such a contact: from the collection's folder, the experiment, a seed and the contact's number to pose and move
-# (12,).
-Chooser = Callable[[Path, ExperimentSpec, int, int], np.ndarray]
+# Distributions of contacts over an experiment's ranges: each at random; or evenly, even for the first contacts alone.
+DESIGNS = ("random", "even")
 COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
 
 
@@ -202,7 +196,7 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
 
     With the design "even", the first contacts fill the ranges evenly, whatever their number is: they are a scrambled Sobol sequence (Sobol
     1967; scrambled by Owen 1998). In recordings of a plate, a model from 10 such contacts has the same error in depth as one from nearly 20
-    random contacts. The design "unsure" begins with the same contacts.
+    random contacts.
     """
     low, high = np.array(list(experiment.ranges().values())).T
     if design == "random":
@@ -214,24 +208,6 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
     numbers = low.copy()
     numbers[varied] += shares * (high - low)[varied]
     return Contact(numbers[:6], numbers[6:])
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """Chooses the next contact of a collection."""
-
-    experiment: ExperimentSpec
-    seed: int
-    design: str
-    folder: Path
-    chooser: Chooser | None
-
-    def __call__(self, index: int) -> Contact:
-        varied = sum(high > low for low, high in self.experiment.ranges().values())
-        if self.chooser is None or self.design != "unsure" or index < EVEN_AT_FIRST * varied:
-            return draw_contact(self.experiment, self.seed, index, self.design)
-        numbers = self.chooser(self.folder, self.experiment, self.seed, index)
-        return Contact(numbers[:6], numbers[6:])
 
 
 class WorkFrame:
@@ -277,7 +253,6 @@ def collect(
     *,
     seed: int,
     design: str = "random",
-    chooser: Chooser | None = None,
     speed: tuple[float, float],
     guards: tuple[Guard, ...] = (),
     frame_timeout_s: float = FRAME_TIMEOUT_S,
@@ -294,10 +269,8 @@ def collect(
         Number of contacts in the collection at the end.
     seed : int
         Seed of the drawn contacts.
-    design : {"random", "even", "unsure"}
+    design : {"random", "even"}
         See ``draw_contact``.
-    chooser : callable, optional
-        Chooses the contacts of the design "unsure" after the first ones.
     speed : (float, float)
         Speed of the arm in mm/s and deg/s.
     guards : tuple of Guard
@@ -327,7 +300,7 @@ def collect(
         raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
     rig = _Stops(source, arm, placed, WorkFrame(experiment, placed), speed, guards, frame_timeout_s, ArmWatch(arm))
     with output(collection.folder), rig.watch.watched(), rig.eyes.watched():
-        ask = _Asked(experiment, seed, design, collection.folder, chooser)
+        ask = partial(draw_contact, experiment, seed, design=design)
         failed = _collect_all(rig, experiment, collection, ask=ask, count=count, progress=progress, on_rest=on_rest, speed=speed)
     if failed:
         raise DeviceError("; ".join(failed))
@@ -483,10 +456,8 @@ class CollectPlan:
         Number of contacts in the folder at the end.
     seed : int or None
         Seed of the drawn contacts. None: the experiment's own seed.
-    design : {"random", "even", "unsure"}
+    design : {"random", "even"}
         Distribution of the contacts over the experiment's ranges.
-    chooser : callable or None
-        Chooses the contacts of the design "unsure" after the first ones: ``training.data.design.LeastSure(sensor)``.
     form : Form or None
         Form of the frames. None: the form of the sensor's recordings if it has one.
     limits : str or None
@@ -508,7 +479,6 @@ class CollectPlan:
     count: int
     seed: int | None = None
     design: str = "random"
-    chooser: Chooser | None = None
     form: Form | None = None
     limits: str | None = None
     plain_light: bool = False
@@ -520,8 +490,6 @@ class CollectPlan:
             raise DeviceError(f"--count {self.count}: a collection has 1 to {MOST_CONTACTS} contacts")
         if self.design not in DESIGNS:
             raise DeviceError(f"--design {self.design}: must be {' or '.join(DESIGNS)}")
-        if self.design == "unsure" and self.chooser is None:
-            raise DeviceError('the design "unsure" needs a chooser, as training.data.design.LeastSure(sensor) is one')
 
     @property
     def drawn_with(self) -> int:
@@ -605,7 +573,6 @@ def _collect_on_rig(
             plan.count,
             seed=plan.drawn_with,
             design=plan.design,
-            chooser=plan.chooser,
             speed=(plan.servo.linear_mm_s, plan.servo.angular_deg_s),
             frame_timeout_s=rig.frame_timeout_s,
             on_rest=require_rest,
@@ -616,9 +583,8 @@ def _collect_on_rig(
 def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
     """Check the plan and report it. Of the contacts the next ``CHECKED_CONTACTS`` are checked."""
     work, near = WorkFrame(plan.experiment, rig.placed), rig.arm.state().pose
-    design = "random" if plan.design == "random" else "even"
     pressed = np.array(plan.experiment.clear) + np.array(plan.experiment.tap)
-    asked = [draw_contact(plan.experiment, plan.drawn_with, n, design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))]
+    asked = [draw_contact(plan.experiment, plan.drawn_with, n, plan.design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))]
     planned = [work.base_pose(one.pose + pressed, near) for one in asked]
     clear = work.base_pose(np.zeros(6), near, away_mm=CLEAR_MM)
     spent_s = (plan.count - made) * CONTACT_S

@@ -22,12 +22,12 @@ from training.environments import register_all as register_all
 from training.environments.learn import Learnt as Learnt
 from training.estimate.estimator import load_remembering as load_remembering
 from training.generation.run import Simulated as Simulated
-from training.runs.train import Trained as Trained
 from training.studies.degradation import Result as Result
 from training.studies.evaluation import Evaluation as Evaluation
 from training.studies.label_audit import LabelAudit as LabelAudit
 from training.studies.prediction import Predictions as Predictions
 from training.studies.realism import Realism as Realism
+from training.studies.train import Trained as Trained
 from training.studies.validation import Validation as Validation
 from twin.fit.contact.calibrate import ContactCalibration as ContactCalibration
 from twin.fit.go_on import WholeSensor as WholeSensor

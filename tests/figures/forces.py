@@ -11,7 +11,7 @@ from figures.jobs import NO_PICTURES, Measured, Value, job, real_folder, run_twi
 from scenes import load_sensor
 from twin.fit.sensor_file import write_sensor
 
-CODE = ("training.generation", "training.runs.train", "training.studies.evaluation")
+CODE = ("training.generation", "training.studies.train", "training.studies.evaluation")
 TAUGHT = {"plane": 300, "ball-40": 300, "cylinder": 300, "edge": 300}  # contacts of the objects that are learnt from
 UNSEEN = {"can": 15, "ball-80": 15, "square": 15}
 DRAGS, UNSEEN_DRAGS = 60, 8  # of each object

@@ -9,6 +9,7 @@ from drawn_frames import drawn_frame
 
 from scenes.pins import PinsSpec
 from training.data.dataset import load_dataset
+from training.errors import TrainingError
 from training.estimate.displacements import (
     FEWEST_CONTACTS,
     FEWEST_FRAMES,
@@ -20,7 +21,6 @@ from training.estimate.displacements import (
 )
 from training.estimate.estimator import PoseEstimator
 from training.estimate.rest_seeking import RestSeeker
-from training.runs.recipes import TrainingError
 from training.studies.evaluation import at_own_rest
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from scenes import load_sensor
+from training.errors import TrainingError
 from training.estimate.domain import FEWEST, Verdict, learn_domain, read_domain, write_domain
 from training.estimate.estimator import PoseEstimator
-from training.runs.recipes import TrainingError
 from twin.pins import nominal_reference
 from twin.types import Form
 

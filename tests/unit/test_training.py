@@ -13,16 +13,16 @@ from drawn_recording import FRAMES, config_of
 
 from scenes import load_sensor
 from training.data.dataset import Dataset, joined
-from training.data.identity import changed_since, learnt_before
 from training.data.pins import PinTable
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator, digest_of, folder_of, models_by_sensor
 from training.models import recipe_of
 from training.models.part import Prediction
-from training.runs.evaluate import judge, leak_check, rows_to_judge, write_evaluation
-from training.runs.recipes import TrainingError
+from training.runs.identity import changed_since, learnt_before
 from training.runs.run import fold_rows, is_finished, train_run, training_rows
 from training.runs.run_files import read_tensors
 from training.studies.evaluation import Evaluation
+from training.studies.judging import judge, leak_check, rows_to_judge, write_evaluation
 from training.studies.prediction import Predictions
 from twin.errors import FrameError, warn_once
 from twin.pins import Pipeline, nominal_reference

@@ -18,11 +18,11 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from training.data.dataset import Dataset
 from training.data.pins import PinTable
+from training.errors import TrainingError
 from training.estimate.contacts import CONTACTS, Contacts, fit_contacts, read_contacts, write_contacts
 from training.estimate.estimator import PoseEstimate, PoseEstimator, folder_of
 from training.models.part import Prediction, Unseen
 from training.runs.packed import pack
-from training.runs.recipes import TrainingError
 from training.runs.run_files import damaged
 from twin.camera.capture import in_form
 from twin.frames import Recording
@@ -203,7 +203,7 @@ class KindOfContact:
     frames : sequence of Dataset
         Frames of this kind, from which the classifier learns. Give the frames from which the run learnt.
     intervals : dict of str to array
-        The run's interval quantiles for this kind, from frames that it did not learn from (``training.runs.evaluate.intervals_on``). If
+        The run's interval quantiles for this kind, from frames that it did not learn from (``training.studies.judging.intervals_on``). If
         empty, the run's own intervals are used.
     """
 

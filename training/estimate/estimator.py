@@ -16,18 +16,30 @@ from scenes.sensor import SensorSpec
 from training.data.dataset import Dataset
 from training.data.pins import PinTable
 from training.data.targets import limits_of
-from training.estimate.displacements import DISPLACEMENTS, MOST_CONTACTS, Displacements, other_rest, read_displacements
-from training.estimate.domain import DOMAIN, FEWEST, Domain, Verdict, read_domain
+from training.errors import TrainingError
+from training.estimate.displacements import MOST_CONTACTS, Displacements, other_rest, read_displacements
+from training.estimate.domain import FEWEST, Domain, Verdict, read_domain
 from training.estimate.rest_seeking import RestSeeker
 from training.models import model_named
 from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen
 from training.runs.assemble import Ensemble
 from training.runs.packed import SHIPPED, WEIGHTS, shipped_names, unpack
-from training.runs.recipes import TrainingError
-from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, require_together
-from training.touch.contact_maps import MAPS, MapModel, read_maps
+from training.runs.run_files import (
+    CHECKPOINT,
+    CONFIG,
+    DISPLACEMENTS,
+    DOMAIN,
+    MAPS,
+    SLIP,
+    TENSORS,
+    damaged,
+    read_config,
+    read_tensors,
+    require_together,
+)
+from training.touch.contact_maps import MapModel, read_maps
 from training.touch.slip import NAMES as SLIP_NAMES
-from training.touch.slip import SLIP, SLIP_UNITS, Slip, SlipModel, SlipTracker, read_slip
+from training.touch.slip import SLIP_UNITS, Slip, SlipModel, SlipTracker, read_slip
 from training.touch.touched import TouchAnswer
 from twin.errors import FrameError
 from twin.estimate import SensorModel
@@ -113,7 +125,7 @@ class PoseEstimator:
     Attributes
     ----------
     learnt_from : (m, 2) int64 or None
-        Marks of the frames from which the model learnt (``training.data.identity.frame_marks``); None if the run does not hold them.
+        Marks of the frames from which the model learnt (``training.runs.identity.frame_marks``); None if the run does not hold them.
     maps : MapModel or None
         Model of contact maps; None unless the run learnt it.
     slip : SlipModel or None
@@ -354,7 +366,7 @@ class PoseEstimator:
         return RestSeeker(self) if self.counts_from_rest else self
 
     def with_intervals(self, intervals: Mapping[str, np.ndarray]) -> "PoseEstimator":
-        """The same model with other interval quantiles, as ``training.runs.evaluate.intervals_on`` finds them for one kind of its
+        """The same model with other interval quantiles, as ``training.studies.judging.intervals_on`` finds them for one kind of its
         frames."""
         found = copy(self)
         found.ensemble = copy(self.ensemble)

@@ -16,14 +16,10 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from scenes.sensor import SensorSpec
-from training.data.identity import ASIDE
-from training.estimate.displacements import DISPLACEMENTS
-from training.estimate.domain import DOMAIN
+from training.errors import TrainingError
 from training.models import model_named
-from training.runs.recipes import TrainingError
-from training.runs.run_files import CONFIG, TENSORS, read_config, read_tensors
-from training.touch.contact_maps import MAPS
-from training.touch.slip import SLIP
+from training.runs.identity import ASIDE
+from training.runs.run_files import BESIDE_FILES, CONFIG, TENSORS, read_config, read_tensors
 from twin.pins import make_reference
 from twin.store import write_bytes, write_text, writes
 
@@ -47,7 +43,7 @@ def shipped_names() -> list[str]:
     return sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS}"))
 
 
-@writes(WEIGHTS, "config.json", MAPS, SLIP, DISPLACEMENTS, DOMAIN)
+@writes(WEIGHTS, CONFIG, *BESIDE_FILES)
 def pack(run: Path, out: Path) -> int:
     """Write the small copy of a finished run, and return its size in bytes.
 
@@ -83,7 +79,7 @@ def pack(run: Path, out: Path) -> int:
     about = {key: value for key, value in config.items() if key not in ASIDE} | {SHA256: hashlib.sha256(weights).hexdigest()}
     about |= {RECORDINGS: [Path(folder).name for folder in config.get("data", "").split(", ") if folder]}
     write_text(out / CONFIG, json.dumps(about) + "\n")
-    for name in (MAPS, SLIP, DISPLACEMENTS, DOMAIN):
+    for name in BESIDE_FILES:
         if (run / name).is_file():
             write_bytes(out / name, (run / name).read_bytes())
     return (out / WEIGHTS).stat().st_size

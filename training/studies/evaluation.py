@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from training.data.dataset import Dataset, joined, load_dataset, told_apart
-from training.data.identity import changed_since, learnt_before
 from training.data.simulated import is_simulated
+from training.errors import TrainingError
 from training.estimate.contact_estimator import ContactEstimator, contacts_folder
 from training.estimate.displacements import OTHER_UNIT
 from training.estimate.estimator import PoseEstimator, folder_of
-from training.runs.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
-from training.runs.recipes import TrainingError
+from training.runs.identity import changed_since, learnt_before
+from training.studies.judging import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
 from training.touch.contact_maps import judge_maps
 from training.touch.slip import Eyes, drags_of, gone_through, judge_slip, random_places
 from twin.frames import open_recording

@@ -49,9 +49,9 @@ from twin.types import FINE
 if TYPE_CHECKING:
     from training.environments.learn import Learnt
     from training.generation.run import Simulated
-    from training.runs.train import Trained
     from training.studies.evaluation import Evaluation
     from training.studies.prediction import Predictions
+    from training.studies.train import Trained
     from training.surrogate.fit import Distilled
 
 
@@ -215,7 +215,7 @@ def train(
       twin train --model vgnn --sensor mg400-331 --data recordings/mine \\
           --target surface-2d --out runs/mine
     """
-    from training.runs.train import train_model
+    from training.studies.train import train_model
 
     return train_model(
         model,

@@ -286,8 +286,8 @@ def study_tac_vgnn(
     curves.png, efficiency.png, contacts.png, index.html, runs/.
     """
     from scenes import load_sensor
-    from training.runs.train import columns_of
     from training.studies import tac_vgnn
+    from training.studies.train import columns_of
 
     plan = tac_vgnn.Plan(
         data=data,

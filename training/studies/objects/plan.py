@@ -6,8 +6,8 @@ import numpy as np
 
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_experiment
 from training.data.dataset import Dataset, joined
+from training.errors import TrainingError
 from training.generation import GenerationConfig, require_count
-from training.runs.recipes import TrainingError
 from training.studies.sim_to_real.twins import contact_of
 from twin.types import FINE
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_experiment, load_object
 from training.data.simulated import is_simulated
+from training.errors import TrainingError
 from training.generation import require_count
-from training.runs.recipes import TrainingError
 from twin.errors import DatasetError
 from twin.types import FINE
 

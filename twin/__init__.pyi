@@ -173,6 +173,7 @@ def make_dataset(
     sensor: str | Path | SensorSpec,
     count: int,
     out: Path | str,
+    wide: bool = ...,
     obj: str | Path | ObjectSpec | None = ...,
     images: Literal['raw', 'gray', 'recording', 'none'] = ...,
     states: Literal['all', 'end'] = ...,

@@ -117,7 +117,7 @@ def study_objects(
 
     Labels mean the same on every object. The depth is the indentation along the surface's normal at the place nearest to the dome's
     centre, and the angle is measured from this normal, as if a flat plate were touched there. --experiment gives the ranges in which the
-    models are judged; they are trained on the experiment that it names as wider.
+    models are judged; they are trained on its wider ranges.
 
     The same command continues an interrupted study. The run that learnt several objects can be given wherever a RUN is asked for:
 

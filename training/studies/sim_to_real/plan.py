@@ -34,7 +34,7 @@ class Plan:
     experiment : ExperimentSpec
         The experiment that the recording was made with. It also names the labels that are learnt.
     contacts : ExperimentSpec or None
-        The experiment that is simulated; None: the one that ``experiment`` names as wider, else ``experiment``.
+        The experiment that is simulated; None: ``experiment`` with its wider ranges.
     labels : int
         Number of labelled frames that are used with the simulated contacts.
     seed : int
@@ -97,4 +97,4 @@ class Plan:
         """The experiment that is simulated."""
         if self.contacts is not None:
             return self.contacts
-        return load_experiment(self.experiment.wider) if self.experiment.wider else self.experiment
+        return load_experiment(self.experiment, wide=bool(self.experiment.wide or self.experiment.wider))

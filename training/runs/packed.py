@@ -8,6 +8,7 @@ leaves out: see ``Model.pack``.
 import hashlib
 import json
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,21 @@ NOT_PACKED = (KERNELS, KERNEL_LABELS, "parameters", "learnt_from")  # entries of
 def shipped_names() -> list[str]:
     """Names of the sensors whose weights are shipped with the package."""
     return sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS}"))
+
+
+def folder_of(run: str | Path) -> Path:
+    """The folder of a run: the given one, or that of the shipped weights if there is no such folder and ``run`` is a sensor's name."""
+    return SHIPPED / run if not Path(run).exists() and str(run) in shipped_names() else Path(run)
+
+
+def instead_of(run: Path) -> str:
+    """Suggestion for a folder that holds no model: the shipped or neighbouring model with the most similar name, if there is one."""
+    shipped = shipped_names()
+    beside = [folder.name for folder in run.parent.iterdir() if (folder / "config.json").is_file()] if run.parent.is_dir() else []
+    near = get_close_matches(run.name, [*(shipped if run.name == str(run) else []), *beside], n=1)
+    if near:
+        return f"did you mean '{near[0] if near[0] in shipped and near[0] not in beside else run.with_name(near[0])}'?"
+    return f"'twin train' writes one; weights for {', '.join(shipped)} go with the package: give the name instead"
 
 
 @writes(WEIGHTS, CONFIG, *BESIDE_FILES)

@@ -8,7 +8,8 @@ from typing import Any
 
 from scenes import SensorSpec
 from scenes.sensor import RecordingSpec
-from training.estimate.estimator import PoseEstimator, digest_of
+from training.estimate.estimator import PoseEstimator
+from training.estimate.loading import digest_of
 from twin.camera.capture import in_form
 from twin.judge.degradation.envelope import Envelope
 from twin.judge.degradation.plan import SweepPlan

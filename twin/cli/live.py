@@ -86,7 +86,7 @@ def live(
     """
     from hardware.live.live import WatchPlan, watch
     from hardware.rig.rig import signals_as_ctrl_c
-    from training.estimate.estimator import load_remembering
+    from training.estimate.loading import load_remembering
 
     plan = WatchPlan(
         camera=camera,
@@ -239,7 +239,7 @@ def servo(
     The exit code is 1 if it ended early.
     """
     from hardware.servo.following import follow
-    from training.estimate.estimator import load_remembering
+    from training.estimate.loading import load_remembering
 
     return run_along(
         follow,

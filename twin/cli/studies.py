@@ -70,7 +70,7 @@ def study_servo_command(
     """
     from hardware.servo.study import ServoStudyPlan, study_servo
     from scenes import load_object, load_servo
-    from training.estimate.estimator import load_by_name
+    from training.estimate.loading import load_by_name
 
     plan = ServoStudyPlan(
         models=load_by_name(models),

@@ -80,12 +80,12 @@ def models_when_asked(run: Path | None, sensor: str) -> Callable[[str], "PoseEst
     """``models_by_sensor``. If no run is given, it loads when the first model is requested, so that the page does not wait for PyTorch."""
 
     def model_of(name: str) -> "PoseEstimator | None":
-        from training.estimate.estimator import models_by_sensor
+        from training.estimate.loading import models_by_sensor
 
         return models_by_sensor()(name)
 
     if run is None:
         return model_of
-    from training.estimate.estimator import models_by_sensor
+    from training.estimate.loading import models_by_sensor
 
     return models_by_sensor(run, sensor)

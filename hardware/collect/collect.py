@@ -49,14 +49,8 @@ CHECKED_CONTACTS, CONTACT_S = 100, 4.0
 MOST_CONTACTS = 1_000_000
 # Files of a collection, as in the published recordings: labels, description, times, and the frame without contact.
 TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
-# Distributions of contacts over an experiment's ranges: each at random; evenly, even for the first contacts alone; or evenly at first, and
-# then at the contacts that reduce a model's uncertainty most.
-DESIGNS = ("random", "even", "unsure")
-# Number of contacts of the design "unsure" that fill the ranges evenly, per label that varies.
-EVEN_AT_FIRST = 2
-# Function that chooses such a contact: from the collection's folder, the experiment, a seed and the contact's number to pose and move
-# (12,).
-Chooser = Callable[[Path, ExperimentSpec, int, int], np.ndarray]
+# Distributions of contacts over an experiment's ranges: each at random; or evenly, even for the first contacts alone.
+DESIGNS = ("random", "even")
 COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
 
 
@@ -189,7 +183,7 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
 
     With the design "even", the first contacts fill the ranges evenly, whatever their number is: they are a scrambled Sobol sequence (Sobol
     1967; scrambled by Owen 1998). In recordings of a plate, a model from 10 such contacts has the same error in depth as one from nearly 20
-    random contacts. The design "unsure" begins with the same contacts.
+    random contacts.
     """
     low, high = np.array(list(experiment.ranges().values())).T
     if design == "random":
@@ -200,15 +194,6 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
     shares = sequence.fast_forward(index).random(1)[0] if index else sequence.random(1)[0]
     numbers = low.copy()
     numbers[varied] += shares * (high - low)[varied]
-    return Contact(numbers[:6], numbers[6:])
-
-
-def choose_contact(experiment: ExperimentSpec, seed: int, index: int, design: str, folder: Path, chooser: Chooser | None) -> Contact:
-    """Contact ``index`` of the collection in a folder: as by ``draw_contact``, or by the chooser after the first ones of "unsure"."""
-    first_n = EVEN_AT_FIRST * sum(high > low for low, high in experiment.ranges().values())
-    if chooser is None or design != "unsure" or index < first_n:
-        return draw_contact(experiment, seed, index, design)
-    numbers = chooser(folder, experiment, seed, index)
     return Contact(numbers[:6], numbers[6:])
 
 
@@ -253,7 +238,6 @@ def collect(
     *,
     seed: int,
     design: str = "random",
-    chooser: Chooser | None = None,
     speed: tuple[float, float],
     frame_timeout_s: float | None = None,
     on_rest: Callable[[Frame], None] | None = None,
@@ -271,10 +255,8 @@ def collect(
         Number of contacts in the collection at the end.
     seed : int
         Seed of the drawn contacts.
-    design : {"random", "even", "unsure"}
+    design : {"random", "even"}
         See ``draw_contact``.
-    chooser : callable, optional
-        Chooses the contacts of the design "unsure" after the first ones.
     speed : (float, float)
         Speed of the arm in mm/s and deg/s.
     frame_timeout_s : float, optional
@@ -315,9 +297,7 @@ def collect(
                     if on_rest is not None:
                         on_rest(rest)
                 for index in range(collection.count, count):
-                    _collect_one(
-                        stops, experiment, collection, index, choose_contact(experiment, seed, index, design, collection.folder, chooser)
-                    )
+                    _collect_one(stops, experiment, collection, index, draw_contact(experiment, seed, index, design))
                     if progress is not None:
                         progress(index + 1, count)
         finally:
@@ -400,10 +380,8 @@ class CollectPlan:
         Number of contacts in the folder at the end.
     seed : int or None
         Seed of the drawn contacts. None: the experiment's own seed.
-    design : {"random", "even", "unsure"}
+    design : {"random", "even"}
         Distribution of the contacts over the experiment's ranges.
-    chooser : callable or None
-        Chooses the contacts of the design "unsure" after the first ones: ``training.data.design.LeastSure(sensor)``.
     form : Form or None
         Form of the frames. None: the form of the sensor's recordings if it has one.
     limits : str or None
@@ -425,7 +403,6 @@ class CollectPlan:
     count: int
     seed: int | None = None
     design: str = "random"
-    chooser: Chooser | None = None
     form: Form | None = None
     limits: str | None = None
     plain_light: bool = False
@@ -437,8 +414,6 @@ class CollectPlan:
             raise DeviceError(f"`count` {self.count}: a collection has 1 to {MOST_CONTACTS} contacts")
         if self.design not in DESIGNS:
             raise DeviceError(f"`design` {self.design}: must be {' or '.join(DESIGNS)}")
-        if self.design == "unsure" and self.chooser is None:
-            raise DeviceError('the design "unsure" needs a chooser, as training.data.design.LeastSure(sensor) is one')
 
     @property
     def drawn_with(self) -> int:
@@ -520,7 +495,6 @@ def _collect_on_rig(
             plan.count,
             seed=plan.drawn_with,
             design=plan.design,
-            chooser=plan.chooser,
             speed=(plan.servo.linear_mm_s, plan.servo.angular_deg_s),
             on_rest=require_rest,
             progress=made,
@@ -530,9 +504,8 @@ def _collect_on_rig(
 def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
     """Check the plan and report it. Of the contacts the next ``CHECKED_CONTACTS`` are checked."""
     work, near = WorkFrame(plan.experiment, rig.placed), rig.arm.state().pose
-    design = "random" if plan.design == "random" else "even"
     pressed = np.array(plan.experiment.clear) + np.array(plan.experiment.tap)
-    asked = [draw_contact(plan.experiment, plan.drawn_with, n, design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))]
+    asked = [draw_contact(plan.experiment, plan.drawn_with, n, plan.design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))]
     planned = [work.base_pose(one.pose + pressed, near) for one in asked]
     clear = work.base_pose(np.zeros(6), near, away_mm=CLEAR_MM)
     spent_s = (plan.count - made) * CONTACT_S

@@ -20,7 +20,7 @@ from websockets.http11 import Request
 from hardware.errors import DeviceError
 from hardware.live.feed import CameraFeed, WatchedArm
 from scenes import load_sensor
-from training.estimate.estimator import models_by_sensor
+from training.estimate.loading import models_by_sensor
 from twin.errors import TwinError
 from twin.frames.images import write_image
 from twin.pins import nominal_reference

@@ -9,12 +9,12 @@ import pytest
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.reader import LiveSource, Picture
-from hardware.collect.collect import COLUMNS, META, Collection, CollectPlan, WorkFrame, choose_contact, collect, draw_contact
+from hardware.collect.collect import COLUMNS, META, Collection, WorkFrame, collect, draw_contact
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, matrix_of
 from hardware.workcell.build import Rig
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
-from training.data.design import least_sure, nearest_to_even
+from training.data.design import nearest_to_even
 from twin.frames import open_recording, read_image
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
@@ -278,37 +278,6 @@ def test_an_even_contact_depends_on_its_number_and_the_seed_alone():
     experiment = load_experiment("surface-3d")
     one, again, other = (draw_contact(experiment, seed, 7, "even").pose for seed in (1, 1, 2))
     assert np.array_equal(one, again) and not np.array_equal(one, other)
-
-
-@pytest.mark.parametrize("name", ["surface-3d", "edge-circle"])
-def test_the_next_contact_is_made_where_the_contacts_so_far_tell_least(name):
-    """All contacts but the asked one lie in one half of the first label's range: the next one lies in the other half."""
-    experiment = load_experiment(name)
-    drawn = np.stack([np.concatenate([c.pose, c.move]) for c in (draw_contact(experiment, 3, k, "even") for k in range(24))])
-    low, high = np.array(list(experiment.ranges().values())).T
-    column = int(np.flatnonzero(high > low)[0])
-    middle = (low + high)[column] / 2
-    half = drawn[drawn[:, column] < middle]
-    rng = np.random.default_rng(0)
-    moved = np.einsum("mk,knd->mnd", half / np.maximum(high, 1), rng.normal(size=(12, 7, 2)))
-    for seed in range(3):
-        chosen = least_sure(experiment, half, moved, seed=seed)
-        assert chosen[column] > middle and (chosen >= low).all() and (chosen <= high).all()
-
-
-def test_contacts_of_the_design_unsure_are_chosen_after_the_first_ones(tmp_path):
-    experiment = load_experiment("surface-3d")
-
-    def asked(index):
-        return choose_contact(experiment, 5, index, "unsure", tmp_path, lambda folder, plan, seed, index: np.full(12, float(index)))
-
-    def even(index):
-        return choose_contact(experiment, 5, index, "even", tmp_path, None)
-
-    assert all(np.array_equal(asked(k).pose, even(k).pose) for k in range(6))
-    assert (asked(6).pose == 6).all() and (asked(7).move == 7).all()
-    with pytest.raises(DeviceError, match="needs a chooser"):
-        CollectPlan(None, None, experiment, None, "sim", "sim", 3, design="unsure")
 
 
 def test_frames_are_chosen_as_evenly_as_a_design_makes_them():

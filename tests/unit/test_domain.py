@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from scenes import load_sensor
+from training.errors import TrainingError
 from training.estimate.domain import FEWEST, Verdict, learn_domain, read_domain, write_domain
 from training.estimate.estimator import PoseEstimator
-from training.runs.recipes import TrainingError
 from twin.pins import nominal_reference
 from twin.types import Form
 
@@ -144,6 +144,6 @@ def test_a_model_of_a_sensor_that_was_never_calibrated_says_what_is_assumed():
     calibrated = PoseEstimator.load("mg400-127")
     assumed = copy(calibrated)
     assumed.sensor, assumed.domain = calibrated.sensor.model_copy(update={"rig": None}), replace(calibrated.domain, simulated=True)
-    low, high, _ = assumed._widened(np.array([-3.0, 20.0]), np.array([0.1, 2.0]), 0.0, Verdict(""), np.zeros(2))
+    low, high, _ = assumed._widening(np.array([-3.0, 20.0]), np.array([0.1, 2.0]), 0.0, Verdict(""), np.zeros(2))
     assert high - low == pytest.approx([2 * (0.1 + 0.015 * 20 + 0.1 * 3), 2 * (2.0 + 1.0)])
     assert any("never calibrated" in line for line in assumed.caveats) and not any("never" in line for line in calibrated.caveats)

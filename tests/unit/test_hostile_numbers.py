@@ -24,8 +24,8 @@ from hardware.servo.study import ServoStudyPlan, folder_name, study_servo
 from scenes import SpecError, load_experiment, load_object, load_sensor, load_servo
 from scenes.body import MOST_POISSON
 from scenes.load import SHIPPED
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
-from training.runs.recipes import TrainingError
 from twin.errors import ContactError, FrameError, OptionError, TwinError
 from twin.frames import open_recording
 from twin.frames.forms import form_of, known_frames

@@ -14,11 +14,12 @@ from scenes import load_experiment, load_object, load_randomisation, load_sensor
 from training.data.dataset import Dataset, load_dataset, split_rows
 from training.data.simulated import config_of
 from training.estimate.contact_estimator import ContactEstimator, contacts_folder
-from training.estimate.domain import DOMAIN, learn_domain, write_domain
+from training.estimate.domain import learn_domain, write_domain
 from training.estimate.estimator import PoseEstimator
 from training.generation import GenerationConfig, generate
 from training.models.part import LIKELY
 from training.runs.packed import SHIPPED
+from training.runs.run_files import DOMAIN
 from training.touch.touched import TouchAnswer
 from twin.rig.kinematics import rig_of
 

@@ -99,7 +99,7 @@ def contacts_of(policy: Policy) -> LearntContacts | None:
     sensor = SensorSpec.model_validate(policy.about["sensor"])
     shipped = _shipped_estimator(sensor)
     if shipped is not None and shipped.domain is not None:
-        return LearntContacts(shipped.domain, shipped.trained_reference, shipped.require_view)
+        return LearntContacts(shipped.domain, shipped.trained_reference, shipped.rest.require_view)
     if not policy.domain:
         return None
     try:

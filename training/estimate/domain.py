@@ -29,15 +29,14 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from training.data.label_code import HALF_CIRCLE_DEG, label_error
+from training.errors import TrainingError
 from training.models.vgnn.registration import align
-from training.runs.recipes import TrainingError
 from training.runs.run_files import AGAIN
 from twin.frames import spread
 from twin.pins import Reference
 from twin.store import ArrayFile
 from twin.types import BoolArray, FloatArray
 
-DOMAIN = "domain.safetensors"
 """File of a run with its domain."""
 FILE = ArrayFile("file of a domain", "twin train", version=3, error=TrainingError, again=AGAIN)
 MODES, LEADING, CUBED = 60, 12, 6

@@ -21,14 +21,15 @@ import numpy as np
 import torch
 
 from training.data.dataset import Dataset, split_rows
-from training.data.identity import ASIDE, difference, frame_marks, identity_of
 from training.data.label_code import LabelCode, goes_round
+from training.errors import TrainingError
 from training.models import model_named
 from training.models.part import Prepared
+from training.models.recipes import Recipe, as_dict
 from training.runs.assemble import calibrate
+from training.runs.identity import ASIDE, difference, frame_marks, identity_of
 from training.runs.loop import Loop, Rows
 from training.runs.networks import parameter_count
-from training.runs.recipes import Recipe, TrainingError, as_dict
 from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, write_tensors
 from twin.frames.forms import blob_spec
 from twin.store import fingerprint, write_text, writes

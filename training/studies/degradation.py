@@ -89,7 +89,7 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     check_pipelines(pipelines, tuple(each.name for each in runs))
     options: dict[str, Any] = {"jobs": plan.jobs, "progress": progress}
     if runs:
-        from training.estimate.estimator import digest_of
+        from training.estimate.loading import digest_of
 
         load_models(runs, plan.sensor)  # each worker process loads its own; loading here reports an error once, before the work starts
         options["models"] = partial(load_models, runs, plan.sensor)

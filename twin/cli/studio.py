@@ -82,12 +82,12 @@ def models_when_asked(run: Path | None, sensor: str) -> Callable[[str], "PoseEst
 
     def model_of(name: str) -> "PoseEstimator | None":
         with extras_named():  # called in a thread of the page, which shows the error
-            from training.estimate.estimator import models_by_sensor
+            from training.estimate.loading import models_by_sensor
 
             return models_by_sensor()(name)
 
     if run is None:
         return model_of
-    from training.estimate.estimator import models_by_sensor
+    from training.estimate.loading import models_by_sensor
 
     return models_by_sensor(run, sensor)

@@ -11,8 +11,8 @@ from scenes import SensorSpec
 from training.data.dataset import Dataset, joined, load_dataset, told_apart, with_common_labels
 from training.data.simulated import is_simulated
 from training.data.targets import CONTACT, PRESETS
-from training.estimate.displacements import DISPLACEMENTS, learn_displacements, write_displacements
-from training.estimate.domain import DOMAIN, learn_domain, write_domain
+from training.estimate.displacements import learn_displacements, write_displacements
+from training.estimate.domain import learn_domain, write_domain
 from training.estimate.estimator import PoseEstimator
 from training.models import model_named, recipe_of
 from training.models.part import LIKELY
@@ -20,9 +20,9 @@ from training.models.touch.model import TOUCH
 from training.runs.loop import epoch_step
 from training.runs.networks import choose_device
 from training.runs.run import RUN_FILES, RunConfig, train_run, training_rows
-from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS
-from training.touch.contact_maps import FEWEST_STATES, MAPS, learn_maps, write_maps
-from training.touch.slip import FEWEST_DRAGS, SLIP, Eyes, drags_of, learn_slip, write_slip
+from training.runs.run_files import BESIDE_FILES, CHECKPOINT, DISPLACEMENTS, DOMAIN, MAPS, SLIP
+from training.touch.contact_maps import FEWEST_STATES, learn_maps, write_maps
+from training.touch.slip import FEWEST_DRAGS, Eyes, drags_of, learn_slip, write_slip
 from training.touch.touched import TouchAnswer
 from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
@@ -31,7 +31,7 @@ from twin.types import Form, Readable
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helper labels
 SHEAR_HELPERS = ("move_1", "move_6")  # these moves
-FILES = (CONFIG, "curves.csv", TENSORS, MAPS, SLIP, DISPLACEMENTS, DOMAIN)  # files of a finished run
+FILES = (*RUN_FILES, *BESIDE_FILES)  # files of a finished run
 
 
 @dataclass(frozen=True, repr=False)
@@ -75,7 +75,7 @@ class Trained(Readable):
         return lines
 
 
-@writes(*RUN_FILES, MAPS, SLIP, DISPLACEMENTS, gone_on=(CHECKPOINT,))
+@writes(*FILES, gone_on=(CHECKPOINT,))
 def train_model(
     model: str,
     sensor: SensorSpec,

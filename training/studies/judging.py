@@ -16,14 +16,14 @@ import numpy as np
 import torch
 
 from training.data.dataset import Dataset, split_rows
-from training.data.identity import rows_named
 from training.data.label_code import label_error
 from training.data.simulated import is_pins_only
 from training.data.targets import Targets, limits_of
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
 from training.runs.assemble import conformal_quantile
-from training.runs.recipes import TrainingError
+from training.runs.identity import rows_named
 from twin.frames import open_recording
 from twin.progress import Step
 from twin.report.charts import new_figure, save_figure

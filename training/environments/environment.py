@@ -114,6 +114,10 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         if page is not None:
             page.__exit__()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the page: a copy of the environment opens its own."""
+        return {**self.__dict__, "_page": None}
+
     def _show(self, reward: float) -> None:
         """Show the newest step on the page, if the render mode is ``human``."""
         if self.render_mode != "human":
@@ -191,7 +195,7 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
             raise OptionError("render_mode='human' shows one environment: make it with gymnasium.make, or give 'rgb_array'")
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS, "autoreset_mode": mode}
         self.render_mode = _render_mode(render_mode)
-        self.num_envs, self._mode = num_envs, mode
+        self.num_envs = num_envs
         self.batch = Batch(task, num_envs, Options.given(options))
         self.single_observation_space = self.batch.observation_space()
         self.single_action_space = self.batch.action_space()
@@ -240,12 +244,13 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
             self._ended = nothing.copy()
             return self.batch.observation(), np.zeros(self.num_envs), nothing, nothing.copy(), info
         ended = done.terminated | done.truncated
-        if self._mode is AutoresetMode.NEXT_STEP:
+        mode = self.metadata["autoreset_mode"]
+        if mode is AutoresetMode.NEXT_STEP:
             info |= _of_rows(done.info, ~begun)
             self._ended = ended
         else:
             info |= _of_rows(done.info, ~ended)
-        if self._mode is AutoresetMode.SAME_STEP and ended.any():
+        if mode is AutoresetMode.SAME_STEP and ended.any():
             last = self.batch.observation()
             final = np.full(self.num_envs, None, object)
             for row in np.flatnonzero(ended):

@@ -19,6 +19,7 @@ LARGEST_MOVE_MM = 30.0
 """Largest motion between two poses. Beyond it the path between them is unknown, and the contact begins anew."""
 CLEAR_MM = 0.5
 """Distance between dome and object at which a contact begins."""
+_field = lru_cache(maxsize=64)(build_field)
 
 
 class SurrogateContacts:
@@ -44,7 +45,6 @@ class SurrogateContacts:
         self._cap_modes = np.ascontiguousarray((modes[:, :, 0] + self._cap_mm * modes[:, :, 1]).reshape(flat), np.float32)
         self._caps_rest = self._rest[:, 0] + self._cap_mm * self._rest[:, 1]
         self._linear = LinearContacts.at_rest(surrogate.node_mm, surrogate.answer, count, bending=surrogate.bending.kernel(surrogate.read))
-        self._field = lru_cache(maxsize=64)(build_field)
         self._before = np.tile(np.eye(4), (count, 1, 1))  # the poses commanded last
         self._known = np.zeros(count, bool)
         self._gap = np.full((count, len(surrogate.node_mm)), np.inf)
@@ -70,7 +70,7 @@ class SurrogateContacts:
     def begin(self, row: int, contact: Contact) -> None:
         """See ``Backend``."""
         self.require(contact)
-        law, thing = contact.law, self._field(contact.touched)
+        law, thing = contact.law, _field(contact.touched)
         assert isinstance(thing, Solid)  # required
         assert law.given_way is None or isinstance(law.given_way, ArmTurning)
         friction, soft = law.friction.static, law.compliance_mm_per_n

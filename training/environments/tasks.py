@@ -407,8 +407,9 @@ class ObjectPush(Task):
     """Range of the support's friction force, N. One value is drawn for each episode."""
     lever_mm = 15.0
     """Lever of the support's friction, mm: largest friction torque divided by the friction force."""
-    give_mm_per_n = 0.7
-    """Displacement of a block, mm, per N by which the push exceeds the support's friction, in one iteration of a step."""
+    give_mm_per_n = 1.0
+    """Displacement of a block, mm, per N by which the push exceeds the support's friction, in one iteration of a step: about what the skin
+    gives way, so that two iterations are enough."""
     columns = 2  # friction force of the support, and the least distance to the goal so far
     success_share = 0.0
     reached_reward = 10.0
@@ -425,26 +426,24 @@ class ObjectPush(Task):
 
     def pushed(self, felt: Felt, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
         T_sensor = T_work @ tool.T_work_sensor
-        force = np.einsum("bij,bj->bi", T_sensor[:, :3, :3], felt.force_n)
-        torque = np.einsum("bij,bj->bi", T_sensor[:, :3, :3], felt.torque_nmm)
+        turn = T_sensor[:, :3, :3]
+        force = (turn @ felt.force_n[:, :, None])[:, :, 0]
         middle = self._middle(T_object)
-        about = torque + np.cross(T_sensor[:, :3, 3] - middle, force)  # torque on the object about its middle
-        load = np.stack([force[:, 0], force[:, 2], about[:, 1] / self.lever_mm], axis=1)
-        size = np.linalg.norm(load, axis=1)
+        arm = T_sensor[:, :3, 3] - middle
+        torque = (turn[:, 1] * felt.torque_nmm).sum(axis=1) + arm[:, 2] * force[:, 0] - arm[:, 0] * force[:, 2]  # about its middle
+        load = np.stack([force[:, 0], force[:, 2], torque / self.lever_mm], axis=1)
+        size = np.sqrt((load * load).sum(axis=1))
         over = np.maximum(size - self.kept[:, 0], 0.0)
         if not over.any():
             return None
         way = (self.give_mm_per_n * over / np.maximum(size, 1e-9))[:, None] * load
-        out = T_object.copy()
         step = np.zeros((len(way), 6))
         step[:, 4] = np.degrees(way[:, 2] / self.lever_mm)
-        turn = motions(step)[:, :3, :3]
-        out[:, :3, :3] = turn @ T_object[:, :3, :3]
-        shifted = middle.copy()
-        shifted[:, 0] += way[:, 0]
-        shifted[:, 2] += way[:, 1]
-        out[:, :3, 3] = shifted + np.einsum("bij,bj->bi", turn, T_object[:, :3, 3] - middle)
-        return out
+        turned = motions(step)
+        turned[:, [0, 2], 3] = way[:, :2]
+        about = np.tile(np.eye(4), (2, len(way), 1, 1))
+        about[:, :, :3, 3] = middle, -middle
+        return about[0] @ turned @ about[1] @ T_object
 
     def _middle(self, T_object: FloatArray) -> FloatArray:
         """Centre of a block's weight: ``lever_mm`` behind its touched face, (B, 3)."""

@@ -22,7 +22,7 @@ from scenes import load_experiment, load_object, load_sensor
 from training.environments import ids
 from training.environments.baselines import BaselinesVecEnv
 from training.environments.batch import Batch, Options
-from training.environments.environment import TactileEnv, TactileVectorEnv
+from training.environments.environment import TactileEnv, TactileVectorEnv, _in_units
 from training.environments.observe import Eye
 from training.environments.tasks import TASKS, ObjectPush, ObjectRoll, SurfaceFollow
 from training.environments.world import Surfaces, Tool, inverse, motions, standing_on, turn_about, work_frame
@@ -322,6 +322,11 @@ def test_an_episode_is_shown_on_a_page_step_by_step(capsys):
         StudioClient(url).__enter__()
     with pytest.raises(OptionError, match="one environment"):
         gymnasium.make_vec("tactip/SurfaceFollow-v0", num_envs=2, render_mode="human")
+
+
+def test_goals_are_shown_in_plain_units():
+    told = [_in_units(*given) for given in (("angle / 10 deg", 0.3), ("force_n", 1.0), ("goal x_mm / 10", -1.2), ("indent_mm", 2.5))]
+    assert told == ["angle 3.0 deg", "force 1.0 N", "goal x -12.0 mm", "indent 2.5 mm"]
 
 
 def test_every_task_is_registered():

@@ -24,6 +24,9 @@ RENDER_MODES = ("rgb_array", "human")
 RENDER_FPS = 10
 """Pictures per second at the pace of the steps. With ``human``, steps are slowed to this pace."""
 
+UNITS = {"n": "N"}
+"""Units whose sign is not the end of a value's name."""
+
 Seen = dict[str, Any]
 
 
@@ -134,7 +137,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         T = batch.tool.seen(batch.T_work, batch.T_object)[0]
         place_mm, felt = batch.touch().place_mm[0], batch.backend.felt
         told = {
-            "goal": "  ".join(f"{name} {value:g}" for name, value in zip(batch.task.goal_names, batch.asked()[0], strict=True)),
+            "goal": ", ".join(_in_units(name, value) for name, value in zip(batch.task.goal_names, batch.asked()[0].tolist(), strict=True)),
             "contact area, slipping": f"{felt.area_mm2[0]:.0f} mm2, {100 * felt.slip[0]:.0f} %",
             "not computed": felt.lost[0],
         }
@@ -293,6 +296,14 @@ def _of_rows(told: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
         if has.any():
             info[name], info[f"_{name}"] = np.where(has, values, None if values.dtype == object else np.zeros_like(values)), has
     return info
+
+
+def _in_units(name: str, value: float) -> str:
+    """A value of an observation and its name in plain units: ``angle / 10 deg`` 0.3 is "angle 3.0 deg", ``force_n`` 1 is "force 1.0 N"."""
+    what, _, divisor = name.partition(" / ")
+    size, _, unit = divisor.partition(" ")
+    what, _, short = what.partition("_")
+    return f"{what} {value * float(size or 1):.1f} {unit or UNITS.get(short, short)}".strip()
 
 
 def _row(seen: Seen) -> Seen:

@@ -49,6 +49,11 @@ def others(kind: str, own: Container[str] = (), *, is_one: Callable[[Any], bool]
     return found
 
 
+def offered(kind: str) -> tuple[str, ...]:
+    """Names of the parts of a kind that other packages offer; nothing is loaded."""
+    return tuple(entry.name for entry in _entries(kind))
+
+
 def _loaded(entry: EntryPoint) -> tuple[Any, str]:
     """A part, and why it can't be loaded."""
     try:

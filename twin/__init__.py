@@ -29,7 +29,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from twin.lazy import named
+from twin.lazy import WhenImported, named
 
 _PLACES = {
     "ContactPose": "twin.mechanics.path",
@@ -95,3 +95,4 @@ def __getattr__(name: str) -> Any:
 __all__ = ["__version__", *sorted([*_PLACES, *_MODULES])]
 
 require_own("scenes")
+WhenImported("gymnasium", lambda: import_module("training.environments"))  # which registers ids such as "twin:tactip/EdgeFollow-v0"

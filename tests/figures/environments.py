@@ -4,12 +4,14 @@ import json
 from functools import partial
 from pathlib import Path
 
+import bench_baselines
 import bench_environments
 import bench_surrogate
 import numpy as np
 
 from figures.jobs import DRAWN, NO_PICTURES, Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
+from training.environments import OWN
 from training.surrogate.model import surrogate_of
 
 SENSORS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127", "ur5-331": "ur5-331-surface-3d-tap"}
@@ -129,3 +131,25 @@ for name, (options, minutes) in LEARNT.items():
         minutes=minutes,
         beside=DRAWN,
     )(partial(learnt, name=name))
+
+BASELINE_SEEDS, BASELINE_STEPS = (0, 1, 2), 200_000
+
+
+def baseline(work: Path, *, task: str, seed: int) -> Measured:
+    """What stable-baselines3's PPO with its default settings learns, and the share of new episodes that it solves."""
+    learner, _, used_s = bench_baselines.learnt(task, seed, BASELINE_STEPS)
+    share = bench_baselines.solved(learner)
+    return {"success": Value(share), "steps": Value(learner.num_timesteps), "core_minutes": Value(used_s / 60, "min")}
+
+
+for task in OWN:
+    for seed in BASELINE_SEEDS:
+        job(
+            f"baselines.{task}.seed{seed}",
+            f"tests/bench/bench_baselines.py --task {task} --seed {seed}",
+            sensors=("mg400-331",),
+            code=("bench_baselines", "training.environments.baselines"),
+            shipped=("training/surrogates/mg400-331.safetensors",),
+            minutes=6,
+            beside=DRAWN,
+        )(partial(baseline, task=task, seed=seed))

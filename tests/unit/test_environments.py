@@ -1,6 +1,9 @@
 """The environments' own laws: geometry of tasks, options, spaces, seeds. Contacts are solved on few poses, by the finite elements."""
 
+import pickle
 import re
+import subprocess
+import sys
 import warnings
 from functools import partial
 
@@ -10,13 +13,16 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from scipy.spatial.transform import Rotation
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as check_for_baselines
+from stable_baselines3.common.env_util import make_vec_env
 from studio_client import StudioClient
 
 from scenes import load_experiment, load_object, load_sensor
 from training.environments import ids
+from training.environments.baselines import BaselinesVecEnv
 from training.environments.batch import Batch, Options
-from training.environments.environment import TactileEnv, TactileVectorEnv
+from training.environments.environment import TactileEnv, TactileVectorEnv, _in_units
 from training.environments.observe import Eye
 from training.environments.tasks import TASKS, ObjectPush, ObjectRoll, SurfaceFollow
 from training.environments.world import Surfaces, Tool, inverse, motions, standing_on, turn_about, work_frame
@@ -26,6 +32,7 @@ from training.surrogate.felt import Felt, FiniteElements
 from twin.errors import ContactError, OptionError
 
 PLACE_TOLERANCE_MM = 1e-6  # of geometry computed in double precision
+SAME_ATOL = 1e-5  # spacings; a row's float32 sums depend on how many rows there are
 FAST = {"backend": "fem", "sensor": "mg400-127", "observation": "oracle"}
 
 
@@ -114,18 +121,59 @@ def test_a_block_rests_while_the_push_is_within_its_friction_and_slides_beyond()
     assert pushed is not None and pushed[0, 2, 3] > 0.1
 
 
-def test_a_push_pays_what_it_gains_and_waiting_pays_nothing():
-    """Whatever the way, the rewards sum to how much nearer the goal has come: a policy gains nothing by waiting near it."""
+def test_a_push_pays_what_it_gains_and_waiting_and_going_back_pay_nothing():
+    """With a push straight towards the goal the rewards sum to how much nearer than ever the block has come."""
     batch = Batch("ObjectPush", 1, Options(**FAST))
     batch.begin(0, np.random.default_rng(0))
-    off, start = [batch.task.kept[0, 1]], batch.T_work[0, :3, 3].copy()
-    for middle in ([0.0, 0.0, 10.0], [5.0, 0.0, 20.0], [5.0, 0.0, 20.0]):
-        batch.T_object[0, :3, 3] = middle
-        batch.T_work[0, :3, 3] = start + middle
-        judged = batch.task.judge(batch._seen_now())
-        off.append(float(np.linalg.norm(batch.task.place(batch._seen_now()))))
-        assert judged.reward[0] == pytest.approx(off[-2] - off[-1])
-    assert judged.reward[0] == pytest.approx(0.0)
+    task, start, told = batch.task, batch.T_work[0, :3, 3].copy(), []
+    batch.goal[0] = [0.0, 50.0]
+    batch.T_work[0, :3, :3] = np.eye(3)
+    task.kept[0, 1] = nearest = 50.0 - task.lever_mm
+    for middle in (10.0, 20.0, 20.0, 15.0, 19.0):
+        batch.T_object[0, 2, 3] = middle
+        batch.T_work[0, :3, 3] = start + [0.0, 0.0, middle]
+        judged = task.judge(batch._seen_now())
+        told.append((judged.reward[0], judged.terms["gain_mm"][0], judged.terms["off_mm"][0]))
+        assert judged.terms["miss_mm"][0] == pytest.approx(0.0)
+    reward, gain, off = np.array(told).T
+    assert np.allclose(reward, gain) and np.allclose(reward[2:], 0.0)
+    assert reward.sum() == pytest.approx(nearest - off.min())
+
+
+def test_a_way_back_and_forth_covers_nothing():
+    batch = Batch("ContourFollow", 1, Options(objects=("square",), **FAST))
+    batch.begin(0, np.random.default_rng(0))
+    surface, task = Surfaces()[load_object("square")], batch.task
+    rewards = []
+    for along in (0.0, 0.5, 1.0, 0.5, 1.0, 1.5):
+        batch.T_work[0] = standing_on(batch.tool, surface, along, 3.0, 0.0)
+        if not rewards:
+            task.kept[0, 2:4] = surface.touched(batch.tool.mounting, batch.tool.seen(batch.T_work, batch.T_object)).place_mm[0, [0, 2]]
+        rewards.append(task.judge(batch._seen_now()).reward[0])
+    assert rewards == pytest.approx([0.0, 1.0, 1.0, 0.0, 0.0, 1.0]) and task.kept[0, 0] == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_failing_is_never_cheaper_than_going_on(name):
+    """In no state that a random motion reaches is the reward of going on less than that of failing, which no step follows."""
+    batch, rng = Batch(name, 4, Options(observation="oracle")), np.random.default_rng(0)
+    failed = gone_on = 0
+    for _ in range(3):
+        for row in range(4):
+            batch.begin(row, rng)
+        batch.settle(np.arange(4))
+        drift, rows = rng.uniform(-1, 1, (4, len(batch.axes))), np.arange(4)
+        for _step in range(25):
+            done = batch.step(drift + rng.uniform(-0.3, 0.3, drift.shape), rows)
+            lost = done.terminated[rows] & ~done.info["is_success"][rows]
+            assert (done.reward[rows][lost] == batch.task.failed_reward).all()
+            assert (done.reward[rows][~lost] >= batch.task.failed_reward).all()
+            assert np.isfinite([done.info[key] for key in ("indent_mm", *batch.task.judge(batch._seen_now()).terms)]).all()
+            failed, gone_on = failed + lost.sum(), gone_on + (~lost).sum()
+            rows = rows[~done.terminated[rows]]
+            if not len(rows):
+                break
+    assert failed and gone_on
 
 
 def test_the_goal_of_a_push_is_told_as_the_tool_sees_it():
@@ -156,7 +204,7 @@ def test_a_way_around_an_object_begins_anywhere_and_counts_from_there():
     begun = []
     for seed in range(20):
         task.begin(0, tool, thing, surfaces, np.random.default_rng(seed))
-        begun.append(task.kept[0, 2:].copy())
+        begun.append(task.kept[0, 2:4].copy())
         assert task.kept[0, 0] == 0.0
         assert np.linalg.norm(surfaces[thing].outline - begun[-1], axis=1).min() < 0.5  # mm, the outline's step
     assert np.abs(np.array(begun)[:, 0]).max() > 37.0 and np.ptp(np.array(begun)[:, 0]) > 40.0  # mm, the corner too
@@ -169,7 +217,9 @@ def test_reward_is_largest_where_the_task_wants_the_sensor():
     rewards = []
     for off_mm in (0.0, 0.5, 1.0):
         batch.T_work[0] = standing_on(batch.tool, surface, 0.0, batch.goal[0, 0] + off_mm, 0.0)
-        rewards.append(float(batch.task.judge(batch._seen_now()).reward[0]))
+        judged = batch.task.judge(batch._seen_now())
+        rewards.append(float(judged.reward[0]))
+        assert judged.terms["off_mm"][0] == pytest.approx(off_mm)
     assert rewards[0] == pytest.approx(1.0) and rewards == sorted(rewards, reverse=True)
 
 
@@ -274,10 +324,64 @@ def test_an_episode_is_shown_on_a_page_step_by_step(capsys):
         gymnasium.make_vec("tactip/SurfaceFollow-v0", num_envs=2, render_mode="human")
 
 
+def test_goals_are_shown_in_plain_units():
+    told = [_in_units(*given) for given in (("angle / 10 deg", 0.3), ("force_n", 1.0), ("goal x_mm / 10", -1.2), ("indent_mm", 2.5))]
+    assert told == ["angle 3.0 deg", "force 1.0 N", "goal x -12.0 mm", "indent 2.5 mm"]
+
+
 def test_every_task_is_registered():
     assert {name.split("/")[1].split("-")[0] for name in ids()} == set(TASKS)
     for name in ids():
         assert gymnasium.spec(name).vector_entry_point is not None
+
+
+@pytest.mark.parametrize(
+    "first", ["import gymnasium", "import twin, gymnasium", "import twin; twin.register_environments(); import gymnasium"]
+)
+def test_an_id_with_the_packages_name_is_known_whatever_is_imported_first(first):
+    code = f"{first}; print('twin' in __import__('sys').modules, gymnasium.make('twin:tactip/EdgeFollow-v0', observation='oracle').spec.id)"
+    told = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.split()[-1] == "tactip/EdgeFollow-v0"
+
+
+def test_an_environment_is_pickled_and_goes_on_alike():
+    for options in ({}, {"observation": "image"}, FAST):
+        env = TactileEnv("SurfaceFollow", **options)
+        env.reset(seed=0)
+        twins = env, pickle.loads(pickle.dumps(env))
+        one, other = ([own.step(np.array([0.2, -0.1], np.float32)) for _ in range(2)] for own in twins)
+        assert all(np.array_equal(a[0]["tactile"], b[0]["tactile"]) and a[1:] == b[1:] for a, b in zip(one, other, strict=True))
+
+
+def test_every_way_of_making_many_gives_the_same_episodes():
+    """Gymnasium's two vectors, ours, and stable-baselines3's, each from the same seeds."""
+    name, actions = "twin:tactip/SurfaceFollow-v0", np.random.default_rng(0).uniform(-0.5, 0.5, (4, 2, 2)).astype(np.float32)
+    ways = [
+        gymnasium.make_vec(name, num_envs=2, vectorization_mode="sync"),
+        gymnasium.make_vec(name, num_envs=2, vectorization_mode="async"),
+        gymnasium.make_vec(name, num_envs=2),
+    ]
+    told = [[way.reset(seed=3)[0]["tactile"], *(way.step(action)[0]["tactile"] for action in actions)] for way in ways]
+    for theirs in (make_vec_env(name, 2, seed=3), BaselinesVecEnv(gymnasium.make_vec(name, num_envs=2))):
+        theirs.seed(3)
+        told.append([theirs.reset()["tactile"], *(theirs.step(action)[0]["tactile"] for action in actions)])
+    for way in ways:
+        way.close()
+    assert all(np.allclose(told[0], other, atol=SAME_ATOL) for other in told[1:])
+
+
+def test_a_learner_of_stable_baselines_gets_ends_as_it_expects_them():
+    env = BaselinesVecEnv(gymnasium.make_vec("tactip/SurfaceFollow-v0", num_envs=2, steps=3, observation="oracle"))
+    PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, n_epochs=1, seed=0, device="cpu").learn(8)
+    env.seed(0)
+    env.reset()
+    for step in range(1, 4):
+        seen, reward, done, infos = env.step(np.zeros((2, 2), np.float32))
+        assert done.all() == (step == 3) and all({"is_success", "off_mm"} <= info.keys() for info in infos)
+    assert all(info["TimeLimit.truncated"] for info in infos)
+    assert all(not np.array_equal(info["terminal_observation"]["tactile"], seen["tactile"][row]) for row, info in enumerate(infos))
+    with pytest.raises(OptionError, match="is no vector"):
+        BaselinesVecEnv(gymnasium.make_vec("CartPole-v1", num_envs=2))
 
 
 def test_the_same_seed_gives_the_same_episode_on_finite_elements():
@@ -341,7 +445,7 @@ def told_alike(one, other):
     one, other = np.asarray(one), np.asarray(other)
     if one.dtype == object:
         return all(told_alike(a, b) if isinstance(a, dict) else a == b for a, b in zip(one, other, strict=True))
-    return one.dtype == other.dtype and np.allclose(one, other, atol=1e-5)
+    return one.dtype == other.dtype and np.allclose(one, other, atol=SAME_ATOL)
 
 
 def test_a_row_that_only_begins_has_gone_no_way():
@@ -396,7 +500,7 @@ def test_too_deep_an_episode_ends_and_says_why():
         _, reward, terminated, _, info = env.step(np.array([1.0, 0.0], np.float32))
         if terminated:
             break
-    assert terminated and reward < 0 and "domain" in info["outside"] and not info["is_success"]
+    assert terminated and reward == 0.0 and "domain" in info["outside"] and not info["is_success"]
 
 
 def test_a_picture_of_the_sensor_is_rendered():

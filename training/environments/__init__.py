@@ -1,8 +1,10 @@
 """Gymnasium environments of a TacTip's tasks, on the finite elements or on their surrogate.
 
-Importing this package registers them: ``gymnasium.make("tactip/EdgeFollow-v0")``. ``training.environments:tactip/EdgeFollow-v0`` makes
-gymnasium import it.
+Importing this package registers them, and so does ``import twin`` together with gymnasium: ``gymnasium.make("twin:tactip/EdgeFollow-v0")``.
+Neither imports the tasks themselves.
 """
+
+from typing import Any
 
 from twin.errors import extras_named
 
@@ -11,29 +13,41 @@ with extras_named():
 
 from gymnasium.envs.registration import register, registry
 
-from training.environments.batch import Options
-from training.environments.environment import TactileEnv, TactileVectorEnv
-from training.environments.tasks import TASKS, add_tasks
+from scenes.plugins import offered
+from twin.lazy import named
 
 NAMESPACE = "tactip"
 """First part of the environments' ids."""
 VERSION = 0
+OWN = ("EdgeFollow", "SurfaceFollow", "ContourFollow", "GentlePress", "ObjectRoll", "ObjectPush")
+"""Names of this package's tasks."""
+_PLACES = {
+    "BaselinesVecEnv": "training.environments.baselines",
+    "Options": "training.environments.batch",
+    "TactileEnv": "training.environments.environment",
+    "TactileVectorEnv": "training.environments.environment",
+}
+"""By public name: its module."""
 
 
 def ids() -> tuple[str, ...]:
     """The ids of all environments."""
-    add_tasks()
-    return tuple(f"{NAMESPACE}/{name}-v{VERSION}" for name in TASKS)
+    return tuple(f"{NAMESPACE}/{name}-v{VERSION}" for name in dict.fromkeys((*OWN, *offered("tasks"))))
 
 
 def register_all() -> None:
     """Register the environments; a second call has no effect. Some versions of gymnasium call it where the package is installed."""
     where = "training.environments.environment"
-    for full, name in zip(ids(), TASKS, strict=True):
+    for full in ids():
         if full not in registry:
-            register(id=full, entry_point=f"{where}:TactileEnv", vector_entry_point=f"{where}:TactileVectorEnv", kwargs={"task": name})
+            task = full.removeprefix(f"{NAMESPACE}/").removesuffix(f"-v{VERSION}")
+            register(id=full, entry_point=f"{where}:TactileEnv", vector_entry_point=f"{where}:TactileVectorEnv", kwargs={"task": task})
+
+
+def __getattr__(name: str) -> Any:
+    return named(_PLACES, "training.environments", name)
 
 
 register_all()
 
-__all__ = ["NAMESPACE", "Options", "TactileEnv", "TactileVectorEnv", "gymnasium", "ids", "register_all"]
+__all__ = ["NAMESPACE", "OWN", "gymnasium", "ids", "register_all"]

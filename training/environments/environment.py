@@ -24,6 +24,9 @@ RENDER_MODES = ("rgb_array", "human")
 RENDER_FPS = 10
 """Pictures per second at the pace of the steps. With ``human``, steps are slowed to this pace."""
 
+UNITS = {"n": "N"}
+"""Units whose sign is not the end of a value's name."""
+
 Seen = dict[str, Any]
 
 
@@ -114,6 +117,10 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         if page is not None:
             page.__exit__()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the page: a copy of the environment opens its own."""
+        return {**self.__dict__, "_page": None}
+
     def _show(self, reward: float) -> None:
         """Show the newest step on the page, if the render mode is ``human``."""
         if self.render_mode != "human":
@@ -130,7 +137,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         T = batch.tool.seen(batch.T_work, batch.T_object)[0]
         place_mm, felt = batch.touch().place_mm[0], batch.backend.felt
         told = {
-            "goal": "  ".join(f"{name} {value:g}" for name, value in zip(batch.task.goal_names, batch.asked()[0], strict=True)),
+            "goal": ", ".join(_in_units(name, value) for name, value in zip(batch.task.goal_names, batch.asked()[0].tolist(), strict=True)),
             "contact area, slipping": f"{felt.area_mm2[0]:.0f} mm2, {100 * felt.slip[0]:.0f} %",
             "not computed": felt.lost[0],
         }
@@ -191,7 +198,7 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
             raise OptionError("render_mode='human' shows one environment: make it with gymnasium.make, or give 'rgb_array'")
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS, "autoreset_mode": mode}
         self.render_mode = _render_mode(render_mode)
-        self.num_envs, self._mode = num_envs, mode
+        self.num_envs = num_envs
         self.batch = Batch(task, num_envs, Options.given(options))
         self.single_observation_space = self.batch.observation_space()
         self.single_action_space = self.batch.action_space()
@@ -240,12 +247,13 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
             self._ended = nothing.copy()
             return self.batch.observation(), np.zeros(self.num_envs), nothing, nothing.copy(), info
         ended = done.terminated | done.truncated
-        if self._mode is AutoresetMode.NEXT_STEP:
+        mode = self.metadata["autoreset_mode"]
+        if mode is AutoresetMode.NEXT_STEP:
             info |= _of_rows(done.info, ~begun)
             self._ended = ended
         else:
             info |= _of_rows(done.info, ~ended)
-        if self._mode is AutoresetMode.SAME_STEP and ended.any():
+        if mode is AutoresetMode.SAME_STEP and ended.any():
             last = self.batch.observation()
             final = np.full(self.num_envs, None, object)
             for row in np.flatnonzero(ended):
@@ -288,6 +296,14 @@ def _of_rows(told: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
         if has.any():
             info[name], info[f"_{name}"] = np.where(has, values, None if values.dtype == object else np.zeros_like(values)), has
     return info
+
+
+def _in_units(name: str, value: float) -> str:
+    """A value of an observation and its name in plain units: ``angle / 10 deg`` 0.3 is "angle 3.0 deg", ``force_n`` 1 is "force 1.0 N"."""
+    what, _, divisor = name.partition(" / ")
+    size, _, unit = divisor.partition(" ")
+    what, _, short = what.partition("_")
+    return f"{what} {value * float(size or 1):.1f} {unit or UNITS.get(short, short)}".strip()
 
 
 def _row(seen: Seen) -> Seen:

@@ -18,8 +18,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
 
+from training.environments.baselines import BaselinesVecEnv
 from training.environments.batch import Options, require_task, require_whole
 from training.environments.environment import TactileVectorEnv
 from training.environments.observe import Pictures
@@ -112,59 +112,20 @@ class Learnt(Readable):
         return [f"{steps} steps in {seconds / 60:.1f} min; solved {told}"]
 
 
-class SteppedTogether(VecEnv):
+class SteppedTogether(BaselinesVecEnv):
     """A ``TactileVectorEnv`` in stable-baselines3's interface, with observations reduced to the network's input."""
 
     def __init__(self, vector: TactileVectorEnv, policy: Policy) -> None:
-        self.vector, self.policy = vector, policy
-        size = policy.reduced(*_seen(vector.batch.observation())).shape[1]
-        super().__init__(vector.num_envs, spaces.Box(-np.inf, np.inf, (size,), np.float32), vector.single_action_space)
-        self._actions: FloatArray = np.zeros((vector.num_envs, *(vector.single_action_space.shape or ())))
+        self.policy = policy
+        super().__init__(vector)
 
-    def _reduced(self, seen: dict[str, Any]) -> FloatArray:
-        return self.policy.reduced(*_seen(seen))
+    def seen_space(self) -> spaces.Box:
+        """See ``BaselinesVecEnv``."""
+        return spaces.Box(-np.inf, np.inf, (self.seen(self.vector.batch.observation()).shape[1],), np.float32)
 
-    def reset(self) -> FloatArray:
-        """See ``VecEnv``."""
-        return self._reduced(self.vector.reset(seed=self._seeds[0])[0])
-
-    def step_async(self, actions: FloatArray) -> None:
-        """See ``VecEnv``."""
-        self._actions = actions
-
-    def step_wait(self) -> Any:
-        """See ``VecEnv``. Rows whose episode ends begin again in the same step."""
-        seen, reward, terminated, truncated, told = self.vector.step(self._actions)
-        done = terminated | truncated
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for row in np.flatnonzero(done):
-            last = told["final_obs"][row]
-            infos[row] = {
-                "terminal_observation": self.policy.reduced(*(part[None] for part in _seen(last)))[0],
-                "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
-                "is_success": bool(told["final_info"]["is_success"][row]),
-            }
-        return self._reduced(seen), reward.astype(np.float32), done, infos
-
-    def close(self) -> None:
-        """See ``VecEnv``."""
-        self.vector.close()
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """See ``VecEnv``."""
-        return [getattr(self.vector, attr_name)] * self.num_envs
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """The environments have nothing to set."""
-        raise OptionError(f"{attr_name} can't be set")
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """The environments have no methods of their own."""
-        raise OptionError(f"the environments have no method {method_name}")
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """See ``VecEnv``."""
-        return [False] * self.num_envs
+    def seen(self, observed: dict[str, Any]) -> FloatArray:
+        """See ``BaselinesVecEnv``."""
+        return self.policy.reduced(*_seen(observed))
 
 
 class _Watch(BaseCallback):
@@ -178,7 +139,7 @@ class _Watch(BaseCallback):
         self.curve: list[tuple[int, float, float, float]] = []
 
     def _on_step(self) -> bool:
-        self._ended += [info["is_success"] for info in self.locals["infos"] if "is_success" in info]
+        self._ended += [info["is_success"] for info in self.locals["infos"] if "terminal_observation" in info]
         self._rewards.append(float(np.mean(self.locals["rewards"])))
         return time.monotonic() - self._begun < 60.0 * self._plan.minutes and not self._enough
 

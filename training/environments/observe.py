@@ -1,9 +1,9 @@
 """Observations of an agent: pins, their graph, pictures, the estimator's pose, or the exact state."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -45,6 +45,10 @@ class View:
     sensor: SensorSpec
     form: Form
     pictures: Pictures
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields alone: what is cached is made anew."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
     @cached_property
     def rest_px(self) -> FloatArray:

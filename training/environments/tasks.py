@@ -1,7 +1,7 @@
 """The tasks: start of an episode, goal, and reward of a state. All are computed for B environments at once."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -73,6 +73,7 @@ class Judged:
     Attributes
     ----------
     reward : (B,) float
+        Reward of the states that do not fail: at least the task's ``failed_reward``.
     failed : (B,) bool
         Whether the episode ends as failed: the object is lost, the sensor is too deep or too oblique, or, of some tasks, the goal is
         out of reach.
@@ -80,12 +81,15 @@ class Judged:
         Whether the episode ends as successful.
     good : (B,) bool
         Whether the state itself is good. In a successful episode most states of the second half are good.
+    terms : dict of str to (B,) float
+        What the reward is made of, for ``info``.
     """
 
     reward: FloatArray
     failed: BoolArray
     reached: BoolArray
     good: BoolArray
+    terms: dict[str, FloatArray] = field(default_factory=dict)
 
 
 class Task(ABC):
@@ -108,6 +112,8 @@ class Task(ABC):
         Motion in the work frame that every step adds to the agent's.
     success_share : float
         Least share of good states in the second half of a successful episode. With 0 only ``reached`` counts.
+    failed_reward : float
+        Reward of a step that fails. No other step has less, so an agent never gains by failing.
     """
 
     name: str
@@ -119,6 +125,7 @@ class Task(ABC):
     steps: int = 60
     feed_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     success_share: float = 0.9
+    failed_reward: float = 0.0
     columns = 1
 
     def require(self, touched: ObjectSpec) -> None:
@@ -156,6 +163,11 @@ class Task(ABC):
         return np.column_stack(columns)
 
 
+def closeness(off: FloatArray) -> FloatArray:
+    """Reward of states that are ``off`` (B,) a goal: 1 at the goal, 1/2 at 1, and more than 0 and falling at any distance."""
+    return 1.0 / (1.0 + off)
+
+
 def lost_or_deep(touch: Touch) -> BoolArray:
     """Rows (B,) where the object is lost, or the sensor too deep."""
     return (touch.indent_mm < LOST_MM) | (touch.indent_mm > DEEPEST_MM)
@@ -188,11 +200,11 @@ class SurfaceFollow(Task):
 
     def judge(self, seen: Seen) -> Judged:
         off_mm = np.abs(seen.touch.indent_mm - seen.goal[:, 0])
-        off_turn = np.abs(seen.touch.angle_deg / TURN_DEG - seen.goal[:, 1])
+        off_deg = np.abs(seen.touch.angle_deg - TURN_DEG * seen.goal[:, 1])
         failed = out_of_touch(seen.touch)
-        good = (off_mm <= self.good_mm) & (off_turn <= self.good_deg / TURN_DEG)
-        reward = np.maximum(1.0 - off_mm - off_turn, -1.0)
-        return Judged(np.where(failed, -5.0, reward), failed, np.zeros(len(failed), bool), good)
+        good = (off_mm <= self.good_mm) & (off_deg <= self.good_deg)
+        reward = closeness(off_mm + off_deg / TURN_DEG)
+        return Judged(reward, failed, np.zeros(len(failed), bool), good, {"off_mm": off_mm, "off_deg": off_deg})
 
 
 class ContourFollow(SurfaceFollow):
@@ -210,22 +222,26 @@ class ContourFollow(SurfaceFollow):
     so that episodes begin on faces and corners alike."""
     covered_share = 0.98
     success_share = 0.0
-    columns = 4  # path length covered, total length, and the place (x, z) that was touched last
+    columns = 5  # path length covered, total length, the place (x, z) that was touched last, and the largest length covered
 
     def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
         start, surface = super().begin(row, tool, touched, surfaces, rng), surfaces[touched]
         self.kept[row, 1] = np.linalg.norm(np.diff(surface.outline, axis=0), axis=1).sum()
-        self.kept[row, 2:] = surface.touched(tool.mounting, tool.seen(start.T_work[None], start.T_object[None])).place_mm[0, [0, 2]]
+        self.kept[row, 2:4] = surface.touched(tool.mounting, tool.seen(start.T_work[None], start.T_object[None])).place_mm[0, [0, 2]]
         return start
 
     def judge(self, seen: Seen) -> Judged:
         judged = super().judge(seen)
+        covered, length, x, z, farthest = self.kept.T
         place = seen.touch.place_mm[:, [0, 2]]
-        moved = np.linalg.norm(place - self.kept[:, 2:], axis=1)
-        self.kept[:, 0] += np.where(judged.failed, 0.0, np.minimum(moved, 2 * self.feed_mm[0] + 2.0))
-        self.kept[:, 2:] = place
-        reached = (self.kept[:, 0] >= self.covered_share * self.kept[:, 1]) & ~judged.failed
-        return Judged(judged.reward, judged.failed, reached, judged.good)
+        moved = place - np.column_stack([x, z])
+        ahead = np.sign((moved * seen.T_work[:, [0, 2], 0]).sum(axis=1))  # a way back and forth covers nothing
+        covered = covered + np.where(judged.failed, 0.0, ahead * np.minimum(np.linalg.norm(moved, axis=1), 2 * self.feed_mm[0] + 2.0))
+        gain_mm = np.maximum(covered - farthest, 0.0)
+        self.kept = np.column_stack([covered, length, place, farthest + gain_mm])
+        reached = (covered >= self.covered_share * length) & ~judged.failed
+        reward = judged.reward * gain_mm / self.feed_mm[0]
+        return Judged(reward, judged.failed, reached, judged.good, judged.terms | {"gain_mm": gain_mm})
 
 
 class EdgeFollow(Task):
@@ -260,11 +276,11 @@ class EdgeFollow(Task):
 
     def judge(self, seen: Seen) -> Judged:
         across, turn = self.place(seen)
-        off_mm, off_turn = np.abs(across - seen.goal[:, 0]), np.abs(turn / TURN_DEG - seen.goal[:, 1])
+        off_mm, off_deg = np.abs(across - seen.goal[:, 0]), np.abs(turn - TURN_DEG * seen.goal[:, 1])
         failed = (off_mm > self.farthest_mm) | (np.abs(turn) > STEEPEST_DEG + self.off_deg) | lost_or_deep(seen.touch)
-        good = (off_mm <= self.good_mm) & (off_turn <= self.good_deg / TURN_DEG) & (seen.touch.indent_mm > 0)
-        reward = np.maximum(1.0 - off_mm / 2 - off_turn / 2, -1.0)
-        return Judged(np.where(failed, -5.0, reward), failed, np.zeros(len(failed), bool), good)
+        good = (off_mm <= self.good_mm) & (off_deg <= self.good_deg) & (seen.touch.indent_mm > 0)
+        reward = closeness((off_mm + off_deg / TURN_DEG) / 2)
+        return Judged(reward, failed, np.zeros(len(failed), bool), good, {"off_mm": off_mm, "off_deg": off_deg})
 
     def oracle(self, seen: Seen) -> FloatArray:
         across, turn = self.place(seen)
@@ -297,12 +313,13 @@ class GentlePress(Task):
         return drifted
 
     def judge(self, seen: Seen) -> Judged:
-        force = np.linalg.norm(seen.felt.force_n, axis=1)
-        off = np.abs(force - seen.goal[:, 0]) / seen.goal[:, 0]
+        force, goal = np.linalg.norm(seen.felt.force_n, axis=1), seen.goal[:, 0]
+        off_n, gap_mm = np.abs(force - goal), np.maximum(-seen.touch.indent_mm, 0.0)
         slips = (seen.felt.slip > self.slip_share) & (force > 0.2)
         failed = (seen.touch.indent_mm > DEEPEST_MM) | (seen.touch.indent_mm < 2 * LOST_MM)
-        reward = 1.0 - np.minimum(off, 1.5) - 0.5 * slips
-        return Judged(np.where(failed, -5.0, reward), failed, np.zeros(len(failed), bool), (off <= self.good_share) & ~slips)
+        good = (off_n <= self.good_share * goal) & ~slips
+        reward = closeness(off_n / goal + gap_mm + seen.felt.slip)
+        return Judged(reward, failed, np.zeros(len(failed), bool), good, {"off_n": off_n, "gap_mm": gap_mm})
 
 
 class ObjectRoll(Task):
@@ -362,11 +379,10 @@ class ObjectRoll(Task):
 
     def judge(self, seen: Seen) -> Judged:
         place = self.place(seen)
-        off = np.linalg.norm(place - seen.goal, axis=1)
+        off_mm = np.linalg.norm(place - seen.goal, axis=1)
         failed = (np.linalg.norm(place, axis=1) > self.farthest_mm) | lost_or_deep(seen.touch)
-        good = (off <= self.near_mm) & (seen.touch.indent_mm > 0)
-        reward = np.maximum(1.0 - off / 2, -1.0)
-        return Judged(np.where(failed, -5.0, reward), failed, np.zeros(len(failed), bool), good)
+        good = (off_mm <= self.near_mm) & (seen.touch.indent_mm > 0)
+        return Judged(closeness(off_mm / 2), failed, np.zeros(len(failed), bool), good, {"off_mm": off_mm})
 
     def oracle(self, seen: Seen) -> FloatArray:
         return np.column_stack([self.place(seen), super().oracle(seen)[:, 2:]])
@@ -391,11 +407,12 @@ class ObjectPush(Task):
     """Range of the support's friction force, N. One value is drawn for each episode."""
     lever_mm = 15.0
     """Lever of the support's friction, mm: largest friction torque divided by the friction force."""
-    give_mm_per_n = 0.7
-    """Displacement of a block, mm, per N by which the push exceeds the support's friction, in one iteration of a step."""
-    columns = 2  # friction force of the support, and distance to the goal in the last step
+    give_mm_per_n = 1.0
+    """Displacement of a block, mm, per N by which the push exceeds the support's friction, in one iteration of a step: about what the skin
+    gives way, so that two iterations are enough."""
+    columns = 2  # friction force of the support, and the least distance to the goal so far
     success_share = 0.0
-    reached_reward = 5.0
+    reached_reward = 10.0
 
     def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
         T = standing_on(tool, surfaces[touched], 0.0, 0.5, rng.uniform(-8.0, 8.0))
@@ -409,26 +426,24 @@ class ObjectPush(Task):
 
     def pushed(self, felt: Felt, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
         T_sensor = T_work @ tool.T_work_sensor
-        force = np.einsum("bij,bj->bi", T_sensor[:, :3, :3], felt.force_n)
-        torque = np.einsum("bij,bj->bi", T_sensor[:, :3, :3], felt.torque_nmm)
+        turn = T_sensor[:, :3, :3]
+        force = (turn @ felt.force_n[:, :, None])[:, :, 0]
         middle = self._middle(T_object)
-        about = torque + np.cross(T_sensor[:, :3, 3] - middle, force)  # torque on the object about its middle
-        load = np.stack([force[:, 0], force[:, 2], about[:, 1] / self.lever_mm], axis=1)
-        size = np.linalg.norm(load, axis=1)
+        arm = T_sensor[:, :3, 3] - middle
+        torque = (turn[:, 1] * felt.torque_nmm).sum(axis=1) + arm[:, 2] * force[:, 0] - arm[:, 0] * force[:, 2]  # about its middle
+        load = np.stack([force[:, 0], force[:, 2], torque / self.lever_mm], axis=1)
+        size = np.sqrt((load * load).sum(axis=1))
         over = np.maximum(size - self.kept[:, 0], 0.0)
         if not over.any():
             return None
         way = (self.give_mm_per_n * over / np.maximum(size, 1e-9))[:, None] * load
-        out = T_object.copy()
         step = np.zeros((len(way), 6))
         step[:, 4] = np.degrees(way[:, 2] / self.lever_mm)
-        turn = motions(step)[:, :3, :3]
-        out[:, :3, :3] = turn @ T_object[:, :3, :3]
-        shifted = middle.copy()
-        shifted[:, 0] += way[:, 0]
-        shifted[:, 2] += way[:, 1]
-        out[:, :3, 3] = shifted + np.einsum("bij,bj->bi", turn, T_object[:, :3, 3] - middle)
-        return out
+        turned = motions(step)
+        turned[:, [0, 2], 3] = way[:, :2]
+        about = np.tile(np.eye(4), (2, len(way), 1, 1))
+        about[:, :, :3, 3] = middle, -middle
+        return about[0] @ turned @ about[1] @ T_object
 
     def _middle(self, T_object: FloatArray) -> FloatArray:
         """Centre of a block's weight: ``lever_mm`` behind its touched face, (B, 3)."""
@@ -439,13 +454,15 @@ class ObjectPush(Task):
         return seen.goal - self._middle(seen.T_object)[:, [0, 2]]
 
     def judge(self, seen: Seen) -> Judged:
-        off = np.linalg.norm(self.place(seen), axis=1)
-        beyond = self.place(seen)[:, 1] < -self.near_mm
-        failed = out_of_touch(seen.touch) | beyond
-        reached = (off <= self.near_mm) & ~failed
-        reward = self.kept[:, 1] - off + self.reached_reward * reached  # the progress, so that waiting near the goal gives no reward
-        self.kept[:, 1] = off
-        return Judged(np.where(failed, -5.0, reward), failed, reached, reached)
+        place = self.place(seen)
+        off_mm = np.linalg.norm(place, axis=1)
+        failed = out_of_touch(seen.touch) | (place[:, 1] < -self.near_mm)
+        reached = (off_mm <= self.near_mm) & ~failed
+        gain_mm = np.maximum(self.kept[:, 1] - off_mm, 0.0)  # so neither waiting nor a way back and forth gives a reward
+        miss_mm = np.abs(10.0 * _seen_in_plane(place, seen.T_work)[:, 0])
+        self.kept[:, 1] -= gain_mm
+        reward = gain_mm * closeness(miss_mm / self.near_mm) + self.reached_reward * reached
+        return Judged(reward, failed, reached, reached, {"off_mm": off_mm, "gain_mm": gain_mm, "miss_mm": miss_mm})
 
     def oracle(self, seen: Seen) -> FloatArray:
         return np.column_stack([_seen_in_plane(self.place(seen), seen.T_work), super().oracle(seen)])

@@ -199,15 +199,6 @@ class LinearContacts:
         return gap, centre
 
 
-def motion_mm(start: FloatArray, stop: FloatArray, radius_mm: float) -> FloatArray:
-    """Upper bound of objects' motion across a dome, (R,) mm, between poses (R, 4, 4)."""
-    turn = stop[:, :3, :3] @ start[:, :3, :3].transpose(0, 2, 1)
-    cosine = (turn[:, 0, 0] + turn[:, 1, 1] + turn[:, 2, 2] - 1) / 2
-    off = stop[:, :3, 3] - (turn @ start[:, :3, 3:])[:, :, 0]
-    found: FloatArray = np.sqrt((off * off).sum(axis=1)) + np.arccos(np.clip(cosine, -1.0, 1.0)) * radius_mm
-    return found
-
-
 @compiled()
 def between(start: FloatArray, stop: FloatArray, steps: int) -> FloatArray:
     """Poses (steps, 4, 4) after each of equal steps of a path: the origin moves in a straight line, the object turns about a fixed axis."""
@@ -353,6 +344,15 @@ def _given_way(T: FloatArray, turning: FloatArray, force: FloatArray) -> FloatAr
             for k in range(3):
                 there[p, q] += turn[p, k] * T[k, q]
     return there
+
+
+@compiled()
+def motion_mm(start: FloatArray, stop: FloatArray, radius_mm: float) -> FloatArray:
+    """Upper bound of objects' motion across a dome, (R,) mm, between poses (R, 4, 4)."""
+    found = np.empty(len(start))
+    for r in range(len(start)):
+        found[r] = _motion(start[r], stop[r], radius_mm)
+    return found
 
 
 @compiled()

@@ -19,6 +19,7 @@ LARGEST_MOVE_MM = 30.0
 """Largest motion between two poses. Beyond it the path between them is unknown, and the contact begins anew."""
 CLEAR_MM = 0.5
 """Distance between dome and object at which a contact begins."""
+_field = lru_cache(maxsize=64)(build_field)
 
 
 class SurrogateContacts:
@@ -41,10 +42,15 @@ class SurrogateContacts:
         self._cap_mm = sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
         modes = surrogate.modes
         flat = len(modes), -1
+        x, y, z = surrogate.node_mm.T
+        self._turns = np.zeros((len(x), 3, 6))  # of a force at each node: the force and the torque on the object
+        self._turns[:, range(3), range(3)] = -1.0
+        self._turns[:, 0, 4:], self._turns[:, 1, 3], self._turns[:, 1, 5] = np.stack([-z, y], axis=1), z, -x
+        self._turns[:, 2, 3:5] = np.stack([-y, x], axis=1)
+        self._turns = self._turns.reshape(-1, 6)
         self._cap_modes = np.ascontiguousarray((modes[:, :, 0] + self._cap_mm * modes[:, :, 1]).reshape(flat), np.float32)
         self._caps_rest = self._rest[:, 0] + self._cap_mm * self._rest[:, 1]
         self._linear = LinearContacts.at_rest(surrogate.node_mm, surrogate.answer, count, bending=surrogate.bending.kernel(surrogate.read))
-        self._field = lru_cache(maxsize=64)(build_field)
         self._before = np.tile(np.eye(4), (count, 1, 1))  # the poses commanded last
         self._known = np.zeros(count, bool)
         self._gap = np.full((count, len(surrogate.node_mm)), np.inf)
@@ -70,7 +76,7 @@ class SurrogateContacts:
     def begin(self, row: int, contact: Contact) -> None:
         """See ``Backend``."""
         self.require(contact)
-        law, thing = contact.law, self._field(contact.touched)
+        law, thing = contact.law, _field(contact.touched)
         assert isinstance(thing, Solid)  # required
         assert law.given_way is None or isinstance(law.given_way, ArmTurning)
         friction, soft = law.friction.static, law.compliance_mm_per_n
@@ -83,14 +89,16 @@ class SurrogateContacts:
     def move(self, rows: IntArray, T_sensor_object: FloatArray, time_s: FloatArray) -> None:
         """See ``Backend``."""
         gap, centre = self._linear.distances(rows, T_sensor_object)
-        inside = np.ones(len(rows), bool)
+        depth = self._linear.radius_mm - centre[:, 0]
+        polar = np.degrees(np.arccos(np.clip(centre[:, 1], -1.0, 1.0)))
+        inside = (depth <= 0) | ((depth <= self._domain["depth_mm"]) & (polar <= self._domain["polar_deg"]))
         for place, row in enumerate(rows.tolist()):
-            why = self._outside(*centre[place])
-            self.felt.lost[row], inside[place] = why, not why
-        self._forget(rows[~inside])
-        if inside.any():
-            rows = rows[inside]
-            self._bring(rows, T_sensor_object[inside], gap[inside])
+            self.felt.lost[row] = "" if inside[place] else self._outside(depth[place], polar[place])
+        if not inside.all():
+            self._forget(rows[~inside])
+            rows, T_sensor_object, gap = rows[inside], T_sensor_object[inside], gap[inside]
+        rows = self._bring(rows, T_sensor_object, gap)
+        if len(rows):
             self._answer(rows)
 
     def attitude(self, row: int) -> PinRest:
@@ -114,20 +122,29 @@ class SurrogateContacts:
         self._linear.free(rows)
         self._known[rows] = False
 
-    def _bring(self, rows: IntArray, T: FloatArray, gap: FloatArray) -> None:
-        """Solve the motions of some rows (R,) to commanded poses (R, 4, 4), at which the nodes at rest have distances (R, M)."""
+    def _bring(self, rows: IntArray, T: FloatArray, gap: FloatArray) -> IntArray:
+        """Solve the motions of some rows (R,) to commanded poses (R, 4, 4), at which the nodes at rest have distances (R, M).
+
+        Returns the rows that were not there before.
+        """
         linear = self._linear
         deepest = gap.argmin(axis=1)
         depth = -gap[np.arange(len(rows)), deepest]
         clear = (depth <= 0) & ~linear.held[rows].any(axis=1)
-        away = rows[clear]
-        linear.free(away)
-        self._before[away] = T[clear]
-        self._known[away], self._gap[away] = True, np.inf
         if not self._memory:
             self._known[rows] = False
-        moves = ~clear & ~(self._known[rows] & (self._before[rows] == T).all(axis=(1, 2)))
-        rows, T, depth, deepest = rows[moves], T[moves], depth[moves], deepest[moves]
+        new = ~(self._known[rows] & (self._before[rows] == T).all(axis=(1, 2)))
+        changed = rows[new]
+        if clear.any():
+            away = rows[clear]
+            linear.free(away)
+            self._before[away] = T[clear]
+            self._known[away], self._gap[away] = True, np.inf
+        moves = new & ~clear
+        if not moves.any():
+            return changed
+        if not moves.all():
+            rows, T, depth, deepest = rows[moves], T[moves], depth[moves], deepest[moves]
         way = motion_mm(self._before[rows], T, linear.radius_mm)
         new = ~self._known[rows] | (way >= LARGEST_MOVE_MM)
         if new.any():
@@ -141,32 +158,28 @@ class SurrogateContacts:
         there = linear.taken[rows]
         there[:, 2, 3] += linear.compliance_mm_per_n[rows] * self._force(rows)[:, 2]
         self._gap[rows] = linear.distances(rows, there)[0]
+        return changed
 
     def _force(self, rows: IntArray) -> FloatArray:
         """Forces (R, 3) of the nodes on the objects."""
         return -self._linear.force_n[rows].sum(axis=1)
 
-    def _outside(self, distance_mm: float, cosine: float) -> str:
-        """The reason why a contact is too deep or too far from the apex; "" for one inside the domain."""
-        domain = self._domain
-        depth = self._linear.radius_mm - distance_mm
-        if depth <= 0:
-            return ""
-        if depth > domain["depth_mm"]:
-            return str(outside(f"the object is {depth:.1f} mm inside the dome, at most {domain['depth_mm']:.1f} is taken"))
-        polar = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-        if polar > domain["polar_deg"]:
-            return str(outside(f"the contact is {polar:.0f} deg from the dome's apex, at most {domain['polar_deg']:.0f} was trained"))
-        return ""
+    def _outside(self, depth_mm: float, polar_deg: float) -> str:
+        """The reason why a contact is too deep or too far from the apex."""
+        depth, polar = self._domain["depth_mm"], self._domain["polar_deg"]
+        if depth_mm > depth:
+            return str(outside(f"the object is {depth_mm:.1f} mm inside the dome, at most {depth:.1f} is taken"))
+        return str(outside(f"the contact is {polar_deg:.0f} deg from the dome's apex, at most {polar:.0f} was trained"))
 
     def _answer(self, rows: IntArray) -> None:
         """Write to ``felt`` what the sensors feel, from the linear skin and the network."""
         felt, linear, surrogate = self.felt, self._linear, self._surrogate
         force = linear.force_n[rows]
-        wrench = -np.concatenate([force.sum(axis=1), np.cross(surrogate.node_mm, force).sum(axis=1)], axis=1)
+        wrench = force.reshape(len(rows), -1) @ self._turns
         held, slides = linear.held[rows].sum(axis=1), linear.slides[rows].sum(axis=1)
         slip = slides / np.maximum(held, 1)
-        gap, depth = self._gap[rows], self.depth_mm[rows]
+        gap = self._gap[rows]
+        depth = np.maximum(-gap.min(axis=1), 0.0)
         beside = features(depth, linear.friction[rows], held, slip, linear.used[rows], wrench)
         parts, added = surrogate.correct(force, beside, gap, depth)
         self._parts[rows] = parts

@@ -17,6 +17,7 @@ from twin.types import FloatArray, IntArray
 
 _KEPT_SOLVERS = 4
 """Number of solvers kept in memory: one of the sensor as specified, the others of randomised sensors."""
+_solver = lru_cache(maxsize=_KEPT_SOLVERS)(SkinSolver)
 
 
 @dataclass(frozen=True)
@@ -102,14 +103,13 @@ class FiniteElements:
         self.felt = Felt.at_rest(count, self._rest.caps_mm)
         self._pins = [self._rest] * count
         self._followers: list[Follower | None] = [None] * count
-        self._solver = lru_cache(maxsize=_KEPT_SOLVERS)(SkinSolver)
 
     def require(self, contact: Contact) -> None:
         """See ``Backend``: no contact is refused before it is solved."""
 
     def begin(self, row: int, contact: Contact) -> None:
         """See ``Backend``. A randomised sensor needs its own solver, which takes about a second to build."""
-        self._followers[row] = Follower(self._solver(contact.sensor), contact.touched, contact.law)
+        self._followers[row] = Follower(_solver(contact.sensor), contact.touched, contact.law)
         self._pins[row] = self._rest if contact.sensor is self._sensor else rest_pins(contact.sensor.geometry)
         self.felt.rest(row, self._pins[row].caps_mm)
 

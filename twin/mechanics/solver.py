@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -81,6 +82,10 @@ class SkinSolver:
         self.shape = shape_of(spec.skin)
         self._blas = ThreadpoolController()
         self._setting = lru_cache(maxsize=_KEPT_SOLIDS)(self._set_up)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled as its specification: a copy computes the rest anew."""
+        return partial(SkinSolver, resolution=self.resolution), (self.spec,)
 
     def rest(self, *, T_sensor_object: FloatArray | None = None) -> ContactState:
         """The undeformed sensor."""

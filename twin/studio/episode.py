@@ -21,6 +21,9 @@ from twin.studio.pictures import badge, number_table
 from twin.studio.scene import PinScene, Shown, Surface, colours
 from twin.types import FloatArray, Form, Frame, PinState
 
+AROUND_MM, MOST_BESIDE_MM = 22.0, 8.0
+"""The part of an object that is shown: so far around the touched place, which may move so far before another part is shown, mm."""
+
 
 @dataclass(frozen=True)
 class EpisodeStep:
@@ -76,6 +79,7 @@ class EpisodeMode(PageMode):
         self._skin = SkinSurface(sensor.skin, self._rest.base_mm)  # interpolated between the pins' feet, because some backends give no skin
         self._scene = PinScene(page.server, sensor, Surface(self._skin.rest_mm.astype(np.float32), self._skin.faces), self._rest)
         self._touched: ObjectSpec | None = None
+        self._middle_mm = np.zeros(3)  # of the part of the object that is shown
         self._last: EpisodeStep | None = None
         self._steps = self.newest(self._show, "episode")
         self._rewards, self._forces = Chart(page, "reward of a step"), Chart(page, "force on the object, N")
@@ -94,9 +98,10 @@ class EpisodeMode(PageMode):
 
     def _show(self, step: EpisodeStep) -> None:
         seen = seen_in(step.frame, None, self._pipeline)
-        if step.touched != self._touched:
-            self._scene.put_object(step.touched)
-            self._touched = step.touched
+        place = step.T_sensor_object[:3, :3].T @ (step.foot_mm - step.T_sensor_object[:3, 3])
+        if step.touched != self._touched or np.abs(place - self._middle_mm).max() > MOST_BESIDE_MM:
+            self._scene.put_object(step.touched, np.add.outer(place, [-AROUND_MM, AROUND_MM]).ravel().tolist())
+            self._touched, self._middle_mm = step.touched, place
         rows = {
             "step": str(step.number),
             "reward": f"{step.reward:+.3f}",

@@ -1,6 +1,6 @@
 """The 3D scene of the page: skin, pins, object, force, and the gizmo with which the user moves the object."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
@@ -217,9 +217,9 @@ class PinScene:
         )
         self._object: viser.MeshHandle | None = None
 
-    def put_object(self, touched: ObjectSpec) -> None:
-        """Show another object."""
-        surface = object_surface(build_field(touched).distance, np.eye(4), bounds_mm=OBJECT_BOX_MM, samples=OBJECT_SAMPLES).triangulate()
+    def put_object(self, touched: ObjectSpec, bounds_mm: Sequence[float] = OBJECT_BOX_MM) -> None:
+        """Show another object, or another part of it: that in a box (x0, x1, y0, y1, z0, z1) of its frame."""
+        surface = object_surface(build_field(touched).distance, np.eye(4), bounds_mm=bounds_mm, samples=OBJECT_SAMPLES).triangulate()
         corners, faces = np.asarray(surface.points, np.float32), np.asarray(surface.regular_faces)
         self._object = self._scene.add_mesh_simple(
             "/object", corners, faces, color=OBJECT_RGB, opacity=0.35, side="double", cast_shadow=False, receive_shadow=False

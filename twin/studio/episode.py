@@ -3,7 +3,6 @@
 The caller hands in the steps; this package does not depend on the environments.
 """
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,7 +122,7 @@ class EpisodeMode(PageMode):
         self.put_up(pictures, f"camera, {step.frame.form} frame", numbers, also=scene)
 
 
-class EpisodePage:
+class EpisodePage(Page):
     """A page that shows the steps of episodes to any number of browsers. A context manager.
 
     Parameters
@@ -135,34 +134,22 @@ class EpisodePage:
     host, port : str, int
         As for ``Page``.
 
-    Attributes
-    ----------
-    url : str
-        The page's address.
-
     Raises
     ------
     TwinError
-        When the context is entered: the server can't listen on this host and port.
+        The server can't listen on this host and port.
     """
 
     def __init__(self, title: str, sensor: SensorSpec, form: Form, *, host: str = "127.0.0.1", port: int = 0) -> None:
-        self._title, self._sensor, self._form, self._host, self._port = title, sensor, form, host, port
-        self._stack = ExitStack()
-        self.url = ""
-
-    def __enter__(self) -> "EpisodePage":
-        page = self._stack.enter_context(Page(self._title, host=self._host, port=self._port))
-        self._mode = EpisodeMode(page, self._sensor, self._form)
-        page.set_modes([self._mode])
-        self._stack.callback(self._mode.stop)
-        self._mode.start()
-        self.url = page.url
-        return self
+        super().__init__(title, host=host, port=port)
+        self._episode = EpisodeMode(self, sensor, form)
+        self.set_modes([self._episode])
+        self._episode.start()
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self._episode.stop()
+        super().__exit__()
 
     def show(self, step: EpisodeStep) -> None:
         """Show a step; returns at once."""
-        self._mode.give(step)
+        self._episode.give(step)

@@ -4,7 +4,6 @@ same.
 Frames and estimates are handed in; this package does not depend on the devices.
 """
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 
 from scenes.sensor import SensorSpec
@@ -47,7 +46,7 @@ def charted(estimate: Estimate) -> dict[str, float]:
     return {label_name(name)[0]: float(value) for name, value in named} if estimate.valid else {}
 
 
-class LivePage:
+class LivePage(Page):
     """A page that shows live frames to any number of browsers. A context manager.
 
     Parameters
@@ -62,24 +61,14 @@ class LivePage:
     Raises
     ------
     TwinError
-        When the context is entered: the server can't listen on this host and port.
+        The server can't listen on this host and port.
     """
 
     def __init__(self, title: str, sensor: SensorSpec, reference: Reference, *, host: str = "127.0.0.1", port: int = 0) -> None:
+        super().__init__(title, host=host, port=port)
         self._title, self._sensor, self._reference = title, sensor, reference
-        self._host, self._port = host, port
-        self._stack = ExitStack()
-        self.url = ""
-
-    def __enter__(self) -> "LivePage":
-        self._page = self._stack.enter_context(Page(self._title, host=self._host, port=self._port))
-        self._chart = Chart(self._page, "live estimates")
-        self._page.show_nothing("Waiting for the first frame.")
-        self.url = self._page.url
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self._chart = Chart(self, "live estimates")
+        self.show_nothing("Waiting for the first frame.")
 
     def show(self, shot: LiveShot, seen: Observation) -> None:
         """Show a frame with the pipeline's observation of it. Browsers get pictures and numbers together."""
@@ -87,8 +76,8 @@ class LivePage:
         numbers = [badge("live", "moving"), paragraph(self._title, "note"), *shot_numbers(shot, seen)]
 
         def change() -> None:
-            self._page.show_pictures(*pictures, f"live {shot.frame.form} frame {shot.frame.sequence}")
-            self._page.show_numbers(*numbers)
+            self.show_pictures(*pictures, f"live {shot.frame.form} frame {shot.frame.sequence}")
+            self.show_numbers(*numbers)
             self._chart.add(charted(shot.estimate))
 
-        self._page.together(change)
+        self.together(change)

@@ -10,7 +10,7 @@ from contextlib import contextmanager, redirect_stdout
 from http import HTTPStatus
 from io import StringIO
 from itertools import count
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -373,7 +373,7 @@ class Page:
         """Hide the message: the user does something else."""
         self._said.visible = False
 
-    def __enter__(self) -> "Page":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

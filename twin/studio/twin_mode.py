@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,24 +33,10 @@ ModelOf = Callable[[str], SensorModel | None]
 
 STEPS = {"mm": 0.25, "deg": 1.0}
 """Step by which a key moves or turns the object, mm and deg."""
-KEYS = {
-    "arrowleft": ("x_mm", -1),
-    "arrowright": ("x_mm", +1),
-    "arrowup": ("y_mm", -1),
-    "arrowdown": ("y_mm", +1),
-    "pageup": ("depth_mm", -1),
-    "pagedown": ("depth_mm", +1),
-}
-"""Keys that move the object together with shift: the number that changes, and its direction."""
-TURN_KEYS = {
-    "arrowleft": ("tilt_y_deg", -1),
-    "arrowright": ("tilt_y_deg", +1),
-    "arrowup": ("tilt_x_deg", -1),
-    "arrowdown": ("tilt_x_deg", +1),
-    "pageup": ("twist_deg", -1),
-    "pagedown": ("twist_deg", +1),
-}
-"""Keys that turn the object together with ctrl (or cmd) and shift: the angle that changes, and its direction."""
+KEYS = (("arrowleft", "arrowright"), ("arrowup", "arrowdown"), ("pageup", "pagedown"))
+"""Pairs of keys that change one of the object's numbers, the first to smaller values."""
+CHANGED = {"shift": ("x_mm", "y_mm", "depth_mm"), "cmd/ctrl+shift": ("tilt_y_deg", "tilt_x_deg", "twist_deg")}
+"""The number that each pair of keys changes together with a modifier."""
 ONE_GESTURE_S = 0.8
 """Longest time, s, between two wishes of one gesture. 'Undo' takes back a whole gesture."""
 MOST_UNDO = 100
@@ -264,11 +251,12 @@ class TwinMode(PageMode):
         self._link.on_update(guarded(lambda: self._links.give(self._link.value)))
         self._record_way.on_update(guarded(self._toggle_way))
         self._filming.on_update(guarded(self._toggle_film))
-        for modifier, keys in (("shift", KEYS), ("cmd/ctrl+shift", TURN_KEYS)):
-            for key, (name, sign) in keys.items():
-                label = f"{spoken(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
-                command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # viser defines it as a literal
-                command.on_trigger(self._key(name, sign))
+        for modifier, names in CHANGED.items():
+            for keys, name in zip(KEYS, names, strict=True):
+                for key, sign in zip(keys, (-1, +1), strict=True):
+                    label = f"{spoken(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
+                    command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # viser defines it as a literal
+                    command.on_trigger(partial(self._keyed, name, sign))
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
         gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(lambda: self.play(tap_and_shear(self._wish))))
 
@@ -279,8 +267,8 @@ class TwinMode(PageMode):
 
         return moved
 
-    def _key(self, name: str, sign: int) -> Callable[[object], None]:
-        return lambda event: self.nudge(name, sign)
+    def _keyed(self, name: str, sign: int, event: object) -> None:
+        self.nudge(name, sign)
 
     def _own_friction(self) -> float:
         setup = self.contact.setup

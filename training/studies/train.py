@@ -17,9 +17,10 @@ from training.estimate.estimator import PoseEstimator
 from training.models import model_named, recipe_of
 from training.models.part import LIKELY
 from training.models.touch.model import TOUCH
+from training.runs.config import RunConfig, labels_learnt, training_rows
 from training.runs.loop import epoch_step
 from training.runs.networks import choose_device
-from training.runs.run import RUN_FILES, RunConfig, train_run, training_rows
+from training.runs.run import RUN_FILES, train_run
 from training.runs.run_files import BESIDE_FILES, CHECKPOINT, DISPLACEMENTS, DOMAIN, MAPS, SLIP
 from training.touch.contact_maps import FEWEST_STATES, learn_maps, write_maps
 from training.touch.slip import FEWEST_DRAGS, Eyes, drags_of, learn_slip, write_slip
@@ -192,10 +193,11 @@ def add_domain(run: Path, config: RunConfig, data: Dataset) -> None:
     pins, targets = data.pins.rows(rows), data.targets.rows(rows)
     moved = (pins.nodes_px - pins.reference.pins_px) / pins.reference.spacing_px.mean()
     least = np.median(estimator.predict_rows(data, rows).half_width, axis=0)
-    labels = targets.corrected if config.labels == "corrected" else targets.raw
     touched = TouchAnswer(pins.reference)
     apart = np.array([touched(nodes_px, lost) < LIKELY for nodes_px, lost in zip(pins.nodes_px, pins.lost, strict=True)])
-    labels = np.where(apart[:, None], np.nan, labels)  # a state before first touch has a label, but no pattern of its own
+    labels = np.where(
+        apart[:, None], np.nan, labels_learnt(data, config)[rows]
+    )  # a state before first touch has a label, but no pattern of its own
     group = None if data.group is None else data.group[rows]
     simulated = not config.labelled and all(is_simulated(folder) for folder in data.folders)
     known = learn_domain(

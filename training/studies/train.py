@@ -10,7 +10,7 @@ import torch
 from scenes import SensorSpec
 from training.data.dataset import Dataset, joined, load_dataset, told_apart, with_common_labels
 from training.data.simulated import is_simulated
-from training.data.targets import CONTACT, PRESETS
+from training.data.targets import CONTACT, PRESETS, SHEAR, TURN
 from training.estimate.displacements import learn_displacements, write_displacements
 from training.estimate.domain import learn_domain, write_domain
 from training.estimate.estimator import PoseEstimator
@@ -31,7 +31,6 @@ from twin.store import writes
 from twin.types import Form, Readable
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helper labels
-SHEAR_HELPERS = ("move_1", "move_6")  # these moves
 FILES = (*RUN_FILES, *BESIDE_FILES)  # files of a finished run
 
 
@@ -141,7 +140,7 @@ def train_model(
         with stage(progress, f"frames of {folder.name}") as step:
             parts.append(load_dataset(folder, sensor, columns_of(target), form=form, progress=step))
     found = joined(with_common_labels(parts) if target == CONTACT else parts)
-    config = RunConfig(model, recipe, labels, seed, split, SHEAR_HELPERS if target == SHEAR_PRESET else ())
+    config = RunConfig(model, recipe, labels, seed, split, (SHEAR, TURN) if target == SHEAR_PRESET else ())
     with stage(progress, model) as step:
         finished = train_run(config, found, out, max_minutes=max_minutes, device=chosen, progress=epoch_step(step))
     if finished and config.model == TOUCH.name and all(is_simulated(folder) for folder in found.folders):

@@ -21,8 +21,9 @@ from training.models.part import PinModel
 from training.models.recipes import Recipe
 from training.models.vgnn.network import mode_components
 from training.models.vgnn.registration import fit_registration, spanned
+from training.runs.config import RunConfig
 from training.runs.packed import SHIPPED, WEIGHTS, pack, shipped_names
-from training.runs.run import RunConfig, train_run
+from training.runs.run import train_run
 from training.studies.judging import judge, rows_to_judge
 from twin.errors import FrameError
 from twin.pins import make_graph

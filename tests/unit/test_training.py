@@ -19,9 +19,10 @@ from training.estimate.estimator import PoseEstimator
 from training.estimate.loading import digest_of, models_by_sensor
 from training.models import recipe_of
 from training.models.part import Prediction
+from training.runs.config import training_rows
 from training.runs.identity import changed_since, learnt_before
 from training.runs.packed import folder_of
-from training.runs.run import fold_rows, is_finished, train_run, training_rows
+from training.runs.run import fold_rows, is_finished, train_run
 from training.runs.run_files import read_tensors
 from training.studies.evaluation import Evaluation
 from training.studies.judging import judge, leak_check, rows_to_judge, write_evaluation

@@ -25,7 +25,6 @@ from twin.cli.options import (
     FormOrAuto,
     NoContact,
     Out,
-    Quality,
     Residual,
     Sensor,
     Split,
@@ -44,7 +43,7 @@ from twin.cli.options import (
     sensor_with,
 )
 from twin.progress import Progress
-from twin.types import FINE
+from twin.types import FINE, Quality
 
 if TYPE_CHECKING:
     from training.environments.learn import Learnt

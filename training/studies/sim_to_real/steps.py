@@ -20,10 +20,11 @@ from training.models import model_named, recipe_of
 from training.models.steered.model import STEERED
 from training.models.vgnn.model import VGNN
 from training.runs.assemble import intervals
+from training.runs.config import RunConfig
 from training.runs.gaussian_process import fit_two_fidelities
 from training.runs.identity import frame_marks, identity_of
 from training.runs.loop import epoch_step
-from training.runs.run import RunConfig, is_finished, train_run
+from training.runs.run import is_finished, train_run
 from training.runs.run_files import CONFIG, TENSORS, read_tensors, write_tensors
 from training.studies.judging import judge, leak_check
 from training.studies.sim_to_real.discrepancy import Discrepancy

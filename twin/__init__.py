@@ -15,7 +15,7 @@ frames, pins    Frame Form Pipeline Observation node_features preprocess tune
 your sensor     new_sensor check calibrate_optics calibrate_contact
 how true it is  validate realism robustness audit
 models          make_dataset train evaluate predict load_model
-policies        register_environments learn
+policies        register_environments BaselinesVecEnv learn
 devices         open_camera open_arm SafeArm load_limits collect servo run_policy
 other           errors extend __version__
 
@@ -32,6 +32,7 @@ from typing import Any
 from twin.lazy import WhenImported, named
 
 _PLACES = {
+    "BaselinesVecEnv": "training.environments.baselines",
     "ContactPose": "twin.mechanics.path",
     "Form": "twin.types",
     "Frame": "twin.types",

@@ -19,6 +19,7 @@ from scenes import load_experiment as load_experiment
 from scenes import load_object as load_object
 from scenes import load_sensor as load_sensor
 from training.environments import register_all as register_all
+from training.environments.baselines import BaselinesVecEnv as BaselinesVecEnv
 from training.environments.learn import Learnt as Learnt
 from training.estimate.loading import load_remembering as load_remembering
 from training.generation.run import Simulated as Simulated

@@ -22,7 +22,6 @@ VERSION = 0
 OWN = ("EdgeFollow", "SurfaceFollow", "ContourFollow", "GentlePress", "ObjectRoll", "ObjectPush")
 """Names of this package's tasks."""
 _PLACES = {
-    "BaselinesVecEnv": "training.environments.baselines",
     "Options": "training.environments.batch",
     "TactileEnv": "training.environments.environment",
     "TactileVectorEnv": "training.environments.environment",

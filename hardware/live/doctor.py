@@ -108,7 +108,8 @@ class Machine(Readable):
             lacking = [*(["a way to render (see above)"] if not self.can_render else []), *missing]
             return f"Not ready: this machine lacks {', '.join(lacking)}."
         plain = " Pictures of the deformed skin are plain ones." if self.plain_pictures else ""
-        return f"Ready: frames can be rendered, read and learnt from.{plain} Next: twin demo --out out/demo"
+        models = "" if self.packages.get("torch") else " Models need PyTorch (torch): pip install 'tactip-twin[models]'."
+        return f"Ready: frames can be rendered and read.{models}{plain} Next: twin demo --out out/demo"
 
     def _own_lines(self) -> list[str]:
         """The place of the program's own packages, or a line for each package if they lie in different places."""

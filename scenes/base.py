@@ -1,9 +1,11 @@
 """The base of every section of a specification (frozen, strict, no unknown key, no NaN), and the error that specifications raise."""
 
 import unicodedata
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic.fields import FieldInfo
 
 
 class SpecError(ValueError):
@@ -63,6 +65,46 @@ class Section(BaseModel):
     def _lists_as_tuples(cls, data: object) -> object:
         """Turn the lists of a file into tuples, because a section is frozen."""
         return _as_tuples(data)
+
+    @classmethod
+    def keys(cls) -> dict[str, FieldInfo]:
+        """The keys of the section in a file."""
+        return cls.model_fields
+
+
+class OpenSection(Section, extra="allow"):
+    """A section of which one key names a part, as a layout or a law, and which holds the keys of this part beside its own."""
+
+    part_key: ClassVar[str]
+
+    @classmethod
+    def parts(cls) -> Mapping[str, type[Section]]:
+        """Classes of the parts by name."""
+        raise NotImplementedError
+
+    @classmethod
+    def keys(cls) -> dict[str, FieldInfo]:
+        return cls.model_fields | {key: field for part in cls.parts().values() for key, field in part.model_fields.items()}
+
+    @property
+    def part(self) -> Any:
+        """The named part with its keys."""
+        return self.parts()[getattr(self, self.part_key)].model_construct(**self.__pydantic_extra__ or {})
+
+    @model_validator(mode="after")
+    def _take_part(self) -> Self:
+        parts, name, given = self.parts(), getattr(self, self.part_key), dict(self.__pydantic_extra__ or {})
+        if name not in parts:
+            raise ValueError(f"{self.part_key} must be one of {', '.join(map(repr, parts))}, got '{name}'")
+        for key in given.keys() - parts[name].model_fields.keys():
+            owners = {owner: part.model_fields[key].default for owner, part in parts.items() if key in part.model_fields}
+            if owners and given[key] in (None, (), *owners.values()):  # as files of earlier versions hold them
+                del given[key]
+            elif owners:
+                raise ValueError(f"{key} belongs to {self.part_key} = {' or '.join(map(repr, owners))}, not to '{name}'")
+        part = parts[name].model_validate(given)
+        object.__setattr__(self, "__pydantic_extra__", part.model_dump(exclude_defaults=True))
+        return self
 
 
 def _as_tuples(value: object) -> object:

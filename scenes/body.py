@@ -4,11 +4,14 @@ Lengths mm, stiffness MPa (N/mm^2).
 """
 
 import math
-from typing import Annotated, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from scenes.base import Fraction, Index, NonNegative, Positive, Section
+from scenes.base import Fraction, Index, NonNegative, OpenSection, Positive, Section
+from scenes.materials.base import MaterialLaw
+from scenes.plugins import classes
 
 
 class RelaxationTerm(Section):
@@ -38,37 +41,32 @@ def _compressible(poisson_ratio: float) -> float:
 Poisson = Annotated[float, Field(ge=0), AfterValidator(_compressible)]
 
 
-class MaterialSpec(Section):
+class MaterialSpec(OpenSection):
     """A nearly incompressible rubber: its stiffness, its hyperelastic law and its relaxation.
 
     Attributes
     ----------
     young_modulus_mpa, poisson_ratio : float
         Young's modulus and Poisson's ratio at small strain. For a viscoelastic rubber they are the instantaneous values, before relaxation.
-    law : {"neo-hookean", "mooney-rivlin", "yeoh"}
-        Hyperelastic law (see ``twin.mechanics.material``).
-    second_invariant_share : float
-        For Mooney-Rivlin: c01 / (c10 + c01).
-    c20_c10, c30_c10 : float
-        For Yeoh: c20 and c30 relative to c10.
+    law : str
+        Name of the hyperelastic law: "neo-hookean", "mooney-rivlin", "yeoh", or one of another package. Each has keys of its own.
     relaxation : tuple of RelaxationTerm
         Terms of a Prony series; empty for an elastic material.
     """
 
+    part_key: ClassVar[str] = "law"
+
     young_modulus_mpa: Positive
     poisson_ratio: Poisson
-    law: Literal["neo-hookean", "mooney-rivlin", "yeoh"] = "neo-hookean"
-    second_invariant_share: Fraction = 0.0
-    c20_c10: NonNegative = 0.0
-    c30_c10: NonNegative = 0.0
+    law: str = "neo-hookean"
     relaxation: tuple[RelaxationTerm, ...] = ()
 
+    @classmethod
+    def parts(cls) -> Mapping[str, type[MaterialLaw]]:
+        return classes("materials", MaterialLaw)
+
     @model_validator(mode="after")
-    def _check_law(self) -> Self:
-        if self.law != "mooney-rivlin" and self.second_invariant_share:
-            raise ValueError("second_invariant_share belongs to law = 'mooney-rivlin'")
-        if self.law != "yeoh" and (self.c20_c10 or self.c30_c10):
-            raise ValueError("c20_c10 and c30_c10 belong to law = 'yeoh'")
+    def _check_relaxation(self) -> Self:
         if sum(term.fraction for term in self.relaxation) >= 1:
             raise ValueError("the fractions of relaxation must sum to less than 1: some stiffness must stay")
         return self

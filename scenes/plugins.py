@@ -1,8 +1,8 @@
 """Parts of other packages, which offer them by entry points ``tactip_twin.KIND``.
 
 A sensor, object, experiment, randomisation, servo or limits is the path of a TOML file. An arm is a function of the text after the colon in
-``NAME:REST``, and a camera a function of this text, the sensor and the form. A condition, model or task is the object itself. A part that
-raises, that is of another kind or that has the name of another one is left out, and a warning names it.
+``NAME:REST``, and a camera a function of this text, the sensor and the form. A layout, material, condition, model or task is the object
+itself. A part that raises, that is of another kind or that has the name of another one is left out, and a warning names it.
 """
 
 import os
@@ -10,11 +10,17 @@ import sys
 import warnings
 from collections.abc import Callable, Container
 from functools import cache
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from inspect import isabstract
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any
 
-KINDS = ("sensors", "objects", "experiments", "randomisations", "servos", "limits", "arms", "cameras", "conditions", "models", "tasks")
+KINDS = (
+    *("sensors", "objects", "experiments", "randomisations", "servos", "limits"),
+    *("layouts", "materials", "arms", "cameras", "conditions", "models", "tasks"),
+)
 _found: dict[str, dict[str, Any]] = {}  # the parts of each kind, by name
 _judged: dict[EntryPoint, str] = {}  # of each entry point that was looked at: why its part is left out, "" if it is not
 
@@ -52,6 +58,25 @@ def others(kind: str, own: Container[str] = (), *, is_one: Callable[[Any], bool]
 def offered(kind: str) -> tuple[str, ...]:
     """Names of the parts of a kind that other packages offer; nothing is loaded."""
     return tuple(entry.name for entry in _entries(kind))
+
+
+def classes(kind: str, base: type) -> dict[str, type]:
+    """The classes of a kind below ``base``, by name: those in the modules of ``scenes.KIND``, and those of other packages; as `others`.
+
+    The name of ours is its module's.
+    """
+    own = _own_classes(kind, base)
+    return own | others(kind, own, is_one=lambda part: isinstance(part, type) and issubclass(part, base) and not isabstract(part))
+
+
+@cache
+def _own_classes(kind: str, base: type) -> dict[str, type]:
+    found: dict[str, type] = {}
+    for module in iter_modules(import_module(f"scenes.{kind}").__path__):
+        names = vars(import_module(f"scenes.{kind}.{module.name}"))
+        own = [part for part in names.values() if isinstance(part, type) and issubclass(part, base) and not isabstract(part)]
+        found |= {module.name.replace("_", "-"): part for part in own if part.__module__ == names["__name__"]}
+    return found
 
 
 def _loaded(entry: EntryPoint) -> tuple[Any, str]:

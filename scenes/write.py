@@ -33,7 +33,8 @@ def sensor_files(spec: SensorSpec, stem: str, comment: str = "", notes: Mapping[
     for line in comment.splitlines():
         document.add(tomlkit.comment(line))
     given = {key: value for key, value in spec.model_dump(exclude_defaults=True).items() if key != "name" and value is not None}
-    given["pins"] = {"layout": spec.pins.layout} | given.get("pins", {})  # the layout is written even if it is the default
+    layout = {"layout": spec.pins.layout} | spec.pins.shape.model_dump(exclude_defaults=True)
+    given["pins"] = layout | given.get("pins", {})  # the layout is written even if it is the default
     plain, tables = take_out_tables(given, stem)
     for key in sorted(plain, key=lambda k: isinstance(plain[k], dict)):  # tables come last
         document.add(key, _item(plain[key]))

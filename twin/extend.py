@@ -1,4 +1,4 @@
-"""What authors of new parts need: protocols and base classes of arms, cameras, models, tasks, degradations and detectors.
+"""What authors of new parts need: protocols and base classes of layouts, materials, arms, cameras, models, tasks, degradations, detectors.
 
 arms          Arm ArmState BaseArm FEEDBACK_AGE_S MG400 Mg400Ports Mg400Emulator
 cameras       FrameSource LiveSource Picture ReadFailed capture
@@ -7,7 +7,7 @@ models        Estimate SensorModel Model PinModel Recipe register_model refuse_s
 tasks         Task
 degradations  Condition View over_channels
 detectors     Detector DetectorSpec
-sensors       PinsSpec
+sensors       PinsSpec Layout LatticeLayout MaterialLaw
 mechanics     SkinSolver
 optics        Preview project rest_pins
 
@@ -30,8 +30,11 @@ _PLACES = {
     "Estimate": "twin.estimate",
     "FEEDBACK_AGE_S": "hardware.arms.arm",
     "FrameSource": "hardware.cameras.source",
+    "LatticeLayout": "scenes.layouts.base",
+    "Layout": "scenes.layouts.base",
     "LiveSource": "hardware.cameras.reader",
     "MG400": "hardware.arms.mg400",
+    "MaterialLaw": "scenes.materials.base",
     "Mg400Emulator": "hardware.emulators.mg400",
     "Mg400Ports": "hardware.arms.mg400",
     "Model": "training.models.part",

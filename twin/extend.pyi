@@ -1,4 +1,4 @@
-"""What authors of new parts need: protocols and base classes of arms, cameras, models, tasks, degradations and detectors. Made by docs/generators/stubs.py."""
+"""What authors of new parts need: protocols and base classes of layouts, materials, arms, cameras, models, tasks, degradations, detectors. Made by docs/generators/stubs.py."""
 
 from hardware.arms.arm import Arm as Arm
 from hardware.arms.arm import ArmState as ArmState
@@ -14,6 +14,9 @@ from hardware.cameras.source import FrameSource as FrameSource
 from hardware.emulators.mg400 import Mg400Emulator as Mg400Emulator
 from hardware.errors import Connection as Connection
 from hardware.errors import DeviceError as DeviceError
+from scenes.layouts.base import LatticeLayout as LatticeLayout
+from scenes.layouts.base import Layout as Layout
+from scenes.materials.base import MaterialLaw as MaterialLaw
 from scenes.pins import PinsSpec as PinsSpec
 from training.environments.tasks import Task as Task
 from training.models import register as register

@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 
 from hardware.safety.decide import SafetyLimits
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, ServoSpec
-from scenes.base import Section
+from scenes.base import OpenSection, Section
 from twin.judge.degradation.plan import SweepPlan
 from twin.pins import DetectorSpec
 
@@ -121,8 +121,10 @@ def parts_of(annotation: Any) -> Iterator[type[Section]]:
 
 
 def sections_of(root: type[Section], path: str = "") -> dict[str, type[Section]]:
-    """Every section of a file by its place in it, the file itself first; the shapes of a union side by side."""
+    """Every section of a file by its place in it, the file itself first; the shapes of a union side by side, and so are a key's parts."""
     found = {path: root}
+    if issubclass(root, OpenSection):
+        found |= {f"{path} ({root.part_key} = {name})": part for name, part in root.parts().items() if part.model_fields}
     for key, field in root.model_fields.items():
         below = list(parts_of(field.annotation))
         for part in below:

@@ -14,7 +14,7 @@ from scenes import load_servo
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "tests" / "helpers" / "example_parts"
-PARTS = 10  # that the package offers; one raises, and one has the name of another
+PARTS = 12  # that the package offers; one raises, and one has the name of another
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +40,7 @@ simulator = twin.Simulator(twin.load_sensor("example-tip"), quality="drawn")
 state = simulator.press(twin.load_object("example-ball"), twin.ContactPose(1.0))
 simulator.render(state).save("frames")
 print("force", state.force_n[2] > 0)
+print("spiral", simulator.spec.pins.in_words(), len(state.caps_mm))
 camera = twin.open_camera("example:frames", simulator.spec, twin.Form.RAW)
 with camera: print("camera", camera.read().image.shape)
 
@@ -66,6 +67,7 @@ def test_each_part_is_used_whatever_is_imported_first(first, installed, tmp_path
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
         "force True",
+        "spiral 61 pins on a spiral 61",
         "camera (320, 320)",
         "guard SafeArm example arm at here",
         "arms True",
@@ -80,6 +82,8 @@ def test_commands_know_the_parts_and_the_doctor_names_the_broken_one(installed, 
     doctor = run(installed, "-m", "twin", "doctor", cwd=tmp_path).stdout.split("Parts of other packages\n")[1].split("\n\n")[0].splitlines()
     assert len(doctor) == PARTS and sum("LEFT OUT" in line for line in doctor) == 2
     assert "  arms: broken of tactip-example 0.1; LEFT OUT: RuntimeError: its maker has left" in doctor
+    unknown = run(installed, "-m", "twin", "new", "--frames", "frames", "--layout", "star:4", "--out", "made.toml", cwd=tmp_path)
+    assert "example-spiral:91" in unknown.stderr
     assert "example-tip" in run(installed, "-m", "twin", "sensors", cwd=tmp_path).stdout
     assert "example-haze" in run(installed, "-m", "twin", "robustness", "--list", cwd=tmp_path).stdout
 

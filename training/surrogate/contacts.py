@@ -7,7 +7,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from training.surrogate.contact import LinearContacts, motion_mm
 from training.surrogate.felt import Contact, Felt
-from training.surrogate.model import Surrogate, features, mechanics_of, outside, rest_of
+from training.surrogate.model import Surrogate, features, outside, rest_of, unlike_parts
 from training.surrogate.paths import unlike_drawn
 from twin.geometry.pins import PinRest
 from twin.objects import build_field
@@ -70,7 +70,7 @@ class SurrogateContacts:
             raise outside(f"the arm gives way to {touched.name} in a way of its own")
         if friction.static > self._domain["friction"]:
             raise outside(f"a friction of {friction.static:g}, at most {self._domain['friction']:g} was trained")
-        if contact.sensor is not self._sensor and mechanics_of(contact.sensor) != self._surrogate.about["mechanics"]:
+        if contact.sensor is not self._sensor and unlike_parts(self._surrogate.about["mechanics"], contact.sensor):
             raise outside("the skin, gel, lens or pins of the sensor are drawn anew; randomise friction, camera and noise only ('moves')")
 
     def begin(self, row: int, contact: Contact) -> None:

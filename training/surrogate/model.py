@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from scenes.base import Section
 from scenes.sensor import SensorSpec
 from training.surrogate.bending import Bending
 from training.surrogate.compliance import NODE_RINGS, POLAR_DEG
@@ -218,8 +219,19 @@ def _of_arrays(about: dict[str, Any], arrays: Mapping[str, FloatArray]) -> Surro
 
 def mechanics_of(sensor: SensorSpec) -> dict[str, Any]:
     """The sections of a specification that decide its mechanics, without the keys that only the optics need."""
-    plain = sensor.model_dump(mode="json")
+    return _felt({part: getattr(sensor, part) for part in MECHANICS})
+
+
+def _felt(sections: Mapping[str, Section]) -> dict[str, Any]:
+    plain = {part: section.model_dump(mode="json") for part, section in sections.items()}
     return {part: {key: value for key, value in plain[part].items() if is_mechanical(part, key)} for part in MECHANICS}
+
+
+def unlike_parts(saved: Mapping[str, Any], sensor: SensorSpec) -> list[str]:
+    """Sections in which a surrogate's saved mechanics are not those of a sensor. An earlier version saved more keys with their defaults."""
+    told = _felt({part: type(getattr(sensor, part)).model_validate(saved[part]) for part in MECHANICS})
+    wanted = mechanics_of(sensor)
+    return [part for part in MECHANICS if told[part] != wanted[part]]
 
 
 def is_mechanical(section: str, key: str) -> bool:
@@ -235,17 +247,15 @@ def surrogate_of(sensor: SensorSpec, file: str | Path | None = None) -> Surrogat
     SurrogateError
         The file is of another sensor, or none is shipped for this one.
     """
-    wanted = mechanics_of(sensor)
     if file is not None:
         found = load_surrogate(Path(file))
-        if found.about["mechanics"] != wanted:
-            parts = [part for part in MECHANICS if found.about["mechanics"][part] != wanted[part]]
+        if parts := unlike_parts(found.about["mechanics"], sensor):
             raise SurrogateError(
                 f"{file}: of a sensor with another [{'], ['.join(parts)}]; make one of {sensor.name} with 'twin surrogate'"
             )
         return found
     for path in sorted(SHIPPED.glob(f"*{SUFFIX}")):
-        if FILE.about(path)["mechanics"] == wanted:
+        if not unlike_parts(FILE.about(path)["mechanics"], sensor):
             return load_surrogate(path)
     raise SurrogateError(
         f"no surrogate of {sensor.name} goes with the package; make one: twin surrogate --sensor NAME_OR_FILE --out FILE, "

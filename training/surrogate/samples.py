@@ -64,9 +64,9 @@ def lattice_sensor(sensor: SensorSpec) -> SensorSpec:
 
     Pins do not change the mechanics. The lattice has symmetries, and each of them gives a further training state.
     """
-    pins = {**sensor.pins.model_dump(mode="json", exclude_defaults=True), "layout": "rings", "rings": PIN_RINGS, "spacing": "polar"}
-    kept = {key: value for key, value in pins.items() if key not in ("missing", "positions", "columns", "rows", "row_distance")}
-    return sensor.model_copy(update={"pins": PinsSpec.model_validate(kept)})
+    kept = sensor.pins.model_dump(include=set(PinsSpec.model_fields) - {"missing"})
+    pins = PinsSpec.model_validate({**kept, "layout": "rings", "rings": PIN_RINGS, "spacing": "polar"})
+    return sensor.model_copy(update={"pins": pins})
 
 
 def solve_path(solver: SkinSolver, nodes: AtNodes, drawn: DrawnPath, *, step_mm: float = STEP_MM) -> SolvedPath | None:

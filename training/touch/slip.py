@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from scenes.layouts.rings import Rings
 from scenes.sensor import SensorSpec
 from training.data.dataset import Dataset
 from training.data.pins import PinTable
@@ -374,7 +375,7 @@ def random_places(states: int, rng: np.random.Generator) -> np.ndarray:
 
 def learn_slip(drags: Sequence[Drag], eyes: Eyes, sensor: SensorSpec, *, seed: int = 0) -> SlipModel:
     """Learn slip from drags. At least ``FEWEST_DRAGS`` must slide in the end. If pins form rings, each drag is also turned and mirrored."""
-    rings = sensor.pins.rings if sensor.pins.layout == "rings" else None
+    rings = sensor.pins.shape.rings if isinstance(sensor.pins.shape, Rings) else None
     turns = [] if rings is None else symmetries(sensor.pins.phase_deg)
     rng = np.random.default_rng([seed, 5])
     held = set(rng.permutation(len(drags))[::HELD_OUT].tolist())

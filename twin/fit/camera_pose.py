@@ -147,7 +147,8 @@ def fit_camera(
     needed: set[str] = set()
     while True:
         sd, correlation = _certainty(residual, slopes)
-        rings = spec.pins.rings or np.sqrt(len(pins_px) / 3)  # as many as rings of so many pins
+        rings = len(spec.pins.shape.ring_ends()) - 1
+        rings = rings if rings > 1 else np.sqrt(len(pins_px) / 3)  # as many as rings of so many pins
         alike = np.sqrt(len(pins_px) / rings)  # the pins of a ring share one error
         doubtful = _undetermined(_values(spec, names), sd * alike * max(MODEL_PX / _rms(residual), 1), correlation)
         name = next((name for name in names if name in doubtful and name not in needed), None)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import Delaunay
 
+from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
 from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Polarity, RecordingSpec, SensorSpec
 from twin.errors import FrameError
@@ -256,7 +257,8 @@ def _holds_its_axis(places: np.ndarray) -> bool:
 
 def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
     """The user's layout, compared with the frames."""
-    if layout.layout == "positions" and not _holds_its_axis(np.array(layout.positions)):
+    alone = not isinstance(layout.shape, LatticeLayout)  # none of those that are searched for in frames
+    if alone and not _holds_its_axis(layout.shape.places()):
         raise FrameError(
             f"the sensor's axis, 0,0, lies outside of the {layout.in_words()} that were given; x,y count from the axis: "
             "subtract the place of the middle pin, or of the middle of all pins"
@@ -268,7 +270,7 @@ def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
         if dark is not None and (shown is None or dark.explained > shown.explained):
             shown, polarity = dark, "dark"
     if shown is not None and shown.explained >= GIVEN_SHOWN:
-        forgotten = unnamed_spots(shown.rest_px, shown.seen) if layout.layout == "positions" else []
+        forgotten = unnamed_spots(shown.rest_px, shown.seen) if alone else []
         doubts = tuple(
             f"a pin-like spot at ({x:.0f}, {y:.0f}) px is none of the {layout.in_words()}: does the file lack its place?"
             for x, y in forgotten
@@ -282,7 +284,7 @@ def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
         instead = f"; they show {other.pins.in_words()}" if other is not None else ""
         places = (
             "compare the places with the picture: one that is missing or wrong hides the others"
-            if layout.layout == "positions"
+            if alone
             else "give each pin's place, `layout` positions:FILE.csv"
         )
         raise FrameError(
@@ -603,8 +605,7 @@ def _notes(found: Identified, rest: Rest, camera: CameraReport) -> dict[str, str
     met = f"fitted: pins at rest within {camera.rms_px:.2f} px"
     return {
         "pins.layout": sure,
-        "pins.rings": sure,
-        "pins.columns": sure,
+        **{f"pins.{key}": sure for key in type(found.best.pins.shape).model_fields},
         "pins.missing": "not seen in any frame, though in view",
         "pins.phase_deg": "turn of the first pin of each ring",
         "pins.spacing": "decided by the caps' sizes",

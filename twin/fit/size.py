@@ -41,7 +41,7 @@ def require_radius(radius_mm: float) -> None:
 
 def _scaled(section: BaseModel, factor: float) -> dict[str, Any]:
     """A section's values, lengths multiplied."""
-    return {name: _value(name, getattr(section, name), factor) for name in type(section).model_fields}
+    return {name: _value(name, value, factor) for name, value in section}
 
 
 def _value(name: str, value: Any, factor: float) -> Any:

@@ -1,7 +1,6 @@
 """Positions of a sensor's pins at rest, in the specification's pin order."""
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
@@ -69,13 +68,9 @@ class Lattice:
 
 @lru_cache(maxsize=32)
 def pin_lattice(pins: PinsSpec) -> Lattice:
-    """The layout of a specification's pins, without its rotation.
-
-    Order of the pins in rings and hexagons: first the centre, then ring by ring, each from its first pin by increasing azimuth (x towards
-    y). The sides of a hexagonal ring are divided into equal parts; its corners are at multiples of 60 deg. Order of the pins in a grid: row
-    by row, each from small to large x. Missing pins are omitted.
-    """
-    places, border, ring_ends = _COMPLETE[pins.layout](pins)
+    """The layout of a specification's pins, without its rotation. Missing pins are omitted."""
+    shape = pins.shape
+    places, border = shape.places(), shape.border()
     there = np.setdiff1d(np.arange(len(places)), pins.missing)
     number = np.full(len(places), -1)
     number[there] = np.arange(len(there))
@@ -83,47 +78,7 @@ def pin_lattice(pins: PinsSpec) -> Lattice:
     outmost = border_of(places) if border is None else number[border][number[border] >= 0]
     if len(outmost) < LEAST_BORDER:
         outmost = border_of(places)
-    return Lattice(places, outmost, number, ring_ends)
-
-
-def _ringed(pins: PinsSpec) -> tuple[FloatArray, IntArray | None, IntArray]:
-    """Places of rings or of a hexagon, indices of their outermost ring, and ends of the rings."""
-    rings = pins.rings or 0
-    points = [0j]
-    for ring in range(1, rings + 1):
-        k = np.arange(6 * ring)
-        if pins.layout == "rings":
-            points += (ring * np.exp(2j * np.pi * k / (6 * ring))).tolist()
-        else:
-            side, step = np.divmod(k, ring)
-            start, end = np.exp(1j * np.pi / 3 * side), np.exp(1j * np.pi / 3 * (side + 1))
-            points += (ring * start + (end - start) * step).tolist()
-    z = np.array(points)
-    ends = 1 + 3 * np.arange(rings + 1) * np.arange(1, rings + 2)
-    return np.column_stack([z.real, z.imag]), np.arange(len(z) - 6 * rings, len(z)), ends
-
-
-def _grid(pins: PinsSpec) -> tuple[FloatArray, IntArray | None, IntArray]:
-    """Places of a grid, indices of its border, and ends of its single ring."""
-    columns, rows = pins.columns or 0, pins.rows or 0
-    y, x = np.mgrid[:rows, :columns]
-    number = np.arange(rows * columns).reshape(rows, columns)
-    border = np.concatenate([number[0, :-1], number[:-1, -1], number[-1, :0:-1], number[:0:-1, 0]])
-    places = np.column_stack([(x - (columns - 1) / 2).ravel(), pins.row_distance * (y - (rows - 1) / 2).ravel()])
-    return places, border, np.array([0, rows * columns])
-
-
-def _given(pins: PinsSpec) -> tuple[FloatArray, IntArray | None, IntArray]:
-    """Given places, no border, and ends of their single ring."""
-    return np.array(pins.positions, float), None, np.array([0, len(pins.positions)])
-
-
-_COMPLETE: dict[str, Callable[[PinsSpec], tuple[FloatArray, IntArray | None, IntArray]]] = {
-    "rings": _ringed,
-    "hexagon": _ringed,
-    "grid": _grid,
-    "positions": _given,
-}
+    return Lattice(places, outmost, number, shape.ring_ends())
 
 
 @lru_cache(maxsize=32)

@@ -29,9 +29,7 @@ def law_coefficients(spec: MaterialSpec, *, layer: bool) -> FloatArray:
     kappa = spec.young_modulus_mpa / (3 * (1 - 2 * spec.poisson_ratio))
     limit = _LARGEST_DIFFERENCE * mu
     difference = 2 * mu * (spec.poisson_ratio / (1 - spec.poisson_ratio) + 1 / 3) if layer else kappa * limit / (kappa + limit)
-    half = mu / 2
-    share = spec.second_invariant_share
-    return np.array([half * (1 - share), half * share, half * spec.c20_c10, half * spec.c30_c10, kappa, difference])
+    return np.array([*(mu / 2 * np.array(spec.part.coefficients())), kappa, difference])
 
 
 @compiled(inline="always")

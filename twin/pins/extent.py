@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
 from twin.geometry.pins import usual_spacing
 from twin.pins.bumps import Bumps
-from twin.pins.families import HALF_GRID, MOST_RINGS, family
+from twin.pins.families import family
 from twin.pins.growth import seen_places
 
 FLAT_SIDE_PX = 5
@@ -100,37 +101,6 @@ def in_view(places: np.ndarray, spots: Bumps) -> np.ndarray:
     return inside
 
 
-def sides(pins: PinsSpec) -> list[np.ndarray]:
-    """Places of a family's lattice just outside a layout: the next ring, or the next row or column on each side of a grid.
-
-    Returns
-    -------
-    list of (k,) int
-        One array for each side. The list is empty for a layout of given positions, and for the largest layout that is searched.
-    """
-    if pins.layout in ("rings", "hexagon"):
-        if (pins.rings or 0) >= MOST_RINGS:
-            return []
-        return [np.arange(pins.complete_count, PinsSpec(layout=pins.layout, rings=(pins.rings or 0) + 1).complete_count)]
-    if pins.layout == "grid":
-        columns, rows = pins.columns or 0, pins.rows or 0
-        if max(columns, rows) > 2 * HALF_GRID - 1:
-            return []
-        x, y = np.arange(1, columns + 1), np.arange(1, rows + 1)
-        nodes = [(x, np.zeros_like(x)), (x, np.full_like(x, rows + 1)), (np.zeros_like(y), y), (np.full_like(y, columns + 1), y)]
-        return [row * (2 * HALF_GRID + 1) + column for column, row in nodes]
-    return []
-
-
-def own_places(pins: PinsSpec) -> np.ndarray:
-    """Places (N,) of a layout's pins in a family's lattice. The places of ``sides`` lie around them."""
-    places = np.arange(pins.complete_count)
-    if pins.layout == "grid":
-        columns = pins.columns or 1
-        places = (places // columns + 1) * (2 * HALF_GRID + 1) + places % columns + 1
-    return np.delete(places, list(pins.missing))
-
-
 @dataclass(frozen=True)
 class Beyond:
     """Visible things around a layout: pixels whose level differs from the usual level there.
@@ -173,12 +143,12 @@ def open_sides(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps, beyond: Beyond
 
     On such a side the frame may cut off more pins. ``beyond`` is the result of ``seen_beyond``.
     """
-    around = sides(pins)
-    if not around:
+    shape = pins.shape
+    if not isinstance(shape, LatticeLayout) or not shape.sides():
         return 0
-    by = family(pins.layout)
+    by, around = family(type(shape)), shape.sides()
     spot = np.full(len(by.lattice), -1)
-    spot[own_places(pins)] = np.arange(pins.count)
+    spot[np.delete(shape.own_places(), list(pins.missing))] = np.arange(pins.count)
     places = seen_places(by.lattice, by.around, rest_px, spot, spots.size_px)
     framed = in_view(places, replace(spots, hidden=None))
     middle = rest_px.mean(axis=0)

@@ -7,25 +7,16 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
+from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
 from twin.geometry.pins import pin_lattice, usual_spacing
 from twin.pins.bumps import Bumps
 from twin.pins.growth import NEIGHBOURS, grow
 
-MOST_RINGS = 16
-"""Largest number of rings that is searched. Printed TacTips have 3 to 11."""
-HALF_GRID = 20
-"""Largest number of columns and rows that is searched on each side of the place at which a grid starts."""
-SEEDS = {"rings": 40, "hexagon": 12, "grid": 12}
-"""Number of spots from which a labelling is started, by family. The spots nearest to the middle are tried first. Rings have only one
-centre, which a contact displaces; a hexagon or a grid may start at any pin."""
 NEARLY_ALL = 0.95
 """Share of the spots that a labelling must hold to end the search for a better start."""
-RING_GAPS_DEG, GRID_GAPS_DEG = (25.0, 100.0), (60.0, 120.0)
-"""Smallest and largest angle, deg, between the directions to neighbouring spots around a start: among the nearest six spots (rings,
-hexagon), and among the nearest four (grid)."""
 MOST_UNEVEN = 2.0
-"""Largest ratio of the distances of these nearest spots from the start."""
+"""Largest ratio of the distances of the nearest spots around a start from it."""
 LEAST_GROWN = 12
 """Least number of spots in a labelling."""
 TURNS_DEG = np.arange(0.0, 360.0, 5.0)
@@ -42,43 +33,41 @@ class Family:
 
     Attributes
     ----------
-    name : {"rings", "hexagon", "grid", "positions"}
+    kind : type of LatticeLayout, optional
+        Kind of the layouts that are parts of the lattice; None if the lattice is one layout.
     lattice : (M, 2) float
         Positions of the places. Neighbouring places are about 1 apart.
     around : (M, k) int
         Neighbours of each place, the nearest first.
-    ring : (M,) int
-        Ring of each place; 0 for all places of a lattice without rings.
     """
 
-    name: str
+    kind: type[LatticeLayout] | None
     lattice: np.ndarray
     around: np.ndarray
-    ring: np.ndarray
 
 
-def _family(name: str, lattice: np.ndarray, ring: np.ndarray) -> Family:
+def _family(kind: type[LatticeLayout] | None, lattice: np.ndarray) -> Family:
     around = cKDTree(lattice).query(lattice, k=min(NEIGHBOURS + 1, len(lattice)))[1][:, 1:]
-    return Family(name, np.ascontiguousarray(lattice), np.ascontiguousarray(around), ring)
+    return Family(kind, np.ascontiguousarray(lattice), np.ascontiguousarray(around))
 
 
 @lru_cache(maxsize=8)
-def family(name: str) -> Family:
-    """The lattice of ``rings``, ``hexagon`` (a triangular lattice) or ``grid``, far larger than any sensor's."""
-    if name == "grid":
-        y, x = np.mgrid[-HALF_GRID : HALF_GRID + 1, -HALF_GRID : HALF_GRID + 1]
-        return _family(name, np.column_stack([x.ravel(), y.ravel()]).astype(float), np.zeros(x.size, int))
-    pins = PinsSpec(layout="rings" if name == "rings" else "hexagon", rings=MOST_RINGS)
-    ring = np.concatenate([[0], np.repeat(np.arange(1, MOST_RINGS + 1), 6 * np.arange(1, MOST_RINGS + 1))])
-    return _family(name, MOST_RINGS * pin_lattice(pins).places, ring)
+def family(kind: type[LatticeLayout]) -> Family:
+    """The lattice of a kind of layouts, far larger than any sensor's."""
+    return _family(kind, kind.largest().places())
+
+
+def families() -> list[Family]:
+    """The lattices for which frames are searched, in the order of the search."""
+    kinds = [kind for kind in PinsSpec.parts().values() if issubclass(kind, LatticeLayout)]
+    return [family(kind) for kind in sorted(kinds, key=lambda kind: kind.order)]
 
 
 @lru_cache(maxsize=8)
 def family_of_positions(pins: PinsSpec) -> Family:
     """A layout of any kind as a lattice of its own."""
     places = pin_lattice(pins).places
-    spacing = usual_spacing(places)
-    return _family("positions", places / spacing, np.zeros(len(places), int))
+    return _family(None, places / usual_spacing(places))
 
 
 def label_spots(found: Bumps, by: Family) -> np.ndarray | None:
@@ -86,7 +75,7 @@ def label_spots(found: Bumps, by: Family) -> np.ndarray | None:
     if len(found.px) < LEAST_GROWN:
         return None
     best, most = None, LEAST_GROWN - 1
-    for start, cell in _laid(found, by) if by.name == "positions" else _starts(found, by):
+    for start, cell in _starts(found, by, by.kind) if by.kind else _laid(found, by):
         labels = grow(by.lattice, by.around, found.px, start, cell)
         count = int((labels >= 0).sum())
         if count > most:
@@ -96,16 +85,12 @@ def label_spots(found: Bumps, by: Family) -> np.ndarray | None:
     return best
 
 
-def _starts(found: Bumps, by: Family) -> Iterator[tuple[np.ndarray, float]]:
+def _starts(found: Bumps, by: Family, kind: type[LatticeLayout]) -> Iterator[tuple[np.ndarray, float]]:
     """First labels (M,) and the spots' distance, px: a spot and its nearest spots, beginning with the one nearest to the x direction."""
-    px, corners = found.px, 4 if by.name == "grid" else 6
-    least, most = GRID_GAPS_DEG if by.name == "grid" else RING_GAPS_DEG
-    middle = len(by.lattice) // 2 if by.name == "grid" else 0
-    side = 2 * HALF_GRID + 1
-    places = middle + np.array([1, side, -1, -side]) if by.name == "grid" else np.arange(1, 7)
-    distance, near = cKDTree(px).query(px, k=corners + 1)
+    px, (least, most), (middle, places) = found.px, kind.gaps_deg, kind.start()
+    distance, near = cKDTree(px).query(px, k=kind.corners + 1)
     away = np.linalg.norm(px - np.median(px, axis=0), axis=1)
-    for spot in np.argsort(away)[: SEEDS[by.name]]:
+    for spot in np.argsort(away)[: kind.seeds]:
         ring, reach = near[spot, 1:], distance[spot, 1:]
         if reach[-1] > MOST_UNEVEN * reach[0]:
             continue

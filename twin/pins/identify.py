@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from scenes.pins import PinsSpec
+from scenes.layouts.base import LatticeLayout
+from scenes.pins import PinsSpec, layout_from
 from scenes.sensor import Polarity
 from twin.errors import FrameError
 from twin.frames import spread
@@ -25,7 +26,7 @@ from twin.frames.forms import is_two_level, levels_at, pin_levels
 from twin.geometry.pins import namings, pin_lattice, usual_spacing
 from twin.pins.bumps import Bumps, find_bumps
 from twin.pins.extent import filled_area, in_view, open_sides, seen_beyond, with_view
-from twin.pins.families import Family, family, family_of_positions, label_spots
+from twin.pins.families import Family, families, family, family_of_positions, label_spots
 from twin.pins.growth import seen_places
 from twin.pins.matching import match
 from twin.pins.reference import make_reference, spread_out, together
@@ -36,9 +37,6 @@ SIZES = tuple(0.003 * 1.4**k for k in range(8))
 deviations wide."""
 SIZED_ON = 3
 """Number of frames from which the size of the spots is determined."""
-FAMILIES = ("rings", "hexagon", "grid")
-FULL_RING = 0.5
-"""Least share of the places in view of a ring that must be seen, for the ring to belong to the layout."""
 LIKE_ITS_NEIGHBOURS = 0.45
 """Least height of a pin-like spot, as a share of the median height of the pins around it."""
 BEYOND = 1.25
@@ -262,17 +260,18 @@ def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
     FrameError
         No frame shows a layout.
     """
-    looks: list[Look] = [partial(_family_look, family(name)) for name in FAMILIES]
+    searched = families()
+    looks: list[Look] = [partial(_family_look, by) for by in searched]
     sizes = [_best_size(images[k], looks) for k in spread(len(images), SIZED_ON)]
     if not any(sizes):
         raise FrameError(f"none of {len(images)} frames shows pins in rings, a hexagon or a grid; {NO_LAYOUT}")
     sigma = float(np.median([size for size in sizes if size]))
     spots = _spots(images, sigma)
     found: list[tuple[PinsSpec, list[Seen]]] = []
-    for k, name in enumerate(FAMILIES):
-        found += _first_guesses(family(name), spots)
+    for k, by in enumerate(searched):
+        found += _first_guesses(by, spots)
         if progress:
-            progress(k + 1, 2 * len(FAMILIES))
+            progress(k + 1, 2 * len(searched))
     found = [guess for guess in found if np.median([one.explained for one in guess[1]]) >= LEAST_EXPLAINED]
     found.sort(key=lambda guess: -sum(one.explained for one in guess[1]))
     candidates = []
@@ -319,7 +318,7 @@ def _faded(layout: Candidate, images: list[np.ndarray]) -> float:
 
 def _end_not_seen(pins: PinsSpec) -> str:
     """Message: the frames do not show the end of the layout, so the sensor may have more pins."""
-    lines = "rows or columns" if pins.layout == "grid" else "rings"
+    lines = getattr(pins.shape, "lines", "pins")
     return (
         f"the frames show nothing beyond {pins.in_words()}: more {lines} may be cut off or masked; frames that show the sensor's rim "
         f"decide, or count the {lines} of the sensor and give the layout"
@@ -329,10 +328,13 @@ def _end_not_seen(pins: PinsSpec) -> str:
 def _with_larger(candidates: list[Candidate], spots: list[Bumps]) -> list[Candidate]:
     """The candidates, with the layout that has one ring more than the first candidate inserted after it."""
     first = candidates[0].pins
-    if first.rings is None or any((c.pins.layout, c.pins.rings) == (first.layout, first.rings + 1) for c in candidates[1:2]):
+    shape = first.shape
+    if not isinstance(shape, LatticeLayout) or len(shape.sides()) != 1:  # of several sides it is not known which has more pins
         return candidates
-    pins = PinsSpec(layout=first.layout, rings=first.rings + 1)
-    seen = [shown for one in spots if (shown := _layout_look(pins, family(pins.layout), one)) is not None]
+    pins = layout_from(f"{first.layout}:{shape.resized(1)}")
+    if any((c.pins.layout, c.pins.complete_count) == (pins.layout, pins.count) for c in candidates[1:2]):
+        return candidates
+    seen = [shown for one in spots if (shown := _layout_look(pins, family(type(shape)), one)) is not None]
     larger = [_candidate(pins, seen, spots, may_miss=False)] if seen else []
     return [candidates[0], *larger, *candidates[1:]]
 
@@ -342,10 +344,11 @@ def judge_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
 
     Its missing pins are not changed.
     """
-    by = family_of_positions(pins) if pins.layout == "positions" or pins.missing else family(pins.layout)
-    layout = _judged(pins, by, images)
-    if by.name == "positions" and pins.layout != "positions" and (layout is None or layout.explained < SHOWN):
-        grown = _judged(pins, family(pins.layout), images)  # it follows a strongly curved view, but may be a row off
+    shape = pins.shape
+    of_kind = family(type(shape)) if isinstance(shape, LatticeLayout) else None
+    layout = _judged(pins, family_of_positions(pins) if of_kind is None or pins.missing else of_kind, images)
+    if of_kind and pins.missing and (layout is None or layout.explained < SHOWN):
+        grown = _judged(pins, of_kind, images)  # it follows a strongly curved view, but may be a row off
         layout = max((one for one in (layout, grown) if one is not None), key=lambda one: one.explained, default=None)
     return layout
 
@@ -422,145 +425,38 @@ def _told(spots: Bumps, spot: np.ndarray, places: np.ndarray) -> Seen:
 
 def _first_guesses(by: Family, spots: list[Bumps]) -> list[tuple[PinsSpec, list[Seen]]]:
     """The two layouts of one family that explain most if each frame is labelled by itself."""
-    votes: dict[tuple[int, ...], list[Seen]] = {}
+    votes: dict[PinsSpec, list[Seen]] = {}
     for one in spots:
         spot = label_spots(one, by)
         if spot is not None and (part := _part(by, one, spot)) is not None:
             votes.setdefault(part[0], []).append(part[1])
-    ranked = sorted(votes, key=lambda size: -sum(seen.explained for seen in votes[size]))
-    return [(_layout_of(by, size), votes[size]) for size in ranked[:2]]
+    return sorted(votes.items(), key=lambda vote: -sum(seen.explained for seen in vote[1]))[:2]
 
 
-def _layout_of(by: Family, size: tuple[int, ...]) -> PinsSpec:
-    """The layout of a family with this number of rings, or of columns and rows."""
-    if by.name == "grid":
-        return PinsSpec(layout="grid", columns=size[0], rows=size[1])
-    return PinsSpec(layout="rings" if by.name == "rings" else "hexagon", rings=size[0])
+def _part(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[PinsSpec, Seen] | None:
+    """The part of a lattice in a frame: the layout, and its pins in the frame."""
+    part = by.kind.seen(spot >= 0, _family_in_view(by, spots, spot)) if by.kind else None
+    return None if part is None else (_named(part[0]), _seen(spots, spot, by, part[1]))
 
 
-def _part(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[tuple[int, ...], Seen] | None:
-    """The part of a lattice in a frame: its number of rings, or of columns and rows, and its pins in the frame."""
-    if by.name == "grid":
-        part = _rectangle(by, spots, spot)
-        return None if part is None else (part[0], _seen(spots, spot, by, part[1]))
-    middle, rings = (0, _rings(by, spots, spot)) if by.name == "rings" else _hexagon(by, spots, spot)
-    return ((rings,), _seen(spots, spot, by, _ring_nodes(by, middle, rings))) if rings else None
+def _named(shape: LatticeLayout) -> PinsSpec:
+    """Pins of a layout."""
+    name = next(name for name, kind in PinsSpec.parts().items() if kind is type(shape))
+    return PinsSpec.model_validate({"layout": name, **shape.model_dump()})
 
 
 def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> Seen | None:
     """A given layout of a family in a labelled frame, at the position with most labels; None if the lattice is too small for it."""
-    if by.name == "positions":
+    shape = pins.shape
+    if by.kind is None or not isinstance(shape, LatticeLayout):
         return _seen(spots, spot, by, np.arange(len(by.lattice)))
-    nodes: np.ndarray | None = None
-    if by.name == "rings" and (pins.rings or 0) <= by.ring.max():
-        nodes = _ring_nodes(by, 0, pins.rings or 0)
-    elif by.name == "hexagon" and (middle := _best_middle(by, spot, pins.rings or 0)) is not None:
-        nodes = _ring_nodes(by, middle, pins.rings or 0)
-    elif by.name == "grid":
-        nodes = _best_rectangle(by, spot, pins.columns or 0, pins.rows or 0)
+    nodes = shape.at_most_labels(spot >= 0)
     return None if nodes is None else _seen(spots, spot, by, np.delete(nodes, list(pins.missing)))
 
 
 def _family_in_view(by: Family, spots: Bumps, spot: np.ndarray) -> np.ndarray:
     """(M,) bool: whether each place of a lattice is in view. A place without a prediction counts as not in view."""
     return in_view(seen_places(by.lattice, by.around, spots.px, spot, spots.size_px), spots)
-
-
-def _rings(by: Family, spots: Bumps, spot: np.ndarray) -> int:
-    """Number of rings that are seen, counted from the middle outwards."""
-    shown = _family_in_view(by, spots, spot)
-    rings = 0
-    for ring in range(1, int(by.ring.max()) + 1):
-        here = by.ring == ring
-        there = (spot >= 0) & here
-        if there.sum() < FULL_RING * max((shown & here).sum(), 1) or there.sum() < 2:
-            break
-        rings = ring
-    return rings
-
-
-def _hexagon(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[int, int]:
-    """Middle place and number of rings of the hexagon with the most labels and the fewest empty places in view."""
-    taken = np.flatnonzero(spot >= 0)
-    empty = np.flatnonzero((spot < 0) & _family_in_view(by, spots, spot))
-    q, labelled, bare = _axial(by.lattice), _axial(by.lattice[taken]), _axial(by.lattice[empty])
-    best, most, rings = 0, -np.inf, 0
-    for middle in taken:
-        widest = int(by.ring.max() - by.ring[middle]) + 1
-        full = np.bincount(_steps(labelled - q[middle]), minlength=widest)[:widest]
-        hollow = np.bincount(_steps(bare - q[middle]), minlength=widest)[:widest]
-        gain = np.cumsum(full - hollow)
-        r = int(gain.argmax())
-        if gain[r] > most:
-            best, most, rings = int(middle), float(gain[r]), r
-    return best, rings
-
-
-def _best_middle(by: Family, spot: np.ndarray, rings: int) -> int | None:
-    """Middle of the hexagon with ``rings`` rings that holds most labels; None if it does not fit in the lattice."""
-    taken = np.flatnonzero(spot >= 0)
-    q, labelled = _axial(by.lattice), _axial(by.lattice[taken])
-    fitting = [m for m in taken if by.ring[m] + rings <= by.ring.max()]
-    if not fitting:
-        return None
-    return int(max(fitting, key=lambda m: int((_steps(labelled - q[m]) <= rings).sum())))
-
-
-def _axial(places: np.ndarray) -> np.ndarray:
-    """Integer coordinates (n, 2) of places in a triangular lattice whose neighbours are 1 apart. The first axis is along x."""
-    r = places[:, 1] / (np.sqrt(3) / 2)
-    return np.round(np.column_stack([places[:, 0] - r / 2, r])).astype(int)
-
-
-def _steps(axial: np.ndarray) -> np.ndarray:
-    """Distance (n,) from the origin of a triangular lattice, as a number of steps between neighbours."""
-    return np.max(np.abs(np.column_stack([axial, axial.sum(axis=1)])), axis=1)
-
-
-def _ring_nodes(by: Family, middle: int, rings: int) -> np.ndarray:
-    """Places of the hexagon with ``rings`` rings around a middle place, in the specification's pin order."""
-    count = 1 + 3 * rings * (rings + 1)
-    if middle == 0:
-        return np.arange(count)
-    distance, node = cKDTree(by.lattice).query(by.lattice[:count] + by.lattice[middle])
-    return np.where(distance < 0.1, node, middle)
-
-
-def _rectangle(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[tuple[int, int], np.ndarray] | None:
-    """The rectangle with the most labels and the fewest empty places in view: its columns and rows, and its places."""
-    side = int(round(np.sqrt(len(by.lattice))))
-    there = (spot >= 0).reshape(side, side)
-    gain = np.where(there, 1, np.where(_family_in_view(by, spots, spot).reshape(side, side), -1, 0))
-    sums = np.pad(gain.cumsum(axis=0), ((1, 0), (0, 0)))
-    best, most = None, 0
-    rows = np.flatnonzero(there.any(axis=1))
-    for top in rows:
-        for bottom in rows[rows > top]:
-            line = sums[bottom + 1] - sums[top]  # the range of columns with the largest sum (Kadane's algorithm)
-            run, first = 0, 0
-            for column in range(side):
-                if run <= 0:
-                    run, first = 0, column
-                run += int(line[column])
-                if run > most and column > first:
-                    best, most = (top, bottom, first, column), run
-    if best is None:
-        return None
-    top, bottom, left, right = best
-    y, x = np.mgrid[top : bottom + 1, left : right + 1]
-    return (int(right - left + 1), int(bottom - top + 1)), (y * side + x).ravel()
-
-
-def _best_rectangle(by: Family, spot: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
-    """Places of the rectangle of a given size that holds most labels; None if it is larger than the lattice."""
-    side = int(round(np.sqrt(len(by.lattice))))
-    if max(columns, rows) > side:
-        return None
-    there = np.pad((spot >= 0).reshape(side, side).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-    held = there[rows:, columns:] - there[:-rows, columns:] - there[rows:, :-columns] + there[:-rows, :-columns]
-    top, left = np.unravel_index(held.argmax(), held.shape)
-    y, x = np.mgrid[top : top + rows, left : left + columns]
-    return (y * side + x).ravel()
 
 
 def _candidate(pins: PinsSpec, seen: list[Seen], spots: list[Bumps], *, may_miss: bool = True) -> Candidate:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError, Voronoi
 
-from scenes.pins import Layout, PinsSpec
+from scenes.pins import PinsSpec
 from scenes.sensor import Polarity, RecordingSpec
 from twin.errors import FrameError
 from twin.frames.forms import gray_levels
@@ -51,7 +51,7 @@ class LegacyParameters:
     virtual_scales: tuple[float, ...] = ()
 
 
-LEGACY: dict[Layout, LegacyParameters] = {
+LEGACY: dict[str, LegacyParameters] = {
     "rings": LegacyParameters(300, 100, (-1, -2), 14, 10.0),
     "hexagon": LegacyParameters(
         256, 80, (0, 2), 15, 1.0, (7.0, 12.0, 22.0, 30.0, 38.0, 48.0, 53.0), (0.95, 0.9, 0.85, 0.85, 0.85, 0.9, 0.95)
@@ -59,7 +59,7 @@ LEGACY: dict[Layout, LegacyParameters] = {
 }
 
 
-def legacy_parameters(layout: Layout) -> LegacyParameters:
+def legacy_parameters(layout: str) -> LegacyParameters:
     """The release's constants for a layout.
 
     Raises

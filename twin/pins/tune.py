@@ -6,7 +6,7 @@ from typing import Any, Literal, TypedDict
 
 import numpy as np
 
-from scenes.pins import Layout, PinsSpec
+from scenes.pins import PinsSpec
 from scenes.sensor import BlobSpec, Polarity, RecordingSpec, SensorSpec
 from twin.errors import FrameError
 from twin.frames import spread
@@ -260,7 +260,7 @@ def _start(
     area: float,
     method: Method,
     form: Form,
-    kind: Layout,
+    kind: str,
     polarity: Polarity,
 ) -> DetectorSpec:
     """A detector with the mask and the caps' size, before a threshold is chosen."""
@@ -288,7 +288,7 @@ def _start(
     )
 
 
-def _recorder(size_px: tuple[int, int], blob: BlobSpec, layout: Layout) -> RecordingSpec:
+def _recorder(size_px: tuple[int, int], blob: BlobSpec, layout: str) -> RecordingSpec:
     """The published recorder, with a square crop that puts the mask at the place where the published method expects it."""
     release = legacy_parameters(layout)
     half = release.size_px // 2

@@ -50,12 +50,7 @@ def corrected(pins: PinsSpec, by: int) -> str:
     SpecError
         The layout is a list of positions, or would become too small.
     """
-    if pins.layout == "positions":
-        raise SpecError("a layout of given positions has no rings; correct its CSV file")
-    if pins.layout == "grid":
-        text = f"grid:{(pins.columns or 0) + by}x{(pins.rows or 0) + by}"
-    else:
-        text = f"{pins.layout}:{(pins.rings or 0) + by}"
+    text = f"{pins.layout}:{pins.shape.resized(by)}"
     layout_from(text)  # raises an error if there is no such layout
     return text
 

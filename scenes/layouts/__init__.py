@@ -1,0 +1,1 @@
+"""Layouts of pins: one class in one module each."""

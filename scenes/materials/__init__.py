@@ -1,0 +1,1 @@
+"""Hyperelastic laws of rubbers: one class in one module each."""

@@ -87,8 +87,8 @@ class Grid(LatticeLayout):
                         best, most = (int(top), first, int(bottom - top + 1), column - first + 1), run
         if best is None:
             return None
-        top, left, height, width = best
-        return cls(columns=width, rows=height), _rectangle(top, left, height, width)
+        first_row, left, height, width = best
+        return cls(columns=width, rows=height), _rectangle(first_row, left, height, width)
 
     def at_most_labels(self, labelled: NDArray[np.bool_]) -> NDArray[np.intp] | None:
         if max(self.columns, self.rows) > SIDE:

@@ -59,7 +59,7 @@ class Hexagon(RingedLayout):
         fitting = [m for m in taken if self.ring_of_place()[m] + self.rings <= MOST_RINGS]
         if not fitting:
             return None
-        return self._around(max(fitting, key=lambda m: int((_steps(q[taken] - q[m]) <= self.rings).sum())))
+        return self._around(int(max(fitting, key=lambda m: int((_steps(q[taken] - q[m]) <= self.rings).sum()))))
 
     def _around(self, middle: int) -> NDArray[np.intp]:
         """Places (N,) of the hexagon around a middle place."""

@@ -32,7 +32,6 @@ from training.surrogate.felt import Felt, FiniteElements
 from twin.errors import ContactError, OptionError
 
 PLACE_TOLERANCE_MM = 1e-6  # of geometry computed in double precision
-SAME_ATOL = 1e-5  # spacings; a row's float32 sums depend on how many rows there are
 FAST = {"backend": "fem", "sensor": "mg400-127", "observation": "oracle"}
 
 
@@ -367,7 +366,7 @@ def test_every_way_of_making_many_gives_the_same_episodes():
         told.append([theirs.reset()["tactile"], *(theirs.step(action)[0]["tactile"] for action in actions)])
     for way in ways:
         way.close()
-    assert all(np.allclose(told[0], other, atol=SAME_ATOL) for other in told[1:])
+    assert all(np.array_equal(told[0], other) for other in told[1:])
 
 
 def test_a_learner_of_stable_baselines_gets_ends_as_it_expects_them():
@@ -445,7 +444,7 @@ def told_alike(one, other):
     one, other = np.asarray(one), np.asarray(other)
     if one.dtype == object:
         return all(told_alike(a, b) if isinstance(a, dict) else a == b for a, b in zip(one, other, strict=True))
-    return one.dtype == other.dtype and np.allclose(one, other, atol=SAME_ATOL)
+    return one.dtype == other.dtype and np.array_equal(one, other)
 
 
 def test_a_row_that_only_begins_has_gone_no_way():

@@ -7,7 +7,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from training.surrogate.contact import LinearContacts, motion_mm
 from training.surrogate.felt import Contact, Felt
-from training.surrogate.model import Surrogate, features, outside, rest_of, unlike_parts
+from training.surrogate.model import Surrogate, by_row, features, outside, rest_of, unlike_parts
 from training.surrogate.paths import unlike_drawn
 from twin.geometry.pins import PinRest
 from twin.objects import build_field
@@ -175,7 +175,7 @@ class SurrogateContacts:
         """Write to ``felt`` what the sensors feel, from the linear skin and the network."""
         felt, linear, surrogate = self.felt, self._linear, self._surrogate
         force = linear.force_n[rows]
-        wrench = force.reshape(len(rows), -1) @ self._turns
+        wrench = by_row(force.reshape(len(rows), -1), self._turns)
         held, slides = linear.held[rows].sum(axis=1), linear.slides[rows].sum(axis=1)
         slip = slides / np.maximum(held, 1)
         gap = self._gap[rows]
@@ -183,7 +183,7 @@ class SurrogateContacts:
         beside = features(depth, linear.friction[rows], held, slip, linear.used[rows], wrench)
         parts, added = surrogate.correct(force, beside, gap, depth)
         self._parts[rows] = parts
-        felt.caps_mm[rows] = self._caps_rest + (parts @ self._cap_modes).reshape(len(rows), -1, 3)
+        felt.caps_mm[rows] = self._caps_rest + by_row(parts, self._cap_modes).reshape(len(rows), -1, 3)
         felt.force_n[rows] = wrench[:, :3] + added[:, :3]
         felt.torque_nmm[rows] = wrench[:, 3:] + added[:, 3:6]
         felt.area_mm2[rows] = np.maximum(added[:, 6], 0.0) * 100.0

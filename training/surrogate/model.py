@@ -45,6 +45,8 @@ VIEW_MM = 1.0
 """Distance from the undeformed skin beyond which the network does not see an object."""
 WRENCH_SCALE = np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
 """Scales of force (N) and torque (N mm) as inputs of the network."""
+BLOCK = 8
+"""Rows of a product of matrices. The order in which BLAS sums depends on their number."""
 BESIDE = 8
 """Number of the network's outputs besides the modes: force, torque, area in 100 mm2, sliding share."""
 
@@ -112,10 +114,11 @@ class Surrogate:
         ``force_n`` (R, M, 3) are the forces at the nodes, ``beside`` (R, FEATURES) the ``features``, ``gap_mm`` (R, M) the distances of the
         object from the nodes at rest, and ``depth_mm`` (R,) its depths.
         """
-        linear = force_n.reshape(len(force_n), -1).astype(np.float32) @ self.read.T
-        x = (np.concatenate([linear, beside.astype(np.float32), within(gap_mm) @ self.view.T], axis=1) - self.mean) / self.scale
+        linear = by_row(force_n.reshape(len(force_n), -1).astype(np.float32), self.read.T)
+        seen = by_row(within(gap_mm), self.view.T)
+        x = (np.concatenate([linear, beside.astype(np.float32), seen], axis=1) - self.mean) / self.scale
         for number, (weights, offset) in enumerate(self.layers):
-            x = x @ weights.T + offset
+            x = by_row(x, weights.T) + offset
             if number < len(self.layers) - 1:
                 x = x / (1.0 + np.exp(-x))  # SiLU
         x = x * (self.out_scale * gate(depth_mm)[:, None]).astype(np.float32)
@@ -147,6 +150,15 @@ class Surrogate:
         return {key: value.astype(np.float32) for key, value in whole.items()} | {
             key: value.astype(np.float16) for key, value in half.items()
         }
+
+
+def by_row(x: FloatArray, matrix: FloatArray) -> FloatArray:
+    """``x @ matrix`` for rows (R, k), each of which comes out the same whatever R is: only products of ``BLOCK`` rows are made."""
+    rows = len(x)
+    if rows % BLOCK:
+        x = np.concatenate([x, np.zeros((-rows % BLOCK, x.shape[1]), x.dtype)])
+    product: FloatArray = (x.reshape(-1, BLOCK, x.shape[1]) @ matrix).reshape(len(x), -1)[:rows]
+    return product
 
 
 def features(

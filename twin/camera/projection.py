@@ -17,6 +17,7 @@ or fisheye (Kannala and Brandt 2006), where the radius is theta (1 + k1 theta^2 
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -37,8 +38,9 @@ CORNERS = 360
 """Corners of the polygon that approximates the aperture's rim."""
 
 
+@lru_cache(maxsize=64)
 def sensor_to_camera(camera: CameraSpec) -> FloatArray:
-    """``T_camera_sensor`` (4, 4): camera looks along +z with x right and y down.
+    """``T_camera_sensor`` (4, 4), read-only: camera looks along +z with x right and y down.
 
     The entrance pupil is at (0, 0, -distance) of the sensor frame; the camera is turned about it
     by tilt_x (about x), then tilt_y (about y). A positive tilt_x turns the optical axis towards -y of the sensor frame, a positive tilt_y
@@ -55,6 +57,7 @@ def sensor_to_camera(camera: CameraSpec) -> FloatArray:
     T_camera_sensor = np.eye(4)
     T_camera_sensor[:3, :3] = rotation
     T_camera_sensor[:3, 3] = rotation @ [0, 0, camera.distance_mm]
+    T_camera_sensor.flags.writeable = False
     return T_camera_sensor
 
 

@@ -67,7 +67,7 @@ class Section(BaseModel):
         return _as_tuples(data)
 
     @classmethod
-    def keys(cls) -> dict[str, FieldInfo]:
+    def file_keys(cls) -> dict[str, FieldInfo]:
         """The keys of the section in a file."""
         return cls.model_fields
 
@@ -83,7 +83,7 @@ class OpenSection(Section, extra="allow"):
         raise NotImplementedError
 
     @classmethod
-    def keys(cls) -> dict[str, FieldInfo]:
+    def file_keys(cls) -> dict[str, FieldInfo]:
         return cls.model_fields | {key: field for part in cls.parts().values() for key, field in part.model_fields.items()}
 
     @property

@@ -237,7 +237,7 @@ def _keys_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
         stepped = [m for c in candidates if part in c.model_fields for m in _models_in(c.model_fields[part].annotation)]
         tagged = [c for c in candidates if part in _tags(c)]
         candidates = stepped or tagged or candidates
-    return sorted({key for c in candidates for key in (c.keys() if issubclass(c, Section) else c.model_fields)})
+    return sorted({key for c in candidates for key in (c.file_keys() if issubclass(c, Section) else c.model_fields)})
 
 
 def _models_in(annotation: object) -> list[type[BaseModel]]:

@@ -111,8 +111,8 @@ def number_type(key: str) -> type | None:
     """``int`` or ``float`` for the dotted key of a number in ``SensorSpec``, else None."""
     section, _, name = key.partition(".")
     field = SensorSpec.model_fields.get(section)
-    models = [m for m in (field.annotation, *getattr(field.annotation, "__args__", ())) if hasattr(m, "keys")] if field else []
-    found = models[0].keys().get(name) if models else None
+    models = [m for m in (field.annotation, *getattr(field.annotation, "__args__", ())) if hasattr(m, "file_keys")] if field else []
+    found = models[0].file_keys().get(name) if models else None
     kind = found.annotation if found else None
     kind = getattr(kind, "__origin__", kind)
     return kind if kind in (int, float) else None

@@ -75,13 +75,15 @@ def also(error: BaseException, what: str) -> None:
         error.add_note(what)
 
 
+# Longest line about an arm or a camera, in characters. Longer messages, and notes, go to a file.
+LONGEST_LINE = 160
 # Words by which a message says that an arm may still move, and what a line says instead of all such words.
 _MOVES = {"switch it off": "the arm may still move: SWITCH IT OFF", "may move": "the arm may still move: PRESS ITS EMERGENCY STOP"}
 # Advice to a Python program, which is no help to the user of a command.
 _PYTHON = re.compile(r"[;,.]? *(?:then |or )?(?:call |\b)(?:(?:disconnect|connect|enable|stop|clear_error)\(\)[^;.]*)")
 
 
-def in_short(text: str, most: int) -> str:
+def in_short(text: str, most: int = LONGEST_LINE) -> str:
     """A device's error in one line of at most ``most`` characters: its cause, and whether the arm may still move."""
     lower = text.lower()
     end = next((told for word, told in _MOVES.items() if word in lower), "")

@@ -7,7 +7,7 @@ moves by ``move`` (the shear). The frame is taken at ``pose + clear + tap``.
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from scenes.base import Name, Section
 
@@ -56,6 +56,33 @@ class MoveRanges(Section):
     move_6: Range = (0.0, 0.0)
 
 
+class WideRanges(Section):
+    """What is larger in an experiment's wide form, in which models are trained, so that no label of the experiment lies at an end.
+
+    Attributes
+    ----------
+    clear, tap : six numbers or None
+        As in the experiment; None: the same.
+    pose_1, pose_2, pose_3, pose_4, pose_5, pose_6, move_1, move_2, move_3, move_4, move_5, move_6 : (lowest, highest) or None
+        Ranges of the pose and of the move; None: the same.
+    """
+
+    clear: Six | None = None
+    tap: Six | None = None
+    pose_1: Range | None = None
+    pose_2: Range | None = None
+    pose_3: Range | None = None
+    pose_4: Range | None = None
+    pose_5: Range | None = None
+    pose_6: Range | None = None
+    move_1: Range | None = None
+    move_2: Range | None = None
+    move_3: Range | None = None
+    move_4: Range | None = None
+    move_5: Range | None = None
+    move_6: Range | None = None
+
+
 class ExperimentSpec(Section):
     """The complete specification of an experiment.
 
@@ -84,7 +111,9 @@ class ExperimentSpec(Section):
     seed : int
         Seed of the random draws.
     wider : str
-        Name of an experiment with slightly larger ranges. In the twin, models for this experiment are trained with it.
+        Name of another experiment, with which models for this one are trained in the twin.
+    wide : WideRanges or None
+        Instead of ``wider``: slightly larger ranges, with which models for this experiment are trained in the twin.
     pose : PoseRanges
         Ranges of the contacts' poses.
     move : MoveRanges
@@ -103,6 +132,7 @@ class ExperimentSpec(Section):
     targets: Annotated[tuple[str, ...], Field(min_length=1)]
     seed: Annotated[int, Field(ge=0)] = 0
     wider: str = ""
+    wide: WideRanges | None = None
     pose: PoseRanges
     move: MoveRanges = MoveRanges()
 
@@ -120,6 +150,16 @@ class ExperimentSpec(Section):
         """Largest coordinate along the approach before the move, mm. The tap is deepest at this coordinate."""
         return self.ranges()[f"pose_{self.axis + 1}"][1] - self.ranges()[f"move_{self.axis + 1}"][0]
 
+    def widened(self) -> "ExperimentSpec":
+        """The experiment in its wide form; itself if it has none."""
+        if self.wide is None:
+            return self
+        larger = self.wide.model_dump(exclude_none=True)
+        parts = {key: getattr(self, key).model_dump() for key in ("pose", "move")}
+        parts = {key: part | {label: larger.pop(label) for label in part if label in larger} for key, part in parts.items()}
+        text = f"As {self.name}, a little beyond its ranges"
+        return ExperimentSpec(**{**dict(self), **larger, **parts, "name": f"{self.name}-wide", "description": text, "wide": None})
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         for label, (low, high) in self.ranges().items():
@@ -134,4 +174,8 @@ class ExperimentSpec(Section):
         start_mm = self.zero_mm + self.highest_mm - self.tap[self.axis]
         if start_mm > 0:
             raise ValueError(f"the deepest tap would begin {start_mm:g} mm inside the object; give a longer tap and as much more clear")
+        try:
+            self.widened()
+        except ValidationError as error:
+            raise ValueError(f"wide: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
         return self

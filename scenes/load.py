@@ -3,6 +3,7 @@
 import difflib
 import hashlib
 import os
+import warnings
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,6 +21,8 @@ from scenes.tables import fill_in_tables
 
 SHIPPED = Path(__file__).parent
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
+OLD_WIDE = "-wide"
+"""End of the names that wide experiments had in version 1."""
 UNLISTED = ("servos",)
 """Kinds of specifications that no command lists. Errors name them all."""
 # Largest number of problems that a message names. For further problems it states only their number.
@@ -110,15 +113,30 @@ def _digest(mesh: Path) -> str:
         raise SpecError(f"{mesh}: can't be read ({error.strerror}); give a mesh file that may be read") from error
 
 
-def load_experiment(name_or_path: str | Path | ExperimentSpec) -> ExperimentSpec:
+def load_experiment(name_or_path: str | Path | ExperimentSpec, *, wide: bool = False) -> ExperimentSpec:
     """Load an experiment by name or by the path of its TOML file.
+
+    Parameters
+    ----------
+    wide : bool
+        The experiment with its slightly larger ranges, in which models are trained.
 
     Raises
     ------
     SpecError
-        There is no such experiment, or its file is not valid. The message names the file, the key and the remedy.
+        There is no such experiment, its file is not valid, or it has no larger ranges. The message names the file, the key and the remedy.
     """
-    return _load(name_or_path, "experiments", ExperimentSpec)
+    name = str(name_or_path).removesuffix(OLD_WIDE)
+    known = {} if name == str(name_or_path) else list_experiments()
+    if name in known and str(name_or_path) not in known:
+        warnings.warn(f"experiment '{name_or_path}' is now '{name}' with `wide`", RuntimeWarning, stacklevel=2)
+        return load_experiment(name, wide=True)
+    spec = _load(name_or_path, "experiments", ExperimentSpec)
+    if wide and spec.wider:
+        return load_experiment(spec.wider)
+    if wide and spec.wide is None:
+        raise SpecError(f"experiment '{spec.name}' has no larger ranges; leave `wide` out, or give its file a section [wide]")
+    return spec.widened() if wide else spec
 
 
 def load_randomisation(name_or_path: str | Path | RandomisationSpec) -> RandomisationSpec:

@@ -41,9 +41,10 @@ def of_all_workers(tmp_path_factory):
 
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(of_all_workers):
-    """The tests keep their arrays apart from the user's; what one worker has computed, the others read."""
+    """The tests keep their arrays and lists apart from the user's; what one worker has computed, the others read."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TACTIP_CACHE", str(of_all_workers / "cache"))
+        patch.setenv("XDG_STATE_HOME", str(of_all_workers / "state"))
         yield
 
 

@@ -49,7 +49,7 @@ _PLACES = {
     "learn": "twin.cli.learning",
     "load_experiment": "scenes",
     "load_limits": "hardware.safety.decide",
-    "load_model": "training.estimate.estimator:load_remembering",
+    "load_model": "training.estimate.loading:load_remembering",
     "load_object": "scenes",
     "load_sensor": "scenes",
     "make_dataset": "twin.cli.learning",

@@ -21,14 +21,14 @@ from scenes import load_sensor as load_sensor
 from training.environments import register_all as register_all
 from training.environments.baselines import BaselinesVecEnv as BaselinesVecEnv
 from training.environments.learn import Learnt as Learnt
-from training.estimate.estimator import load_remembering as load_remembering
+from training.estimate.loading import load_remembering as load_remembering
 from training.generation.run import Simulated as Simulated
-from training.runs.train import Trained as Trained
 from training.studies.degradation import Result as Result
 from training.studies.evaluation import Evaluation as Evaluation
 from training.studies.label_audit import LabelAudit as LabelAudit
 from training.studies.prediction import Predictions as Predictions
 from training.studies.realism import Realism as Realism
+from training.studies.train import Trained as Trained
 from training.studies.validation import Validation as Validation
 from twin.fit.contact.calibrate import ContactCalibration as ContactCalibration
 from twin.fit.go_on import WholeSensor as WholeSensor
@@ -174,6 +174,7 @@ def make_dataset(
     sensor: str | Path | SensorSpec,
     count: int,
     out: Path | str,
+    wide: bool = ...,
     obj: str | Path | ObjectSpec | None = ...,
     images: Literal['raw', 'gray', 'recording', 'none'] = ...,
     states: Literal['all', 'end'] = ...,

@@ -1,6 +1,17 @@
-"""``python -m twin``: the command line."""
+"""The program ``twin``, also as ``python -m twin``. It handles signals first, because the command line takes a while to import."""
 
-from twin.cli import main
+from twin.signals import end_interrupted, end_on_sigterm
+
+
+def main() -> None:
+    """Run the command line (``twin.cli.main``)."""
+    end_on_sigterm()
+    try:
+        from twin.cli import main as run
+    except KeyboardInterrupt as interrupt:
+        end_interrupted(interrupt)
+    run()
+
 
 if __name__ == "__main__":
     main()

@@ -1,7 +1,8 @@
 """Errors and warnings for the user. The command line prints each of them as one line."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from types import MappingProxyType
 
@@ -48,6 +49,38 @@ class DatasetError(TwinError):
 
 class WorkersError(TwinError):
     """Processes that share the work ended unexpectedly."""
+
+
+class ExtraError(TwinError):
+    """A library that is installed with an extra of this program is missing."""
+
+
+EXTRAS = {
+    "dask": "cluster",
+    "distributed": "cluster",
+    "gymnasium": "gym",
+    "mcap": "records",
+    "mcap_ros2": "records",
+    "pyarrow": "records",
+    "rerun": "rerun",
+    "stable_baselines3": "rl",
+    "torch": "models",
+    "viser": "studio",
+    "websockets": "studio",
+}
+"""The extra that brings a library, by the name under which the library is imported."""
+
+
+@contextmanager
+def extras_named() -> Iterator[None]:
+    """Context in which a missing library of an extra raises ``ExtraError``, which names the extra."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        library = (error.name or "").partition(".")[0]
+        if library not in EXTRAS:
+            raise
+        raise ExtraError(f"this needs {library}, which is not installed: pip install 'tactip-twin[{EXTRAS[library]}]'") from error
 
 
 @cache

@@ -40,7 +40,7 @@ _PLACES = {
     "PinsSpec": "scenes.pins",
     "Preview": "twin.optics.preview",
     "ReadFailed": "hardware.cameras.reader",
-    "Recipe": "training.runs.recipes",
+    "Recipe": "training.models.recipes",
     "SensorModel": "twin.estimate",
     "SkinSolver": "twin.mechanics",
     "Task": "training.environments.tasks",

@@ -20,7 +20,7 @@ from training.models import register as register
 from training.models.part import Model as Model
 from training.models.part import PinModel as PinModel
 from training.models.part import refuse_sizes as refuse_sizes
-from training.runs.recipes import Recipe as Recipe
+from training.models.recipes import Recipe as Recipe
 from twin.camera.projection import project as project
 from twin.estimate import Estimate as Estimate
 from twin.estimate import SensorModel as SensorModel

@@ -9,6 +9,8 @@ from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
 
+from twin.errors import extras_named
+
 
 def named(places: Mapping[str, str], module: str, name: str) -> Any:
     """What a module offers under a name: the work of its ``__getattr__``.
@@ -23,11 +25,14 @@ def named(places: Mapping[str, str], module: str, name: str) -> Any:
     ------
     AttributeError
         The module does not offer this name.
+    ExtraError
+        A library that it needs is not installed.
     """
     if name not in places:
         raise AttributeError(f"'{module}' has no name '{name}'; help({module}) lists its names")
     place, _, other = places[name].partition(":")
-    return getattr(import_module(place), other or name)
+    with extras_named():
+        return getattr(import_module(place), other or name)
 
 
 class WhenImported(MetaPathFinder):

@@ -9,7 +9,7 @@ from scenes.object import ObjectSpec
 from twin.frames.images import write_image
 from twin.mechanics.path import ContactPose
 from twin.objects import build_field
-from twin.optics.render import Quality, write_exr
+from twin.optics.render import write_exr
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.report.charts import save_figure
@@ -17,7 +17,7 @@ from twin.report.plots import Look, contact_panel
 from twin.report.skin3d import displaced_skin, draw_contact_skin, write_surface
 from twin.simulator import RenderedFrame, Simulator
 from twin.store import made_by, write_json, write_npz, writes
-from twin.types import ContactState, FloatArray, Form, Readable
+from twin.types import ContactState, FloatArray, Form, Quality, Readable
 
 FILES = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
 """Files of a contact, in the order in which they are written."""

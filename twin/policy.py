@@ -3,9 +3,10 @@
 A policy's file contains no code. A policy takes frames through the real pipeline, both on a real arm and in the twin.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
 from twin.pins import Pipeline, Reference, measure_reference, nominal_reference
 from twin.store import ArrayFile, Layers, layers_from, layers_to
-from twin.types import FloatArray, Form, Frame, ImageArray, Observation
+from twin.types import BoolArray, FloatArray, Form, Frame, ImageArray, Observation
 
 
 class PolicyError(TwinError):
@@ -21,8 +22,26 @@ class PolicyError(TwinError):
 
 
 FILE = ArrayFile("policy", "twin learn", version=1, error=PolicyError)
+Displacements = Callable[[FloatArray, BoolArray], tuple[FloatArray, str]]
+"""Function from pins (N, 2), px, of which some are lost (N,), to their displacements from rest in mean spacings, and to the reason why no
+action may follow from them; "" if it may."""
+DOMAIN = "domain."
+"""Beginning of the names of a domain's arrays in a policy's file."""
 PICTURE_CELL_PX = 4
 """Side of the squares whose means are the inputs from a picture. It is about half the distance between two pins."""
+
+
+class KnownContacts(Protocol):
+    """The contacts that a policy knows (``training.environments.policy_domain``)."""
+
+    def seen_from(self, rest: Reference, name: str) -> Displacements:
+        """Displacements from pins at rest in the frame ``name``.
+
+        Raises
+        ------
+        FrameError
+            The camera's view is turned, mirrored or stretched too far.
+        """
 
 
 @dataclass(frozen=True)
@@ -42,6 +61,9 @@ class Policy:
     sight : tuple of ((o, i), (o,)) float
         Layers of a network that estimates quantities without a sensor (such as place and force) from the K numbers and the goal; empty
         without such a network.
+    domain : dict of str to array
+        The contacts that it knows (``training.environments.policy_domain``); empty in policies learnt before version 2, and in those that
+        do not see pins.
     """
 
     about: dict[str, Any]
@@ -49,6 +71,7 @@ class Policy:
     basis: FloatArray
     layers: Layers
     sight: Layers = ()
+    domain: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def reduced(self, tactile: FloatArray, goal: FloatArray) -> FloatArray:
         """Inputs (B, K + G + S) of the network of the actions, from observations (B, ...) and goals (B, G)."""
@@ -75,7 +98,8 @@ class Policy:
     def save(self, path: Path) -> int:
         """Write the policy to a file; returns its size in bytes."""
         arrays = {"mean": self.mean, "basis": self.basis, **layers_to(self.layers), **layers_to(self.sight, "sight")}
-        return FILE.write(path, {key: value.astype(np.float32) for key, value in arrays.items()}, self.about)
+        domain = {DOMAIN + key: value for key, value in self.domain.items()}
+        return FILE.write(path, {key: value.astype(np.float32) for key, value in arrays.items()} | domain, self.about)
 
 
 def load_policy(path: Path) -> Policy:
@@ -88,7 +112,8 @@ def load_policy(path: Path) -> Policy:
     """
     with FILE.opened(path) as (about, arrays):
         SensorSpec.model_validate(about["sensor"])
-        return Policy(about, arrays["mean"], arrays["basis"], layers_from(arrays), layers_from(arrays, "sight"))
+        domain = {key.removeprefix(DOMAIN): arrays.pop(key) for key in list(arrays) if key.startswith(DOMAIN)}
+        return Policy(about, arrays["mean"], arrays["basis"], layers_from(arrays), layers_from(arrays, "sight"), domain)
 
 
 def flattened(tactile: FloatArray | ImageArray) -> FloatArray:
@@ -140,6 +165,8 @@ class PolicyModel:
         A policy whose observations are pins.
     goal : (G,) float, optional
         Default: the policy's own goal.
+    contacts : KnownContacts, optional
+        The contacts that the policy knows. There is no action for others.
 
     Raises
     ------
@@ -149,31 +176,37 @@ class PolicyModel:
 
     counts_from_rest = True
 
-    def __init__(self, policy: Policy, *, goal: FloatArray | None = None) -> None:
+    def __init__(self, policy: Policy, *, goal: FloatArray | None = None, contacts: KnownContacts | None = None) -> None:
         if policy.about["observation"] != "pins":
             raise PolicyError(
                 f"a policy that sees {policy.about['observation']!r} can't be run on frames; train one with observation 'pins'"
             )
-        self.policy = policy
+        self.policy, self.contacts = policy, contacts
         self.sensor = SensorSpec.model_validate(policy.about["sensor"])
         self.form = Form.PROCESSED if self.sensor.recording else Form.RAW
         self._nominal = nominal_reference(self.sensor, self.form)
         self._goal = np.asarray(policy.about["goal"] if goal is None else goal, np.float32)
         self._stack: list[FloatArray] = []
         self.pipeline = Pipeline(self.sensor, self.form)
+        self._displacements = self._displacements_from(self.pipeline.reference, "")
 
     def at_rest(self, frame: Frame) -> "PolicyModel":
         """The same policy; it measures the pins' displacements from a frame without contact."""
-        return self._counted_from(measure_reference(self.sensor, self.form, frame))
+        reference = measure_reference(self.sensor, self.form, frame)
+        found = PolicyModel(self.policy, goal=self._goal, contacts=self.contacts)
+        found.pipeline = Pipeline(self.sensor, self.form, reference)
+        found._displacements = self._displacements_from(reference, frame.name)
+        return found
 
     def seeking_rest(self) -> "PolicyModel":
         """The policy itself, because it has no model of how contacts displace pins."""
         return self
 
-    def _counted_from(self, reference: Reference) -> "PolicyModel":
-        found = PolicyModel(self.policy, goal=self._goal)
-        found.pipeline = Pipeline(self.sensor, self.form, reference)
-        return found
+    def _displacements_from(self, rest: Reference, name: str) -> Displacements:
+        if self.contacts is not None:
+            return self.contacts.seen_from(rest, name or "the frame without contact")
+        spacing_px = float(self._nominal.spacing_px.mean())
+        return lambda nodes_px, _: ((nodes_px - rest.pins_px) / spacing_px, "")
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """Raise ``FrameError`` for frames of another sensor or form."""
@@ -183,11 +216,13 @@ class PolicyModel:
             )
 
     def __call__(self, frame: Frame) -> Action:
-        """The action for a frame. It is not valid if too few pins are found."""
-        seen = self.pipeline(frame)
-        if seen.graph is None:
-            return Action(self.policy.axes, np.full(len(self.policy.axes), np.nan), False, seen.reason, seen)
-        moved = (seen.graph.nodes_px - self.pipeline.reference.pins_px) / float(self._nominal.spacing_px.mean())
+        """The action for a frame. It is not valid if too few pins are found, or if they show a contact that the policy does not know."""
+        seen, moved = self.pipeline(frame), None
+        reason = seen.reason
+        if seen.graph is not None:
+            moved, reason = self._displacements(seen.graph.nodes_px, np.isnan(seen.pins_px[:, 0]))
+        if moved is None or reason:
+            return Action(self.policy.axes, np.full(len(self.policy.axes), np.nan), False, reason, seen)
         count = int(self.policy.about["stack"])
         self._stack = [*(self._stack or [moved] * count), moved][-count:]
         action = self.policy.act(np.array(self._stack)[None], self._goal[None])[0]

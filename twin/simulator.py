@@ -22,10 +22,10 @@ from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import ContactPath, ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Shading
-from twin.optics.render import Quality, Renderer
+from twin.optics.render import Renderer
 from twin.progress import Progress, silent, stage
 from twin.store import write_npz
-from twin.types import ContactState, FloatArray, Form, Frame
+from twin.types import ContactState, FloatArray, Form, Frame, Quality
 
 _SAME_MM = 1e-6
 """Largest distance between the same place of two states of one sensor, where nothing moves, mm: rounding."""

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ ComplexArray: TypeAlias = NDArray[np.complexfloating]
 ImageArray: TypeAlias = NDArray[np.uint8]
 """Gray or RGB levels of a frame."""
 
+Quality = Literal["drawn", "preview", "standard", "high"]
+"""Quality of a render: drawn with exact edges and without noise, or path-traced with an increasing number of samples."""
 FINE = 20
 """Number of elements across the skin for calibrations and data sets. In the deepest contacts the displacements of the outer pins differ by
 1 % from those with 32 elements."""

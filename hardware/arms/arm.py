@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -170,21 +170,13 @@ class BaseArm(Connection):
     @abstractmethod
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState: ...
 
-    def wait_settled(
-        self,
-        pose: np.ndarray,
-        *,
-        tolerance_mm: float = 0.1,
-        tolerance_deg: float = 0.1,
-        timeout_s: float = 10.0,
-        at_rest: bool = True,
-    ) -> ArmState:
+    def wait_settled(self, pose: np.ndarray, **options: Any) -> ArmState:
         """Wait for feedback of the arm at rest at ``pose``; see ``Arm``."""
         with self._watched():
-            return self._settled(pose, tolerance_mm=tolerance_mm, tolerance_deg=tolerance_deg, timeout_s=timeout_s, at_rest=at_rest)
+            return self._settled(pose, **options)
 
     def _settled(
-        self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float, at_rest: bool = True
+        self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0, at_rest: bool = True
     ) -> ArmState:
         """As ``wait_settled``, for callers that stop the arm after an error themselves."""
         deadline = time.monotonic() + timeout_s
@@ -247,6 +239,11 @@ class BaseArm(Connection):
             f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; give more time or more speed, "
             "or look for what holds the arm"
         )
+
+    def _require_speeds(self, linear_mm_s: float, angular_deg_s: float) -> None:
+        self._require_connected()
+        if not (0 < linear_mm_s < np.inf and 0 < angular_deg_s < np.inf):
+            raise DeviceError(f"{self.name}: speeds of {linear_mm_s} mm/s and {angular_deg_s} deg/s; both must be positive")
 
     def _require_connected(self) -> None:
         if not self.is_connected:

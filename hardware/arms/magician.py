@@ -12,12 +12,12 @@ import serial
 from serial.tools import list_ports
 
 from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm
+from hardware.arms.awake import awake_s
 from hardware.arms.dobot_alarms import explain
 from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
 from hardware.arms.supervisor import Supervisor
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
-from hardware.safety.awake import awake_s
 
 # Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take as long as feedback may be old.
 REPLY_TIMEOUT_S = 0.2
@@ -156,9 +156,7 @@ class Magician(BaseArm):
         return ArmState(pose, values[4:], begun_s, self._enabled, moving, explain(alarms) if alarms else "")
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
-        self._require_connected()
-        if not (0 < linear_mm_s < np.inf and 0 < angular_deg_s < np.inf):
-            raise DeviceError(f"{self.name}: speeds of {linear_mm_s} mm/s and {angular_deg_s} deg/s; both must be positive")
+        self._require_speeds(linear_mm_s, angular_deg_s)
         line = (linear_mm_s, angular_deg_s, ACCELERATION * linear_mm_s, ACCELERATION * angular_deg_s)
         joints = [angular_deg_s] * 4 + [ACCELERATION * angular_deg_s] * 4
         self._request(Id.PTP_COORDINATE_PARAMS, struct.pack("<4f", *line), ctrl=WRITE)

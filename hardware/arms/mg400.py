@@ -23,6 +23,7 @@ from hardware.arms.mg400_wire import (
     ErrorId,
     Mode,
     Reply,
+    pose_in,
     require_ports,
     why_refused,
 )
@@ -212,8 +213,7 @@ class MG400(BaseArm):
     def state(self, *, max_age_s: float = SILENCE_S) -> ArmState:
         self._require_connected()
         packet, time_s = self._feedback.newest(max_age_s)
-        x, y, z, turn = packet["tool_actual"][:4]
-        pose = np.array([x, y, z, 0.0, 0.0, turn])
+        pose = pose_in(packet)
         self._require_possible(pose)
         mode = int(packet["mode"])
         if mode != Mode.ERROR:
@@ -240,9 +240,7 @@ class MG400(BaseArm):
 
         In a linear move the turn may also reach the given angular speed, even if the move is short.
         """
-        self._require_connected()
-        if not (0 < linear_mm_s < np.inf and 0 < angular_deg_s < np.inf):
-            raise DeviceError(f"{self.name}: speeds of {linear_mm_s} mm/s and {angular_deg_s} deg/s; both must be positive")
+        self._require_speeds(linear_mm_s, angular_deg_s)
         self.set_speed_percent(linear=100 * linear_mm_s / MAX_LINEAR_MM_S, angular=100 * angular_deg_s / MAX_JOINT_DEG_S)
         self._speed = linear_mm_s, angular_deg_s
 

@@ -9,10 +9,10 @@ from threading import Condition, Event, RLock, Thread
 import numpy as np
 
 from hardware.arms.arm import FEEDBACK_AGE_S
+from hardware.arms.awake import awake_s
 from hardware.arms.mg400_wire import PACKET_BYTES, Reply, newest_packet, take_reply, told_apart, why_no_packet
 from hardware.arms.supervisor import Supervisor
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
-from hardware.safety.awake import awake_s
 
 # Longest wait for a connection, in s.
 CONNECT_TIMEOUT_S = 2.0

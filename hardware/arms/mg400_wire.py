@@ -18,6 +18,22 @@ DEFAULT_HOSTS = {"LAN1": "192.168.1.6", "LAN2": "192.168.2.6", "Wi-Fi": "192.168
 MAX_LINEAR_MM_S, MAX_JOINT_DEG_S = 1000.0, 300.0
 
 
+def address_of(text: str) -> tuple[str, int]:
+    """Host ("" if there is none) and offset of the ports of ``ADDRESS[:DASHBOARD_PORT]``.
+
+    Raises
+    ------
+    DeviceError
+        The port is not a number, or not valid.
+    """
+    host, _, port = text.partition(":")
+    if port and not port.isdecimal():
+        raise DeviceError(f"mg400:{text}: '{port}' is no port; for example mg400:127.0.0.1:{DASHBOARD_PORT}")
+    offset = int(port) - DASHBOARD_PORT if port else 0
+    require_ports(offset)
+    return host, offset
+
+
 def require_ports(offset: int) -> None:
     """``DeviceError`` if the arm's ports plus the offset are not valid ports."""
     lowest, highest = DASHBOARD_PORT + offset, max(FEEDBACK_PERIOD_S) + offset
@@ -164,6 +180,12 @@ PACKET = np.dtype(
         "itemsize": PACKET_BYTES,
     }
 )
+
+
+def pose_in(packet: np.void) -> np.ndarray:
+    """Pose (6,) of the tool in a packet."""
+    x, y, z, turn = packet["tool_actual"][:4]
+    return np.array([x, y, z, 0.0, 0.0, turn])
 
 
 def newest_packet(buffer: bytes, *, lenient: bool = False) -> tuple[np.void | None, bytes, int]:

@@ -4,7 +4,7 @@ from hardware.arms.arm import Arm
 from hardware.arms.magician import Magician
 from hardware.arms.magician_wire import USB_VENDORS
 from hardware.arms.mg400 import MG400, Mg400Ports
-from hardware.arms.mg400_wire import DASHBOARD_PORT, DEFAULT_HOSTS
+from hardware.arms.mg400_wire import DEFAULT_HOSTS, address_of
 from hardware.arms.simulated import SimulatedArm
 from hardware.errors import DeviceError
 from scenes.files import shown
@@ -36,11 +36,8 @@ def open_arm(spec: str) -> Arm:
     if kind == "simulated" and rest in ("", "4", "6"):
         return SimulatedArm(axes=int(rest or 6), name=f"simulated arm of {rest or 6} axes")
     if kind in ("mg400", "mg400-lenient"):
-        host, _, port = rest.partition(":")
-        if port and not port.isdigit():
-            raise DeviceError(f"arm '{spec}': '{port}' is no port; for example mg400:127.0.0.1:29999")
-        ports = Mg400Ports().shifted(int(port) - DASHBOARD_PORT if port else 0)
-        return MG400(host or DEFAULT_HOSTS["LAN1"], ports=ports, lenient=kind == "mg400-lenient")
+        host, offset = address_of(rest)
+        return MG400(host or DEFAULT_HOSTS["LAN1"], ports=Mg400Ports().shifted(offset), lenient=kind == "mg400-lenient")
     if kind == "magician":
         return Magician(rest or _attached_magician())
     there = others("arms", KINDS)

@@ -114,9 +114,7 @@ class SimulatedArm(BaseArm):
         )
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
-        self._require_connected()
-        if not (0 < linear_mm_s < np.inf and 0 < angular_deg_s < np.inf):
-            raise DeviceError(f"{self.name}: speeds of {linear_mm_s} mm/s and {angular_deg_s} deg/s; both must be positive")
+        self._require_speeds(linear_mm_s, angular_deg_s)
         self._speeds = Speeds(linear_mm_s, angular_deg_s, self._speeds.linear_mm_s2, self._speeds.angular_deg_s2)
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:

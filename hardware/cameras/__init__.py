@@ -1,1 +1,1 @@
-"""Sources of frames behind one protocol."""
+"""Sources of frames behind one protocol: cameras, streams, recordings, sessions, the twin."""

@@ -1,13 +1,13 @@
-"""Makes a frame source from the text that a user gives with ``--camera``."""
+"""Makes a frame source from the text that a user gives for ``camera``."""
 
 import os
 
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.recorded import RecordedSource
+from hardware.cameras.session import SessionSource
 from hardware.cameras.source import FrameSource
 from hardware.cameras.uvc import UvcCamera, UvcSettings
 from hardware.errors import DeviceError
-from hardware.live.session import SessionSource
 from scenes.files import LONGEST_PATH, shown
 from scenes.plugins import others
 from scenes.sensor import SensorSpec

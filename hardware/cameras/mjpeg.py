@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 
-from hardware.cameras.reader import LiveSource, Picture, ReadFailed, TornPicture, capture
+from hardware.cameras.reader import LiveSource, Picture, ReadFailed, TornPicture
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
@@ -135,11 +135,7 @@ class MjpegCamera(LiveSource):
 
     def _grab(self) -> Picture:
         if self._stream is None:
-            try:
-                self._request()
-            except OSError as error:
-                self._pause()
-                raise ReadFailed(str(error)) from error
+            self._again(self._request)
         stream = self._stream
         if stream is None:  # another thread closed it
             raise ReadFailed("the stream was closed")
@@ -155,9 +151,6 @@ class MjpegCamera(LiveSource):
         if number is not None:
             self._last = number
         return Picture(image, stamped_s(headers), lost, note, again)
-
-    def _finish(self, image: np.ndarray) -> np.ndarray:
-        return capture(image, self._spec, self.form)
 
 
 def next_part(stream: Readable) -> tuple[dict[str, str], bytes]:

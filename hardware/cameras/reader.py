@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hardware.arms.awake import awake_s
 from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
-from hardware.safety.awake import awake_s
 from scenes.sensor import SensorSpec
 from twin.camera.capture import record
 from twin.frames.forms import form_named, frame_size, gray_levels
@@ -132,7 +132,7 @@ class LiveSource(Connection):
 
     def _finish(self, image: np.ndarray) -> np.ndarray:
         """The picture in the source's form."""
-        return image
+        return capture(image, self._spec, self.form)
 
     @property
     def is_connected(self) -> bool:
@@ -293,9 +293,13 @@ class LiveSource(Connection):
         """Usual time between two pictures."""
         return float(np.median(self._periods_s)) if self._periods_s else 1.0 / self.fps
 
-    def _pause(self) -> None:
-        """Wait before the device is tried again."""
-        self._end.wait(FAILED_PAUSE_S)
+    def _again(self, open_device: Callable[[], None]) -> None:
+        """Open a device that was lost; ``ReadFailed`` after a pause if it can't be opened."""
+        try:
+            open_device()
+        except (DeviceError, OSError) as error:
+            self._end.wait(FAILED_PAUSE_S)
+            raise ReadFailed(str(error)) from error
 
     def _give_up(self, error: Exception) -> None:
         with self._new:

@@ -4,9 +4,8 @@ import time
 from dataclasses import dataclass
 
 import cv2
-import numpy as np
 
-from hardware.cameras.reader import LiveSource, Picture, ReadFailed, capture
+from hardware.cameras.reader import LiveSource, Picture, ReadFailed
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
 from twin.frames.images import quiet
@@ -80,11 +79,7 @@ class UvcCamera(LiveSource):
 
     def _grab(self) -> Picture:
         if self._device is None:
-            try:
-                self._open()
-            except DeviceError as error:
-                self._pause()
-                raise ReadFailed(str(error)) from error
+            self._again(self._open)
         device = self._device
         if device is None:  # another thread closed it
             raise ReadFailed("the camera was closed")
@@ -93,9 +88,6 @@ class UvcCamera(LiveSource):
             self._close()  # the camera may be unplugged: it must be opened again
             raise ReadFailed("no picture")
         return Picture(image if image.ndim == 2 else image[..., ::-1].copy(), exposed_s(device.get(cv2.CAP_PROP_POS_MSEC)))
-
-    def _finish(self, image: np.ndarray) -> np.ndarray:
-        return capture(image, self._spec, self.form)
 
 
 def exposed_s(position_ms: float) -> float:

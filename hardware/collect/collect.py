@@ -11,7 +11,7 @@ import json
 import logging
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,24 +20,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats.qmc import Sobol
 
-from hardware.arms.arm import Arm, ArmState
-from hardware.cameras.source import FrameSource
+from hardware.arms.arm import ArmState
 from hardware.errors import DeviceError
-from hardware.rig.approach import way_around
 from hardware.rig.geometry import PlacedObject, matrix_of, pose_of
-from hardware.rig.plan import check_plan
-from hardware.rig.rig import Rig, build_rig
-from hardware.safety.eyes import Eyes
-from hardware.safety.safe_arm import try_each
-from hardware.safety.watch import ArmWatch
-from hardware.servo.step import Guard
+from hardware.workcell.build import Rig, build_rig
+from hardware.workcell.mover import Mover
+from hardware.workcell.plan import check_plan
 from scenes import ObjectSpec, SensorSpec, ServoSpec
 from scenes.experiment import LABELS, ExperimentSpec
 from scenes.files import shown
 from twin.errors import FrameError
 from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
-from twin.pins import measure_reference
+from twin.pins import Pipeline, measure_reference
 from twin.progress import Progress, Step, silent, stage
 from twin.records import KeptAlso
 from twin.store import contents, made_by, output, write_json, write_text, writes
@@ -48,28 +43,14 @@ LOGGER = logging.getLogger(__name__)
 CLEAR_MM = 50.0
 # Distance from the object between two contacts, in mm.
 LIFT_MM = 10.0
-# Largest shortening of a move by guards or arm, mm. A larger one is an error.
-NEAR_MM = 0.5
-# Time in s that a move may take in addition to the duration that its path and speed give.
-MOVE_TIMEOUT_S = 30.0
-# Factor on the duration that a move's path and speed give, because arms round their speed to whole percents.
-SPARE = 2.0
-# Longest wait in s for a frame while the arm stands still.
-FRAME_TIMEOUT_S = 5.0
 # Largest number of contacts that are checked before anything moves, and the usual time of a contact in s.
 CHECKED_CONTACTS, CONTACT_S = 100, 4.0
 # Most contacts of a collection. At a few seconds each, they take an arm months.
 MOST_CONTACTS = 1_000_000
 # Files of a collection, as in the published recordings: labels, description, times, and the frame without contact.
 TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
-# Distributions of contacts over an experiment's ranges: each at random; evenly, even for the first contacts alone; or evenly at first, and
-# then at the contacts that reduce a model's uncertainty most.
-DESIGNS = ("random", "even", "unsure")
-# Number of contacts of the design "unsure" that fill the ranges evenly, per label that varies.
-EVEN_AT_FIRST = 2
-# Function that chooses such a contact: from the collection's folder, the experiment, a seed and the contact's number to pose and move
-# (12,).
-Chooser = Callable[[Path, ExperimentSpec, int, int], np.ndarray]
+# Distributions of contacts over an experiment's ranges: each at random; or evenly, even for the first contacts alone.
+DESIGNS = ("random", "even")
 COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
 
 
@@ -123,7 +104,7 @@ class Collection:
                 write_json(meta, about | {"made_by": made_by(collect, inputs=about)})
             elif other:
                 raise DeviceError(
-                    f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another --out"
+                    f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another `out`"
                 )
         elif contents(self.folder):
             raise DeviceError(f"{self.folder}: holds something else; give an empty or a new folder")
@@ -156,9 +137,9 @@ class Collection:
             with table.open(newline="", encoding="utf-8") as file:
                 rows = list(csv.reader(file))
         except (ValueError, csv.Error) as error:
-            raise DeviceError(f"{table}: is damaged ({shown(error)}); give another --out") from error
+            raise DeviceError(f"{table}: is damaged ({shown(error)}); give another `out`") from error
         if rows[:1] != [list(COLUMNS)] or any(len(row) != len(COLUMNS) for row in rows):
-            raise DeviceError(f"{table}: is not the table of a collection; give another --out")
+            raise DeviceError(f"{table}: is not the table of a collection; give another `out`")
         return len(rows) - 1
 
     @property
@@ -192,7 +173,7 @@ class Collection:
         try:
             text = lines.read_text(encoding="utf-8")
         except ValueError as error:
-            raise DeviceError(f"{lines}: is damaged ({shown(error)}); give another --out") from error
+            raise DeviceError(f"{lines}: is damaged ({shown(error)}); give another `out`") from error
         if not text.endswith("\n"):
             write_text(lines, text[: text.rfind("\n") + 1])
 
@@ -202,7 +183,7 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
 
     With the design "even", the first contacts fill the ranges evenly, whatever their number is: they are a scrambled Sobol sequence (Sobol
     1967; scrambled by Owen 1998). In recordings of a plate, a model from 10 such contacts has the same error in depth as one from nearly 20
-    random contacts. The design "unsure" begins with the same contacts.
+    random contacts.
     """
     low, high = np.array(list(experiment.ranges().values())).T
     if design == "random":
@@ -214,24 +195,6 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
     numbers = low.copy()
     numbers[varied] += shares * (high - low)[varied]
     return Contact(numbers[:6], numbers[6:])
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """Chooses the next contact of a collection."""
-
-    experiment: ExperimentSpec
-    seed: int
-    design: str
-    folder: Path
-    chooser: Chooser | None
-
-    def __call__(self, index: int) -> Contact:
-        varied = sum(high > low for low, high in self.experiment.ranges().values())
-        if self.chooser is None or self.design != "unsure" or index < EVEN_AT_FIRST * varied:
-            return draw_contact(self.experiment, self.seed, index, self.design)
-        numbers = self.chooser(self.folder, self.experiment, self.seed, index)
-        return Contact(numbers[:6], numbers[6:])
 
 
 class WorkFrame:
@@ -268,19 +231,15 @@ class WorkFrame:
 
 
 def collect(
-    source: FrameSource,
-    arm: Arm,
+    rig: Rig,
     experiment: ExperimentSpec,
-    placed: PlacedObject,
     collection: Collection,
     count: int,
     *,
     seed: int,
     design: str = "random",
-    chooser: Chooser | None = None,
     speed: tuple[float, float],
-    guards: tuple[Guard, ...] = (),
-    frame_timeout_s: float = FRAME_TIMEOUT_S,
+    frame_timeout_s: float | None = None,
     on_rest: Callable[[Frame], None] | None = None,
     progress: Step | None = None,
 ) -> int:
@@ -290,20 +249,18 @@ def collect(
 
     Parameters
     ----------
+    rig : Rig
+        Connected.
     count : int
         Number of contacts in the collection at the end.
     seed : int
         Seed of the drawn contacts.
-    design : {"random", "even", "unsure"}
+    design : {"random", "even"}
         See ``draw_contact``.
-    chooser : callable, optional
-        Chooses the contacts of the design "unsure" after the first ones.
     speed : (float, float)
         Speed of the arm in mm/s and deg/s.
-    guards : tuple of Guard
-        Called before every move, in this order. Each may change the target or refuse it.
-    frame_timeout_s : float
-        Longest wait in s for a frame while the arm stands still.
+    frame_timeout_s : float, optional
+        Longest wait in s for a frame while the arm stands still. By default that of the rig.
     on_rest : callable, optional
         Called with the frame without contact after it was kept.
     progress : Step, optional
@@ -323,67 +280,46 @@ def collect(
     """
     if experiment.tap_frame != "work":
         raise DeviceError(f"{experiment.name}: its tap follows the tool's axes; the arm taps along those of the work frame here")
-    if not source.is_live:
-        raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
-    rig = _Stops(source, arm, placed, WorkFrame(experiment, placed), speed, guards, frame_timeout_s, ArmWatch(arm))
-    with output(collection.folder), rig.watch.watched(), rig.eyes.watched():
-        ask = _Asked(experiment, seed, design, collection.folder, chooser)
-        failed = _collect_all(rig, experiment, collection, ask=ask, count=count, progress=progress, on_rest=on_rest, speed=speed)
+    if not rig.source.is_live:
+        raise DeviceError(f"{rig.source.name}: a recording shows nothing of this arm; give a live `camera`")
+    timeout_s = rig.frame_timeout_s if frame_timeout_s is None else frame_timeout_s
+    stops = _Stops(Mover(rig, speed, clear_mm=CLEAR_MM, patience_s=timeout_s), WorkFrame(experiment, rig.placed), timeout_s)
+    with output(collection.folder), stops.mover.watched():
+        at_object = False
+        try:
+            with stops.mover.watch.alert():
+                stops.mover.enable()
+                state = stops.go_around(np.zeros(6), CLEAR_MM)
+                at_object = True
+                if not collection.has_rest:
+                    rest = stops.frame_after(state)
+                    collection.keep_rest(rest)
+                    if on_rest is not None:
+                        on_rest(rest)
+                for index in range(collection.count, count):
+                    _collect_one(stops, experiment, collection, index, draw_contact(experiment, seed, index, design))
+                    if progress is not None:
+                        progress(index + 1, count)
+        finally:
+            failed = stops.mover.release(touching=at_object)
     if failed:
         raise DeviceError("; ".join(failed))
     return collection.count
 
 
-def _collect_all(
-    rig: "_Stops",
-    experiment: ExperimentSpec,
-    collection: Collection,
-    *,
-    ask: Callable[[int], Contact],
-    count: int,
-    speed: tuple[float, float],
-    on_rest: Callable[[Frame], None] | None,
-    progress: Step | None,
-) -> list[str]:
-    """Go to the object, make the missing contacts, and release the arm. Returns the failures of the release."""
-    try:
-        with rig.watch.alert():
-            rig.eyes.await_sight(timeout_s=rig.source.first_frame_s)
-            rig.arm.enable()
-            rig.arm.set_speed(*speed)
-            state = rig.go_around(rig.label, CLEAR_MM)
-            rig.at_object = True
-            if not collection.has_rest:
-                rest = rig.frame_after(state)
-                collection.keep_rest(rest)
-                if on_rest is not None:
-                    on_rest(rest)
-            for index in range(collection.count, count):
-                _collect_one(rig, experiment, collection, index, ask(index))
-                if progress is not None:
-                    progress(index + 1, count)
-    finally:
-        back = {"retreat": rig.withdraw} if rig.at_object else {}
-        with rig.watch.doing("letting go"):
-            failed = try_each(stop=rig.arm.stop, **back, disable=rig.arm.disable)
-    return failed
-
-
-def _collect_one(rig: "_Stops", experiment: ExperimentSpec, collection: Collection, index: int, asked: Contact) -> None:
+def _collect_one(stops: "_Stops", experiment: ExperimentSpec, collection: Collection, index: int, asked: Contact) -> None:
     """Make one contact and keep its frame: go above the place, tap, move along the surface, take the frame, lift off.
 
     A frame is awaited at every stop, because the skin's state depends on where the arm has been.
     """
     clear, tap = np.array(experiment.clear), np.array(experiment.tap)
     before = asked.pose - asked.move + clear
-    rig.go_around(before, LIFT_MM)
-    rig.label = before
-    rig.frame_after(rig.go(before))
-    rig.frame_after(rig.go(before + tap))
-    rig.label = asked.pose + clear + tap
-    confirmed = rig.go(rig.label)
-    frame = rig.frame_after(confirmed)
-    after = rig.arm.state()
+    stops.go_around(before, LIFT_MM)
+    stops.frame_after(stops.go(before))
+    stops.frame_after(stops.go(before + tap))
+    confirmed = stops.go(asked.pose + clear + tap)
+    frame = stops.frame_after(confirmed)
+    after = stops.mover.arm.state()
     log = {
         "asked": [*asked.pose.tolist(), *asked.move.tolist()],
         "confirmed_pose": confirmed.pose.tolist(),
@@ -392,76 +328,37 @@ def _collect_one(rig: "_Stops", experiment: ExperimentSpec, collection: Collecti
         "sequence": frame.sequence,
         "moved_meanwhile_mm": float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3])),
     }
-    collection.keep(index, frame, rig.work.label(confirmed.pose), asked.move, log)
-    rig.frame_after(rig.go(rig.label, LIFT_MM))
+    collection.keep(index, frame, stops.work.label(confirmed.pose), asked.move, log)
+    stops.frame_after(stops.go(asked.pose + clear + tap, LIFT_MM))
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Stops:
-    """Moves an arm from stop to stop in its work frame, and takes frames while it stands still.
+    """Moves an arm from stop to stop in its work frame, and takes frames while it stands still."""
 
-    Attributes
-    ----------
-    label : (6,) float
-        Work coordinates of the contact at which the arm is, or to which it moves. From there the arm is withdrawn.
-    at_object : bool
-        Whether the arm has come around the object. From then on a straight path leads back from ``label``.
-    """
-
-    source: FrameSource
-    arm: Arm
-    placed: PlacedObject
+    mover: Mover
     work: WorkFrame
-    speed: tuple[float, float]
-    guards: tuple[Guard, ...]
     frame_timeout_s: float
-    watch: ArmWatch
-    label: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    at_object: bool = False
-
-    def __post_init__(self) -> None:
-        self.eyes = Eyes(self.arm, self.source, self.watch.pose_at, lambda pose: float(self.placed.touch(pose).indent_mm))
 
     def go(self, label: np.ndarray, away_mm: float = 0.0) -> ArmState:
         """Move straight to work coordinates (6,), ``away_mm`` back along the approach. Returns the state there."""
-        return self._go_to(self.work.base_pose(label, self.arm.state().pose, away_mm=away_mm))
+        with self.mover.watch.doing("moving"):
+            return self.mover.go(self._pose(label, away_mm))
 
     def go_around(self, label: np.ndarray, away_mm: float) -> ArmState:
         """As ``go``, but on a path around the object."""
-        start = self.arm.state().pose
-        for pose in way_around(self.placed, start, self.work.base_pose(label, start, away_mm=away_mm)):
-            state = self._go_to(pose)
-        return state
-
-    def withdraw(self) -> ArmState:
-        """Move clear of the object. This needs no frames."""
-        return self._go_to(self.work.base_pose(self.label, self.arm.state().pose, away_mm=CLEAR_MM), sees=False)
+        with self.mover.watch.doing("moving"):
+            return self.mover.go_around(self._pose(label, away_mm))
 
     def frame_after(self, state: ArmState) -> Frame:
         """The first frame exposed after a state."""
         try:
-            return self.watch.frame_after(self.source, state.time_s, timeout_s=self.frame_timeout_s)
+            return self.mover.frame_after(state.time_s, timeout_s=self.frame_timeout_s)
         except TimeoutError as error:
             raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
 
-    def _go_to(self, target: np.ndarray, *, sees: bool = True) -> ArmState:
-        """Move straight to a pose (6,), if the camera ``sees`` only while its frames are fresh. Returns the state that confirms it."""
-        self.watch.require()
-        if sees:
-            self.eyes.await_sight(timeout_s=self.frame_timeout_s)
-        state = self.arm.state()
-        for guard in self.guards:
-            target = guard(state, target)
-        timeout_s = MOVE_TIMEOUT_S + SPARE * float(np.linalg.norm(target[:3] - state.pose[:3])) / self.speed[0]
-        move = partial(self.arm.move_linear, target, wait=False, timeout_s=timeout_s)
-        sent = self.eyes.move(move, ends=False) if sees else move()
-        if (short_mm := float(np.linalg.norm(sent[:3] - target[:3]))) > NEAR_MM:
-            raise DeviceError(
-                f"{self.arm.name}: a move ends {short_mm:.1f} mm from where it should; give --limits without step_mm and step_deg"
-            )
-        settle = partial(self.arm.wait_settled, sent, timeout_s=timeout_s)
-        with self.watch.doing("moving"):
-            return self.eyes.move(settle) if sees else settle()
+    def _pose(self, label: np.ndarray, away_mm: float) -> np.ndarray:
+        return self.work.base_pose(label, self.mover.arm.state().pose, away_mm=away_mm)
 
 
 @dataclass(frozen=True)
@@ -483,10 +380,8 @@ class CollectPlan:
         Number of contacts in the folder at the end.
     seed : int or None
         Seed of the drawn contacts. None: the experiment's own seed.
-    design : {"random", "even", "unsure"}
+    design : {"random", "even"}
         Distribution of the contacts over the experiment's ranges.
-    chooser : callable or None
-        Chooses the contacts of the design "unsure" after the first ones: ``training.data.design.LeastSure(sensor)``.
     form : Form or None
         Form of the frames. None: the form of the sensor's recordings if it has one.
     limits : str or None
@@ -508,7 +403,6 @@ class CollectPlan:
     count: int
     seed: int | None = None
     design: str = "random"
-    chooser: Chooser | None = None
     form: Form | None = None
     limits: str | None = None
     plain_light: bool = False
@@ -517,11 +411,9 @@ class CollectPlan:
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= MOST_CONTACTS:
-            raise DeviceError(f"--count {self.count}: a collection has 1 to {MOST_CONTACTS} contacts")
+            raise DeviceError(f"`count` {self.count}: a collection has 1 to {MOST_CONTACTS} contacts")
         if self.design not in DESIGNS:
-            raise DeviceError(f"--design {self.design}: must be {' or '.join(DESIGNS)}")
-        if self.design == "unsure" and self.chooser is None:
-            raise DeviceError('the design "unsure" needs a chooser, as training.data.design.LeastSure(sensor) is one')
+            raise DeviceError(f"`design` {self.design}: must be {' or '.join(DESIGNS)}")
 
     @property
     def drawn_with(self) -> int:
@@ -597,17 +489,13 @@ def _collect_on_rig(
         if plan.dry_run:
             return
         collect(
-            rig.source,
-            rig.arm,
+            rig,
             plan.experiment,
-            rig.placed,
             collection,
             plan.count,
             seed=plan.drawn_with,
             design=plan.design,
-            chooser=plan.chooser,
             speed=(plan.servo.linear_mm_s, plan.servo.angular_deg_s),
-            frame_timeout_s=rig.frame_timeout_s,
             on_rest=require_rest,
             progress=made,
         )
@@ -616,13 +504,17 @@ def _collect_on_rig(
 def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
     """Check the plan and report it. Of the contacts the next ``CHECKED_CONTACTS`` are checked."""
     work, near = WorkFrame(plan.experiment, rig.placed), rig.arm.state().pose
-    design = "random" if plan.design == "random" else "even"
     pressed = np.array(plan.experiment.clear) + np.array(plan.experiment.tap)
-    asked = [draw_contact(plan.experiment, plan.drawn_with, n, design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))]
+    asked = [draw_contact(plan.experiment, plan.drawn_with, n, plan.design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))]
     planned = [work.base_pose(one.pose + pressed, near) for one in asked]
     clear = work.base_pose(np.zeros(6), near, away_mm=CLEAR_MM)
     spent_s = (plan.count - made) * CONTACT_S
-    for line in check_plan(rig, clear, planned, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s):
+    form = rig.source.form
+    at_rest = partial(measure_reference, plan.sensor, form)
+    lines = check_plan(
+        rig, Pipeline(plan.sensor, form), clear, planned, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s, at_rest=at_rest
+    )
+    for line in lines:
         LOGGER.warning("%s", line)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from hardware.cameras.mjpeg import CONTENT_TYPE, hold_little, jpeg_of, write_part
 from hardware.cameras.source import FrameSource, await_frame
-from hardware.emulators.faults import EVERY_NTH, SECONDS, Faults
+from hardware.emulators.faults import EVERY_NTH, SECONDS, Emulator, Faults
 from hardware.errors import DeviceError, cannot_listen
 from twin.errors import TwinError
 
@@ -38,7 +38,7 @@ class _Part:
     jpeg: bytes
 
 
-class CameraEmulator:
+class CameraEmulator(Emulator):
     """Serves a source's frames as a stream. A context manager, which listens between ``start`` and ``stop``.
 
     Parameters
@@ -103,13 +103,6 @@ class CameraEmulator:
         self._threads.clear()
         self._source.disconnect()
 
-    def __enter__(self) -> "CameraEmulator":
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
     @property
     def pulled_out(self) -> bool:
         """Whether the camera is unplugged by a fault at present."""
@@ -149,20 +142,16 @@ class CameraEmulator:
             if "resized" in self.faults:
                 image = image[::2]
             self.made += 1
-            if "silent" in self.faults or self._every("dropped"):
+            if "silent" in self.faults or self.faults.every("dropped", self.made):
                 continue
             jpeg = jpeg_of(image)
-            if self._every("torn"):
+            if self.faults.every("torn", self.made):
                 jpeg = jpeg[: len(jpeg) // 2]
             age_s = time.monotonic() - frame.time_s
             part = _Part(self.made, time.time() - age_s, time.monotonic() + (self.faults.value("late") or 0.0), jpeg)
             with self._new:
                 self._part = part
                 self._new.notify_all()
-
-    def _every(self, fault: str) -> bool:
-        value = self.faults.value(fault)
-        return value is not None and self.made % int(value) == 0
 
 
 class _Server(ThreadingHTTPServer):

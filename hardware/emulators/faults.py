@@ -1,8 +1,11 @@
-"""Faults of an emulated device, switched on by name: ``NAME`` or ``NAME=VALUE``."""
+"""What all emulated devices have: faults, switched on by name (``NAME`` or ``NAME=VALUE``), and a start and an end."""
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
+from threading import Timer
+from typing import Self
 
 from scenes.files import shown
 from twin.errors import TwinError
@@ -96,3 +99,37 @@ class Faults:
         if name not in self.known:
             raise KeyError(name)
         return self._on.get(name)
+
+    def every(self, name: str, count: int) -> bool:
+        """Whether a fault of every n-th thing strikes the thing with this number."""
+        every = self.value(name)
+        return every is not None and count % int(every) == 0
+
+    def factor(self, name: str) -> float:
+        """The fault's value as a factor: 1 if it is off."""
+        value = self.value(name)
+        return 1.0 if value is None else value
+
+    def after(self, name: str, act: Callable[[], object]) -> None:
+        """Call a function after the time that is the fault's value, if it is on."""
+        if (after_s := self.value(name)) is not None:
+            timer = Timer(after_s, act)
+            timer.daemon = True
+            timer.start()
+
+
+class Emulator(ABC):
+    """An emulated device. A context manager, which works between ``start`` and ``stop``."""
+
+    @abstractmethod
+    def start(self) -> None: ...
+
+    @abstractmethod
+    def stop(self) -> None: ...
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()

@@ -11,12 +11,12 @@ import time
 import tty
 from collections.abc import Sequence
 from pathlib import Path
-from threading import Event, Lock, Thread, Timer
+from threading import Event, Lock, Thread
 
 import numpy as np
 
 from hardware.arms.magician_wire import Message, take_message
-from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Faults, Range
+from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Faults, Range
 from hardware.emulators.magician_controller import START_JOINTS_DEG, MagicianController
 from twin.errors import TwinError
 
@@ -44,7 +44,7 @@ RANGES = {
 }
 
 
-class MagicianEmulator:
+class MagicianEmulator(Emulator):
     """A Magician on a pseudo-terminal. A context manager, which works between ``start`` and ``stop``.
 
     Parameters
@@ -80,13 +80,6 @@ class MagicianEmulator:
         self._thread: Thread | None = None
         self._noise, self._replies = random.Random(0), 0
 
-    def __enter__(self) -> "MagicianEmulator":
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
     def pose(self, time_s: float | None = None) -> np.ndarray:
         """Pose (6,) of the tool at a ``time.monotonic()`` (now if not given)."""
         return self.arm.pose(time_s)
@@ -114,10 +107,7 @@ class MagicianEmulator:
                 ) from error
         self._thread = Thread(target=self._serve, daemon=True, name="magician-emulator")
         self._thread.start()
-        if (after_s := self.faults.value("unplugged")) is not None:
-            timer = Timer(after_s, self.unplug)
-            timer.daemon = True
-            timer.start()
+        self.faults.after("unplugged", self.unplug)
 
     def stop(self) -> None:
         self.unplug()
@@ -163,9 +153,9 @@ class MagicianEmulator:
 
     def _send(self, frame: bytes) -> None:
         self._replies += 1
-        if "mute" in self.faults or self._every("lost-reply"):
+        if "mute" in self.faults or self.faults.every("lost-reply", self._replies):
             return
-        if self._every("wrong-checksum"):
+        if self.faults.every("wrong-checksum", self._replies):
             frame = frame[:-1] + bytes([frame[-1] ^ 0xFF])
         if (count := self.faults.value("noise")) is not None:
             frame = self._noise.randbytes(int(count)) + frame
@@ -177,7 +167,3 @@ class MagicianEmulator:
             with self._lock, contextlib.suppress(OSError):
                 if self._ends is not None:
                     os.write(self._ends[0], piece)
-
-    def _every(self, fault: str) -> bool:
-        every = self.faults.value(fault)
-        return every is not None and self._replies % int(every) == 0

@@ -25,25 +25,22 @@ START_JOINTS_DEG = (0.0, 45.0, 45.0, 0.0)
 HOME_SPEED_DEG_S = 30.0
 # Length of a jog, mm and deg. It is longer than every range of motion.
 JOG_MM, JOG_DEG = 400.0, 300.0
-# Parameters that are stored as received, with their initial bytes. The number of bytes must agree.
-PARAMETERS: dict[int, bytes] = {
-    Id.HOME_PARAMS: struct.pack("<4f", 200.0, 0.0, 0.0, 0.0),
-    Id.END_EFFECTOR: struct.pack("<3f", 0.0, 0.0, 0.0),
-    Id.LASER: bytes(2),
-    Id.SUCTION: bytes(2),
-    Id.GRIPPER: bytes(2),
-    Id.IO: bytes(2),
-    Id.JOG_JOINT_PARAMS: struct.pack("<8f", *[20.0] * 4, *[50.0] * 4),
-    Id.JOG_COORDINATE_PARAMS: struct.pack("<8f", *[20.0] * 4, *[50.0] * 4),
-    Id.JOG_COMMON_PARAMS: struct.pack("<2f", 50.0, 50.0),
-    Id.PTP_JOINT_PARAMS: struct.pack("<8f", *[200.0] * 8),
-    Id.PTP_COORDINATE_PARAMS: struct.pack("<4f", *[200.0] * 4),
-    Id.PTP_JUMP_PARAMS: struct.pack("<2f", 20.0, 100.0),
-    Id.PTP_COMMON_PARAMS: struct.pack("<2f", 50.0, 50.0),
-    Id.CP_PARAMS: struct.pack("<3fB", 100.0, 50.0, 10.0, 0),
-    Id.ARC_PARAMS: struct.pack("<4f", 100.0, 100.0, 100.0, 100.0),
-    Id.HANDHELD_OUTPUT: bytes(1),
+# Parameters that are stored as received: their numbers' form, and their initial values. The number of bytes must agree.
+STORED: dict[int, tuple[str, tuple[float, ...]]] = {
+    Id.HOME_PARAMS: ("<4f", (200.0, 0.0, 0.0, 0.0)),
+    Id.END_EFFECTOR: ("<3f", (0.0,) * 3),
+    **dict.fromkeys((Id.LASER, Id.SUCTION, Id.GRIPPER, Id.IO), ("<2B", (0, 0))),
+    **dict.fromkeys((Id.JOG_JOINT_PARAMS, Id.JOG_COORDINATE_PARAMS), ("<8f", (20.0,) * 4 + (50.0,) * 4)),
+    Id.JOG_COMMON_PARAMS: ("<2f", (50.0, 50.0)),
+    Id.PTP_JOINT_PARAMS: ("<8f", (200.0,) * 8),
+    Id.PTP_COORDINATE_PARAMS: ("<4f", (200.0,) * 4),
+    Id.PTP_JUMP_PARAMS: ("<2f", (20.0, 100.0)),
+    Id.PTP_COMMON_PARAMS: ("<2f", (50.0, 50.0)),
+    Id.CP_PARAMS: ("<3fB", (100.0, 50.0, 10.0, 0)),
+    Id.ARC_PARAMS: ("<4f", (100.0,) * 4),
+    Id.HANDHELD_OUTPUT: ("<B", (0,)),
 }
+PARAMETERS: dict[int, bytes] = {id: struct.pack(form, *values) for id, (form, values) in STORED.items()}
 # Parts that are not attached to the arm: bytes of a write, and the reply to a read, which shows no signal.
 NOT_ATTACHED: dict[int, tuple[int, bytes]] = {
     Id.MOTOR: (6, b""),
@@ -72,23 +69,13 @@ SIZES: dict[int, tuple[int, ...]] = {
 }
 # Floating-point numbers at the beginning of a command's parameters. All must be finite.
 NUMBERS: dict[int, struct.Struct] = {
-    id: struct.Struct(form)
+    id: struct.Struct(form.rstrip("B"))
     for id, form in {
+        **{id: form for id, (form, _) in STORED.items() if "f" in form},
         Id.RESET_POSE: "<x2f",
-        Id.HOME_PARAMS: "<4f",
-        Id.END_EFFECTOR: "<3f",
-        Id.JOG_JOINT_PARAMS: "<8f",
-        Id.JOG_COORDINATE_PARAMS: "<8f",
-        Id.JOG_COMMON_PARAMS: "<2f",
-        Id.PTP_JOINT_PARAMS: "<8f",
-        Id.PTP_COORDINATE_PARAMS: "<4f",
-        Id.PTP_JUMP_PARAMS: "<2f",
-        Id.PTP_COMMON_PARAMS: "<2f",
         Id.PTP: "<x4f",
-        Id.CP_PARAMS: "<3f",
         Id.CP: "<x3f",
         Id.CP_LASER: "<x4f",
-        Id.ARC_PARAMS: "<4f",
         Id.ARC: "<8f",
     }.items()
 }
@@ -148,6 +135,16 @@ class MagicianController:
         with self.lock:
             self.alarms.add(NOT_UNDERSTOOD)
         return Message(message.id, message.ctrl)
+
+    def busy(self) -> bool:
+        """Whether commands are in progress or queued."""
+        with self.lock:
+            return bool(self._queue) or self.track.moving(self.advance())
+
+    @property
+    def takes_moves(self) -> bool:
+        """Whether the queue runs, as ``enable`` of a driver makes it."""
+        return self._running
 
     def advance(self) -> float:
         """Execute the queue up to the present time, which is returned. A command that fails ends with an alarm and is not tried again."""
@@ -244,13 +241,13 @@ class MagicianController:
             return self._arc(np.array(struct.unpack("<8f", params)), begins_s)
         elif message.id in (Id.CP, Id.CP_LASER):
             absolute, x, y, z = struct.unpack("<B3f", params[:13])
-            here = self._target_pose()
+            here = self.track.pose(np.inf)
             end = np.array([x, y, z, 0, 0, 0]) if absolute else here + [x, y, z, 0, 0, 0]
             end[5] = here[5]
-            speed, acceleration = self._floats(Id.CP_PARAMS, "<3fB")[1], self._floats(Id.CP_PARAMS, "<3fB")[0]
+            acceleration, speed, *_ = self._stored(Id.CP_PARAMS)
             return self._go(end, Speeds(speed, speed, acceleration, acceleration), begins_s, linear=True)
         elif message.id == Id.HOME:
-            x, y, z, r = self._floats(Id.HOME_PARAMS, "<4f")
+            x, y, z, r = self._stored(Id.HOME_PARAMS)
             return self._go_to(np.array([x, y, z, 0, 0, r]), Speeds(HOME_SPEED_DEG_S, HOME_SPEED_DEG_S), begins_s)
         elif message.id == Id.WAIT:
             return begins_s + struct.unpack("<I", params)[0] / 1000.0
@@ -260,7 +257,7 @@ class MagicianController:
         return begins_s  # ResetPose needs no action: the emulated arm always knows its pose
 
     def _ptp(self, mode: int, numbers: np.ndarray, begins_s: float) -> float:
-        here, joints = self._target_pose(), self._target_joints()
+        here, joints = self.track.pose(np.inf), self.track.joints_deg(np.inf)
         target = np.array([*numbers[:3], 0.0, 0.0, numbers[3]])
         line, turn = self._ptp_speeds()
         if mode in (Ptp.MOVJ_ANGLE, Ptp.MOVJ_INC):
@@ -274,7 +271,7 @@ class MagicianController:
         if mode in (Ptp.MOVJ_XYZ, Ptp.MOVJ_XYZ_INC):
             return self._go_to(target, turn, begins_s)
         if mode in (Ptp.JUMP_XYZ, Ptp.JUMP_ANGLE, Ptp.JUMP_MOVL_XYZ):
-            height, limit = self._floats(Id.PTP_JUMP_PARAMS, "<2f")
+            height, limit = self._stored(Id.PTP_JUMP_PARAMS)
             top = min(max(here[2], target[2]) + height, limit)
             over, above = here.copy(), target.copy()
             over[2] = above[2] = top
@@ -286,10 +283,10 @@ class MagicianController:
     def _arc(self, numbers: np.ndarray, begins_s: float) -> float:
         """Move along the circle through the present place and two others."""
         via, end = (np.array([*part[:3], 0.0, 0.0, part[3]]) for part in (numbers[:4], numbers[4:]))
-        lines = circle(self._target_pose(), via, end)
+        lines = circle(self.track.pose(np.inf), via, end)
         if len(lines) == 2:  # on one straight line
             return self._alarm(ARC_PLACES, begins_s)
-        speed, turn, _, _ = self._floats(Id.ARC_PARAMS, "<4f")
+        speed, turn, _, _ = self._stored(Id.ARC_PARAMS)
         for pose in lines:
             begins_s = self._go(pose, Speeds(speed, turn), begins_s, linear=True)
         return begins_s
@@ -299,8 +296,8 @@ class MagicianController:
         if not 1 <= command <= 8:
             return
         axis, sign = (command - 1) // 2, 1 if command % 2 else -1
-        speed = struct.unpack("<8f", self._params[Id.JOG_JOINT_PARAMS if joints else Id.JOG_COORDINATE_PARAMS])[axis]
-        speed *= self._floats(Id.JOG_COMMON_PARAMS, "<2f")[0] / 100.0 * self._time_scale
+        speed = self._stored(Id.JOG_JOINT_PARAMS if joints else Id.JOG_COORDINATE_PARAMS)[axis]
+        speed *= self._stored(Id.JOG_COMMON_PARAMS)[0] / 100.0 * self._time_scale
         start = self.track.joints_deg(begins_s) if joints else self.track.pose(begins_s)
         at, length = (axis if joints or axis < 3 else 5), JOG_DEG if joints or axis == 3 else JOG_MM
         while length > 0.5 and speed > 0:  # the target is the last place within the limits
@@ -320,21 +317,18 @@ class MagicianController:
     def _go(self, end: np.ndarray, speeds: Speeds, begins_s: float, *, linear: bool) -> float:
         if self.alarms or "ignore-moves" in self.faults:
             return begins_s
-        slow = self.faults.value("slow")
-        speeds = speeds.scaled(self._time_scale * (1.0 if slow is None else slow))
+        speeds = speeds.scaled(self._time_scale * self.faults.factor("slow"))
         # The end comes first: the places along a line to a far one are too many to count.
         broken = check_line(self.kinematics, end, end) if linear else None
         piece = broken or self.track.move(end, speeds, linear=linear, now_s=begins_s)
         if isinstance(piece, Violation):
             return self._alarm(piece.code, begins_s)
-        share = self.faults.value("stall")
-        if share is not None and piece.duration_s > 0:
-            self.track.stop(piece.start_s + share * piece.duration_s)
-            return np.inf
-        share = self.faults.value("lost-steps")
-        if share is not None and piece.duration_s > 0:
-            self.track.stop(piece.start_s + share * piece.duration_s)
-            self._lost_at_s = self.track.end_s
+        for fault in ("stall", "lost-steps"):
+            if fault in self.faults and piece.duration_s > 0:
+                self.track.stop(piece.start_s + self.faults.factor(fault) * piece.duration_s)
+                if fault == "stall":
+                    return np.inf
+                self._lost_at_s = self.track.end_s
         return piece.end_s
 
     def _alarm(self, alarm: int, begins_s: float) -> float:
@@ -342,22 +336,18 @@ class MagicianController:
         return begins_s
 
     def _ptp_speeds(self) -> tuple[Speeds, Speeds]:
-        speed, acceleration = np.clip(self._floats(Id.PTP_COMMON_PARAMS, "<2f"), 0.01, 100.0) / 100.0
-        xyz, r, xyz2, r2 = self._floats(Id.PTP_COORDINATE_PARAMS, "<4f")
-        joints = self._floats(Id.PTP_JOINT_PARAMS, "<8f")
+        speed, acceleration = np.clip(self._stored(Id.PTP_COMMON_PARAMS), 0.01, 100.0) / 100.0
+        xyz, r, xyz2, r2 = self._stored(Id.PTP_COORDINATE_PARAMS)
+        joints = self._stored(Id.PTP_JOINT_PARAMS)
         line = Speeds(speed * xyz, speed * r, acceleration * xyz2, acceleration * r2)
         return line, Speeds(speed * joints[0], speed * min(joints[:4]), acceleration * joints[4], acceleration * min(joints[4:]))
 
-    def _floats(self, id: Id, form: str) -> tuple:
-        return struct.unpack(form, self._params[id])
+    def _stored(self, id: Id) -> tuple:
+        return struct.unpack(STORED[id][0], self._params[id])
 
     def _set_tool(self, x_mm: float, time_s: float) -> None:
+        if x_mm == self.kinematics.r0_mm:  # so that the past poses stay known
+            return
         joints = self.track.joints_deg(time_s)
         self.kinematics = replace(MAGICIAN, r0_mm=x_mm)
         self.track = MotionTrack(self.kinematics, joints)
-
-    def _target_pose(self) -> np.ndarray:
-        return self.track.pose(np.inf)
-
-    def _target_joints(self) -> np.ndarray:
-        return self.track.joints_deg(np.inf)

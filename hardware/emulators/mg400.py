@@ -8,7 +8,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from threading import Event, Lock, Thread, Timer
+from threading import Event, Lock, Thread
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from hardware.arms.mg400_wire import (
     Mode,
     require_ports,
 )
-from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Faults, Range
+from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Faults, Range
 from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame
 from hardware.emulators.mg400_grammar import RefusedError, Request, take_request
@@ -76,7 +76,7 @@ RANGES = {
 }
 
 
-class Mg400Emulator:
+class Mg400Emulator(Emulator):
     """An MG400 on loopback. A context manager, which listens between ``start`` and ``stop``.
 
     Parameters
@@ -129,13 +129,6 @@ class Mg400Emulator:
         self._threads: list[Thread] = []
         self._started_s = time.monotonic()
 
-    def __enter__(self) -> "Mg400Emulator":
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
     def pose(self, time_s: float | None = None) -> np.ndarray:
         """Pose (6,) of the flange at a ``time.monotonic()`` (now if not given)."""
         now_s = self.arm.update()
@@ -166,11 +159,8 @@ class Mg400Emulator:
                 self._listeners[listener] = port
         self._started_s = time.monotonic()
         self._run(self._accept)
-        for name, action in (("emergency-stop", self.arm.press_emergency_stop), ("die", self.kill)):
-            if (after_s := self.faults.value(name)) is not None:
-                timer = Timer(after_s, action)
-                timer.daemon = True
-                timer.start()
+        self.faults.after("emergency-stop", self.arm.press_emergency_stop)
+        self.faults.after("die", self.kill)
 
     def stop(self) -> None:
         """Close all connections and stop listening."""
@@ -251,12 +241,9 @@ class Mg400Emulator:
 
     def _packet(self, count: int) -> bytes:
         packet = feedback_packet(self.arm)
-        if (every := self.faults.value("wrong-test-value")) is not None and count % int(every) == 0:
+        if self.faults.every("wrong-test-value", count):
             packet["test_value"] = 0
-        data = packet.tobytes()
-        if (every := self.faults.value("short-packets")) is not None and count % int(every) == 0:
-            return data[:SHORT_BYTES]
-        return data
+        return packet.tobytes()[: SHORT_BYTES if self.faults.every("short-packets", count) else None]
 
     def _converse(self, client: socket.socket, port: int) -> None:
         buffer = ""

@@ -271,9 +271,7 @@ class Mg400Controller:
 
     def speeds(self, percent: float, acceleration: float) -> Speeds:
         """Speeds at the given percentages."""
-        factor = self._time_scale * percent / 100.0 * self.percent["speedfactor"] / 100.0
-        if (slow := self.faults.value("slow")) is not None:
-            factor *= slow
+        factor = self._time_scale * percent / 100.0 * self.percent["speedfactor"] / 100.0 * self.faults.factor("slow")
         ramp = acceleration / 100.0 * self._time_scale**2
         return Speeds(MAX_LINEAR_MM_S * factor, MAX_JOINT_DEG_S * factor, MAX_LINEAR_MM_S2 * ramp, MAX_JOINT_DEG_S2 * ramp)
 

@@ -5,15 +5,13 @@
 
 from collections.abc import Callable
 
-import numpy as np
-
 from hardware.arms.arm import ArmState
 from hardware.arms.mg400_link import Feedback
-from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, require_ports
+from hardware.arms.mg400_wire import FEEDBACK_PERIOD_S, address_of, pose_in
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.running import run_until_told, say
 from hardware.rig.geometry import PlacedObject
-from hardware.rig.rig import twin_camera
+from hardware.workcell.build import twin_camera
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
 from twin.errors import OptionError
 from twin.rig.mounting import Mounting
@@ -42,11 +40,9 @@ class FeedbackPose:
     def of(cls, spec: str) -> "FeedbackPose":
         """The reader for ``mg400:ADDRESS[:DASHBOARD_PORT]``. The feedback ports have the same offset as the dashboard port."""
         kind, _, rest = spec.partition(":")
-        host, _, port = rest.partition(":")
-        if kind not in ("mg400", "mg400-lenient") or not host or (port and not port.isdecimal()):
+        if kind not in ("mg400", "mg400-lenient") or rest[:1] in ("", ":"):
             raise OptionError(f"`arm` {spec}: expected mg400:ADDRESS, for example mg400:127.0.0.1 with 'twin emulate mg400' running")
-        offset = int(port) - DASHBOARD_PORT if port else 0
-        require_ports(offset)
+        host, offset = address_of(rest)
         return cls(host, tuple(number + offset for number in FEEDBACK_PERIOD_S), lenient=kind != "mg400")
 
     def __enter__(self) -> "FeedbackPose":
@@ -59,8 +55,7 @@ class FeedbackPose:
     def __call__(self) -> ArmState:
         """The newest state; raises ``StaleDataError`` if it is too old."""
         packet, time_s = self._feedback.newest(MAX_AGE_S)
-        x, y, z, turn = packet["tool_actual"][:4]
-        return ArmState(np.array([x, y, z, 0.0, 0.0, turn]), packet["q_actual"][:4].copy(), time_s, bool(packet["enabled"]), False)
+        return ArmState(pose_in(packet), packet["q_actual"][:4].copy(), time_s, bool(packet["enabled"]), False)
 
 
 def emulate_camera(
@@ -91,7 +86,7 @@ def emulate_camera(
     faults : tuple of str
         See ``CameraEmulator``.
     plain_light : bool
-        Without path tracing at the start; see ``hardware.rig.rig.drawn``.
+        Without path tracing at the start; see ``hardware.workcell.build.drawn``.
     """
     placed = PlacedObject(stimulus, servo.placement, Mounting.of(sensor, load_experiment(servo.experiment)))
     pose = FeedbackPose.of(arm)

@@ -11,7 +11,7 @@ from serial.tools import list_ports
 
 from scenes import list_experiments, list_objects, list_randomisations, list_sensors
 from scenes.plugins import plugin_lines
-from twin.errors import RenderError
+from twin.errors import EXTRAS, RenderError
 from twin.optics.variant import report
 from twin.report.skin3d import probe_offscreen
 from twin.store import cache_folder
@@ -88,7 +88,7 @@ class Machine(Readable):
     def lines(self) -> list[str]:
         """The result as lines of text."""
         lines = [f"Python      {platform.python_version()} ({sys.executable}) on {platform.system()} {platform.machine()}"]
-        lines += [f"{name:11} {version or 'MISSING; run ' + repr('make setup')}" for name, version in self.packages.items()]
+        lines += [f"{name:11} {version or _remedy(name)}" for name, version in self.packages.items()]
         lines += ["", *self._own_lines(), f"kept results {self.kept or 'none: the cache is off'}"]
         lines += ["", "Rendering (Mitsuba)", *(f"  {line}" for line in self.rendering)]
         lines += ["", "3D pictures (VTK offscreen)", f"  {'PLAIN ONLY: ' + self.plain_pictures if self.plain_pictures else 'works'}"]
@@ -103,12 +103,13 @@ class Machine(Readable):
 
     def _verdict(self) -> str:
         """What can be done here, in a sentence."""
-        missing = [name for name, version in self.packages.items() if not version]
+        missing = [name for name, version in self.packages.items() if not version and name not in EXTRAS]
         if missing or not self.can_render:
             lacking = [*(["a way to render (see above)"] if not self.can_render else []), *missing]
             return f"Not ready: this machine lacks {', '.join(lacking)}."
         plain = " Pictures of the deformed skin are plain ones." if self.plain_pictures else ""
-        return f"Ready: frames can be rendered, read and learnt from.{plain} Next: twin demo --out out/demo"
+        models = "" if self.packages.get("torch") else " Models need PyTorch (torch): pip install 'tactip-twin[models]'."
+        return f"Ready: frames can be rendered and read.{models}{plain} Next: twin demo --out out/demo"
 
     def _own_lines(self) -> list[str]:
         """The place of the program's own packages, or a line for each package if they lie in different places."""
@@ -126,6 +127,11 @@ def examine_machine() -> Machine:
     devices = dict(zip(DEVICES, (cameras(), serial_ports()), strict=True))
     versions = {name: _version(name) for name in PACKAGES}
     return Machine(versions, rendering, can_render, probe_offscreen(), devices, _places(), cache_folder(), plugin_lines())
+
+
+def _remedy(package: str) -> str:
+    """What is said of a package that is missing."""
+    return f"not installed: pip install 'tactip-twin[{EXTRAS[package]}]'" if package in EXTRAS else "MISSING; run 'make setup'"
 
 
 def _places() -> dict[str, Path]:

@@ -18,9 +18,11 @@ from hardware.live.live import LiveSession, estimate_line
 from hardware.safety.decide import load_limits
 from hardware.safety.eyes import Eyes
 from hardware.safety.safe_arm import SafeArm, try_each
+from hardware.workcell.plan import check_standing
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
 from twin.estimate import Estimate, SensorModel
+from twin.pins import Pipeline
 from twin.records.session import SessionWriter
 from twin.studio.live_page import LiveShot
 from twin.types import Frame
@@ -42,6 +44,8 @@ class WatchedArm:
         Text for ``open_arm``.
     source : FrameSource, optional
         The camera. Without one the arm does not move.
+    pipeline : Pipeline, optional
+        Finds the pins of the sensor in the camera's frames.
 
     Raises
     ------
@@ -49,12 +53,13 @@ class WatchedArm:
         There is no such arm, or no limits are known for its kind.
     """
 
-    def __init__(self, text: str, source: FrameSource | None = None) -> None:
+    def __init__(self, text: str, source: FrameSource | None = None, pipeline: Pipeline | None = None) -> None:
         arm, kind = open_arm(text), kind_of(text)
         self._arm = SafeArm(arm, load_limits(kind))
         self.name = self._arm.name
         self._armed = False
         self._moves = threading.Lock()
+        self._source, self._pipeline = source, pipeline
         self._eyes = Eyes(self._arm, source) if source is not None else None
         self._steps: list[tuple[int, float]] = []  # axis and length of the steps from the pose at which it was armed
 
@@ -84,12 +89,22 @@ class WatchedArm:
         slow = min(SLOW_MM_S, limits.linear_mm_s)
         return f"tool within {box} mm, {slow:g} mm/s, one step at a time; it is disabled when the studio ends"
 
-    def arm(self) -> None:
-        """Enable the arm, and set a low speed."""
+    def arm(self) -> list[str]:
+        """Check the camera and the arm's place, enable the arm, and set a low speed. Returns what was checked, one line for each part.
+
+        Raises
+        ------
+        DeviceError
+            There is no camera, it does not show the sensor's pins, or the arm stands outside its limits. The arm stays disabled.
+        """
+        if self._source is None or self._pipeline is None:
+            raise DeviceError(f"{self.name}: moves only with a camera; connect one")
+        checked = check_standing(self._source, self._arm, self._pipeline)
         self._steps.clear()
         self._arm.enable()
         self._arm.set_speed(SLOW_MM_S, SLOW_DEG_S)
         self._armed = True
+        return checked
 
     def disarm(self) -> None:
         """Stop and disable the arm. Both are tried."""
@@ -105,7 +120,7 @@ class WatchedArm:
         DeviceError
             The arm is not armed, is already moving, its limits forbid the move, or the camera gives no fresh frame.
         """
-        if not self._armed:
+        if not self._armed or self._eyes is None:
             raise DeviceError(f"{self.name}: read only; arm it first")
         if not self._moves.acquire(blocking=False):
             raise DeviceError(f"{self.name}: moves already; wait for its end")
@@ -116,8 +131,6 @@ class WatchedArm:
             if self._steps and self._steps[-1] == (axis, -by_mm):  # the way it came needs no frame
                 move()
                 self._steps.pop()
-            elif self._eyes is None:
-                raise DeviceError(f"{self.name}: moves only with a camera; connect one")
             else:
                 with self._eyes.watched():
                     self._eyes.stand()
@@ -152,7 +165,7 @@ def require_feed(camera: str, arm: str, recording: str, sensor: SensorSpec) -> N
     if arm:
         WatchedArm(arm)
     if recording and not os.path.exists(recording):  # its content is checked when it is opened
-        raise FrameError(f"--recording {recording}: no such folder; give a recording")
+        raise FrameError(f"`recording` {recording}: no such folder; give a recording")
 
 
 class CameraFeed:
@@ -176,7 +189,7 @@ class CameraFeed:
         self.model = model = model.seeking_rest()
         self._source = open_camera(camera, model.sensor, model.form)
         model.check(model.sensor, self._source.form)
-        self.robot = WatchedArm(arm, self._source) if arm else None
+        self.robot = WatchedArm(arm, self._source, model.pipeline) if arm else None
         self.name = self._source.name + (f" and {self.robot.name}" if self.robot else "")
         self._session = LiveSession(self._source, model)
         self._writer: SessionWriter | None = None

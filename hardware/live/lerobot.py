@@ -9,12 +9,12 @@ from typing import Any, Self
 import numpy as np
 
 from hardware.arms.arm import Arm
+from hardware.arms.newest import NewestTarget
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError, leave
 from hardware.live.doctor import cameras
-from hardware.rig.newest import NewestTarget
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 from scenes import SensorSpec, load_sensor

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from hardware.cameras.choose import open_camera
+from hardware.cameras.session import SessionSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.live.rerun_view import RerunView
-from hardware.live.session import SessionSource
-from hardware.rig.rig import given_frame
 from hardware.servo.timing import Spread, Timing
+from hardware.workcell.build import given_frame
 from twin.errors import FrameError, OptionError, TwinError
 from twin.estimate import Estimate, Estimator, SensorModel, seen_in
 from twin.pins import Pipeline
@@ -196,7 +196,7 @@ class Shower:
         if isinstance(self._error, TwinError):
             raise self._error
         if self._error is not None:
-            raise DeviceError(f"the view broke ({self._error}); without --rerun, --headless shows nothing") from self._error
+            raise DeviceError(f"the view broke ({self._error}); without `rerun`, `headless` shows nothing") from self._error
 
     def _run(self) -> None:
         try:
@@ -263,12 +263,12 @@ class WatchPlan:
 
     def __post_init__(self) -> None:
         if self.also and self.record is None:
-            raise OptionError("--also goes with --record: it keeps that session in a further format")
+            raise OptionError("`also` goes with `record`: it keeps that session in a further format")
         if bool(self.camera) == (self.replay is not None):
-            raise OptionError("give either --camera or --replay")
+            raise OptionError("give either `camera` or `replay`")
         if self.replay is not None and self.at_rest != NONE:
             raise OptionError(
-                "--at-rest goes with --camera: a replay counts pins from the frame that was kept with its session; leave --at-rest out"
+                "`at_rest` goes with `camera`: a replay counts pins from the frame that was kept with its session; leave `at_rest` out"
             )
 
 

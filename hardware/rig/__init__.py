@@ -1,1 +1,1 @@
-"""A rig: camera, arm and object, and the ways between their poses."""
+"""Places of tool, sensor and object, the path around an object, and the last axis of an arm of four axes."""

@@ -3,8 +3,7 @@
 import numpy as np
 
 from hardware.errors import DeviceError
-from hardware.rig.geometry import PlacedObject, matrix_of, pose_of
-from hardware.safety.decide import distance_to_axis
+from hardware.rig.geometry import PlacedObject, distance_to_axis, matrix_of, pose_of
 
 # Distance between the dome and the circle around the object, in mm.
 MARGIN_MM = 10.0

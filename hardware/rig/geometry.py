@@ -33,6 +33,14 @@ def moved(pose: np.ndarray, step_mm: np.ndarray) -> np.ndarray:
     return out
 
 
+def distance_to_axis(a: np.ndarray, b: np.ndarray) -> float:
+    """Smallest distance from the origin to the line segment from a to b in the plane."""
+    along = b - a
+    length = float(along @ along)
+    share = 0.0 if length == 0 else float(np.clip(-(a @ along) / length, 0.0, 1.0))
+    return float(np.linalg.norm(a + share * along))
+
+
 def object_in_base(placement: PlacementSpec) -> np.ndarray:
     """``T_base_object`` (4, 4)."""
     c, s = np.cos(np.radians(placement.turn_deg)), np.sin(np.radians(placement.turn_deg))

@@ -14,6 +14,7 @@ from hardware.arms.arm import FEEDBACK_AGE_S, ArmState
 from hardware.arms.kinematics import LINKAGE_ABOVE, LINKAGE_BELOW, Kinematics, OutOfReachError, finite_numbers
 from hardware.arms.motion import check_line, turn_between_deg
 from hardware.errors import DeviceError
+from hardware.rig.geometry import distance_to_axis
 from scenes.base import Fraction, NonNegative, Positive, Section, SpecError
 from scenes.files import LONGEST_PATH, shown
 from scenes.load import read_section
@@ -383,14 +384,6 @@ def _place(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits) -> Decisio
             Action.REFUSE, Code.OUTSIDE_ANNULUS, f"comes within {nearest:.1f} mm of the base's axis or beyond [{inner:g}, {outer:g}] mm"
         )
     return None
-
-
-def distance_to_axis(a: np.ndarray, b: np.ndarray) -> float:
-    """Smallest distance from the origin to the line segment from a to b in the plane."""
-    along = b - a
-    length = float(along @ along)
-    share = 0.0 if length == 0 else float(np.clip(-(a @ along) / length, 0.0, 1.0))
-    return float(np.linalg.norm(a + share * along))
 
 
 def _joints(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics: Kinematics) -> Decision | None:

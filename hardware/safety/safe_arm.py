@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -132,9 +132,13 @@ class SafeArm:
     def connect(self) -> None:
         self.arm.connect()
 
+    def _ungated(self, call: str) -> None:
+        """Pass on a call that is never refused."""
+        self._note(call, Decision(Action.MOVE, Code.UNGATED, ""))
+        getattr(self.arm, call)()
+
     def disconnect(self) -> None:
-        self._note("disconnect", Decision(Action.MOVE, Code.UNGATED, ""))
-        self.arm.disconnect()
+        self._ungated("disconnect")
 
     def __enter__(self) -> Self:
         self.connect()
@@ -152,34 +156,23 @@ class SafeArm:
         self.set_speed(self.limits.linear_mm_s, self.limits.angular_deg_s)
 
     def disable(self) -> None:
-        self._note("disable", Decision(Action.MOVE, Code.UNGATED, ""))
-        self.arm.disable()
+        self._ungated("disable")
 
     def clear_error(self) -> None:
-        self._note("clear_error", Decision(Action.MOVE, Code.UNGATED, ""))
-        self.arm.clear_error()
+        self._ungated("clear_error")
 
     def stop(self) -> None:
-        self._note("stop", Decision(Action.MOVE, Code.UNGATED, ""))
-        self.arm.stop()
+        self._ungated("stop")
 
     def emergency_stop(self) -> None:
-        self._note("emergency_stop", Decision(Action.MOVE, Code.UNGATED, ""))
-        self.arm.emergency_stop()
+        self._ungated("emergency_stop")
 
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         return self.arm.state(max_age_s=max_age_s)
 
-    def wait_settled(
-        self,
-        pose: np.ndarray,
-        *,
-        tolerance_mm: float = 0.1,
-        tolerance_deg: float = 0.1,
-        timeout_s: float = 10.0,
-        at_rest: bool = True,
-    ) -> ArmState:
-        return self.arm.wait_settled(pose, tolerance_mm=tolerance_mm, tolerance_deg=tolerance_deg, timeout_s=timeout_s, at_rest=at_rest)
+    def wait_settled(self, pose: np.ndarray, **options: Any) -> ArmState:
+        """See ``Arm``."""
+        return self.arm.wait_settled(pose, **options)
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
         """Set the speed; a speed above the limits is reduced to them."""

@@ -14,9 +14,9 @@ from contextlib import AbstractContextManager, contextmanager
 import numpy as np
 
 from hardware.arms.arm import Arm, ArmState
+from hardware.arms.awake import awake_s
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
-from hardware.safety.awake import awake_s
 from twin.types import Frame
 
 LOG = logging.getLogger(__name__)

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from hardware.arms.open_arm import kind_of, open_arm
-from hardware.errors import DeviceError
-from hardware.rig.geometry import moved
+from hardware.errors import DeviceError, in_short
+from hardware.rig.geometry import PlacedObject, moved
 from hardware.rig.last_axis import LastAxis, poses_along, turns_back_mm
-from hardware.rig.plan import check_plan
-from hardware.rig.rig import TWIN, Rig, build_rig, given_frame, servo_loop, steps_round
-from hardware.servo.loop import ServoLoop
+from hardware.servo.loop import ServoLoop, require_labels
 from hardware.servo.policy_law import policy_law
-from hardware.servo.step import LoopSettings, StepRecord
+from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
 from hardware.servo.timing import Timing
 from hardware.servo.trajectory import Measures, Trajectory, measure, trajectory_figure, trajectory_of, write_csv
+from hardware.workcell.build import TWIN, Rig, build_rig, given_frame
+from hardware.workcell.plan import check_plan
 from scenes import ObjectSpec, ServoSpec, load_experiment
 from scenes.files import shown
 from twin.errors import OptionError, TwinError
@@ -102,16 +102,16 @@ class FollowPlan:
 
     def __post_init__(self) -> None:
         if self.also and not self.record:
-            raise OptionError("--also goes with --record: it keeps that session in a further format")
+            raise OptionError("`also` goes with `record`: it keeps that session in a further format")
         if self.stream_hz is not None and not SLOWEST_HZ <= self.stream_hz <= FASTEST_HZ:
-            raise DeviceError(f"--rate {self.stream_hz:g}: expected {SLOWEST_HZ:g} to {FASTEST_HZ:g} decisions a second")
+            raise DeviceError(f"`rate` {self.stream_hz:g}: expected {SLOWEST_HZ:g} to {FASTEST_HZ:g} decisions a second")
         if self.steps is not None and not 1 <= self.steps <= MOST_STEPS:
-            raise DeviceError(f"--steps {self.steps}: expected 1 to {MOST_STEPS}")
+            raise DeviceError(f"`steps` {self.steps}: expected 1 to {MOST_STEPS}")
         if not self.camera:
             if kind_of(self.arm) != "simulated":
                 open_arm(self.arm)  # an arm that does not exist is said first; nothing is opened
                 raise OptionError(
-                    f"--arm {shown(self.arm)} moves by what a camera sees: give the sensor's with --camera; '--camera twin' draws the "
+                    f"`arm` {shown(self.arm)} moves by what a camera sees: give the sensor's with `camera`; `camera=twin` draws the "
                     "frames for the pose that the arm reports, and such a loop does not feel what it touches"
                 )
             object.__setattr__(self, "camera", TWIN)
@@ -125,12 +125,15 @@ class DryRunDone:
 
     def lines(self) -> list[str]:
         """The result as lines of text."""
-        return ["nothing was moved; leave out --dry-run to begin"]
+        return ["nothing was moved; leave out `dry_run` to begin"]
 
 
 @dataclass(frozen=True)
 class Followed:
-    """The result of ``follow``. ``failure`` states why it ended early ("" if it did not); ``outline_mm`` (N, 2) is in the base frame."""
+    """The result of ``follow``. ``failure`` states why it ended early ("" if it did not); ``outline_mm`` (N, 2) is in the base frame.
+
+    ``lines()`` shortens the failure; ``measures.json`` holds all of it.
+    """
 
     measures: Measures
     timing: Timing
@@ -158,8 +161,8 @@ class Followed:
                 f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
             ]
         else:
-            out[0] += "; where the object truly stands is not known, so nothing is measured against it ('--known-place' says it is)"
-        return out + ([f"ended early: {self.failure}"] if self.failure else [])
+            out[0] += "; where the object truly stands is not known, so nothing is measured against it (`known_place` says it is)"
+        return out + ([in_short(f"ended early: {self.failure}")] if self.failure else [])
 
 
 @writes("trajectory.csv", "trajectory.png", "measures.json", SESSION)
@@ -194,22 +197,21 @@ def follow(
     told = _told(plan, model) | (about or {})
     failure, followed = "", None
     with rig, stage(progress, f"following the {plan.stimulus.name}") as step, ExitStack() as stack:
-        _say_plan(plan, rig, wanted_mm, steps)
+        takes_rest = plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live
+        _say_plan(plan, rig, model, wanted_mm, steps, takes_rest)
         first = rig.await_frame()
-        loop = servo_loop(rig, plan.servo, model, _settings(plan, rig, steps))
-        if isinstance(model, PolicyModel):
-            loop.law = policy_law(model.policy, rig.mounting)
-        else:
-            loop.require_labels(model(first).names)
+        law = policy_law(model.policy, rig.mounting) if isinstance(model, PolicyModel) else None
+        if law is None:
+            require_labels(rig.mounting, model(first).names)
         _say_turns(rig, plan.servo, wanted_mm)
         if plan.dry_run:
             return DryRunDone()
         session = stack.enter_context(SessionWriter(out / SESSION, told)) if plan.record else None
         if session is not None and rest is not None:
             session.keep_rest(rest)
-        loop.on_step = partial(_note_step, session, step, steps)
-        if plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live:
-            loop.take_rest = partial(_take_rest, session, model)
+        take_rest = partial(_take_rest, session, model) if takes_rest else None
+        hooks = LoopHooks(law, take_rest, partial(_note_step, session, step, steps))
+        loop = ServoLoop(rig, plan.servo, model, _settings(plan, rig, steps), hooks)
         try:
             loop.run(rig.placed.start_pose(plan.servo.indent_mm))
         except TwinError as error:
@@ -225,6 +227,20 @@ def follow(
     if followed is None:
         raise DeviceError(f"{rig.source.name}: ended before the first step, nothing was followed; give a camera or a longer recording")
     return followed
+
+
+def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[int, float]:
+    """The number of steps for ``rounds`` around the object, and the distance along its outline in mm.
+
+    The tool stands off the surface, so its path around a closed outline is longer than the outline. The number of steps takes this into
+    account.
+    """
+    outline = placed.outline()
+    length_mm = float(np.linalg.norm(np.diff(outline, axis=0), axis=1).sum())
+    tool_mm = placed.mounting.apex_mm @ placed.mounting.axis - servo.indent_mm  # distance of the tool from the surface
+    closed = bool(np.allclose(outline[0], outline[-1]))
+    way_mm = rounds * (length_mm + closed * 2 * np.pi * max(tool_mm, 0.0))
+    return int(np.ceil(way_mm / servo.feed_mm)), rounds * length_mm
 
 
 def _rig_of(plan: FollowPlan, model: SensorModel) -> Rig:
@@ -259,7 +275,7 @@ def _told(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
     return names | {"servo": plan.servo.model_dump()}
 
 
-def _say_plan(plan: FollowPlan, rig: Rig, wanted_mm: float, steps: int) -> None:
+def _say_plan(plan: FollowPlan, rig: Rig, model: SensorModel, wanted_mm: float, steps: int, takes_rest: bool) -> None:
     """Check the plan and report it. Of the outline every ``CHECK_MM`` is checked."""
     planned = [pose for distance, pose in poses_along(rig.placed, plan.servo.indent_mm, wanted_mm)]
     axis, along, near = LastAxis(getattr(rig.arm, "kinematics", None)), [planned[0]], planned[0]
@@ -269,7 +285,8 @@ def _say_plan(plan: FollowPlan, rig: Rig, wanted_mm: float, steps: int) -> None:
             along.append(near)
     clear = moved(planned[0], -plan.servo.clear_mm * rig.mounting.axis)
     spent_s = steps / plan.stream_hz if plan.stream_hz else steps * plan.servo.feed_mm / plan.servo.linear_mm_s
-    for line in check_plan(rig, clear, along, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s):
+    at_rest = model.at_rest if takes_rest else None
+    for line in check_plan(rig, model.pipeline, clear, along, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s, at_rest=at_rest):
         LOG.warning("%s", line)
 
 

@@ -6,43 +6,29 @@ frame's exposure from them. The thread of ``ArmWatch`` also stops an arm that no
 
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from functools import partial
 
 import numpy as np
 
-from hardware.arms.arm import Arm, ArmState
-from hardware.arms.motion import turn_between_deg
-from hardware.cameras.source import FrameSource
+from hardware.arms.arm import ArmState
 from hardware.errors import DeviceError, StaleDataError
-from hardware.rig.geometry import matrix_of, moved
-from hardware.rig.last_axis import HOLD_DEG, LastAxis
+from hardware.rig.last_axis import HOLD_DEG
 from hardware.safety.decide import Code, Sensed
 from hardware.safety.eyes import NEAR_MM as PIECES_MM
-from hardware.safety.eyes import BlindError, Eyes, pieces_to
-from hardware.safety.safe_arm import NoWayBackError, RefusedMoveError, try_each
-from hardware.safety.watch import ArmWatch
+from hardware.safety.eyes import BlindError, pieces_to
+from hardware.safety.safe_arm import RefusedMoveError
 from hardware.servo.law import Memory, Reading, servo_step, tangent_of
-from hardware.servo.step import Guard, LoopSettings, StepRecord
+from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
 from hardware.servo.timing import Spread, Timing
+from hardware.workcell.build import Rig
+from hardware.workcell.mover import MOVE_TIMEOUT_S, Mover
 from scenes.servo import ServoSpec
 from twin.estimate import Estimate, Estimator
 from twin.rig.mounting import Mounting
 from twin.types import Frame
 
 LOG = logging.getLogger(__name__)
-# Largest number of pieces into which guards and arm may divide a move that is waited for.
-MOST_PIECES = 200
-# Largest distance, mm, between the end of a move and its target at which no further piece is needed.
-NEAR_MM = 0.5
-# The same for the turn, in deg.
-NEAR_DEG = 0.5
-# Time in s that a move may take in addition to the duration that its path and speed give.
-MOVE_TIMEOUT_S = 10.0
-# Factor on the duration that a move's path and speed give, because arms round their speed to whole percents.
-SPARE = 2.0
 # Largest lag of the arm behind its target, in largest moves of the servo. An arm that lags farther gets no new target.
 BEHIND_MOVES = 2.0
 
@@ -81,72 +67,36 @@ class _View:
     tangent: np.ndarray | None = None
 
 
-@dataclass
 class ServoLoop:
-    """Runs the law on the frames of a camera.
+    """Runs the law on the frames of a connected rig.
 
     Parameters
     ----------
-    source : FrameSource
-        Connected source.
-    estimator : Estimator
-    arm : Arm
-        Connected arm; ``run`` enables and disables it.
+    rig : Rig
     servo : ServoSpec
-    mounting : Mounting
+    estimator : Estimator
     settings : LoopSettings
-    guards : list of Guard
-        Called before every move, in this order. Each may change the target or refuse it.
-    sense : callable, optional
-        Called before each move with the contact of each fresh estimate: depth, force, torque, slip, and time of the exposure.
-    forget : callable, optional
-        Called when the sensor leaves the object on purpose, for a turn back of the last axis of an arm of four axes.
-    retreat : callable, optional
-        Withdraws the arm. It gets the direction (3,) away from the object in the base frame. By default the arm moves straight by the
-        servo's ``clear_mm``.
-    contact_mm : callable, optional
-        Gives the depth of the contact (negative: the gap) at a pose (6,) of the arm, as far as the object's place is known.
-    way : callable, optional
-        Gives the poses of the path from the arm's pose to the pose clear of the object, which is the last one. By default the path is
-        straight.
-    law : callable, optional
-        Replaces the servo law: gives the next pose (6,) from the arm's pose (6,) and the estimate.
-    take_rest : callable, optional
-        Gets a frame without contact, taken clear of the object, and returns the estimator to use from then on.
-    on_step : callable, optional
-        Called with each record, its frame and its estimate after the move was commanded.
+    hooks : LoopHooks, optional
     """
 
-    source: FrameSource
-    estimator: Estimator
-    arm: Arm
-    servo: ServoSpec
-    mounting: Mounting
-    settings: LoopSettings
-    guards: list[Guard] = field(default_factory=list)
-    sense: Callable[[Sensed], None] | None = None
-    forget: Callable[[], object] | None = None
-    retreat: Callable[[np.ndarray], object] | None = None
-    contact_mm: Callable[[np.ndarray], float] | None = None
-    way: Callable[[np.ndarray, np.ndarray], list[np.ndarray]] | None = None
-    law: Callable[[np.ndarray, Estimate], np.ndarray] | None = None
-    take_rest: Callable[[Frame], Estimator] | None = None
-    on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None
-
-    def __post_init__(self) -> None:
+    def __init__(self, rig: Rig, servo: ServoSpec, estimator: Estimator, settings: LoopSettings, hooks: LoopHooks | None = None) -> None:
+        self.source, self.arm, self.mounting = rig.source, rig.arm, rig.mounting
+        self.servo, self.estimator, self.settings, self.hooks = servo, estimator, settings, hooks or LoopHooks()
+        self.mover = Mover(rig, (servo.linear_mm_s, servo.angular_deg_s), clear_mm=servo.clear_mm, patience_s=settings.give_up_s)
         self.records: list[StepRecord] = []
-        self.notes: list[str] = []  # problems of the run
         self.decided: list[tuple[Decided, float]] = []  # every decision, with the age (s) of its frame (NaN without a frame)
         self._held_since: float | None = None  # when the arm began to hold still
         self._sent: np.ndarray | None = None  # pose (6,) where the arm's queue ends, if it has a queue
         self._behind_since: float | None = None  # when the arm began to lag too far behind for a new target
         self._view, self._memory = _View(), Memory()
-        self._watch = ArmWatch(self.arm)
-        self._eyes = Eyes(self.arm, self.source, lambda time_s: self._watch.pose_at(time_s), self._contact)
-        self._came: list[np.ndarray] = []  # the poses (6,) at which the arm was since it left the pose clear of the object
-        self._axis = LastAxis(getattr(self.arm, "kinematics", None), self.mounting.centre_mm)
+        self._watch, self._axis = self.mover.watch, self.mover.axis
         self._arrived_s: float | None = None  # when the arm came to the object; None once a frame exposed after that was used
         self._started_s = self._ended_s = 0.0
+
+    @property
+    def notes(self) -> list[str]:
+        """Problems of the run."""
+        return self.mover.notes
 
     def run(self, start_pose: np.ndarray) -> Timing:
         """Approach the start pose (6,), follow the surface for the number of steps of the settings, retreat.
@@ -159,7 +109,7 @@ class ServoLoop:
             No usable frame or estimate for ``give_up_s``, or the arm failed.
         """
         touching = False
-        with self._watch.watched(), self._eyes.watched():
+        with self.mover.watched():
             try:
                 with self._watch.alert():
                     self._approach(start_pose)
@@ -169,50 +119,31 @@ class ServoLoop:
                     self._follow()
             finally:
                 self._ended_s = time.monotonic()
-                with self._watch.doing("letting go"):
-                    self._let_go(retreat=touching)
+                self.mover.release(touching=touching)
         return self.timing()
 
     def _approach(self, start_pose: np.ndarray) -> None:
         """Move to the pose clear of the object, and take the frame without contact there."""
-        if self.forget is not None:  # the contact of an earlier run
-            self.forget()
-        with self._watch.doing("waiting for a fresh frame"):
-            self._eyes.await_sight(timeout_s=max(self.settings.give_up_s, self.source.first_frame_s))
-        with self._watch.doing("enabling"):
-            self.arm.enable()
-            self.arm.set_speed(self.servo.linear_mm_s, self.servo.angular_deg_s)
-        clear = self._away_from(start_pose)
+        self.mover.enable()
         with self._watch.doing("moving clear of the object"):
-            for pose in self.way(self._state().pose, clear) if self.way else [clear]:
-                self._move(pose, wait=True)
-        if self.take_rest is not None:
+            self.mover.go_around(self.mover.away_from(start_pose))
+        if self.hooks.take_rest is not None:
             try:
-                rest = self._exposed_after(self._state().time_s)
+                rest = self._exposed_after(self.mover.state().time_s)
             except (TimeoutError, EOFError) as error:
                 raise DeviceError(f"{error}; check the camera") from error
-            self.estimator = self.take_rest(rest)
-        self._came.clear()
+            self.estimator = self.hooks.take_rest(rest)
 
     def _touch(self, target: np.ndarray) -> None:
         """Move straight to a pose (6,) in contact. Near the object each piece of the way follows a frame that shows its beginning."""
         near_mm = max(self.servo.indent_mm, 0.0) + PIECES_MM if self.source.streams else 0.0
-        for pose in pieces_to(self._state().pose, self._turned_for(target), near_mm):
+        for pose in pieces_to(self.mover.state().pose, self.mover.turned_for(target), near_mm):
             if near_mm:
                 try:
-                    self._exposed_after(self._state().time_s)
+                    self._exposed_after(self.mover.state().time_s)
                 except TimeoutError as error:
                     raise BlindError(f"{error}; {self.arm.name} moves only with fresh frames") from error
-            self._move(pose, wait=True)
-
-    def _contact(self, pose: np.ndarray) -> float:
-        return -np.inf if self.contact_mm is None else self.contact_mm(pose)
-
-    def require_labels(self, names: tuple[str, ...]) -> None:
-        """Raise ``DeviceError`` unless the model has the labels that following needs. Call it before anything moves."""
-        depth, angle = self.mounting.depth_label, self.mounting.angle_label
-        if not {depth, angle} <= set(names):
-            raise DeviceError(f"the model tells {', '.join(names)}; following a surface needs the experiment's {depth} and {angle}")
+            self.mover.go(pose)
 
     def timing(self) -> Timing:
         """Figures of the steps so far."""
@@ -239,7 +170,7 @@ class ServoLoop:
             if not self.settings.blocking:
                 time.sleep(max(0.0, due_s - time.monotonic()))
                 due_s = max(due_s + self.settings.period_s, time.monotonic())
-            state = self._state()
+            state = self.mover.state()
             try:
                 frame = self._frame(state)
             except EOFError:
@@ -272,7 +203,7 @@ class ServoLoop:
             self._turn_back(wanted)
             return
         try:
-            self._sent = self._move(pose, wait=False)
+            self._sent = self.mover.send(pose)
         except BlindError as blind:
             self._hold(str(blind), blind, age_s)
             return
@@ -289,16 +220,16 @@ class ServoLoop:
         if self.settings.blocking:
             with self._watch.doing(f"waiting for the end of step {len(self.records)}"):
                 try:
-                    self._eyes.move(partial(self.arm.wait_settled, self._sent, timeout_s=MOVE_TIMEOUT_S))
+                    self.mover.settle(self._sent)
                 except BlindError as blind:
                     self._hold(str(blind), blind, age_s)
 
     def _next(self, from_pose: np.ndarray, fresh: bool) -> tuple[np.ndarray, Memory]:
         """The next pose (6,) of the law, and the sums that it keeps."""
         view = self._view
-        if self.law is not None:
+        if self.hooks.law is not None:
             assert view.estimate is not None  # a trusted view has an estimate
-            return self.law(from_pose, view.estimate), self._memory
+            return self.hooks.law(from_pose, view.estimate), self._memory
         assert view.tangent is not None
         step = servo_step(self.servo, self.mounting, view.tangent, from_pose, self._memory, fresh=fresh)
         return step.pose, step.memory
@@ -313,10 +244,9 @@ class ServoLoop:
         view.reading, view.doubt = self._reading(view.estimate)
         if not view.doubt:
             view.exposed_pose = self._watch.pose_at(frame.time_s) if self.source.is_live else state.pose
-            if self.law is None:
+            if self.hooks.law is None:
                 view.tangent = tangent_of(self.mounting, view.exposed_pose, view.reading)
-            if self.sense is not None:
-                self.sense(Sensed.of(view.reading.depth_mm, frame.time_s, view.estimate.names, view.estimate.value))
+            self.mover.sense(Sensed.of(view.reading.depth_mm, frame.time_s, view.estimate.names, view.estimate.value))
         return True
 
     def _lags(self, state: ArmState, from_pose: np.ndarray, now_s: float) -> bool:
@@ -360,8 +290,8 @@ class ServoLoop:
             sent=sent,
         )
         self.records.append(record)
-        if self.on_step is not None:
-            self.on_step(record, view.frame, view.estimate)
+        if self.hooks.on_step is not None:
+            self.hooks.on_step(record, view.frame, view.estimate)
 
     def _frame(self, state: ArmState) -> Frame:
         """The frame to decide on: the next one of a recording, one exposed at the present stop, or the newest one."""
@@ -377,15 +307,15 @@ class ServoLoop:
 
     def _exposed_after(self, time_s: float) -> Frame:
         """The first frame exposed after a time; raises ``TimeoutError`` if none comes. The wait also ends if the arm is lost."""
-        return self._watch.frame_after(self.source, time_s, timeout_s=self.settings.frame_timeout_s)
+        return self.mover.frame_after(time_s, timeout_s=self.settings.frame_timeout_s)
 
     def _reading(self, estimate: Estimate) -> tuple[Reading, str]:
         """Depth and angle of an estimate, and the reason why they can't be trusted ("" if they can)."""
         if not estimate.valid:
             return Reading(np.nan, np.nan), estimate.reason
-        if self.law is not None:  # such a law does not use depth and angle
+        if self.hooks.law is not None:  # such a law does not use depth and angle
             return Reading(np.nan, np.nan), ""
-        self.require_labels(estimate.names)
+        require_labels(self.mounting, estimate.names)
         value = dict(zip(estimate.names, np.asarray(estimate.value, float), strict=True))
         depth, angle = value[self.mounting.depth_label], value[self.mounting.angle_label]
         reading = Reading(self.mounting.depth_mm(depth), self.mounting.angle_deg(angle))
@@ -406,58 +336,11 @@ class ServoLoop:
             self.arm.stop()
             self.notes.append(f"held still before step {len(self.records)}: {reason}")
             LOG.warning("%s: %s", self.arm.name, self.notes[-1])
-        self._eyes.stand()
+        self.mover.eyes.stand()
         held_s = time.monotonic() - self._held_since
         if held_s > self.settings.give_up_s:
             raise DeviceError(f"no usable frame for {held_s:.1f} s, the arm holds still: {reason}") from problem
         time.sleep(min(0.05, self.settings.period_s))
-
-    def _state(self) -> ArmState:
-        """The arm's newest state, which is also kept in the track; ``DeviceError`` if the arm reports an error."""
-        self._watch.require()
-        state = self.arm.state()
-        if state.error:
-            raise DeviceError(f"{self.arm.name}: {state.error}")
-        self._watch.add(state)
-        return state
-
-    def _move(self, target: np.ndarray, *, wait: bool) -> np.ndarray:
-        """Move to a pose (6,) and return the pose that was sent last.
-
-        With ``wait``, the move is repeated until it ends at the target, because guards and arm may shorten it. If the last axis must turn
-        back for the target, it turns first, at the arm's present place.
-        """
-        if wait:
-            target = self._turned_for(target)
-        for _ in range(MOST_PIECES if wait else 1):
-            if wait:
-                self._eyes.await_sight(timeout_s=self.settings.give_up_s)
-            state, allowed = self._state(), target
-            for guard in self.guards:
-                allowed = guard(state, allowed)
-            way_s = max(_apart_mm(allowed, state.pose) / self.servo.linear_mm_s, abs(allowed[5] - state.pose[5]) / self.servo.angular_deg_s)
-            send = partial(self.arm.move_linear, allowed, wait=wait, timeout_s=MOVE_TIMEOUT_S + SPARE * way_s)
-            self._came.append(state.pose)
-            sent = self._eyes.move(send, ends=wait)
-            if np.linalg.norm(sent[:3] - target[:3]) < NEAR_MM and turn_between_deg(sent, target) < NEAR_DEG:
-                break
-        return sent
-
-    def _turned_for(self, target: np.ndarray) -> np.ndarray:
-        """The target (6,) on the present turn of the last axis, after a turn back if one is needed."""
-        here = self._state().pose
-        pose, held_deg = self._axis.on_turn(target, here[5])
-        if held_deg <= HOLD_DEG:
-            return pose
-        turned = self._axis.turned_back(here, target)
-        if turned is None:
-            raise DeviceError(
-                f"{self.arm.name}: its last axis can't turn the sensor that far, {held_deg:.0f} deg are missing; turn the object "
-                "('placement.turn_deg' in a file for --servo), or give no more --steps than were made"
-            )
-        for share in (1 / 3, 2 / 3, 1.0):  # each part is less than half a turn, so that its direction is unambiguous
-            self._move(here + share * (turned - here), wait=True)
-        return self._axis.on_turn(target, turned[5])[0]
 
     def _turn_back(self, target: np.ndarray) -> None:
         """Leave the object, turn the last axis back by a full turn, and touch the object again at a target (6,) of the other turn."""
@@ -465,42 +348,21 @@ class ServoLoop:
         LOG.warning("%s: the last axis is at its end; it turns back, clear of the object", self.arm.name)
         with self._watch.doing("turning its last axis back"):
             self.arm.stop()
-            if self.forget is not None:
-                self.forget()
-            here = self._state().pose
-            self._move(self._axis.on_turn(self._away_from(here), here[5])[0], wait=True)
-            self._move(self._away_from(target), wait=True)
+            self.mover.forget()
+            here = self.mover.state().pose
+            self.mover.go(self.mover.turned_for(self.mover.away_from(here)))
+            self.mover.go(self.mover.turned_for(self.mover.away_from(target)))
             self._touch(target)
         self._view, self._sent, self._arrived_s = _View(), None, time.monotonic()
 
-    def _away_from(self, pose: np.ndarray) -> np.ndarray:
-        """The pose (6,) withdrawn by the servo's ``clear_mm`` along the sensor's axis."""
-        return moved(pose, -self.servo.clear_mm * self.mounting.axis)
 
-    def _let_go(self, *, retreat: bool) -> None:
-        """Stop the arm, withdraw it if it may touch the object, and disable it. Every step is tried, even if one before it failed.
-
-        If the arm can't leave the object straight, it goes back through the poses at which it was.
-        """
-
-        def back() -> None:
-            pose = self.arm.state().pose
-            try:
-                if self.retreat is not None:
-                    self.retreat(-matrix_of(pose)[:3, :3] @ self.mounting.axis)
-                else:
-                    self.arm.move_linear(self._axis.on_turn(self._away_from(pose), pose[5])[0], wait=True, timeout_s=MOVE_TIMEOUT_S)
-            except NoWayBackError as error:
-                if not self._came:
-                    raise
-                self.notes.append(f"{error}; went back the way it came instead")
-                if self.forget is not None:
-                    self.forget()
-                for there in reversed(self._came):
-                    self.arm.move_linear(there, wait=True, timeout_s=MOVE_TIMEOUT_S)
-
-        between = {"retreat": back} if retreat else {}
-        self.notes += try_each(stop=self.arm.stop, **between, disable=self.arm.disable)
+def require_labels(mounting: Mounting, names: tuple[str, ...]) -> None:
+    """Raise ``DeviceError`` unless a model has the labels that following needs. Call it before anything moves."""
+    if not {mounting.depth_label, mounting.angle_label} <= set(names):
+        raise DeviceError(
+            f"the model tells {', '.join(names)}; following a surface needs the experiment's {mounting.depth_label} and "
+            f"{mounting.angle_label}"
+        )
 
 
 def _apart_mm(one: np.ndarray, other: np.ndarray) -> float:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from hardware.rig.geometry import matrix_of, pose_of
 from twin.estimate import Estimate
-from twin.policy import Policy, PolicyError, PolicyModel, load_policy
+from twin.policy import KnownContacts, Policy, PolicyError, PolicyModel, load_policy
 from twin.rig.mounting import Mounting
 
 AROUND = ("SurfaceFollow", "ContourFollow")
@@ -30,8 +30,8 @@ def policy_law(policy: Policy, mounting: Mounting) -> Callable[[np.ndarray, Esti
     return law
 
 
-def load_for_outlines(path: Path) -> PolicyModel:
-    """Load a policy that follows an object's outline, ready for frames.
+def load_for_outlines(path: Path, contacts_of: Callable[[Policy], KnownContacts | None] = lambda _: None) -> PolicyModel:
+    """Load a policy that follows an object's outline, ready for frames. ``contacts_of`` gives the contacts that it knows.
 
     Raises
     ------
@@ -41,4 +41,4 @@ def load_for_outlines(path: Path) -> PolicyModel:
     policy = load_policy(path)
     if policy.about["task"] not in AROUND:
         raise PolicyError(f"{path}: of {policy.about['task']}; an arm goes along an outline with policies of {' or '.join(AROUND)}")
-    return PolicyModel(policy)
+    return PolicyModel(policy, contacts=contacts_of(policy))

@@ -1,4 +1,4 @@
-"""Settings and guards of a servo loop, and the record of each of its steps."""
+"""Settings and hooks of a servo loop, and the record of each of its steps."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from hardware.arms.arm import ArmState
-
-Guard = Callable[[ArmState, np.ndarray], np.ndarray]
-"""A function from the arm's state and a target (6,) to the pose (6,) that may be sent. It raises an error to refuse a move."""
+from twin.estimate import Estimate, Estimator
+from twin.types import Frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,3 +92,22 @@ class LoopSettings:
     period_s: float = 0.1
     frame_timeout_s: float = 3.0
     give_up_s: float = 3.0
+
+
+@dataclass(frozen=True)
+class LoopHooks:
+    """Functions that a loop calls.
+
+    Attributes
+    ----------
+    law : callable, optional
+        Replaces the servo law: gives the next pose (6,) from the arm's pose (6,) and the estimate.
+    take_rest : callable, optional
+        Gets a frame without contact, taken clear of the object, and returns the estimator to use from then on.
+    on_step : callable, optional
+        Called with each record, its frame and its estimate after the move was commanded.
+    """
+
+    law: Callable[[np.ndarray, Estimate], np.ndarray] | None = None
+    take_rest: Callable[[Frame], Estimator] | None = None
+    on_step: Callable[[StepRecord, Frame, Estimate], object] | None = None

@@ -41,10 +41,11 @@ def once() -> dict[str, float]:
     from hardware.arms.mg400 import MG400, Mg400Ports
     from hardware.cameras.mjpeg import MjpegCamera
     from hardware.rig.geometry import PlacedObject
-    from hardware.rig.rig import Rig, servo_loop
     from hardware.safety.decide import load_limits
     from hardware.safety.safe_arm import SafeArm
+    from hardware.servo.loop import ServoLoop
     from hardware.servo.step import LoopSettings
+    from hardware.workcell.build import Rig
     from scenes import load_experiment, load_object, load_sensor, load_servo
     from twin.rig.mounting import Mounting
     from twin.types import Form
@@ -66,7 +67,7 @@ def once() -> dict[str, float]:
         with Rig(MjpegCamera(url[0], None, Form.RAW), arm, placed, True) as rig:
             rig.source.read(timeout_s=10.0)
             settings = LoopSettings(STEPS, blocking=False, period_s=1.0 / RATE_HZ)
-            timing = servo_loop(rig, servo, estimator, settings).run(placed.start_pose(servo.indent_mm))
+            timing = ServoLoop(rig, servo, estimator, settings).run(placed.start_pose(servo.indent_mm))
     finally:
         for child in children:
             child.kill()

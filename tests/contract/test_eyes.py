@@ -11,25 +11,29 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from arms import bench
-from blind_runs import CAMERA_FAULTS, COMMANDS, FAULTS, HEALTHY, PHASES, draw, measure, table
+from blind_runs import CAMERA_FAULTS, COMMANDS, FAULTS, HEALTHY, KINDS, PHASES, draw, faults_of, measure, table
 from noisy_camera import NoisyCamera
+from pins_camera import AT_REST, SENSOR, StudioModel, Switched, shows
 from true_estimator import TrueEstimate, TrueEstimator
 
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import Picture
+from hardware.collect.collect import LIFT_MM, Collection, CollectPlan, collect, collect_frames
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
 from hardware.live.feed import CameraFeed
 from hardware.rig.geometry import PlacedObject, moved
-from hardware.rig.plan import check_plan
-from hardware.rig.rig import Rig, servo_loop
 from hardware.safety.decide import SafetyLimits, load_limits
 from hardware.safety.eyes import NEAR_MM, PIECE_MM, BlindError, Eyes, pieces_to
 from hardware.safety.safe_arm import SafeArm
+from hardware.servo.following import FollowPlan, follow
 from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.step import LoopHooks, LoopSettings
+from hardware.workcell.build import Rig
+from hardware.workcell.plan import check_plan
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
+from twin.pins import Pipeline, measure_reference, nominal_reference
 from twin.rig.mounting import Mounting
 from twin.types import Form
 
@@ -44,9 +48,16 @@ def test_a_fault_in_a_phase_stops_the_arm(seed, case):
     assert not found.wrong(), found
 
 
+@pytest.mark.parametrize("seed", range(0, 4 * len(faults_of("magician")), 5))  # each fault, in a phase of its own
+def test_a_fault_in_a_phase_stops_a_magician(seed):
+    found = measure(seed, kind="magician")
+    assert not found.wrong(), found
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_healthy_run_comes_to_its_end(command):
-    found = measure(7, (command, "contact", HEALTHY))
+def test_a_healthy_run_comes_to_its_end(command, kind):
+    found = measure(7, (command, "contact", HEALTHY), kind)
     assert found.safe and not found.told, found
 
 
@@ -57,9 +68,10 @@ def all_of(cases):
 
 
 @pytest.mark.slow
-def test_no_fault_in_any_phase_goes_on():
-    runs = all_of([(seed, draw(seed)) for seed in range(RUNS)])
-    print(f"\n{len(runs)} runs, seeds 0 to {RUNS - 1}\n{table(runs)}")
+@pytest.mark.parametrize(("kind", "count"), [("mg400", RUNS), ("magician", RUNS // 4)])
+def test_no_fault_in_any_phase_goes_on(kind, count):
+    runs = all_of([(seed, draw(seed, kind), kind) for seed in range(count)])
+    print(f"\n{len(runs)} runs with a {kind}, seeds 0 to {count - 1}\n{table(runs)}")
     assert not [run for run in runs if run.wrong()], "\n".join(f"{run}: {run.wrong()}" for run in runs if run.wrong())
 
 
@@ -79,18 +91,6 @@ def arm(placed):
     with SimulatedArm(pose=placed.start_pose(-60.0)) as arm:
         arm.enable()
         yield arm
-
-
-class Switched(NoisyCamera):
-    """A camera that can be switched off, or be given one picture to repeat."""
-
-    off, picture = False, None
-
-    def _grab(self):
-        while self.off and not self._end.wait(0.01):
-            pass
-        made = super()._grab()
-        return made if self.picture is None else Picture(self.picture, made.time_s)
 
 
 def test_the_last_millimetres_are_made_in_pieces():
@@ -169,7 +169,7 @@ def test_a_stream_of_thresholded_pictures_is_not_frozen_at_rest():
 def test_an_arm_that_stopped_for_want_of_frames_goes_on_with_them(arm, placed, blocking):
     with Switched(fps=60) as source:
         servo = load_servo("surface").model_copy(update={"clear_mm": 20.0})
-        loop = ServoLoop(source, TrueEstimator(arm, placed), arm, servo, placed.mounting, LoopSettings(6, blocking=blocking))
+        loop = ServoLoop(Rig(source, arm, placed, False), servo, TrueEstimator(arm, placed), LoopSettings(6, blocking=blocking))
         waits = iter((True,))
 
         def step(record, frame, estimate):
@@ -177,48 +177,68 @@ def test_an_arm_that_stopped_for_want_of_frames_goes_on_with_them(arm, placed, b
                 source.off = True
                 Timer(0.6, lambda: setattr(source, "off", False)).start()
 
-        loop.on_step = step
+        loop.hooks = LoopHooks(on_step=step)
         loop.run(placed.start_pose(3.0))
     assert len(loop.records) == 6 and len(loop.notes) == (not blocking) and all("held still" in note for note in loop.notes)
 
 
-def test_where_the_limits_allow_no_way_back_the_arm_goes_back_the_way_it_came(placed):
+@pytest.mark.parametrize("command", ["servo", "collect"])
+def test_where_the_limits_allow_no_way_back_the_arm_goes_back_the_way_it_came(placed, tmp_path, caplog, command):
     arm = SimulatedArm(pose=placed.start_pose(-60.0), time_scale=20.0)
     safe = SafeArm(arm, FREE)
     with NoisyCamera() as source, safe:
-        servo = load_servo("surface")
-        loop = servo_loop(Rig(source, safe, placed, True), servo, TrueEstimator(arm, placed), LoopSettings(3))
-        loop.way = lambda start, clear: [clear]
+        rig, servo = Rig(source, safe, placed, True), load_servo("surface")
 
-        def narrow(record, frame, estimate):
+        def narrow(*_):
             safe.retreat = lambda: None
+            if command == "collect":
+                raise DeviceError("in contact")
 
-        loop.on_step = narrow
-        loop.run(placed.start_pose(servo.indent_mm))
-        assert placed.touch(arm.state().pose).indent_mm < -40.0
-    assert any("the way it came" in note for note in loop.notes)
+        if command == "servo":
+            loop = ServoLoop(rig, servo, TrueEstimator(arm, placed), LoopSettings(3), LoopHooks(on_step=narrow))
+            loop.run(placed.start_pose(servo.indent_mm))
+            clear_mm, told = 40.0, loop.notes
+        else:
+            contacts = Collection(tmp_path, {"seed": 1}, Form.RAW)
+            contacts.keep = narrow
+            with pytest.raises(DeviceError, match="in contact"):
+                collect(rig, load_experiment("surface-2d"), contacts, 1, seed=1, speed=(200.0, 200.0))
+            clear_mm, told = LIFT_MM - 1.0, [record.getMessage() for record in caplog.records]
+        assert placed.touch(arm.state().pose).indent_mm < -clear_mm
+    assert any("the way it came" in note for note in told)
 
 
-def test_the_studio_moves_an_arm_only_with_frames_and_back_without(monkeypatch):
-    source = Switched()
-    monkeypatch.setattr("hardware.live.feed.open_camera", lambda *_: source)
-    model = SimpleNamespace(sensor=load_sensor("mg400-331"), form=Form.RAW, check=lambda *_: None)
-    value = np.zeros(1)
+def dented():
+    """The pins of a contact at the side."""
+    away = AT_REST - AT_REST.mean(axis=0) - [60.0, 0.0]
+    return AT_REST + 0.25 * away * np.exp(-np.sum(away**2, axis=1, keepdims=True) / 2 / 60.0**2)
 
-    class Model(SimpleNamespace):
-        def seeking_rest(self):
-            return self
 
-        def __call__(self, frame):
-            return TrueEstimate(("pose_2",), value, value, value)
+def other_sensor():
+    """A camera of a sensor with fewer pins in the same picture."""
+    return shows(nominal_reference(load_sensor("mg400-127"), Form.RAW).pins_px)
 
-    feed = CameraFeed("any", "simulated", Model(**vars(model)))
-    feed.start(lambda shot: None, lambda why: None)
+
+@pytest.fixture
+def studio_arm(monkeypatch):
+    """Starts the studio's feed with a camera, and gives its arm."""
+    feeds = []
+
+    def start(source):
+        monkeypatch.setattr("hardware.live.feed.open_camera", lambda *_: source)
+        feeds.append(CameraFeed("any", "simulated", StudioModel()))
+        feeds[0].start(lambda shot: None, lambda why: None)
+        return feeds[0].robot
+
+    yield start
+    feeds[0].stop()
+
+
+def test_the_studio_moves_an_arm_only_with_frames_and_back_without(studio_arm):
+    source = shows(AT_REST)
+    robot = studio_arm(source)
     try:
-        robot = feed.robot
-        robot.arm()
-        while source.blind():
-            time.sleep(0.01)
+        assert [line.split(":")[0] for line in robot.arm()] == ["camera", "sensor", "limits"]
         robot.nudge(1, 1.0)
         source.off = True
         time.sleep(0.4)
@@ -230,23 +250,79 @@ def test_the_studio_moves_an_arm_only_with_frames_and_back_without(monkeypatch):
         np.testing.assert_allclose(robot._arm.state().pose[1], 0.0, atol=1e-6)
     finally:
         source.off = False
-        feed.stop()
 
 
 @pytest.mark.parametrize(
-    ("kind", "servo", "refused"), [("mg400", "surface", ""), ("magician", "surface", "--servo magician"), ("magician", "magician", "")]
+    ("make", "outside", "refused"),
+    [(NoisyCamera, False, "expected 640x480"), (lambda: shows(AT_REST[:20]), False, "no pins"), (lambda: shows(AT_REST), True, "outside")],
+    ids=["other size", "covered", "outside the limits"],
+)
+def test_the_studio_arms_nothing_without_the_sensor_or_outside_the_limits(studio_arm, make, outside, refused):
+    robot = studio_arm(make())
+    if outside:
+        robot._arm.limits = FREE.model_copy(update={"box_mm": ((50.0, 60.0),) * 3})
+    with pytest.raises(DeviceError, match=refused):
+        robot.arm()
+    assert not robot.armed and not robot._arm.state().enabled
+
+
+@pytest.mark.parametrize(
+    ("kind", "servo", "refused"), [("mg400", "surface", ""), ("magician", "surface", "magician"), ("magician", "magician", "")]
 )
 def test_the_plan_is_checked_before_anything_moves(kind, servo, refused):
     spec = load_servo(servo)
-    placed = PlacedObject(load_object("can"), spec.placement, Mounting.of(load_sensor("mg400-331"), load_experiment(spec.experiment)))
-    with bench(kind) as at, NoisyCamera(fps=60) as source, SafeArm(at.arm, load_limits(kind)) as arm:
+    placed = PlacedObject(load_object("can"), spec.placement, Mounting.of(SENSOR, load_experiment(spec.experiment)))
+    with bench(kind) as at, shows(AT_REST) as source, SafeArm(at.arm, load_limits(kind)) as arm:
         rig, start, before = Rig(source, arm, placed, False), placed.start_pose(spec.indent_mm), at.reads()
         clear = moved(start, -spec.clear_mm * placed.mounting.axis)
-        check = partial(check_plan, rig, clear, [start], linear_mm_s=spec.linear_mm_s, spent_s=1.0)
+        check = partial(check_plan, rig, Pipeline(SENSOR, Form.RAW), clear, [start], linear_mm_s=spec.linear_mm_s, spent_s=1.0)
         if refused:
             with pytest.raises(DeviceError, match=refused):
                 check()
         else:
             lines = check()
-            assert [line.split(":")[0] for line in lines] == ["camera", "way", "limits", "time"] and "frames/s" in lines[0]
+            assert [line.split(":")[0] for line in lines] == ["camera", "sensor", "way", "limits", "time"] and "frames/s" in lines[0]
+            assert "331 of 331 pins of mg400-331" in lines[1]
+        np.testing.assert_array_equal(at.reads(), before)
+
+
+@pytest.mark.parametrize("command", ["servo", "servo without a rest frame", "policy", "collect"])
+@pytest.mark.parametrize(
+    ("make", "refused"),
+    [
+        (NoisyCamera, "expected 640x480"),
+        (lambda: shows(AT_REST[:20]), "no pins"),
+        (other_sensor, "pins"),
+        (lambda: shows(dented()), "pressed"),
+    ],
+    ids=["other size", "covered", "other sensor", "pressed"],
+)
+def test_nothing_moves_with_a_camera_that_does_not_show_the_sensor(monkeypatch, tmp_path, command, make, refused):
+    class Model(SimpleNamespace):
+        counts_from_rest = True
+        at_rest = partial(measure_reference, SENSOR, Form.RAW)
+
+        def seeking_rest(self):
+            return self
+
+        def __call__(self, frame):
+            return TrueEstimate(("pose_2", "pose_6"), *np.zeros((3, 2)))
+
+    monkeypatch.setattr("hardware.workcell.build.open_camera", lambda *_, **__: make())
+    can, spec = load_object("can"), load_servo("surface")
+    with bench("mg400") as at:
+        monkeypatch.setattr("hardware.workcell.build.open_arm", lambda _: at.arm)
+        arm, before = "mg400:any", at.reads()
+        if command == "collect":
+            plan = CollectPlan(SENSOR, can, load_experiment("surface-2d"), spec, "any", arm, 1, form=Form.RAW, dry_run=True)
+            run = partial(collect_frames, plan, tmp_path)
+        else:
+            at_rest = "none" if "without" in command else "first"
+            plan = FollowPlan(can, spec, camera="any", arm=arm, at_rest=at_rest, dry_run=True)
+            run = partial(follow, plan, Model(sensor=SENSOR, form=Form.RAW, pipeline=Pipeline(SENSOR, Form.RAW)), tmp_path)
+        if refused == "pressed" and "without" in command:
+            run()
+        else:
+            with pytest.raises(DeviceError, match=f"nothing was moved: .*{refused}"):
+                run()
         np.testing.assert_array_equal(at.reads(), before)

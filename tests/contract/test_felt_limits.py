@@ -13,10 +13,11 @@ from true_estimator import TrueEstimator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
-from hardware.rig.rig import Rig, servo_loop
 from hardware.safety.decide import Code, load_limits
 from hardware.safety.safe_arm import RefusedMoveError, SafeArm
+from hardware.servo.loop import ServoLoop
 from hardware.servo.step import LoopSettings
+from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 
@@ -50,7 +51,7 @@ def feeling(odd, until=10**6, **limited):
         source = stack.enter_context(NoisyCamera(fps=200))
         safe = stack.enter_context(SafeArm(mg400_of(emulator), limits))
         truth = TrueEstimator(SimpleNamespace(track=SimpleNamespace(pose=emulator.pose)), placed)
-        loop = servo_loop(Rig(source, safe, placed, True), servo, Feeling(truth, odd, until), LoopSettings(STEPS, give_up_s=0.3))
+        loop = ServoLoop(Rig(source, safe, placed, True), servo, Feeling(truth, odd, until), LoopSettings(STEPS, give_up_s=0.3))
         yield loop, placed, emulator, placed.start_pose(servo.indent_mm)
 
 

@@ -12,10 +12,12 @@ from hardware.arms.kinematics import MG400
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.rig.geometry import PlacedObject
 from hardware.rig.last_axis import HOLD_DEG, LastAxis, turns_back_mm
-from hardware.rig.rig import Rig, servo_loop, steps_round
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
+from hardware.servo.following import steps_round
+from hardware.servo.loop import ServoLoop
 from hardware.servo.step import LoopSettings
+from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 
@@ -42,7 +44,7 @@ def rounds(name, count, *, feed_mm, blocking=True):
             for _ in range(count):
                 steps, way_mm = steps_round(placed, servo, 1.0)
                 settings = LoopSettings(steps, blocking=blocking, period_s=0.03)
-                loop = servo_loop(Rig(source, safe, placed, True), servo, truth, settings)
+                loop = ServoLoop(Rig(source, safe, placed, True), servo, truth, settings)
                 loop.run(placed.start_pose(servo.indent_mm))
                 yield loop, placed, steps, way_mm
 

@@ -1,9 +1,11 @@
 """The last line of a command that lost its arm is short and true; signals have their own exit codes, at the start too."""
 
+import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,9 @@ import pytest
 from arms import bench
 
 from hardware.errors import DeviceError, in_short
+from hardware.servo.following import Followed
+from hardware.servo.timing import Spread, Timing
+from hardware.servo.trajectory import Measures
 
 LONGEST = 160
 ENDS = """
@@ -48,6 +53,29 @@ def test_a_long_error_is_one_short_line_and_the_rest_is_in_a_file():
 def test_a_line_tells_what_the_arm_may_do_and_gives_no_advice_to_programs(text, line):
     assert in_short(text, LONGEST) == line
     assert len(in_short(text + 99 * " more", 90)) <= 90
+
+
+def test_a_run_that_ended_early_says_so_in_a_short_line():
+    nan = float("nan")
+    spread, failure = Spread(nan, nan, nan), "MG400 at 1: the connection was lost; call connect() again; " + 30 * "more " + "may move"
+    run = Followed(Measures(*[nan] * len(fields(Measures))), Timing(0, 0, 0, spread, spread, spread, 0), None, None, failure, [])
+    *_, line = run.lines()
+    assert len(line) <= LONGEST and line.startswith("ended early: MG400") and line.endswith("PRESS ITS EMERGENCY STOP") and "()" not in line
+
+
+SLOW_IMPORT = "import os, time\nprint('begun', flush=True)\ntime.sleep(30)\n"
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_while_libraries_are_imported_ends_with_one_line(tmp_path, number, code):
+    (tmp_path / "typer.py").write_text(SLOW_IMPORT, encoding="utf-8")
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": os.environ | {"PYTHONPATH": path}}
+    with subprocess.Popen([sys.executable, "-m", "twin", "doctor"], **options) as process:
+        process.stdout.readline()
+        process.send_signal(number)
+        process.send_signal(number)
+        assert process.wait(timeout=10) == code and process.stderr.read().splitlines() == ["twin: interrupted"]
 
 
 def test_a_pulled_cable_is_told_by_every_later_call():

@@ -10,7 +10,8 @@ import pytest
 from arms import mg400_of
 from free_ports import free_offset
 from noisy_camera import NoisyCamera
-from true_estimator import TrueEstimate, TrueEstimator
+from pins_camera import AT_REST, StudioModel, shows
+from true_estimator import TrueEstimator
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.collect.collect import Collection, collect
@@ -19,13 +20,14 @@ from hardware.errors import DeviceError, DeviceNotConnectedError
 from hardware.live.feed import CameraFeed
 from hardware.live.lerobot import LeRobotArm
 from hardware.rig.geometry import PlacedObject
-from hardware.rig.rig import Rig, servo_loop, signals_as_ctrl_c
 from hardware.safety.decide import SafetyLimits
 from hardware.safety.safe_arm import SafeArm
 from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.step import LoopHooks, LoopSettings
+from hardware.workcell.build import Rig
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
+from twin.signals import signals_as_ctrl_c
 from twin.types import Form
 
 AWAY = np.array([300.0, 60, -10, 0, 0, 30])
@@ -65,7 +67,9 @@ def test_ctrl_c_during_the_retreat_still_disables(arm, placed):
         raise KeyboardInterrupt
 
     with NoisyCamera() as source:
-        loop = ServoLoop(source, TrueEstimator(arm, placed), arm, load_servo("surface"), placed.mounting, LoopSettings(100), on_step=now)
+        loop = ServoLoop(
+            Rig(source, arm, placed, False), load_servo("surface"), TrueEstimator(arm, placed), LoopSettings(100), LoopHooks(on_step=now)
+        )
         with pytest.raises(KeyboardInterrupt):
             loop.run(placed.start_pose(2.0))
     assert not arm.state().enabled
@@ -74,8 +78,8 @@ def test_ctrl_c_during_the_retreat_still_disables(arm, placed):
 def test_ctrl_c_during_a_retreat_after_the_last_step_disables_and_ends(arm, placed):
     interrupted_retreat(arm)
     with NoisyCamera() as source:
-        loop = ServoLoop(source, TrueEstimator(arm, placed), arm, load_servo("surface"), placed.mounting, LoopSettings(1))
-        loop.on_step = lambda record, frame, estimate: setattr(arm, "retreats", True)
+        loop = ServoLoop(Rig(source, arm, placed, False), load_servo("surface"), TrueEstimator(arm, placed), LoopSettings(1))
+        loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: setattr(arm, "retreats", True))
         with pytest.raises(KeyboardInterrupt):
             loop.run(placed.start_pose(2.0))
     assert not arm.state().enabled
@@ -83,8 +87,8 @@ def test_ctrl_c_during_a_retreat_after_the_last_step_disables_and_ends(arm, plac
 
 def test_a_retreat_that_breaks_in_any_way_still_disables(arm, placed):
     with NoisyCamera() as source:
-        loop = ServoLoop(source, TrueEstimator(arm, placed), arm, load_servo("surface"), placed.mounting, LoopSettings(1))
-        loop.retreat = lambda away: 1 / 0
+        loop = ServoLoop(Rig(source, arm, placed, False), load_servo("surface"), TrueEstimator(arm, placed), LoopSettings(1))
+        loop.mover._retreat = lambda pose: 1 / 0
         loop.run(placed.start_pose(2.0))
     assert not arm.state().enabled
     assert any("retreat" in note and "division" in note for note in loop.notes)
@@ -103,7 +107,7 @@ def test_a_safe_arm_is_disabled_though_its_retreat_is_interrupted(arm):
 
 def collected(arm, placed, folder, source):
     about = Collection(folder, {"seed": 1}, Form.RAW)
-    return collect(source, arm, load_experiment("surface-2d"), placed, about, 3, seed=1, speed=(100.0, 100.0))
+    return collect(Rig(source, arm, placed, False), load_experiment("surface-2d"), about, 3, seed=1, speed=(100.0, 100.0))
 
 
 def test_collecting_disables_though_its_retreat_is_interrupted(arm, placed, tmp_path):
@@ -151,8 +155,8 @@ def test_a_retreat_that_the_limits_forbid_is_noted(placed):
     arm = SimulatedArm(pose=placed.start_pose(-60.0), time_scale=20.0)
     safe = SafeArm(arm, BOX)
     with NoisyCamera() as source, safe:
-        loop = servo_loop(Rig(source, safe, placed, True), load_servo("surface"), TrueEstimator(arm, placed), LoopSettings(1))
-        loop.on_step = lambda record, frame, estimate: setattr(safe, "limits", SafetyLimits(box_mm=((5000, 6000),) * 3))
+        loop = ServoLoop(Rig(source, safe, placed, True), load_servo("surface"), TrueEstimator(arm, placed), LoopSettings(1))
+        loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: setattr(safe, "limits", SafetyLimits(box_mm=((5000, 6000),) * 3)))
         loop.run(placed.start_pose(2.0))
     assert any("retreat" in note for note in loop.notes)
 
@@ -221,20 +225,10 @@ class TestMg400:
 @pytest.fixture
 def feed(monkeypatch):
     """The studio's camera with an armed arm, an emulator of it, and the texts that it ended with."""
-    monkeypatch.setattr("hardware.live.feed.open_camera", lambda *_: NoisyCamera())
-    value = np.zeros(1)
-    model = SimpleNamespace(sensor=load_sensor("mg400-331"), form=Form.RAW, check=lambda *_: None, counts_from_rest=False)
+    monkeypatch.setattr("hardware.live.feed.open_camera", lambda *_: shows(AT_REST))
     offset = free_offset()
-
-    class Model(SimpleNamespace):
-        def seeking_rest(self):
-            return self
-
-        def __call__(self, frame):
-            return TrueEstimate(("pose_2",), value, value, value)
-
     with Mg400Emulator(port_offset=offset) as emulator:
-        made = CameraFeed("any", f"mg400:127.0.0.1:{29999 + offset}", Model(**vars(model)))
+        made = CameraFeed("any", f"mg400:127.0.0.1:{29999 + offset}", StudioModel())
         ends, shots = [], []
         made.start(shots.append, ends.append)
         made.robot.arm()

@@ -10,13 +10,14 @@ from true_estimator import TrueEstimate, TrueEstimator
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.mjpeg import MjpegCamera
+from hardware.cameras.session import SessionSource
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
-from hardware.live.session import SessionSource
 from hardware.rig.geometry import PlacedObject
 from hardware.servo.loop import Decided, ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.step import LoopHooks, LoopSettings
 from hardware.servo.trajectory import measure, trajectory_of, write_csv
+from hardware.workcell.build import Rig
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.records.session import Session, SessionWriter
 from twin.rig.mounting import Mounting
@@ -38,7 +39,7 @@ def rig():
 def loop_of(rig, source, steps=20, *, servo=None, estimator=None, **settings):
     placed, arm = rig
     servo = servo or load_servo("surface")
-    return ServoLoop(source, estimator or TrueEstimator(arm, placed), arm, servo, placed.mounting, LoopSettings(steps, **settings))
+    return ServoLoop(Rig(source, arm, placed, False), servo, estimator or TrueEstimator(arm, placed), LoopSettings(steps, **settings))
 
 
 def start(rig):
@@ -108,7 +109,7 @@ def test_it_takes_a_frame_clear_of_the_object_before_it_touches(rig):
 
     with arm, NoisyCamera() as source:
         loop = loop_of(rig, source, 3)
-        loop.take_rest = take
+        loop.hooks = LoopHooks(take_rest=take)
         loop.run(start(rig))
     ((time_s, indent_mm),) = taken
     assert indent_mm < -10 and time_s < loop.records[0].frame_s
@@ -119,7 +120,7 @@ def test_a_camera_that_fails_for_good_stops_the_arm(rig, fault):
     _, arm = rig
     with CameraEmulator(NoisyCamera(fps=60)) as emulator, arm, MjpegCamera(emulator.url) as source:
         loop = loop_of(rig, source, 10_000, blocking=False, period_s=0.02, give_up_s=1.0)
-        loop.on_step = lambda record, frame, estimate: record.index == 5 and emulator.faults.add(fault)
+        loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: record.index == 5 and emulator.faults.add(fault))
         with pytest.raises(DeviceError, match="holds still"):
             loop.run(start(rig))
         assert_let_go(rig)
@@ -130,7 +131,7 @@ def test_a_short_fault_is_waited_for(rig):
     _, arm = rig
     with CameraEmulator(NoisyCamera(fps=60)) as emulator, arm, MjpegCamera(emulator.url) as source:
         loop = loop_of(rig, source, 60, blocking=False, period_s=0.02, give_up_s=5.0)
-        loop.on_step = lambda record, frame, estimate: record.index == 5 and emulator.faults.add("unplugged=0.8")
+        loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: record.index == 5 and emulator.faults.add("unplugged=0.8"))
         timing = loop.run(start(rig))
     assert timing.steps == 60
     assert all(record.age_s <= loop.servo.max_frame_age_s + 0.05 for record in loop.records)
@@ -151,7 +152,7 @@ def test_the_arm_stands_still_while_it_holds(rig):
             held.append(arm.state().pose)
 
         loop._hold = watched
-        loop.on_step = lambda record, frame, estimate: record.index == 5 and emulator.faults.add("silent")
+        loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: record.index == 5 and emulator.faults.add("silent"))
         with pytest.raises(DeviceError):
             loop.run(start(rig))
     assert len(held) > 3
@@ -188,7 +189,7 @@ def test_after_a_hold_it_goes_on_from_where_the_arm_stands(rig):
             estimator.fail = ""
 
         loop._hold = held
-        loop.on_step = lambda record, frame, estimate: setattr(estimator, "fail", "no pins" if record.index == 2 else "")
+        loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: setattr(estimator, "fail", "no pins" if record.index == 2 else ""))
         loop.run(start((placed, arm)))
     assert len(stands) >= 1
     dropped, after = loop.records[2], loop.records[3]
@@ -229,7 +230,7 @@ def test_an_arm_that_is_held_is_not_awaited_for_ever(rig, monkeypatch):
                 arm.held = record.pose
                 monkeypatch.setattr("hardware.servo.loop.MOVE_TIMEOUT_S", 1.0)
 
-        loop.on_step = hold
+        loop.hooks = LoopHooks(on_step=hold)
         with pytest.raises(DeviceError, match="look for what holds it"):
             loop.run(start((placed, arm)))
         assert_let_go((placed, arm))
@@ -240,7 +241,7 @@ def test_an_estimate_that_is_not_valid_moves_nothing(rig):
     estimator = TrueEstimator(arm, placed)
     with arm, NoisyCamera() as source:
         loop = loop_of(rig, source, 10_000, estimator=estimator, give_up_s=0.5)
-        loop.on_step = lambda record, frame, estimate: setattr(estimator, "fail", "no pins" if record.index >= 5 else "")
+        loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: setattr(estimator, "fail", "no pins" if record.index >= 5 else ""))
         with pytest.raises(DeviceError, match="no pins"):
             loop.run(start(rig))
         assert_let_go(rig)
@@ -269,7 +270,7 @@ def test_an_arm_that_fails_ends_the_loop(rig, fault):
     _, arm = rig
     with arm, NoisyCamera() as source:
         loop = loop_of(rig, source, 10_000)
-        loop.on_step = lambda record, frame, estimate: record.index == 5 and arm.faults.add(fault)
+        loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: record.index == 5 and arm.faults.add(fault))
         with pytest.raises(DeviceError):
             loop.run(start(rig))
         assert not arm._enabled
@@ -286,24 +287,25 @@ def test_ctrl_c_and_any_exception_retreat_and_disable(rig, error):
 
     with arm, NoisyCamera() as source:
         loop = loop_of(rig, source, 10_000)
-        loop.on_step = broken
+        loop.hooks = LoopHooks(on_step=broken)
         with pytest.raises(error):
             loop.run(start(rig))
         assert_let_go(rig)
     assert loop.notes == []
 
 
-def test_a_guard_may_clamp_or_refuse(rig):
+def test_an_arm_may_refuse_a_step(rig, monkeypatch):
     _, arm = rig
+    move = arm.move_linear
 
-    def guard(state, target):
-        if len(loop.records) == 10:
+    def guarded(target, **options):
+        if len(loop.records) == 10 and not options.get("wait", True):
             raise DeviceError("outside the box")
-        return target
+        return move(target, **options)
 
+    monkeypatch.setattr(arm, "move_linear", guarded)
     with arm, NoisyCamera() as source:
         loop = loop_of(rig, source, 10_000)
-        loop.guards.append(guard)
         with pytest.raises(DeviceError, match="outside the box"):
             loop.run(start(rig))
         assert_let_go(rig)
@@ -323,7 +325,7 @@ def test_a_replayed_session_decides_the_same(rig, tmp_path):
 
     with arm, NoisyCamera() as source, SessionWriter(tmp_path / "s", {"camera": source.name}) as session:
         loop = loop_of(rig, source, 12, estimator=of_picture)
-        loop.on_step = lambda record, frame, estimate: session.append(frame, record.plain())
+        loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: session.append(frame, record.plain()))
         loop.run(start(rig))
     live, estimates = np.array(estimates), []
     with SessionSource(tmp_path / "s") as replayed:
@@ -371,7 +373,7 @@ def test_an_hour_of_it_neither_grows_nor_slows(rig):
 
     with CameraEmulator(NoisyCamera(fps=30)) as emulator, arm, MjpegCamera(emulator.url) as source:
         loop = loop_of(rig, source, 10**9, blocking=False, period_s=0.05)
-        loop.on_step = watch
+        loop.hooks = LoopHooks(on_step=watch)
         with pytest.raises(Enough):
             loop.run(start(rig))
         with source._new:

@@ -19,7 +19,8 @@ from hardware.safety.decide import SafetyLimits
 from hardware.safety.safe_arm import SafeArm
 from hardware.safety.watch import ArmWatch
 from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.step import LoopHooks, LoopSettings
+from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
@@ -84,9 +85,9 @@ def test_a_loop_tells_a_lost_arm_at_once(emulator, placed, fault, blocking):
         truth = TrueEstimator(SimpleNamespace(track=SimpleNamespace(pose=emulator.pose)), placed)
         settings = LoopSettings(1000, blocking=blocking, period_s=0.05)
         with pytest.raises(DeviceError) as raised, arm:
-            loop = ServoLoop(source, truth, arm, servo, placed.mounting, settings)
-            loop._watch = ArmWatch(arm, tell=clock.tell)
-            loop.on_step = lambda record, frame, estimate: record.index == 3 and clock.lose()
+            loop = ServoLoop(Rig(source, arm, placed, False), servo, truth, settings)
+            loop.mover.watch._tell = clock.tell
+            loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: record.index == 3 and clock.lose())
             loop.run(placed.start_pose(2.0))
     clock.check(raised.value)
 
@@ -101,10 +102,10 @@ def test_a_lost_arm_is_told_while_a_frame_is_waited_for(emulator, placed, tmp_pa
     clock = Clock(emulator, "frozen=0")
     arm = SafeArm(mg400_of(emulator), FREE)
     with pytest.MonkeyPatch.context() as patch, Blind() as source:
-        patch.setattr("hardware.collect.collect.ArmWatch", lambda arm: ArmWatch(arm, tell=clock.tell))
+        patch.setattr("hardware.workcell.mover.ArmWatch", lambda arm: ArmWatch(arm, tell=clock.tell))
         with pytest.raises(DeviceError) as raised, arm:
             about = Collection(tmp_path, {"seed": 1}, Form.RAW)
-            collect(source, arm, load_experiment("surface-2d"), placed, about, 3, seed=1, speed=(200.0, 200.0))
+            collect(Rig(source, arm, placed, False), load_experiment("surface-2d"), about, 3, seed=1, speed=(200.0, 200.0))
     clock.check(raised.value)
 
 

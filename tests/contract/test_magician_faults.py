@@ -92,7 +92,7 @@ def test_an_arm_whose_replies_are_mostly_lost_is_stale_within_a_second(monkeypat
     count = itertools.count()
     with MagicianEmulator() as emulator, Magician(emulator.device) as arm:
         arm.enable()
-        monkeypatch.setattr(emulator, "_every", lambda fault: fault == "lost-reply" and next(count) % 4 != 3)
+        monkeypatch.setattr(emulator.faults, "every", lambda fault, _: fault == "lost-reply" and next(count) % 4 != 3)
         begun_s = time.monotonic()
         with pytest.raises(StaleDataError):
             arm.state()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from arms import bench, mg400_of
 
+from hardware.arms.newest import PIECE_S
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
 from hardware.live.lerobot import LeRobotArm
-from hardware.rig.newest import PIECE_S
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 

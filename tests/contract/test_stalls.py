@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from endurance import Child
 
+from hardware.arms.awake import AwakeClock
 from hardware.arms.magician import Magician
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.errors import DeviceError
-from hardware.safety.awake import AwakeClock
 from hardware.safety.decide import SafetyLimits
 from hardware.safety.safe_arm import SafeArm
 from hardware.safety.watch import ArmWatch

@@ -21,6 +21,7 @@ from figures import (  # noqa: F401  (each registers its jobs)
     sure,
 )
 from figures.jobs import FIGURES, JOBS, FiguresError, Job, is_kept, lacking, run, values
+from figures.same import keep_same
 from figures.tables import documents, fill_documents, named_in_templates, used_in
 
 
@@ -55,6 +56,7 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="what there is, what is kept, what is missing")
     parser.add_argument("--tables", action="store_true", help="only print the kept figures into the documents")
     parser.add_argument("--again", action="store_true", help="also what is kept")
+    parser.add_argument("--same-as", metavar="COMMIT", help="keep figures that were kept there, of families whose samples are equal")
     options = parser.parse_args()
     try:
         jobs, failed = chosen(options.only), []
@@ -62,6 +64,9 @@ def main() -> None:
         sys.exit(f"figures: {error}")
     if options.list:
         show(jobs)
+        return
+    if options.same_as:
+        print(f"kept: {', '.join(keep_same(options.same_as)) or 'none'}")
         return
     for job in [] if options.tables else jobs:
         if is_kept(job) and not options.again:

@@ -11,13 +11,13 @@ from figures.jobs import NO_PICTURES, Measured, Value, job, real_folder, run_twi
 from scenes import load_sensor
 from twin.fit.sensor_file import write_sensor
 
-CODE = ("training.generation", "training.runs.train", "training.studies.evaluation")
+CODE = ("training.generation", "training.studies.train", "training.studies.evaluation")
 TAUGHT = {"plane": 300, "ball-40": 300, "cylinder": 300, "edge": 300}  # contacts of the objects that are learnt from
 UNSEEN = {"can": 15, "ball-80": 15, "square": 15}
 DRAGS, UNSEEN_DRAGS = 60, 8  # of each object
 ACROSS = 16
-EXPERIMENTS = {"mg400-331": "objects-2d-wide", "mg400-127": "objects-2d-wide", "ur5-331": "surface-3d-sheared-wide"}
-EDGES = {"ur5-331": "edge-circle-sheared-wide"}  # where an edge has an experiment of its own
+EXPERIMENTS = {"mg400-331": "objects-2d", "mg400-127": "objects-2d", "ur5-331": "surface-3d-sheared"}
+EDGES = {"ur5-331": "edge-circle-sheared"}  # where an edge has an experiment of its own
 FORCES = ("force_x", "force_y", "force_z")
 SEED, UNSEEN_SEED = 5, 77
 TACPAD, TACPAD_SET = "ur5-tacpad", "tacpad-force"
@@ -26,9 +26,23 @@ WIDE_SPOTS_PX = 4.5  # instead of the sensor's 3.7: they average over the caps' 
 TACPAD_SPLITS = (0, 1, 2)
 
 
-def contacts(work: Path, name: str, sensor: str, thing: str, count: int, *, experiment: str, randomise: str, seed: int) -> Path:
+def contacts(
+    work: Path, name: str, sensor: str, thing: str, count: int, *, experiment: str, randomise: str, seed: int, wide: bool = True
+) -> Path:
     """Simulated contacts of an object in a folder below ``work``; those that are there already are kept."""
-    options = ("--sensor", sensor, "--object", thing, "--experiment", experiment, "--count", count, "--randomise", randomise)
+    options = (
+        "--sensor",
+        sensor,
+        "--object",
+        thing,
+        "--experiment",
+        experiment,
+        "--count",
+        count,
+        "--randomise",
+        randomise,
+        *(("--wide",) if wide else ()),
+    )
     run_twin(work, "dataset", *options, "--images", "none", "--states", "all", "--across", ACROSS, "--seed", seed, "--out", work / name)
     return work / name
 
@@ -87,7 +101,7 @@ def slip(work: Path, *, sensor: str) -> Measured:
     made = {}
     for seed, things, count in ((SEED, TAUGHT, DRAGS), (UNSEEN_SEED, UNSEEN, UNSEEN_DRAGS)):
         for thing in things:
-            made[thing] = contacts(work, thing, sensor, thing, count, experiment="drag", randomise="drag", seed=seed)
+            made[thing] = contacts(work, thing, sensor, thing, count, experiment="drag", randomise="drag", seed=seed, wide=False)
     run = trained(work, sensor, [made[thing] for thing in TAUGHT])
     metrics, _ = judged(work, run, [made[thing] for thing in UNSEEN], "--rows", "all")
     units = {"lead_mm": "mm", "left_mm": "mm", "direction_deg": "deg"}

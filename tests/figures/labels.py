@@ -13,8 +13,8 @@ from scenes import load_experiment, load_sensor
 from training.data.dataset import load_dataset
 from training.data.targets import unit_of
 from training.estimate.estimator import PoseEstimator
-from training.runs.evaluate import judge
 from training.studies.evaluation import models_of_kinds
+from training.studies.judging import judge
 from training.studies.sim_to_real import Plan
 from training.studies.sim_to_real.page import errors_figure
 from training.studies.sim_to_real.worth import worth

@@ -14,12 +14,12 @@ from bench_training import drawn_table, inputs_of
 from figures.jobs import NO_PICTURES, FiguresError, Measured, Value, job, read, real_folder, run_twin
 from training.data.dataset import load_dataset
 from training.estimate.estimator import PoseEstimator
-from training.runs.evaluate import judge
 from training.studies.evaluation import at_own_rest
+from training.studies.judging import judge
 from training.studies.tac_vgnn.models import measure_training
 
 SETS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
-TRAINED = ("training.runs.train", "training.studies.evaluation")
+TRAINED = ("training.studies.train", "training.studies.evaluation")
 SHIPPED = "training/weights"
 UNITS = {"pose_2": "mm", "pose_6": "deg"}
 SPLITS = (0, 1, 2)

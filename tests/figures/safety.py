@@ -16,7 +16,14 @@ WORST = {"detected_s": "s", "stands_s": "s", "towards_mm": "mm", "pressed_mm": "
     "safety.faults",
     f"python tests/helpers/blind_runs.py 0 {RUNS} {WORKERS}",
     sensors=("mg400-331",),
-    code=("hardware.servo.loop", "hardware.collect.collect", "hardware.safety.eyes", "hardware.arms.mg400", "hardware.cameras.mjpeg"),
+    code=(
+        "hardware.servo.loop",
+        "hardware.collect.collect",
+        "hardware.workcell.mover",
+        "hardware.safety.eyes",
+        "hardware.arms.mg400",
+        "hardware.cameras.mjpeg",
+    ),
     minutes=10,
 )
 def faults(work: Path) -> Measured:

@@ -1,6 +1,7 @@
 """A fault in a phase of a command that moves an arm to an object: when it is detected, when the arm stands, and how far it went on.
 
-Arm and camera are emulated: an MG400 on its ports, and a stream of pictures over HTTP. Each run is drawn from its seed.
+Arm and camera are emulated: an MG400 on its ports or a Magician on a serial line, and a stream of pictures over HTTP. Each run is drawn
+from its seed.
 """
 
 import random
@@ -12,6 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,19 +21,22 @@ import numpy as np
 from noisy_camera import NoisyCamera
 from true_estimator import TrueEstimator
 
+from hardware.arms.magician import Magician
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import Picture
 from hardware.collect.collect import Collection, collect
 from hardware.emulators.camera import CameraEmulator
+from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, moved
-from hardware.rig.rig import Rig, servo_loop
 from hardware.safety.decide import SafetyLimits
 from hardware.safety.eyes import NEAR_MM
 from hardware.safety.safe_arm import SafeArm
-from hardware.servo.step import LoopSettings
+from hardware.servo.loop import ServoLoop
+from hardware.servo.step import LoopHooks, LoopSettings
+from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 from twin.types import Form
@@ -49,6 +54,9 @@ ARM_FAULTS = {
     "feedback garbled": ("wrong-test-value=1", "short-packets=1"),
     "replies lost": ("no-move-reply",),
 }
+# A Magician sends nothing unasked, so that its feedback and its replies are the same, and a reply that comes 2 s late is lost.
+SERIAL_FAULTS = {"feedback dead": ("mute",), "feedback garbled": ("wrong-checksum=1",)}
+KINDS = {"mg400": ("surface", ARM_FAULTS), "magician": ("magician", SERIAL_FAULTS)}
 KILLED, HEALTHY = "program killed", "healthy"
 FAULTS = (*CAMERA_FAULTS, *ARM_FAULTS, KILLED)
 PHASES = ("standing", "approach", "near", "contact")
@@ -128,43 +136,47 @@ class Run:
         return ", ".join(what for what, broken in found.items() if broken)
 
 
-def draw(seed: int) -> tuple[str, str, str]:
+def faults_of(kind: str) -> tuple[str, ...]:
+    """The faults of runs with this arm."""
+    return (*CAMERA_FAULTS, *KINDS[kind][1], KILLED)
+
+
+def draw(seed: int, kind: str = "mg400") -> tuple[str, str, str]:
     """Command, phase and fault of a run. All phases and faults come in turn."""
-    pairs = [(phase, fault) for fault in FAULTS for phase in PHASES]
+    pairs = [(phase, fault) for fault in faults_of(kind) for phase in PHASES]
     phase, fault = pairs[seed % len(pairs)]
     return COMMANDS[(seed // len(pairs) + seed) % len(COMMANDS)], phase, fault
 
 
-def placed_can() -> PlacedObject:
-    servo = load_servo("surface")
+def placed_can(kind: str) -> PlacedObject:
+    servo = load_servo(KINDS[kind][0])
     return PlacedObject(load_object("can"), servo.placement, Mounting.of(load_sensor("mg400-331"), load_experiment(servo.experiment)))
 
 
-def program(command: str, ports: tuple[int, ...], url: str, folder: Path, pose=None, *, steps: int = STEPS) -> Callable[[], None]:
-    """What runs the command with the arm."""
-    placed, servo = placed_can(), load_servo("surface").model_copy(update={"clear_mm": CLEAR_MM})
-    arm = SafeArm(MG400("127.0.0.1", ports=Mg400Ports(ports[0], ports[1], tuple(ports[2:]))), SafetyLimits(box_mm=((-2000, 2000),) * 3))
+def program(
+    kind: str, command: str, place: tuple[int, ...] | str, url: str, folder: Path, pose=None, *, steps: int = STEPS
+) -> Callable[[], None]:
+    """What runs the command with an arm at its ports or at its serial line."""
+    placed, servo = placed_can(kind), load_servo(KINDS[kind][0]).model_copy(update={"clear_mm": CLEAR_MM})
+    device = Magician(place) if kind == "magician" else MG400("127.0.0.1", ports=Mg400Ports(place[0], place[1], tuple(place[2:])))
+    arm = SafeArm(device, SafetyLimits(box_mm=((-2000, 2000),) * 3))
     source = MjpegCamera(url, load_sensor("mg400-331"), Form.RAW)
 
+    rig = Rig(source, arm, placed, False)
+
     def run() -> None:
-        with ExitStack() as stack:
-            stack.enter_context(arm)
-            stack.enter_context(source)
+        with rig:
             source.read(timeout_s=5.0)
             if command == "collect":
                 about = Collection(folder, {"seed": 1}, Form.RAW)
                 experiment, speed = load_experiment("surface-2d"), (servo.linear_mm_s, servo.angular_deg_s)
-                collect(
-                    source, arm, experiment, placed, about, 9 if steps == STEPS else 1, seed=1, speed=speed, frame_timeout_s=FRAME_WAIT_S
-                )
+                collect(rig, experiment, about, 9 if steps == STEPS else 1, seed=1, speed=speed, frame_timeout_s=FRAME_WAIT_S)
                 return
             track = SimpleNamespace(pose=pose or (lambda time_s: arm.state().pose))
             truth = TrueEstimator(SimpleNamespace(track=track), placed)
             settings = LoopSettings(steps, blocking=command != "stream", period_s=0.1, frame_timeout_s=FRAME_WAIT_S, give_up_s=WAIT_S)
-            loop = servo_loop(Rig(source, arm, placed, False), servo, truth, settings)
-            if command == "policy":
-                loop.law = lambda here, estimate: moved(here, servo.feed_mm * placed.mounting.across)
-            loop.take_rest = lambda frame: loop.estimator
+            law = (lambda here, estimate: moved(here, servo.feed_mm * placed.mounting.across)) if command == "policy" else None
+            loop = ServoLoop(rig, servo, truth, settings, LoopHooks(law, lambda frame: truth))
             loop.run(placed.start_pose(servo.indent_mm))
             if loop.notes:
                 raise DeviceError("; ".join(loop.notes))
@@ -172,20 +184,20 @@ def program(command: str, ports: tuple[int, ...], url: str, folder: Path, pose=N
     return run
 
 
-def measure(seed: int, case: tuple[str, str, str] | None = None) -> Run:
+def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg400") -> Run:
     """Make one run."""
-    command, phase, fault = case or draw(seed)
-    rng, placed = random.Random(seed), placed_can()
+    command, phase, fault = case or draw(seed, kind)
+    rng, placed = random.Random(seed), placed_can(kind)
     gap_mm = rng.uniform(*GAPS_MM.get(phase, (0.0, 0.0)))
     later_s = rng.uniform(0.0, 1.0)
     start = placed.start_pose(-CLEAR_MM - 10.0)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        emulator = stack.enter_context(Mg400Emulator(port_offset=None))
+        emulator = stack.enter_context(MagicianEmulator() if kind == "magician" else Mg400Emulator(port_offset=None))
         kinematics = emulator.arm.kinematics
         emulator.arm.track.__init__(kinematics, kinematics.inverse(kinematics.nearest_pose(start)))
         camera = stack.enter_context(CameraEmulator(DomeCamera()))
-        ports = tuple(emulator.ports[port] for port in (29999, 30003, 30004, 30005))
+        place = emulator.device if kind == "magician" else tuple(emulator.ports[port] for port in (29999, 30003, 30004, 30005))
         stops: list[float] = []
         stop = emulator.arm.track.stop
 
@@ -199,12 +211,12 @@ def measure(seed: int, case: tuple[str, str, str] | None = None) -> Run:
         process = None
         if fault == KILLED:
             words = f"import sys; sys.path[:0] = {sys.path!r}; from pathlib import Path; from blind_runs import program"
-            call = f"program({command!r}, {ports!r}, {camera.url!r}, Path({str(folder / 'data')!r}))()"
+            call = f"program({kind!r}, {command!r}, {place!r}, {camera.url!r}, Path({str(folder / 'data')!r}))()"
             process = subprocess.Popen([sys.executable, "-c", f"{words}; {call}"], stderr=subprocess.DEVNULL)
             thread = threading.Thread(target=lambda: (process.wait(), done.set()), daemon=True)
         else:
             steps = HEALTHY_STEPS if fault == HEALTHY else STEPS
-            act = program(command, ports, camera.url, folder / "data", emulator.pose, steps=steps)
+            act = program(kind, command, place, camera.url, folder / "data", emulator.pose, steps=steps)
 
             def go() -> None:
                 try:
@@ -222,7 +234,7 @@ def measure(seed: int, case: tuple[str, str, str] | None = None) -> Run:
             process.kill()
             told.append("killed")
         elif fault != HEALTHY:
-            kinds = (CAMERA_FAULTS | ARM_FAULTS)[fault]
+            kinds = (CAMERA_FAULTS | KINDS[kind][1])[fault]
             device = camera if fault in CAMERA_FAULTS else emulator
             device.faults.add(kinds[rng.randrange(len(kinds))])
         fault_s = time.monotonic()
@@ -231,7 +243,7 @@ def measure(seed: int, case: tuple[str, str, str] | None = None) -> Run:
         ended = done.is_set()
         emulator.arm.track.stop = stop
         found = _judged(emulator, placed, fault_s, stops)
-        safe = ended and not emulator.arm.enabled and not emulator.arm.busy()
+        safe = ended and not emulator.arm.busy() and (kind == "magician" or not emulator.arm.enabled)  # which has no such state
         if fault in (*CAMERA_FAULTS, HEALTHY):  # without feedback, an arm is not moved back
             safe = safe and -placed.touch(emulator.pose()).indent_mm > 5.0
         thread.join(5.0)
@@ -245,7 +257,8 @@ def _await_phase(emulator, placed, phase: str, gap_mm: float, later_s: float, do
         now_s, pose = time.monotonic(), emulator.pose()
         gap = -placed.touch(pose).indent_mm
         clear = clear or gap < CLEAR_MM - 1.0
-        if phase == "standing" and emulator.arm.enabled:
+        ready = emulator.arm.takes_moves if isinstance(emulator, MagicianEmulator) else emulator.arm.enabled
+        if phase == "standing" and ready:
             return
         if phase in GAPS_MM and clear and gap <= gap_mm:
             return
@@ -269,7 +282,7 @@ def _judged(emulator, placed, fault_s: float, stops: list[float]) -> tuple[float
         else:
             segments.append([int(k), int(k)])
     # the stop may be followed at once by the withdrawal
-    first_stop_s = next((time_s for time_s in stops if time_s > fault_s), fault_s)
+    first_stop_s = next((time_s for time_s in stops if time_s > fault_s), np.inf)
     on_the_way = [segment for segment in segments if times[segment[0]] < first_stop_s - STEP_S]
     if not on_the_way:
         return 0.0, 0.0, 0.0, 0.0
@@ -303,9 +316,10 @@ if __name__ == "__main__":
     from multiprocessing import get_context
 
     first, last, workers = (int(text) for text in sys.argv[1:4])
+    kind = sys.argv[4] if len(sys.argv) > 4 else "mg400"
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         found = []
-        for run in pool.map(measure, range(first, last)):
+        for run in pool.map(partial(measure, kind=kind), range(first, last)):
             found.append(run)
             print(run, "WRONG: " + run.wrong() if run.wrong() else "", flush=True)
     print(table(found))

@@ -9,7 +9,7 @@ from training.data.dataset import Dataset
 from training.data.pins import PinTable
 from training.data.targets import Targets
 from training.models import recipe_of
-from training.runs.run import RunConfig
+from training.runs.config import RunConfig
 from twin.pins import make_graph, nominal_reference
 from twin.types import Form
 

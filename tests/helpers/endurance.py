@@ -17,9 +17,9 @@ import psutil
 from free_ports import free_offset
 
 from hardware.arms.mg400_wire import DASHBOARD_PORT
-from hardware.rig.rig import build_rig, servo_loop
 from hardware.servo.loop import Decided, ServoLoop
 from hardware.servo.step import LoopSettings
+from hardware.workcell.build import build_rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.errors import TwinError
 from twin.estimate import SensorModel
@@ -62,7 +62,7 @@ CAMERA = """
 import sys
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.twin_camera import FeedbackPose
-from hardware.rig.rig import twin_camera
+from hardware.workcell.build import twin_camera
 from hardware.rig.geometry import PlacedObject
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
@@ -250,7 +250,7 @@ def run_round(model: SensorModel, bench: Bench) -> Round:
     began_s, told, loop = time.monotonic(), "", None
     try:
         with rig:
-            loop = servo_loop(rig, servo, model, settings)
+            loop = ServoLoop(rig, servo, model, settings)
             if rig.arm.state().error:
                 rig.arm.clear_error()
             rig.await_frame()

@@ -17,12 +17,13 @@ from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.twin_camera import FeedbackPose
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
-from hardware.rig.rig import Rig, servo_loop
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
+from hardware.servo.loop import ServoLoop
 from hardware.servo.policy_law import load_for_outlines, policy_law
-from hardware.servo.step import LoopSettings
+from hardware.servo.step import LoopHooks, LoopSettings
 from hardware.servo.trajectory import measure, trajectory_of
+from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.pins import Pipeline
 from twin.rig.mounting import Mounting
@@ -68,7 +69,7 @@ def test_it_follows_the_can_and_the_frames_show_the_contact(emulated):
         found.append(seen.found)
         assert moved.max() > 4.0  # px: the pins of a sensor that is pressed 3 mm deep
 
-    loop = servo_loop(rig, servo, estimator, LoopSettings(STEPS, frame_timeout_s=10.0, give_up_s=10.0), look)
+    loop = ServoLoop(rig, servo, estimator, LoopSettings(STEPS, frame_timeout_s=10.0, give_up_s=10.0), LoopHooks(on_step=look))
     timing = loop.run(rig.placed.start_pose(servo.indent_mm))
     assert timing.steps == STEPS
     assert min(found) > 0.95 * 331
@@ -83,9 +84,8 @@ def test_a_learnt_policy_follows_the_can(emulated):
     """Trained on the surrogate, run on frames of the finite elements through the live pipeline and the safety layer."""
     rig, servo, camera, _, _ = emulated
     model = load_for_outlines(POLICY)
-    loop = servo_loop(rig, servo, model, LoopSettings(STEPS, frame_timeout_s=10.0, give_up_s=10.0))
-    loop.law = policy_law(model.policy, rig.mounting)
-    loop.take_rest = model.at_rest
+    hooks = LoopHooks(policy_law(model.policy, rig.mounting), model.at_rest)
+    loop = ServoLoop(rig, servo, model, LoopSettings(STEPS, frame_timeout_s=10.0, give_up_s=10.0), hooks)
     loop.run(rig.placed.start_pose(servo.indent_mm))
     measures = measure(trajectory_of(loop.records, rig.mounting, rig.placed), indent_mm=3.0, angle_deg=0.0, wanted_mm=STEPS)
     assert measures.lost_contacts == 0 and measures.hold_depth_mm < 1.0 and measures.completed > 0.5
@@ -94,8 +94,8 @@ def test_a_learnt_policy_follows_the_can(emulated):
 
 def test_a_frozen_camera_makes_the_arm_let_go(emulated):
     rig, servo, camera, estimator, _ = emulated
-    loop = servo_loop(rig, servo, estimator, LoopSettings(1000, blocking=False, period_s=0.1, give_up_s=2.0))
-    loop.on_step = lambda record, frame, estimate: record.index == 3 and camera.faults.add("frozen")
+    loop = ServoLoop(rig, servo, estimator, LoopSettings(1000, blocking=False, period_s=0.1, give_up_s=2.0))
+    loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: record.index == 3 and camera.faults.add("frozen"))
     with pytest.raises(DeviceError, match="holds still"):
         loop.run(rig.placed.start_pose(servo.indent_mm))
     assert_let_go(rig)

@@ -21,16 +21,17 @@ from typer.testing import CliRunner
 
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.reader import LiveSource, Picture
+from hardware.cameras.session import SessionSource
 from hardware.cameras.twin import preview_of
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import run_until_told
 from hardware.errors import DeviceError
 from hardware.live.live import LiveSession, Shower, WatchPlan, watch
-from hardware.live.session import SessionSource
 from hardware.rig.geometry import PlacedObject
-from hardware.rig.rig import build_rig, steps_round
 from hardware.servo import following
+from hardware.servo.following import steps_round
+from hardware.workcell.build import build_rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.estimate.displacements import FEWEST_CONTACTS
 from training.estimate.estimator import PoseEstimator
@@ -198,7 +199,7 @@ def test_collect_in_the_twin_makes_a_recording_that_is_gone_on_with(tmp_path):
 
 
 def test_a_replay_takes_no_other_frame_at_rest(tmp_path):
-    with pytest.raises(OptionError, match="leave --at-rest out"):
+    with pytest.raises(OptionError, match="leave `at_rest` out"):
         run("live", "--replay", tmp_path, "--at-rest", "first", "--headless")
 
 
@@ -211,7 +212,7 @@ def test_live_records_and_replays_the_same(stand_in, tmp_path):
     told = run("live", "--camera", folder, "--model", "any", "--headless", "--record", tmp_path / "s", "--also", "lerobot")
     assert "5 steps" in told and "5 of 5 frames valid" in told
     assert [episode.length for episode in open_records(tmp_path / "s" / "lerobot").episodes] == [5]
-    with pytest.raises(OptionError, match="--also goes with --record"):
+    with pytest.raises(OptionError, match="`also` goes with `record`"):
         run("live", "--camera", folder, "--model", "any", "--headless", "--also", "lerobot")
     assert "5 of 5 estimates" in run("live", "--replay", tmp_path / "s", "--model", "any", "--headless")
 
@@ -349,7 +350,7 @@ def test_a_view_that_breaks_ends_the_session_with_its_error():
     camera = NoisyCamera(fps=50, size_px=pipeline.size_px)
     session = LiveSession(camera, lambda frame: TrueEstimate(("pose_2",), *np.zeros((3, 1))))
     shower = Shower(session, pipeline, Broken("live", pipeline.spec, pipeline.reference))
-    with session.source, pytest.raises(DeviceError, match="no such colour.*--headless"), shower:
+    with session.source, pytest.raises(DeviceError, match="no such colour.*`headless`"), shower:
         session.run(seconds=30.0, going=lambda: shower.open)
     assert session.timing().steps < 1000  # it did not go on for half a minute
 

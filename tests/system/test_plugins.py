@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import twin
-from hardware.rig.rig import build_rig
+from hardware.workcell.build import build_rig
 from scenes import load_servo
 
 ROOT = Path(__file__).parents[2]
@@ -43,7 +43,7 @@ print("force", state.force_n[2] > 0)
 camera = twin.open_camera("example:frames", simulator.spec, twin.Form.RAW)
 with camera: print("camera", camera.read().image.shape)
 
-from hardware.rig.rig import build_rig
+from hardware.workcell.build import build_rig
 from scenes import load_servo
 plane, placement, how = twin.load_object("plane"), load_servo("surface").placement, twin.load_experiment("surface-2d")
 rig = build_rig(simulator.spec, plane, placement, how, camera="example:frames", arm="example:here", form=twin.Form.RAW)

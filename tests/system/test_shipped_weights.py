@@ -13,8 +13,8 @@ import pytest
 from fresh_contacts import read_for, simulate_contacts
 
 from training.estimate.estimator import PoseEstimator
-from training.runs.evaluate import judge
 from training.runs.packed import shipped_names
+from training.studies.judging import judge
 from twin.frames import open_recording
 from twin.types import Form
 

@@ -6,8 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hardware.rig.rig import build_rig, servo_loop
+from hardware.servo.loop import ServoLoop
 from hardware.servo.step import LoopSettings
+from hardware.workcell.build import build_rig
 from scenes import load_experiment, load_object, load_servo
 from training.estimate.estimator import PoseEstimator
 
@@ -45,7 +46,7 @@ def test_a_strange_frame_holds_the_arm_and_the_next_good_one_goes_on(change):
         return answers[-1]
 
     with rig:
-        loop = servo_loop(rig, servo, estimate, LoopSettings(STEPS, frame_timeout_s=rig.frame_timeout_s))
+        loop = ServoLoop(rig, servo, estimate, LoopSettings(STEPS, frame_timeout_s=rig.frame_timeout_s))
         loop.run(rig.placed.start_pose(servo.indent_mm))
     assert [answer.valid for answer in answers[STRANGE - 1 : STRANGE + 2]] == [True, False, True]
     assert answers[STRANGE].reason.startswith(("displaced camera", "torn frame", "not a contact", "ambiguous pins", "inconsistent pins"))

@@ -20,7 +20,7 @@ from websockets.http11 import Request
 from hardware.errors import DeviceError
 from hardware.live.feed import CameraFeed, WatchedArm
 from scenes import load_sensor
-from training.estimate.estimator import models_by_sensor
+from training.estimate.loading import models_by_sensor
 from twin.errors import TwinError
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
@@ -195,6 +195,21 @@ def test_an_answer_of_the_sensor_that_is_being_replaced_does_no_harm(studio, cli
     assert not failed
     client.wait(lambda u: "of 331" in u.html, WAIT_S)
     monkeypatch.undo()
+    since = len(client.updates)
+    studio.twin.open(StudioState(sensor=SENSOR, object="sphere", pose={"depth_mm": 1.0}))
+    client.wait(lambda u: "of 127" in u.html, WAIT_S, since=since)
+
+
+def test_an_object_that_is_chosen_while_a_sensor_opens_is_kept(studio, client):
+    drag(client, 1.5)
+    since = len(client.updates)
+    client.set("sensor", "mg400-331")
+    client.set("object", "cylinder")
+    client.wait(lambda u: "of 331" in u.html, WAIT_S, since=since)
+    end = time.monotonic() + WAIT_S
+    while studio.twin.contact.setup.touched.name != "cylinder" and time.monotonic() < end:
+        time.sleep(0.02)
+    assert studio.twin.contact.setup.touched.name == client.value("object") == "cylinder"
     since = len(client.updates)
     studio.twin.open(StudioState(sensor=SENSOR, object="sphere", pose={"depth_mm": 1.0}))
     client.wait(lambda u: "of 127" in u.html, WAIT_S, since=since)

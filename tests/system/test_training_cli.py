@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from scenes import load_experiment, load_sensor
 from training.data.dataset import load_dataset
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
-from training.runs.recipes import TrainingError
 from training.studies.sim_to_real import Plan
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
 from training.studies.sim_to_real.read import READ, read_twin

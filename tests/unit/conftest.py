@@ -11,7 +11,7 @@ from small_generation import SENSOR, small_config
 from scenes import load_experiment, load_sensor
 from training.generation import generate
 from training.runs.run import train_run
-from training.runs.train import train_model
+from training.studies.train import train_model
 from twin.frames.images import write_image
 
 PRESSES = """

@@ -9,7 +9,7 @@ from small_generation import small_config
 
 from scenes import RandomisationSpec, load_object
 from training.data.dataset import joined, split_rows, with_common_labels
-from training.runs.recipes import TrainingError
+from training.errors import TrainingError
 from training.runs.run import fold_rows
 from training.studies.objects import Plan, rows_in_range, verdicts
 from training.studies.objects.plan import MIXED

@@ -14,6 +14,7 @@ import pytest
 from hostile.forked_program import LIBRARIES as FORKED_LIBRARIES
 
 import twin
+from twin import errors
 from twin.store.fingerprint import LIBRARIES as FINGERPRINTED
 
 ROOT = Path(__file__).parents[2]
@@ -26,6 +27,7 @@ MAY_IMPORT = {
 }
 TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may import those before it
     "errors",
+    "signals",
     "lazy",
     "types",
     "progress",
@@ -54,6 +56,7 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "extend",
     "__main__",
 )
+EXTRAS = ("cluster", "models", "records", "rl", "studio")  # what the extra `all` brings
 BY_HAND = {"pyoidn"}  # installed by hand for the one measurement that needs it, as its head says
 NAMED_OTHERWISE = {"rerun": "rerun-sdk"}  # imported under another name than it is installed by, and not installed everywhere
 # The outermost layer may join everything, and nothing joins it: the command line (test_command_line), and the names that Python offers.
@@ -254,7 +257,71 @@ def test_folders_stay_small_and_top_floors_empty():
     folders = {path.parent for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py")}
     counts = {str(folder.relative_to(ROOT)): len([path for path in folder.glob("*.py") if path.stem != "__init__"]) for folder in folders}
     assert not {name: count for name, count in counts.items() if count > LARGE.get(name, MOST_MODULES)}
-    assert counts["training"] == 0 and [path.name for path in (ROOT / "hardware").glob("*.py") if path.stem != "__init__"] == ["errors.py"]
+    for package in ("training", "hardware"):
+        assert [path.name for path in (ROOT / package).glob("*.py") if path.stem != "__init__"] == ["errors.py"]
+
+
+WITHOUT_CYCLES = ("training", "hardware")
+
+
+def room_of(name: str) -> str:
+    """Package and folder of a dotted name: "hardware.arms" of "hardware.arms.cri.robot"; "" for a module that lies in no folder."""
+    parts = name.split(".")
+    return ".".join(parts[:2]) if len(parts) > 1 and (ROOT / parts[0] / parts[1]).is_dir() else ""
+
+
+def cycles_in(imports: dict[str, set[str]]) -> set[str]:
+    """The nodes of a graph from which a way leads back to them."""
+    reached = {name: set(to) for name, to in imports.items()}
+    for middle in imports:
+        for name in imports:
+            if middle in reached[name]:
+                reached[name] |= reached[middle]
+    return {name for name, to in reached.items() if name in to}
+
+
+def cycles_between_rooms(package: str) -> set[str]:
+    """Folders of a package that import each other in a cycle. Imports inside functions count."""
+    rooms: dict[str, set[str]] = {}
+    for path in sorted((ROOT / package).rglob("*.py")):
+        room = room_of(".".join(path.relative_to(ROOT).with_suffix("").parts))
+        rooms.setdefault(room, set()).update(set(map(room_of, imports_of(path))) - {room})
+    rooms.pop("", None)
+    return cycles_in({room: to & set(rooms) for room, to in rooms.items()})
+
+
+@pytest.mark.parametrize("package", WITHOUT_CYCLES)
+def test_folders_import_each_other_without_cycles(package):
+    assert not cycles_between_rooms(package)
+
+
+def test_cycles_are_recognised():
+    assert cycles_in({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == {"b", "c"}
+
+
+SPEAK_OF_ARGUMENTS = ("hardware",)
+OPTION = re.compile(r"(?<![\w-])--[a-z]+")
+
+
+def options_in_errors(source: str) -> list[str]:
+    """Options of the command line that errors of a module name. Whole commands in quotes don't count."""
+    raised = [n for n in nodes_of(source) if isinstance(n, ast.Raise)]
+    texts = [n.value for each in raised for n in ast.walk(each) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+    return [found for text in texts for found in OPTION.findall(re.sub(r"'twin [^']*'", "", text))]
+
+
+@pytest.mark.parametrize("package", SPEAK_OF_ARGUMENTS)
+def test_errors_speak_of_arguments_which_the_command_line_translates(package):
+    for path in sorted((ROOT / package).rglob("*.py")):
+        assert not options_in_errors(path.read_text(encoding="utf-8")), path.relative_to(ROOT)
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [("raise E(f'give --out {x}')", ["--out"]), ("raise E('give `out`')", []), ("raise E(\"run 'twin new --out F'\")", [])],
+)
+def test_options_in_errors_are_recognised(source, found):
+    assert options_in_errors(source) == found
 
 
 def test_the_repository_holds_no_foreign_data():
@@ -278,7 +345,7 @@ def declared(*extras: str) -> frozenset[str]:
 
 @pytest.mark.parametrize(
     ("folders", "extras"),
-    [(tuple(MAY_IMPORT), ("rerun", "rl", "records")), (("tests",), ("rerun", "dev", "browser"))],
+    [(tuple(MAY_IMPORT), ("rerun", *EXTRAS)), (("tests",), ("rerun", "dev", "browser", *EXTRAS))],
     ids=["product", "tests"],
 )
 def test_what_is_imported_is_asked_for(folders, extras):
@@ -297,6 +364,12 @@ def test_what_is_imported_is_asked_for(folders, extras):
 
 
 def test_what_is_named_as_a_library_is_asked_for():
-    assert set(FINGERPRINTED.values()) <= declared()
-    known = {name for name, distributions in metadata.packages_distributions().items() if {d.lower() for d in distributions} & declared()}
+    assert set(FINGERPRINTED.values()) <= declared("models")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for library, extra in errors.EXTRAS.items():
+        assert any(library.replace("_", "-") in line.replace("_", "-") for line in project["optional-dependencies"][extra]), library
+    assert project["optional-dependencies"]["all"] == [f"tactip-twin[{','.join(EXTRAS)}]"]
+    known = {
+        name for name, distributions in metadata.packages_distributions().items() if {d.lower() for d in distributions} & declared("models")
+    }
     assert {name.split(".")[0] for name in FORKED_LIBRARIES} <= known

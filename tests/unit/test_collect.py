@@ -9,11 +9,12 @@ import pytest
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.reader import LiveSource, Picture
-from hardware.collect.collect import COLUMNS, META, Collection, CollectPlan, WorkFrame, _Asked, collect, draw_contact
+from hardware.collect.collect import COLUMNS, META, Collection, WorkFrame, collect, draw_contact
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, matrix_of
+from hardware.workcell.build import Rig
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
-from training.data.design import least_sure, nearest_to_even
+from training.data.design import nearest_to_even
 from twin.frames import open_recording, read_image
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
@@ -66,9 +67,8 @@ def run(rig, folder, count, *, late_s=0.0, about=None):
     experiment, placed, arm = rig
     camera = PoseCamera(arm, late_s=late_s)
     with arm, camera:
-        return collect(
-            camera, arm, experiment, placed, Collection(folder, about or {"seed": 1}, Form.RAW), count, seed=1, speed=(100.0, 100.0)
-        )
+        collection = Collection(folder, about or {"seed": 1}, Form.RAW)
+        return collect(Rig(camera, arm, placed, False), experiment, collection, count, seed=1, speed=(100.0, 100.0))
 
 
 def rows(folder):
@@ -182,14 +182,20 @@ def test_killed_before_the_first_row_it_begins_anew(rig, tmp_path):
         Collection(tmp_path, {"seed": 1}, Form.RAW)
 
 
-def test_limits_that_shorten_its_moves_are_refused(rig, tmp_path):
-    """A contact that the arm stops short of is not the one that was asked for."""
+@pytest.mark.parametrize(("share", "reached"), [(0.5, True), (0.0, False)])
+def test_a_contact_that_the_arm_stops_short_of_is_not_the_one_that_was_asked_for(rig, tmp_path, share, reached, monkeypatch):
     experiment, placed, arm = rig
+    monkeypatch.setattr("hardware.workcell.mover.MOST_PIECES", 20)
     move = arm.move_linear
-    arm.move_linear = lambda pose, **options: move(0.5 * (arm.state().pose + pose), **options)
-    with pytest.raises(DeviceError, match="--limits"):
-        run(rig, tmp_path, 1)
-    assert rows(tmp_path) == []
+    arm.move_linear = lambda pose, **options: move(share * pose + (1 - share) * arm.state().pose, **options)
+    if reached:
+        assert run(rig, tmp_path, 1) == 1
+        asked = draw_contact(experiment, 1, 0).pose
+        assert abs(float(rows(tmp_path)[0]["pose_2"]) - asked[1]) < 1.0  # mm: less than two moves may be off
+    else:
+        with pytest.raises(DeviceError, match="`limits`"):
+            run(rig, tmp_path, 1)
+        assert rows(tmp_path) == []
 
 
 @pytest.mark.parametrize("name", ["square", "can"])
@@ -218,15 +224,19 @@ def test_stopped_on_the_way_it_does_not_cross_the_object(rig, tmp_path):
     arm = SimulatedArm(axes=6, pose=behind, time_scale=FAST)
     calls = []
 
-    def interrupted(state, target):
+    move = arm.move_linear
+
+    def interrupted(target, **options):
         calls.append(target)
         if len(calls) > 2:
             raise KeyboardInterrupt
-        return target
+        return move(target, **options)
+
+    arm.move_linear = interrupted
 
     with arm, PoseCamera(arm) as camera, pytest.raises(KeyboardInterrupt):
-        options = {"seed": 1, "speed": (100.0, 100.0), "guards": (interrupted,)}
-        collect(camera, arm, experiment, placed, Collection(tmp_path, {"seed": 1}, Form.RAW), 1, **options)
+        rig = Rig(camera, arm, placed, False)
+        collect(rig, experiment, Collection(tmp_path, {"seed": 1}, Form.RAW), 1, seed=1, speed=(100.0, 100.0))
     assert len(calls) == 3 and not arm._enabled  # no fourth move, which would lead straight to the front
 
 
@@ -239,11 +249,11 @@ def test_a_frame_at_rest_that_is_refused_is_kept_to_go_on_with(rig, tmp_path):
     collection = Collection(tmp_path, {"seed": 1}, Form.RAW)
     options = {"seed": 1, "speed": (100.0, 100.0), "on_rest": refuse}
     with arm, PoseCamera(arm) as camera, pytest.raises(DeviceError, match="pressed"):
-        collect(camera, arm, experiment, placed, collection, 1, **options)
+        collect(Rig(camera, arm, placed, False), experiment, collection, 1, **options)
     assert collection.rest.is_file() and rows(tmp_path) == []
     again = SimulatedArm(axes=6, time_scale=FAST)
     with again, PoseCamera(again) as camera:
-        assert collect(camera, again, experiment, placed, collection, 1, **options) == 1
+        assert collect(Rig(camera, again, placed, False), experiment, collection, 1, **options) == 1
 
 
 @pytest.mark.parametrize("count", [10, 20, 40])
@@ -268,32 +278,6 @@ def test_an_even_contact_depends_on_its_number_and_the_seed_alone():
     experiment = load_experiment("surface-3d")
     one, again, other = (draw_contact(experiment, seed, 7, "even").pose for seed in (1, 1, 2))
     assert np.array_equal(one, again) and not np.array_equal(one, other)
-
-
-@pytest.mark.parametrize("name", ["surface-3d", "edge-circle"])
-def test_the_next_contact_is_made_where_the_contacts_so_far_tell_least(name):
-    """All contacts but the asked one lie in one half of the first label's range: the next one lies in the other half."""
-    experiment = load_experiment(name)
-    drawn = np.stack([np.concatenate([c.pose, c.move]) for c in (draw_contact(experiment, 3, k, "even") for k in range(24))])
-    low, high = np.array(list(experiment.ranges().values())).T
-    column = int(np.flatnonzero(high > low)[0])
-    middle = (low + high)[column] / 2
-    half = drawn[drawn[:, column] < middle]
-    rng = np.random.default_rng(0)
-    moved = np.einsum("mk,knd->mnd", half / np.maximum(high, 1), rng.normal(size=(12, 7, 2)))
-    for seed in range(3):
-        chosen = least_sure(experiment, half, moved, seed=seed)
-        assert chosen[column] > middle and (chosen >= low).all() and (chosen <= high).all()
-
-
-def test_contacts_of_the_design_unsure_are_chosen_after_the_first_ones(tmp_path):
-    experiment = load_experiment("surface-3d")
-    asked = _Asked(experiment, 5, "unsure", tmp_path, lambda folder, plan, seed, index: np.full(12, float(index)))
-    even = _Asked(experiment, 5, "even", tmp_path, None)
-    assert all(np.array_equal(asked(k).pose, even(k).pose) for k in range(6))
-    assert (asked(6).pose == 6).all() and (asked(7).move == 7).all()
-    with pytest.raises(DeviceError, match="needs a chooser"):
-        CollectPlan(None, None, experiment, None, "sim", "sim", 3, design="unsure")
 
 
 def test_frames_are_chosen_as_evenly_as_a_design_makes_them():

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from training.data.dataset import load_dataset
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.part import OneFrame
 from training.models.touch.model import TOUCH
 from training.runs.packed import pack
-from training.runs.recipes import TrainingError
+from training.runs.run_files import MAPS
 from training.studies.prediction import Predictions, write_frame_maps
-from training.touch.contact_maps import MAPS, judge_maps, read_maps, write_maps
+from training.touch.contact_maps import judge_maps, read_maps, write_maps
 from twin.errors import StoreError
 from twin.geometry.mesh import build_mesh
 from twin.mechanics.skin_map import SIDE, ContactMaps, between_nodes, skin_grid

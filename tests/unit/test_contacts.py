@@ -13,14 +13,14 @@ from drawn_recording import config_of
 from training.data.dataset import joined
 from training.data.label_code import label_error
 from training.data.targets import Targets
+from training.errors import TrainingError
 from training.estimate.contact_estimator import ContactEstimator, KindOfContact, contacts_folder, put_together
 from training.estimate.contacts import CONTACTS, fit_contacts, read_contacts, write_contacts
 from training.estimate.estimator import PoseEstimator
-from training.runs.evaluate import intervals_on, judge
-from training.runs.recipes import TrainingError
 from training.runs.run import train_run
-from training.runs.train import add_domain
+from training.studies.judging import intervals_on, judge
 from training.studies.sim_to_real.steps import widen_intervals
+from training.studies.train import add_domain
 from twin.camera.capture import record
 from twin.frames import open_recording
 from twin.frames.forms import recording_to_raw

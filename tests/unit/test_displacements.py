@@ -9,6 +9,7 @@ from drawn_frames import drawn_frame
 
 from scenes.pins import PinsSpec
 from training.data.dataset import load_dataset
+from training.errors import TrainingError
 from training.estimate.displacements import (
     FEWEST_CONTACTS,
     FEWEST_FRAMES,
@@ -19,8 +20,8 @@ from training.estimate.displacements import (
     write_displacements,
 )
 from training.estimate.estimator import PoseEstimator
+from training.estimate.rest import RestPlaces
 from training.estimate.rest_seeking import RestSeeker
-from training.runs.recipes import TrainingError
 from training.studies.evaluation import at_own_rest
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
@@ -96,7 +97,7 @@ def test_the_shipped_weights_find_another_units_rest_places():
     start = nominal_reference(estimator.sensor, estimator.form)
     off = np.random.default_rng(5).normal(0, 0.03 * float(np.median(start.spacing_px)), start.pins_px.shape)
     moved = estimator.displacements.at(np.random.default_rng(6).normal(size=(FEWEST_CONTACTS, 6))).reshape(FEWEST_CONTACTS, -1, 2)
-    found = estimator.other_rest(start, start.pins_px + off + moved)
+    found = estimator.rest.other(start, start.pins_px + off + moved)
     assert np.sqrt(np.mean((found.pins_px - start.pins_px - off) ** 2)) < 0.2 * np.sqrt(np.mean(off**2))
 
 
@@ -107,7 +108,9 @@ def test_a_recording_without_a_no_contact_frame_is_counted_from_where_its_contac
     (tmp_path / "targets.csv").write_text("image_name,pose_2,pose_6\nf_0.png,-1,2\n")
     data = load_dataset(tmp_path, estimator.sensor, estimator.names, form=estimator.form)
     assert at_own_rest(estimator, data) is data, "one contact tells nothing"
-    monkeypatch.setattr(estimator, "other_rest", lambda start, nodes_px: make_reference(start.pins_px + [1.0, 0.0], estimator.sensor.pins))
+    monkeypatch.setattr(
+        RestPlaces, "other", lambda rest, start, nodes_px: make_reference(start.pins_px + [1.0, 0.0], estimator.sensor.pins)
+    )
     told = at_own_rest(estimator, data)
     assert "found from the contacts" in told.problems[-1]
     estimates = [estimator.predict_rows(each, np.arange(1)).mean for each in (data, told)]
@@ -126,13 +129,11 @@ class PinsSeen:
     def at_known_rest(self):
         return PinsSeen(self.known)
 
-    def told_rest(self, nodes_px):
-        other = other_rest(self.known, START, nodes_px)
-        return (self.at_known_rest(), False) if other is None else (PinsSeen(self.known, make_reference(other, PINS)), True)
-
-    def require_view_of_contacts(self, nodes_px, rest, name):
+    def told_rest(self, nodes_px, name):
         if self.turned:
             raise FrameError(f"{name}: the camera's picture is turned")
+        other = other_rest(self.known, START, nodes_px)
+        return (self.at_known_rest(), False) if other is None else (PinsSeen(self.known, make_reference(other, PINS)), True)
 
     def unseen(self, seen, started):
         return SimpleNamespace(valid=False, reason=seen.reason, seen=seen.seen)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from scenes import load_sensor
+from training.errors import TrainingError
 from training.estimate.domain import FEWEST, Verdict, learn_domain, read_domain, write_domain
 from training.estimate.estimator import PoseEstimator
-from training.runs.recipes import TrainingError
 from twin.pins import nominal_reference
 from twin.types import Form
 
@@ -75,12 +75,13 @@ def test_a_small_displacement_of_the_camera_is_removed_as_far_as_models_can():
     assert judged(straight + [0.2, -0.1], corrects=False).reason.startswith("displaced camera")
 
 
-def test_the_upper_half_of_one_contact_and_the_lower_half_of_another_are_no_contact():
+@pytest.mark.parametrize("axis, share", [(1, 0.5), (1, 0.25), (1, 0.8), (0, 0.5), (0, 0.3)])
+def test_a_part_of_one_contact_and_the_rest_of_another_are_no_contact(axis, share):
     one, other = contacts(80, 12)[0], contacts(80, 13)[0]
-    lower = PLACES[:, 1:] > np.median(PLACES[:, 1])
+    beyond = PLACES[:, axis : axis + 1] > np.quantile(PLACES[:, axis], share)
     apart = np.sqrt(((one - other) ** 2).mean(axis=(1, 2)))
-    mixed = [judged(np.where(lower, a, b)).reason for a, b, far in zip(one, other, apart > 0.08, strict=True) if far]
-    assert len(mixed) > 20 and np.mean([bool(reason) for reason in mixed]) > 0.95
+    mixed = [judged(np.where(beyond, a, b)).reason for a, b, far in zip(one, other, apart > 0.08, strict=True) if far]
+    assert len(mixed) > 20 and np.mean([bool(reason) for reason in mixed]) > 0.9
 
 
 def test_the_cameras_place_follows_from_contacts_of_which_most_are_known():
@@ -94,7 +95,7 @@ def test_the_cameras_place_follows_from_contacts_of_which_most_are_known():
 
 def test_intervals_grow_with_the_distance_and_never_shrink_until_there_is_no_estimate():
     straight, strange = contacts(1, 5)[0][0], np.random.default_rng(6).normal(size=(len(PLACES), 2))
-    loose = replace(domain(), limits=domain().limits * [1, 1, 1, 9, 1, 1, 1, 1])  # the halves alone would refuse before
+    loose = replace(domain(), limits=domain().limits * [1, 1, 1, 9, 9, 9, 9, 1, 1, 1, 1])  # the parts alone would refuse before
     verdicts = [loose.judge(straight + size * strange, NONE_LOST, REFERENCE) for size in np.linspace(0, 0.2, 41)]
     first = next(k for k, each in enumerate(verdicts) if each.reason)
     factors = [each.factor for each in verdicts[:first]]
@@ -143,6 +144,6 @@ def test_a_model_of_a_sensor_that_was_never_calibrated_says_what_is_assumed():
     calibrated = PoseEstimator.load("mg400-127")
     assumed = copy(calibrated)
     assumed.sensor, assumed.domain = calibrated.sensor.model_copy(update={"rig": None}), replace(calibrated.domain, simulated=True)
-    low, high, _ = assumed._widened(np.array([-3.0, 20.0]), np.array([0.1, 2.0]), 0.0, Verdict(""), np.zeros(2))
+    low, high, _ = assumed._widening(np.array([-3.0, 20.0]), np.array([0.1, 2.0]), 0.0, Verdict(""), np.zeros(2))
     assert high - low == pytest.approx([2 * (0.1 + 0.015 * 20 + 0.1 * 3), 2 * (2.0 + 1.0)])
     assert any("never calibrated" in line for line in assumed.caveats) and not any("never" in line for line in calibrated.caveats)

@@ -3,11 +3,13 @@
 import json
 from functools import partial
 
+import numpy as np
 import pytest
 from figures import __main__ as driver
 from figures import jobs as module
 from figures import tables
 from figures.jobs import FIGURES, JOBS, NO_PICTURES, NO_RESIDUAL, FiguresError, Job, Value, is_kept, read, run, values
+from figures.same import SAMPLES, differences
 
 from scenes import load_sensor
 from twin.errors import RenderError
@@ -167,3 +169,22 @@ def test_documents_state_what_was_measured(path):
     """Marked tables and numbers are those of figures.json: `make tables` writes them."""
     text = path.read_text()
     assert tables.filled(text, read(FIGURES)) == text, f"{path.name} states other figures than {FIGURES.name}: run 'make tables'"
+
+
+def test_states_of_the_code_that_compute_the_same_differ_in_times_alone(tmp_path):
+    for side, ms in (("before", 3.0), ("after", 4.0)):
+        (tmp_path / side).mkdir()
+        (tmp_path / side / "pins.csv").write_text(f"image_name,x_px,ms_detect\na.png,1.5,{ms}\n")
+        np.savez(tmp_path / side / "truth.npz", caps_mm=np.array([0.1, np.nan]))
+    old, new = tmp_path / "before", tmp_path / "after"
+    assert differences(old, new) == []
+    np.savez(new / "truth.npz", caps_mm=np.array([0.1 + 1e-15, 1.0]))
+    (new / "pins.csv").write_text("image_name,x_px\na.png,1.6\n")
+    assert differences(old, new) == ["pins.csv x_px", "truth.npz caps_mm"]
+    (new / "pins.csv").unlink()
+    assert differences(old, new) == ["pins.csv: not there", "truth.npz caps_mm"]
+    assert differences(tmp_path / "none", new) == ["nothing was written"]
+
+
+def test_every_family_with_a_sample_has_jobs():
+    assert {family for sample in SAMPLES.values() for family in sample.families} <= {job.family for job in JOBS.values()}

@@ -255,7 +255,7 @@ def test_a_broken_off_run_ends_with_the_same_bytes(made, tmp_path, monkeypatch):
                 raise KeyboardInterrupt
             os.replace(source, target)
 
-        return SimpleNamespace(replace=replace, fsync=os.fsync, getpid=os.getpid)  # for this module alone
+        return SimpleNamespace(**vars(os) | {"replace": replace})  # for this module alone
 
     for limit in (4, 4, 6):  # in the second record, in the first table, in the last step of all
         calls.clear()
@@ -341,7 +341,7 @@ def test_a_full_disk_ends_the_run_in_one_line(made, tmp_path, monkeypatch):
             raise OSError(28, "No space left on device")
         os.fsync(number)
 
-    monkeypatch.setattr(atomic, "os", SimpleNamespace(replace=os.replace, fsync=full, getpid=os.getpid))
+    monkeypatch.setattr(atomic, "os", SimpleNamespace(**vars(os) | {"fsync": full}))
     with pytest.raises(DatasetError, match=r"No space left on device\); free some space .*; 2 contacts are kept"):
         generate(tmp_path / "set", config, COUNT)
     assert not list(tmp_path.rglob("*.part"))

@@ -24,8 +24,8 @@ from hardware.servo.study import ServoStudyPlan, folder_name, study_servo
 from scenes import SpecError, load_experiment, load_object, load_sensor, load_servo
 from scenes.body import MOST_POISSON
 from scenes.load import SHIPPED
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
-from training.runs.recipes import TrainingError
 from twin.errors import ContactError, FrameError, OptionError, TwinError
 from twin.frames import open_recording
 from twin.frames.forms import form_of, known_frames
@@ -46,14 +46,14 @@ def test_rates_that_are_none_are_refused_with_their_range(number):
         emulate_mg400(time_scale=number)
     with pytest.raises(DeviceError, match="`time_scale` .*: expected 0.001 to 1000"):
         emulate_magician(time_scale=number)
-    with pytest.raises(DeviceError, match="--rate .*: expected 0.1 to 1000 decisions a second"):
+    with pytest.raises(DeviceError, match="`rate` .*: expected 0.1 to 1000 decisions a second"):
         FollowPlan(load_object("can"), load_servo("surface"), stream_hz=number)
 
 
 @pytest.mark.parametrize("arm", ["mg400", "mg400:127.0.0.1", "mg400-lenient:127.0.0.1", "magician:/dev/ttyUSB0"])
 def test_a_real_arm_is_not_moved_by_drawn_frames_unless_that_is_said(arm):
     thing, servo = load_object("can"), load_servo("surface")
-    with pytest.raises(OptionError, match="give the sensor's with --camera"):
+    with pytest.raises(OptionError, match="give the sensor's with `camera`"):
         FollowPlan(thing, servo, arm=arm)
     with pytest.raises(DeviceError, match="no arm 'magicain:/dev/ttyUSB0'; there are: mg400"):
         FollowPlan(thing, servo, arm="magicain:/dev/ttyUSB0")
@@ -63,9 +63,9 @@ def test_a_real_arm_is_not_moved_by_drawn_frames_unless_that_is_said(arm):
 @pytest.mark.parametrize("count", [0, -1, 2_000_000_000])
 def test_steps_and_contacts_beyond_all_bounds_are_refused(count):
     thing, servo = load_object("can"), load_servo("surface")
-    with pytest.raises(DeviceError, match=f"--steps {count}: expected 1 to"):
+    with pytest.raises(DeviceError, match=f"`steps` {count}: expected 1 to"):
         FollowPlan(thing, servo, steps=count)
-    with pytest.raises(DeviceError, match=f"--count {count}: a collection has 1 to"):
+    with pytest.raises(DeviceError, match=f"`count` {count}: a collection has 1 to"):
         CollectPlan(load_sensor("mg400-127"), thing, load_experiment("surface-2d"), servo, "twin", "simulated", count)
 
 

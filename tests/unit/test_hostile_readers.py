@@ -17,8 +17,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save
 
+from hardware.cameras.session import SessionSource
 from hardware.collect.collect import Collection
-from hardware.live.session import SessionSource
 from scenes import SpecError, load_sensor
 from training.runs.packed import unpack
 from twin.errors import TwinError

@@ -10,8 +10,8 @@ from training.data.label_code import LabelCode, goes_round, label_error
 from training.data.targets import Targets
 from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
-from training.runs.evaluate import judge
 from training.runs.run import train_run
+from training.studies.judging import judge
 
 UNITS = ("mm", "deg")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from training.data.targets import Targets
-from training.runs.evaluate import leak_check
+from training.studies.judging import leak_check
 
 FRAMES = 12
 

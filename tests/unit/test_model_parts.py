@@ -14,15 +14,17 @@ from drawn_recording import config_of, drawn_pins
 from torch import nn
 
 from training.data.pins import PinTable
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models import MODELS, model_named, recipe_of, register, variant_named
 from training.models.part import PinModel
+from training.models.recipes import Recipe
 from training.models.vgnn.network import mode_components
 from training.models.vgnn.registration import fit_registration, spanned
-from training.runs.evaluate import judge, rows_to_judge
+from training.runs.config import RunConfig
 from training.runs.packed import SHIPPED, WEIGHTS, pack, shipped_names
-from training.runs.recipes import Recipe, TrainingError
-from training.runs.run import RunConfig, train_run
+from training.runs.run import train_run
+from training.studies.judging import judge, rows_to_judge
 from twin.errors import FrameError
 from twin.pins import make_graph
 from twin.types import Form, Frame

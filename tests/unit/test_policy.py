@@ -6,14 +6,16 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from changed_views import altered, mirrored, moved, rolled, torn
 from typer.testing import CliRunner
 
 from hardware.rig.geometry import PlacedObject
 from hardware.servo.policy_law import load_for_outlines, policy_law
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from training.environments import learn
+from training.environments import learn, policy_domain
 from training.environments.batch import Batch, Options
 from training.environments.learn import LearnPlan, Learnt, judge_policy, learn_policy
+from training.environments.policy_domain import contacts_of
 from training.environments.world import Surfaces, standing_on
 from twin.cli import command_line
 from twin.errors import FrameError, OptionError
@@ -87,6 +89,64 @@ def test_a_frame_without_pins_gives_no_action(policy):
     model = PolicyModel(policy)
     told = model(Frame(np.zeros((360, 360), np.uint8), Form.PROCESSED))
     assert not told.valid and told.reason and np.isnan(told.value).all()
+
+
+@pytest.fixture(scope="module")
+def known_contacts(policy):
+    """A frame at rest and one of a contact, and the policy that knows the sensor's contacts, counted from the first."""
+    env = gymnasium.make("tactip/SurfaceFollow-v0", pictures="preview", disable_env_checker=True).unwrapped
+    env.reset(seed=4)
+    eye = env.batch.eye
+    rest = eye.frame(0, rest_pins(eye.sensor.geometry), np.random.default_rng(0))
+    model = PolicyModel(policy, contacts=contacts_of(policy))
+    return rest, eye.frame(0, env.batch.backend.attitude(0), np.random.default_rng(1)), model
+
+
+@pytest.mark.parametrize("change", [rolled(9), torn(15), mirrored, moved(turn_deg=5), moved(zoom=1.1)])
+def test_a_policy_does_not_act_on_a_strange_frame(known_contacts, change):
+    rest, frame, model = known_contacts
+    model = model.at_rest(rest)
+    assert model(frame).valid
+    strange = model(altered(frame, change))
+    assert not strange.valid and strange.reason and np.isnan(strange.value).all()
+
+
+@pytest.mark.parametrize("change", [moved(turn_deg=37), moved(stretch=1.08), moved(zoom=1.1)])
+def test_a_policy_refuses_a_view_that_is_not_its_cameras(known_contacts, change):
+    rest, _, model = known_contacts
+    with pytest.raises(FrameError, match="picture is (turned|stretched|zoomed)"):
+        model.at_rest(altered(rest, change))
+
+
+def test_a_policy_acts_as_before_through_a_camera_that_is_turned_a_little(known_contacts):
+    rest, frame, model = known_contacts
+    turn = moved(turn_deg=3)
+    straight, turned = model.at_rest(rest)(frame), model.at_rest(altered(rest, turn))(altered(frame, turn))
+    assert turned.valid and np.allclose(straight.value, turned.value, atol=0.15)
+
+
+def test_a_policy_of_an_own_sensor_knows_the_contacts_of_its_training(tmp_path, few_looks, monkeypatch):
+    """Its file holds them: it knows the motions that it learnt from, and no torn frame."""
+    monkeypatch.setattr(policy_domain, "_shipped_estimator", lambda sensor: None)
+    monkeypatch.setattr(policy_domain, "ACTING_STEPS", 150)
+    made = learn_policy(LearnPlan("SurfaceFollow", SMALL, minutes=0.02, environments=4, episodes=1), tmp_path)
+    again = load_policy(tmp_path / "policy.safetensors")
+    known = contacts_of(again)
+    displacements = known.seen_from(known.reference, "rest")
+    vector = learn.TactileVectorEnv("SurfaceFollow", 4, sensor="mg400-127", autoreset_mode="SameStep")
+    seen, _ = vector.reset(seed=1)
+    spacing, none = known.reference.spacing_px.mean(), np.zeros(127, bool)
+    right = torn_apart = 0
+    for _ in range(20):
+        for pins in seen["tactile"][:, -1].astype(float):
+            nodes = known.reference.pins_px + spacing * pins
+            right += not displacements(nodes, none)[1]
+            nodes[nodes[:, 1] > nodes[:, 1].mean(), 0] += 0.5 * spacing
+            torn_apart += bool(displacements(nodes, none)[1])
+        seen, *_ = vector.step(made.policy.act(seen["tactile"], seen["goal"]))
+    assert right >= 76 and torn_apart >= 78  # of 80
+    with pytest.raises(PolicyError, match="domain is damaged"):
+        contacts_of(replace(again, about={**again.about, "domain": {}}))
 
 
 def test_the_shipped_policy_presses_where_it_is_too_shallow_and_lifts_where_it_is_too_deep(policy):

@@ -473,7 +473,7 @@ def test_batch_writes_what_it_promises(tmp_path, spec, pictures):
     assert written["parameters"]["reference"] == "init_0.png" and set(written["ms"]["total"]) == {"p50", "p95", "p99"}
     assert sorted(p.name for p in (tmp_path / "out" / "overlay").iterdir()) == sorted(names)
     assert seen[-1] == (3, 3)
-    assert {path.name for path in (tmp_path / "out").glob(".*")} == {".lock", ".written.json"}
+    assert {path.name for path in (tmp_path / "out").glob(".*")} == {".written.json"}
 
 
 def test_json_nested_without_end_is_reported(tmp_path, spec, pictures):

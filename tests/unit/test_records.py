@@ -16,7 +16,7 @@ import pytest
 from made_records import ABOUT, COLOUR, assert_same, made_episode
 
 from scenes import load_sensor
-from twin.errors import FrameError, StoreError, TwinError
+from twin.errors import ExtraError, FrameError, StoreError, TwinError
 from twin.frames import open_recording
 from twin.records import FORMATS, RecordError, Records, convert, open_records, open_writer, record, with_pins
 from twin.records.folder import SIDECAR
@@ -277,10 +277,10 @@ def test_a_model_with_a_single_label_is_kept_in_every_format(tmp_path):
 
 def test_a_missing_library_names_its_remedy(tmp_path):
     def missing(name):
-        raise ImportError(name)
+        raise ModuleNotFoundError(name, name=name)
 
     for to, library in (("lerobot", "pyarrow"), ("mcap", "mcap_ros2")):
-        with patch.object(record, "import_module", missing), pytest.raises(RecordError, match=f"{library}.*tactip-twin\\[records\\]"):
+        with patch.object(record, "import_module", missing), pytest.raises(ExtraError, match=f"{library}.*tactip-twin\\[records\\]"):
             written(tmp_path / to, to)
         assert not (tmp_path / to).exists()
 

@@ -8,7 +8,7 @@ import pytest
 from drawn_frames import drawn_frame
 
 from training.estimate.estimator import PoseEstimator
-from training.runs.evaluate import CHANGES, judge_changes
+from training.studies.judging import CHANGES, judge_changes
 from twin.report.table import write_table
 from twin.types import Form, Frame
 

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from scenes import SpecError
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.runs.packed import pack
-from training.runs.recipes import TrainingError
 from training.runs.run import train_run
 from training.runs.run_files import read_tensors, write_tensors
 from twin.errors import FrameError

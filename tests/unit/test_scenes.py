@@ -27,6 +27,28 @@ def test_every_shipped_specification_loads():
         assert load_object(load_experiment(name).object).name
 
 
+WIDE = [name for name in list_experiments() if load_experiment(name).wide]
+
+
+@pytest.mark.parametrize("name", WIDE)
+def test_a_wide_experiment_holds_the_ranges_of_its_own(name):
+    own, wide = load_experiment(name), load_experiment(name, wide=True)
+    for label, (low, high) in own.ranges().items():
+        assert wide.ranges()[label][0] <= low and high <= wide.ranges()[label][1]
+    assert own.ranges() != wide.ranges() and (wide.object, wide.approach, wide.targets) == (own.object, own.approach, own.targets)
+    assert load_experiment(wide) == wide
+
+
+def test_the_names_of_wide_experiments_of_version_1_are_read_with_a_warning():
+    with pytest.warns(RuntimeWarning, match="'surface-2d' with `wide`"):
+        assert load_experiment("surface-2d-wide") == load_experiment("surface-2d", wide=True)
+
+
+def test_an_experiment_without_larger_ranges_says_so():
+    with pytest.raises(SpecError, match=r"drag.*\[wide\]"):
+        load_experiment("drag", wide=True)
+
+
 def test_the_recordings_ranges_are_those_of_their_experiment():
     experiment = load_experiment("surface-2d")
     moving = {label: ends for label, ends in experiment.ranges().items() if ends[0] < ends[1]}
@@ -66,6 +88,7 @@ def test_pin_counts(sensor_name, pins):
         ("experiments/surface-2d.toml", "pose_2 = [", "pose_7 = [", ["pose.pose_7", "did you mean 'pose_"]),
         ("experiments/surface-2d.toml", "[-4, 0]", "[0, -4]", ["pose_2", "lower end first"]),
         ("experiments/surface-2d.toml", "[-4, 0]", "[-4, 1]", ["1 mm inside the object"]),
+        ("experiments/surface-2d.toml", "[-4.4, 0.3]", "[-4.4, 1.3]", ["wide: the deepest tap"]),
         ("experiments/surface-2d.toml", "[0, 5, 0", "[1, 5, 0", ["tap must go along the approach, y"]),
         ("experiments/surface-2d.toml", '["pose_2", ', '["depth", ', ["depth is no label"]),
     ],

@@ -9,11 +9,11 @@ import pytest
 import torch
 from drawn_recording import config_of
 
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.vgnn import network as vgnn
 from training.runs.gaussian_process import Points, fit_two_fidelities
 from training.runs.packed import pack, shipped_names
-from training.runs.recipes import TrainingError
 from training.runs.run import train_run, write_tensors
 from training.studies.sim_to_real import inverted
 from training.studies.sim_to_real.inverted import TwinBackwards

@@ -8,15 +8,15 @@ import pytest
 
 from scenes import load_sensor
 from training.data.dataset import load_dataset
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models import recipe_of
 from training.models.part import OneFrame, Unseen
-from training.runs import train
+from training.runs.config import RunConfig
 from training.runs.packed import pack
-from training.runs.recipes import TrainingError
-from training.runs.run import RunConfig
-from training.runs.train import add_slip
+from training.runs.run_files import SLIP
 from training.studies.evaluation import evaluate_run
+from training.studies.train import add_slip
 from training.surrogate.symmetry import symmetries
 from training.touch import slip
 from training.touch.slip import (
@@ -167,7 +167,7 @@ def test_a_run_that_learnt_from_drags_remembers_them_and_its_small_copy_does(con
     assert "30 are needed to learn slip from" in add_slip(tmp_path / "run", config, parts)[0]
     for name, small in (("WAYS", 20), ("EPOCHS", 2)):
         monkeypatch.setattr(slip, name, small)
-    monkeypatch.setattr(train, "FEWEST_DRAGS", 0)
+    monkeypatch.setattr("training.studies.train.FEWEST_DRAGS", 0)
     assert add_slip(tmp_path / "run", config, parts) == []
     pack(tmp_path / "run", tmp_path / "small")
     for place in ("run", "small"):
@@ -182,7 +182,7 @@ def test_slip_of_simulated_drags_is_judged_and_said(contacts, tmp_path):
     data = load_dataset(folder, sensor, estimator.names)
     network = slip.SlipNetwork(2 * estimator.modes_of(data.pins).shape[1]).eval()
     shutil.copytree(run, tmp_path / "run")
-    write_slip(tmp_path / "run" / slip.SLIP, slip.SlipModel(network, 1.0, np.ones(network.enter.in_features // 2), 0.5, 1.0, 1.0))
+    write_slip(tmp_path / "run" / SLIP, slip.SlipModel(network, 1.0, np.ones(network.enter.in_features // 2), 0.5, 1.0, 1.0))
     found = evaluate_run(tmp_path / "run", [folder], tmp_path / "out", rows="all")
     assert found.metrics["slip"]["contacts"] == 10 and found.metrics["maps"]["states"] > 20
     assert sum("slip of 10 contacts" in line or "contact maps of" in line for line in found.lines()) == 2

@@ -9,11 +9,11 @@ from drawn_recording import config_of
 
 from scenes import load_sensor
 from training.data.label_code import LabelCode, label_error
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.steered.field import waves_of
 from training.models.steered.network import Steered, SteeredSize
 from training.runs.packed import pack
-from training.runs.recipes import TrainingError
 from training.runs.run import train_run
 from training.studies.sim_to_real.steps import model_for, put_beside
 from twin.pins import nominal_reference

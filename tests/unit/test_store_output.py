@@ -42,7 +42,7 @@ def fitted(out: Path | None, text: str = "made") -> None:
 
 
 def everything(folder: Path) -> dict[str, object]:
-    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in folder.rglob("*") if p.name != ".lock"}
+    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -143,6 +143,22 @@ def test_a_file_beside_others_is_not_lost_and_its_folder_is_free_meanwhile(tmp_p
     with output_file(tmp_path / "other.toml"), locked(tmp_path):
         pass
     fitted(None)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.light.csv", "mine.toml"], "the user's folder shows results alone"
+
+
+def test_a_file_is_written_where_the_home_takes_no_list(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
+    fitted(tmp_path / "mine.toml")
+    with pytest.raises(StoreError, match=NOT_OURS):
+        fitted(tmp_path / "mine.toml")
+
+
+def test_single_files_and_results_may_share_a_folder(tmp_path: Path) -> None:
+    fitted(tmp_path / "mine.toml")
+    work(tmp_path)
+    fitted(tmp_path / "mine.toml", "again")
+    assert work(tmp_path, "again").read_text() == "again"
+    assert written_by_us(tmp_path) == ["mine.light.csv", "mine.toml", "pictures", "table.csv"]
 
 
 def test_a_name_with_brackets_is_no_pattern(tmp_path: Path) -> None:
@@ -300,7 +316,7 @@ def test_a_failed_run_keeps_the_folder_in_which_another_will_write(tmp_path: Pat
         with pytest.raises(ValueError, match="no fit"), output_file(out / "a.toml"):
             raise ValueError("no fit")
         write_text(out / "b.toml", "fitted")
-    assert json.loads((out / WRITTEN).read_text()).keys() == {"b.toml"}
+    assert written_by_us(out) == ["b.toml"]
 
 
 def test_a_failed_run_leaves_no_empty_folder_around_a_file(tmp_path: Path) -> None:

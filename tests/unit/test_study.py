@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.runs.recipes import TrainingError
+from training.errors import TrainingError
 from training.runs.run import is_finished, train_run
 from training.studies.tac_vgnn.contacts import AreaChange, compare_graphs, recorded_contacts
 from training.studies.tac_vgnn.models import PeakMemory, measure_training, ordering, plan_run, table_row, train_all

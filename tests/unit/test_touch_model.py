@@ -7,11 +7,11 @@ import pytest
 import torch
 from drawn_recording import config_of, drawn_dataset
 
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.touch.features import Bases
 from training.models.touch.model import TOUCH
 from training.runs.gaussian_process import fit_smooth_processes
-from training.runs.recipes import TrainingError
 from training.runs.run import train_run
 
 PINS, MODES = 40, 6

@@ -13,16 +13,19 @@ from drawn_recording import FRAMES, config_of
 
 from scenes import load_sensor
 from training.data.dataset import Dataset, joined
-from training.data.identity import changed_since, learnt_before
 from training.data.pins import PinTable
-from training.estimate.estimator import PoseEstimator, digest_of, folder_of, models_by_sensor
+from training.errors import TrainingError
+from training.estimate.estimator import PoseEstimator
+from training.estimate.loading import digest_of, models_by_sensor
 from training.models import recipe_of
 from training.models.part import Prediction
-from training.runs.evaluate import judge, leak_check, rows_to_judge, write_evaluation
-from training.runs.recipes import TrainingError
-from training.runs.run import fold_rows, is_finished, train_run, training_rows
+from training.runs.config import training_rows
+from training.runs.identity import changed_since, learnt_before
+from training.runs.packed import folder_of
+from training.runs.run import fold_rows, is_finished, train_run
 from training.runs.run_files import read_tensors
 from training.studies.evaluation import Evaluation
+from training.studies.judging import judge, leak_check, rows_to_judge, write_evaluation
 from training.studies.prediction import Predictions
 from twin.errors import FrameError, warn_once
 from twin.pins import Pipeline, nominal_reference
@@ -314,7 +317,7 @@ def test_a_runs_digest_is_that_of_its_weights_and_configuration(tmp_path, monkey
         content[-1] ^= 1
         file.write_bytes(content)
         found.append(digest_of(copy))
-    monkeypatch.setattr("training.estimate.estimator.fingerprint", lambda *makers: "of another version")
+    monkeypatch.setattr("training.estimate.loading.fingerprint", lambda *makers: "of another version")
     found.append(digest_of(copy))
     assert len(set(found)) == 5  # its displacements alone change no estimate with known rest places
 

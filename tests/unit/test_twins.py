@@ -14,7 +14,7 @@ def twins():
     sensor = load_sensor("mg400-331")
     moves, contact = load_randomisation("moves"), load_randomisation("contact")
     seen = moves.model_copy(update={"friction": FrictionSpread(low=0.3, high=0.6)})
-    full = Twin("sim_only", "simulated", "sim", sensor, load_experiment("surface-2d-wide"), seen, 20)
+    full = Twin("sim_only", "simulated", "sim", sensor, load_experiment("surface-2d", wide=True), seen, 20)
     return full, {twin.name: twin for twin in without_one_ingredient(full, as_mounted(sensor), moves, contact)}
 
 

@@ -86,8 +86,7 @@ class PinTable:
         """
         if np.array_equal(self.reference.pins_px, reference.pins_px):
             return replace(self, reference=reference)
-        own, other = (rest.pins_px - rest.pins_px.mean(axis=0) for rest in (self.reference, reference))
-        nodes_px = reference.pins_px + (self.nodes_px - self.reference.pins_px) @ np.linalg.lstsq(own, other, rcond=None)[0]
+        nodes_px = reference.pins_px + (self.nodes_px - self.reference.pins_px) @ self.reference.map_to(reference)
         area_px2 = reference.area_px2 * (self.area_px2 / self.reference.area_px2)
         return replace(self, reference=reference, nodes_px=nodes_px, area_px2=area_px2)
 

@@ -18,9 +18,12 @@ from twin.frames import Recording
 from twin.frames.tables import numbers
 from twin.rig.labels import read_executed
 
+# Columns by their role in recordings of an arm that holds the sensor level: depth and angle of the surface, shear along it and turn.
+DEPTH, ANGLE = "pose_2", "pose_6"
+SHEAR, TURN = "move_1", "move_6"
 PRESETS = {
-    "surface-2d": ("pose_2", "pose_6"),
-    "surface-2d-shear": ("pose_2", "pose_6", "move_1", "move_6"),
+    "surface-2d": (DEPTH, ANGLE),
+    "surface-2d-shear": (DEPTH, ANGLE, SHEAR, TURN),
     "surface-3d": ("pose_3", "pose_4", "pose_5"),
     "edge-2d": ("pose_1", "pose_6"),
     "edge-3d": ("pose_1", "pose_3", "pose_6"),
@@ -146,10 +149,10 @@ def choose_targets(
             f"choose columns of these, or one of {', '.join((*PRESETS, CONTACT))}"
         )
     raw = np.column_stack([_numbers(recording.labels[name], name, problems) for name in names])[rows]
-    both = all(name in recording.labels for name in ("move_1", "move_6"))
+    both = all(name in recording.labels for name in (SHEAR, TURN))
     move = np.full((len(rows), 2), np.nan)
     if both:
-        move = np.column_stack([_numbers(recording.labels[name], name, []) for name in ("move_1", "move_6")])[rows]
+        move = np.column_stack([_numbers(recording.labels[name], name, []) for name in (SHEAR, TURN)])[rows]
     executed = np.full(len(rows), np.nan)
     known = read_executed(recording.path, [recording.names[row] for row in rows], problems) if both else {}
     if known:
@@ -159,7 +162,7 @@ def choose_targets(
     undone = 1.0 - np.where(np.isnan(executed), 1.0, executed)
     for k, name in enumerate(names):  # further labels, which published recordings lack: subtract a move that was not executed from each
         made = f"move_{name.removeprefix('pose_')}"
-        if name.startswith("pose_") and name != "pose_6" and made in recording.labels:
+        if name.startswith("pose_") and name != ANGLE and made in recording.labels:
             right[:, k] -= undone * np.nan_to_num(_numbers(recording.labels[made], made, [])[rows])
     return Targets(names, raw, right, executed, move)
 
@@ -195,11 +198,11 @@ def corrected(
     undone = 1.0 - np.where(np.isnan(executed), 1.0, executed)
     out = raw.copy()
     for k, name in enumerate(names):
-        if name == "pose_6":
+        if name == ANGLE:
             out[:, k] -= undone * np.nan_to_num(move[:, 1])
-        elif name == "pose_2":
+        elif name == DEPTH:
             out[:, k] += depth_per_move * (undone * np.nan_to_num(move[:, 0]) - x_mm)
-        elif name in ("move_1", "move_6"):
+        elif name in (SHEAR, TURN):
             out[:, k] *= 1 - undone
     return out
 

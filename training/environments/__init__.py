@@ -6,10 +6,10 @@ Neither imports the tasks themselves.
 
 from typing import Any
 
-try:
+from twin.errors import extras_named
+
+with extras_named():
     import gymnasium
-except ImportError as error:  # gymnasium is an optional dependency: the rest of the package works without it
-    raise ImportError("the environments need gymnasium: pip install 'tactip-twin[gym]'") from error
 
 from gymnasium.envs.registration import register, registry
 

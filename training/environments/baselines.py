@@ -34,8 +34,8 @@ class BaselinesVecEnv(VecEnv):
             raise OptionError(
                 f"{inner!r} is no vector of this program's environments; give gymnasium.make_vec('twin:tactip/EdgeFollow-v0')"
             )
-        self._actions: FloatArray = np.zeros(0)
         self.vector = inner
+        self._actions: FloatArray = np.zeros(0)
         self.vector.metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
         super().__init__(inner.num_envs, self.seen_space(), inner.single_action_space)
 

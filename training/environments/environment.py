@@ -132,7 +132,6 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         assert contact is not None, "reset first"
         if self._page is None:
             self._page = EpisodePage(f"TacTip episode: {self.spec.id if self.spec else batch.sensor.name}", batch.sensor, frame.form)
-            self._page.__enter__()
             print(f"open {self._page.url} in a browser: it shows the episode", file=sys.stderr, flush=True)
         T = batch.tool.seen(batch.T_work, batch.T_object)[0]
         place_mm, felt = batch.touch().place_mm[0], batch.backend.felt

@@ -23,6 +23,7 @@ from training.environments.baselines import BaselinesVecEnv
 from training.environments.batch import Options, require_task, require_whole
 from training.environments.environment import TactileVectorEnv
 from training.environments.observe import Pictures
+from training.environments.policy_domain import with_domain
 from twin.errors import OptionError
 from twin.policy import Policy, flattened
 from twin.progress import Progress, Step, silent, stage
@@ -188,6 +189,7 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
         ppo.learn(10**9, callback=watch)
     used_s = time.process_time() - used_s
     made = replace(blank, layers=_layers_of([*ppo.policy.mlp_extractor.policy_net, ppo.policy.action_net]))
+    made = with_domain(made, vector, seed=plan.seed)
     written = [out / "policy.safetensors", out / "learning.csv", out / "learning.png", out / "result.json"]
     made.save(written[0])  # saved before it is judged, because judging takes long and may be interrupted
     _write_curve(watch.curve, written[1], written[2])

@@ -18,11 +18,11 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from training.data.dataset import Dataset
 from training.data.pins import PinTable
+from training.errors import TrainingError
 from training.estimate.contacts import CONTACTS, Contacts, fit_contacts, read_contacts, write_contacts
-from training.estimate.estimator import PoseEstimate, PoseEstimator, folder_of
+from training.estimate.estimator import PoseEstimate, PoseEstimator
 from training.models.part import Prediction, Unseen
-from training.runs.packed import pack
-from training.runs.recipes import TrainingError
+from training.runs.packed import folder_of, pack
 from training.runs.run_files import damaged
 from twin.camera.capture import in_form
 from twin.frames import Recording
@@ -118,12 +118,9 @@ class ContactEstimator:
     def at_rest_of(self, frames: Iterable[Frame]) -> tuple["ContactEstimator", bool]:
         """As for ``PoseEstimator``."""
         nodes_px = self._any.at_known_rest().nodes_in(frames)
-        best = max(self.parts.values(), key=lambda part: part.usual_share(nodes_px))
-        found, other = best.told_rest(nodes_px)
-        rest = found.pipeline.reference if other else None
-        undecided = best.require_view_of_contacts(nodes_px, rest, "these contacts")
-        counted = {name: part.at_known_rest() if rest is None else part.counted_from(rest) for name, part in self.parts.items()}
-        return self._with({name: part.noting(undecided) for name, part in counted.items()}), other
+        best = max(self.parts.values(), key=lambda part: part.rest.usual_share(nodes_px))
+        rest, undecided = best.rest.of_contacts(nodes_px, "these contacts")
+        return self._with({name: part.counted_from_told(rest).noting(undecided) for name, part in self.parts.items()}), rest is not None
 
     def _with(self, parts: dict[str, PoseEstimator]) -> "ContactEstimator":
         found = copy(self)
@@ -203,7 +200,7 @@ class KindOfContact:
     frames : sequence of Dataset
         Frames of this kind, from which the classifier learns. Give the frames from which the run learnt.
     intervals : dict of str to array
-        The run's interval quantiles for this kind, from frames that it did not learn from (``training.runs.evaluate.intervals_on``). If
+        The run's interval quantiles for this kind, from frames that it did not learn from (``training.studies.judging.intervals_on``). If
         empty, the run's own intervals are used.
     """
 

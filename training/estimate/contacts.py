@@ -14,7 +14,7 @@ from torch import nn
 
 from training.data.dataset import Dataset
 from training.data.pins import PinTable
-from training.runs.recipes import TrainingError
+from training.errors import TrainingError
 from training.runs.run_files import AGAIN
 from twin.store import ArrayFile, Layers, layers_from, layers_to
 

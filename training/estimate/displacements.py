@@ -16,13 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from training.runs.recipes import TrainingError
+from training.errors import TrainingError
 from training.runs.run_files import AGAIN
 from twin.frames import spread
 from twin.pins import Reference
 from twin.store import ArrayFile
 
-DISPLACEMENTS = "displacements.safetensors"
 """File of a run with its model of displacements."""
 FILE = ArrayFile("file of displacements", "twin train", version=1, error=TrainingError, again=AGAIN)
 LEADING, MODES, DEGREE = 6, 40, 3

@@ -9,8 +9,8 @@ left out of the fit:
 - misfit: rms difference between the further components and those that a polynomial of the leading ones predicts (a pattern that is
   possible, but that no contact makes);
 - beyond: distance of the leading components from the nearest training frame (a contact deeper, or of another kind, than any);
-- halves: difference between the components that follow from the upper and from the lower half of the pins (a torn frame, or two frames
-  in one picture), less what a polynomial of the leading components predicts;
+- parts: difference between the components that follow from a part of the pins (upper quarter, half, three quarters, left half) and from the
+  others (a torn frame, or two frames in one picture), less what a polynomial of the leading components predicts; of the four the largest;
 - camera: difference between the camera's motions and those that the contact itself causes, by the same polynomial.
 
 The lightest contacts of a training set may be far from the frame at rest. So that lighter ones are no strangers, training frames are also
@@ -19,25 +19,26 @@ difference from the nearest frame whose label is known, by the rate at which lab
 where the others make them most probable, and what is not known of them counts as such a difference, too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from training.data.label_code import HALF_CIRCLE_DEG, label_error
+from training.errors import TrainingError
 from training.models.vgnn.registration import align
-from training.runs.recipes import TrainingError
 from training.runs.run_files import AGAIN
 from twin.frames import spread
 from twin.pins import Reference
 from twin.store import ArrayFile
 from twin.types import BoolArray, FloatArray
 
-DOMAIN = "domain.safetensors"
 """File of a run with its domain."""
-FILE = ArrayFile("file of a domain", "twin train", version=2, error=TrainingError, again=AGAIN)
+FILE = ArrayFile("file of a domain", "twin train", version=3, error=TrainingError, again=AGAIN)
 MODES, LEADING, CUBED = 60, 12, 6
 """Number of principal components, of leading ones, and of those whose products of three are terms of the polynomial."""
 FEWEST = 60
@@ -55,7 +56,11 @@ FOLDS = 5
 ALLOWED = 0.005
 """Share of left-out training frames beyond each limit."""
 WHITE = 1e-3
-"""Share of the variance of the halves' differences that counts as noise."""
+"""Share of the variance of the parts' differences that counts as noise."""
+PARTS = ((1, 0.5), (1, 0.25), (1, 0.75), (0, 0.5))
+"""Axis across which the pins are parted (0: x, 1: y), and the share of the pins in the first part. All components are compared for the
+first one, ``COMPARED`` for the others."""
+COMPARED = 20
 RIDGE = 1e-3
 """Penalty of the polynomial's coefficients, per frame, for components of standard deviation 1."""
 LEAST_DEVIATION = 1e-4
@@ -68,7 +73,7 @@ FARTHEST = 50.0
 SHIFT, TURN_DEG, SCALE = 0.02, 0.1, 0.002
 """Least limits of the camera's motions: shift in spacings, turn, change of scale."""
 EVEN = 1.5
-"""Limit of the halves for training frames of one kind. Frames of many kinds have rare ones that are farther off, and contacts that are not
+"""Limit of the parts for training frames of one kind. Frames of many kinds have rare ones that are farther off, and contacts that are not
 among them are farther still; their limit is up to 1.3 times as large. Two frames in one picture lie at 2 and more, or at 6 and more."""
 USUAL_DISTANCE = 0.995
 """Share of left-out training frames whose distance to the nearest known one counts as usual."""
@@ -77,7 +82,7 @@ NEIGHBOURS = 10
 SURE_RATE = 0.9
 """Share of pairs of neighbouring frames whose labels differ by at most the rate."""
 REFUSED = np.array([2.0, 2.0, 2.0, 1.0])
-"""Distances outside, misfit, beyond and halves, in limits, above which a frame gets no estimate. Between 1 and this the intervals grow."""
+"""Distances outside, misfit, beyond and parts, in limits, above which a frame gets no estimate. Between 1 and this the intervals grow."""
 GROWS = 2.0
 """Growth of the intervals for each limit of distance beyond the first."""
 CORRECTED = np.array([0.6, 0.6, np.radians(3.0), 0.05])
@@ -112,12 +117,14 @@ class Strangeness:
     Attributes
     ----------
     parts : (5,) float
-        The distances outside, misfit, beyond, halves and camera (see the module), each divided by its limit.
+        The distances outside, misfit, beyond, parts and camera (see the module), each divided by its limit.
     camera : (4,) float
         Difference of the camera: shift in x and y (spacings), turn (rad, from x towards y), relative change of scale.
     unknown : float
         Rms difference of a coordinate, in spacings, from the nearest frame with a known label, less the usual one; 0 for usual frames. What
         is not known of lost pins is added.
+    uneven : (4,) float
+        Differences between each of ``PARTS`` and the others, before they are divided by their limits.
     ample : float
         Rms size of the leading components, in standard deviations, at least 1. What no model of contacts explains grows with it.
     """
@@ -125,6 +132,7 @@ class Strangeness:
     parts: np.ndarray
     camera: np.ndarray
     unknown: float
+    uneven: np.ndarray
     ample: float
 
     @property
@@ -171,17 +179,17 @@ class Domain:
         Orthonormal, and orthogonal to the motions.
     deviation : (D,) float
         Standard deviations of the components.
-    weight : (T, D - L + 4 + D) float
-        Coefficients from the polynomial's terms in the L leading components to the further ones, to the camera's motions, and to the
-        differences of the halves.
-    whiten : (D, D) float
-        Inverse square root of the covariance of the differences of the halves.
+    weight : (T, D - L + 4 + P) float
+        Coefficients from the polynomial's terms in the L leading components to the further ones, to the camera's motions, and to the P
+        differences of parts.
+    whiten : (P, P) float
+        Inverse square roots of the covariances of each part's differences, on the diagonal.
     usual : (D - L,) float
         Root mean square of the polynomial's residual in the further components.
     known : (n, L) float
         Leading components of training frames with labels, then ``lighter`` ones.
-    limits : (8,) float
-        Limits of outside, misfit, beyond and halves, and of the camera's motions.
+    limits : (3 + 4 + 4,) float
+        Limits of outside, misfit and beyond, of each of ``PARTS``, and of the camera's motions.
     rate : (K,) float
         Rate of each label: change for each spacing of rms difference between frames.
     least : (K,) float
@@ -217,7 +225,8 @@ class Domain:
     simulated: bool = False
     _project: np.ndarray = field(init=False, repr=False, compare=False)
     _modes: np.ndarray = field(init=False, repr=False, compare=False)
-    _halves: np.ndarray = field(init=False, repr=False, compare=False)
+    _apart: np.ndarray = field(init=False, repr=False, compare=False)
+    _sizes: np.ndarray = field(init=False, repr=False, compare=False)
     _near: "tuple[_Nearest, _Nearest]" = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -226,7 +235,8 @@ class Domain:
         for name, value in (
             ("_project", np.concatenate([camera, self.components / self.deviation[:, None]]).T.copy()),
             ("_modes", np.concatenate([self.motions, modes])),
-            ("_halves", _halves(self.motions, modes)),
+            ("_apart", _apart(self.motions, modes)),
+            ("_sizes", _sizes(len(modes))),
             ("_near", (_Nearest(self.known), _Nearest(self.known[:labelled] * lead))),
         ):
             object.__setattr__(self, name, value)
@@ -283,7 +293,7 @@ class Domain:
         found = [self(each) for each in moved]
         motions = np.median([each.camera for each in found], axis=0)
         usual = float(np.mean([(each.parts[:4] <= USUAL).all() for each in found]))
-        return np.where((np.abs(motions) > self.limits[4:]).any(), motions, 0.0), usual
+        return np.where((np.abs(motions) > self.limits[7:]).any(), motions, 0.0), usual
 
     def without_camera(self, nodes_px: FloatArray, area_px2: FloatArray, camera: FloatArray, spacing_px: float) -> tuple:
         """Pins (N, 2) and areas (N,) without motions (4,) of the camera."""
@@ -393,18 +403,19 @@ class Domain:
         ample = max(float(first @ first / lead) ** 0.5, 1.0)  # what is left grows with the contact
         expected = _terms(first) @ self.weight
         ends = len(a) - lead, len(a) - lead + 4
-        further, of_camera, of_halves = expected[: ends[0]], expected[ends[0] : ends[1]], expected[ends[1] :]
+        further, of_camera, of_parts = expected[: ends[0]], expected[ends[0] : ends[1]], expected[ends[1] :]
         camera = camera - of_camera
         wrong = (a[lead:] - further) / self.usual
-        apart = self.whiten @ ((away - seen[:4] @ self.motions) @ self._halves - of_halves)
-        halves = float(apart @ apart / len(apart)) ** 0.5 / ample
+        apart = self.whiten @ ((away - seen[:4] @ self.motions) @ self._apart - of_parts)
+        square = np.add.reduceat(apart * apart, np.cumsum(self._sizes) - self._sizes)
+        uneven = np.sqrt(square / self._sizes) / ample
         misfit = float(wrong @ wrong / max(len(wrong), 1)) ** 0.5 / ample
         outside = float(left @ left / len(flat)) ** 0.5 / ample
-        moved_by = float((np.abs(camera) / self.limits[4:]).max()) / ample
-        parts = np.array([outside, misfit, self._near[0](first), halves, moved_by])
-        parts[:4] /= self.limits[:4]
+        moved_by = float((np.abs(camera) / self.limits[7:]).max()) / ample
+        parts = np.array([outside, misfit, self._near[0](first), (uneven / self.limits[3:7]).max(), moved_by])
+        parts[:3] /= self.limits[:3]
         unknown = self._near[1](first * self.deviation[:lead]) / len(flat) ** 0.5 - self.near
-        return Strangeness(parts, camera, max(unknown, 0.0), ample)
+        return Strangeness(parts, camera, max(unknown, 0.0), uneven, ample)
 
     def filled(self, moved: FloatArray, lost: BoolArray) -> tuple[FloatArray, float]:
         """Displacements (N, 2) in which ``lost`` pins are the most probable ones, and the rms of what is not known of all coordinates."""
@@ -493,15 +504,15 @@ def learn_domain(
     flat = moved.reshape(len(moved), -1)
     part = rng.permutation(np.arange(len(names)) % FOLDS)[of_row.ravel()]
     motions = _motions(reference)
-    measures = np.full((len(flat), 9), np.nan)
+    measures = np.full((len(flat), 12), np.nan)
     for fold in range(FOLDS):
         here = part == fold
         one = _fit(flat[~here], labelled[~here], motions, rng)
-        measures[here] = [[*found.parts[:4], *found.usual_camera, found.unknown] for found in map(one, moved[here])]
+        measures[here] = [[*found.parts[:3], *found.uneven, *found.usual_camera, found.unknown] for found in map(one, moved[here])]
     fitted = _fit(flat, labelled, motions, rng)
-    limits = np.quantile(measures[:, :8], 1 - ALLOWED, axis=0)
-    limits[3] *= np.clip(limits[3] / EVEN, 1.0, 1.3)
-    floors = np.array([OUTSIDE, 1.0, 1.0, 1.0, SHIFT, SHIFT, np.radians(TURN_DEG), SCALE])
+    limits = np.quantile(measures[:, :-1], 1 - ALLOWED, axis=0)
+    limits[3:7] *= np.clip(limits[3:7] / EVEN, 1.0, 1.3)
+    floors = np.array([OUTSIDE, *[1.0] * 6, SHIFT, SHIFT, np.radians(TURN_DEG), SCALE])
     blind = [0.0]
     if lost is not None:
         rows = spread(len(moved), LOST_FRAMES)
@@ -510,7 +521,7 @@ def learn_domain(
     return replace(
         fitted,
         limits=np.maximum(limits, floors),
-        near=float(np.quantile(measures[labelled, 8], USUAL_DISTANCE)),
+        near=float(np.quantile(measures[labelled, -1], USUAL_DISTANCE)),
         rate=_rates(fitted, flat[labelled], labels[labelled], units, rng),
         least=least,
         low=low,
@@ -538,21 +549,20 @@ def _fit(flat: np.ndarray, labelled: np.ndarray, motions: np.ndarray, rng: np.ra
     a = (rest @ components.T) / deviation
     lead = next((n for n in range(min(LEADING, len(deviation)), 1, -1) if _terms(np.zeros((1, n))).shape[1] * PER_TERM <= len(every)), 1)
     terms = _terms(a[:, :lead])
-    halves = rest @ _halves(motions, components * deviation[:, None])
-    wanted = np.concatenate([a[:, lead:], (every - mean) @ camera, halves], axis=1)
+    apart = rest @ _apart(motions, components * deviation[:, None])
+    wanted = np.concatenate([a[:, lead:], (every - mean) @ camera, apart], axis=1)
     weight = np.linalg.solve(terms.T @ terms + RIDGE * len(terms) * np.eye(terms.shape[1]), terms.T @ wanted)
     left = wanted - terms @ weight
     further = len(deviation) - lead
     usual = np.maximum(np.sqrt((left[:, :further] ** 2).mean(axis=0)), NOISE / deviation[lead:])
-    square = np.atleast_2d(np.cov(left[:, further + 4 :].T))
-    whiten = np.linalg.inv(np.linalg.cholesky(square + WHITE * np.diag(np.diag(square)) + 1e-12 * np.eye(len(square))))
+    whiten = block_diag(*map(_whitening, np.split(left[:, further + 4 :], np.cumsum(_sizes(len(deviation)))[:-1], axis=1)))
     rows = np.flatnonzero(labelled)
     rows = np.sort(rng.permutation(rows)[:KNOWN])
     dim = np.sort(rng.permutation(np.concatenate([np.flatnonzero(~labelled), np.arange(len(flat), len(every))]))[: KNOWN // 2])
     known = np.concatenate([a[rows, :lead], a[dim, :lead], (-mean @ components.T / deviation)[None, :lead]])
     none = np.zeros(0)
     return Domain(
-        motions, mean, components, deviation, weight, whiten, usual, known, np.ones(8), none, none, none, none, len(dim) + 1, 0.0, 0.0
+        motions, mean, components, deviation, weight, whiten, usual, known, np.ones(11), none, none, none, none, len(dim) + 1, 0.0, 0.0
     )
 
 
@@ -569,18 +579,33 @@ def _motions(reference: Reference) -> np.ndarray:
     return np.stack([np.column_stack(pair).ravel() for pair in ((one, none), (none, one), (-y, x), (x, y))])
 
 
-def _halves(motions: np.ndarray, modes: np.ndarray) -> np.ndarray:
-    """Map (2N, D) from displacements to the difference of the D components, in standard deviations, by the upper and by the lower pins.
+def _sizes(components: int) -> np.ndarray:
+    """Number of components that are compared for each of ``PARTS``, of so many."""
+    return np.array([components, *[min(COMPARED, components)] * (len(PARTS) - 1)])
 
-    The halves are those of the pins at rest; by each, the components are the most probable ones with the noise ``NOISE``.
+
+def _apart(motions: np.ndarray, modes: np.ndarray) -> np.ndarray:
+    """Map (2N, P) from displacements to the differences of the components, in standard deviations, by each of ``PARTS`` and by the others.
+
+    Parts are those of the pins at rest; by each, the components are the most probable ones with the noise ``NOISE``.
     """
-    y = motions[2, 0::2]  # a turn moves a pin along x by -y
-    upper = np.repeat(y >= np.median(y), 2)
-    found = np.zeros((len(upper), len(modes)))
-    for half, sign in ((upper, 1.0), (~upper, -1.0)):
-        part = modes[:, half]
-        found[half] = sign * np.linalg.solve(part @ part.T + NOISE**2 * np.eye(len(part)), part).T
-    return found
+    at = (motions[3, 0::2], -motions[2, 0::2])  # a scale moves a pin along x by x, a turn by -y
+    found = []
+    for (axis, share), size in zip(PARTS, _sizes(len(modes)), strict=True):
+        first = np.repeat(at[axis] <= np.quantile(at[axis], share), 2)
+        map_ = np.zeros((len(first), size))
+        for half, sign in ((first, -1.0), (~first, 1.0)):
+            part = modes[:, half]
+            map_[half] = sign * np.linalg.solve(part @ part.T + NOISE**2 * np.eye(len(part)), part).T[:, :size]
+        found.append(map_)
+    return np.concatenate(found, axis=1)
+
+
+def _whitening(left: np.ndarray) -> np.ndarray:
+    """Inverse square root (D, D) of the covariance of differences (M, D)."""
+    square = np.atleast_2d(np.cov(left.T))
+    white: np.ndarray = np.linalg.inv(np.linalg.cholesky(square + WHITE * np.diag(np.diag(square)) + 1e-12 * np.eye(len(square))))
+    return white
 
 
 def _aligned(moved: FloatArray, reference: Reference) -> FloatArray:
@@ -601,12 +626,37 @@ def _rates(found: Domain, flat: np.ndarray, labels: np.ndarray, units: Sequence[
     return np.quantile(change / np.maximum(apart[i, j], 1e-9)[:, None], SURE_RATE, axis=0)
 
 
-def write_domain(path: Path, domain: Domain) -> None:
-    """Write a domain in the form that ``read_domain`` reads; components and known frames in half precision."""
+def domain_arrays(domain: Domain) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """A domain as arrays and numbers for a file; components and known frames in half precision."""
     arrays = {each.name: getattr(domain, each.name) for each in fields(Domain) if each.init}
     about = {name: arrays.pop(name) for name in ("lighter", "near", "blind", "simulated")}
     half = ("components", "known", "weight", "whiten")
-    FILE.write(path, {key: array.astype(np.float16 if key in half else np.float32) for key, array in arrays.items()}, about)
+    return {key: array.astype(np.float16 if key in half else np.float32) for key, array in arrays.items()}, about
+
+
+def domain_of(arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], pins: int, labels: int) -> Domain:
+    """The domain that ``domain_arrays`` turned into arrays, of a model for so many ``pins`` and ``labels``.
+
+    Raises
+    ------
+    ValueError
+        It belongs to other pins or labels.
+    """
+    found = Domain(
+        **{name: array.astype(float) for name, array in arrays.items()},
+        lighter=int(about["lighter"]),
+        near=float(about["near"]),
+        blind=float(about["blind"]),
+        simulated=bool(about.get("simulated", False)),
+    )
+    if found.mean.shape != (2 * pins,) or found.rate.shape != (labels,):
+        raise ValueError("of other pins or labels")
+    return found
+
+
+def write_domain(path: Path, domain: Domain) -> None:
+    """Write a domain in the form that ``read_domain`` reads."""
+    FILE.write(path, *domain_arrays(domain))
 
 
 def read_domain(path: Path, pins: int, labels: int) -> Domain:
@@ -618,13 +668,4 @@ def read_domain(path: Path, pins: int, labels: int) -> Domain:
         The file can't be read, is damaged, or belongs to another sensor or model.
     """
     with FILE.opened(path) as (about, arrays):
-        found = Domain(
-            **{name: array.astype(float) for name, array in arrays.items()},
-            lighter=int(about["lighter"]),
-            near=float(about["near"]),
-            blind=float(about["blind"]),
-            simulated=bool(about.get("simulated", False)),
-        )
-        if found.mean.shape != (2 * pins,) or found.rate.shape != (labels,):
-            raise ValueError("of other pins or labels")
-        return found
+        return domain_of(arrays, about, pins, labels)

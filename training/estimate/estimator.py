@@ -1,10 +1,8 @@
 """A trained model with its sensor and pipeline: it estimates the pose in a frame. A live loop calls it."""
 
-import hashlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
@@ -16,46 +14,42 @@ from scenes.sensor import SensorSpec
 from training.data.dataset import Dataset
 from training.data.pins import PinTable
 from training.data.targets import limits_of
-from training.estimate.displacements import DISPLACEMENTS, MOST_CONTACTS, Displacements, other_rest, read_displacements
-from training.estimate.domain import DOMAIN, FEWEST, Domain, Verdict, read_domain
+from training.errors import TrainingError
+from training.estimate.displacements import Displacements, read_displacements
+from training.estimate.domain import Domain, Verdict, read_domain
+from training.estimate.rest import RestPlaces
 from training.estimate.rest_seeking import RestSeeker
+from training.estimate.widening import Widening
 from training.models import model_named
 from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen
 from training.runs.assemble import Ensemble
-from training.runs.packed import SHIPPED, WEIGHTS, shipped_names, unpack
-from training.runs.recipes import TrainingError
-from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, require_together
-from training.touch.contact_maps import MAPS, MapModel, read_maps
+from training.runs.packed import WEIGHTS, folder_of, instead_of, unpack
+from training.runs.run_files import (
+    CHECKPOINT,
+    CONFIG,
+    DISPLACEMENTS,
+    DOMAIN,
+    MAPS,
+    SLIP,
+    TENSORS,
+    damaged,
+    read_config,
+    read_tensors,
+    require_together,
+)
+from training.touch.contact_maps import MapModel, read_maps
 from training.touch.slip import NAMES as SLIP_NAMES
-from training.touch.slip import SLIP, SLIP_UNITS, Slip, SlipModel, SlipTracker, read_slip
+from training.touch.slip import SLIP_UNITS, Slip, SlipModel, SlipTracker, read_slip
 from training.touch.touched import TouchAnswer
 from twin.errors import FrameError
 from twin.estimate import SensorModel
-from twin.frames import spread
 from twin.frames.forms import blob_spec, form_named
 from twin.mechanics.skin_map import ContactMaps
-from twin.pins import Pipeline, Reference, View, make_reference, measure_reference, view_of
-from twin.pins.view import camera_modes
-from twin.store import fingerprint
+from twin.pins import Pipeline, Reference, make_reference
 from twin.types import Form, Frame, Observation
 
-LOST_USUAL = 0.02
-"""Share of lost pins in usual frames."""
-LOST_WIDENS = 2.0
-"""Growth of the intervals with the share of lost pins. With a hidden patch of 15 or 30 % of the pins, errors of depth in the twin grow by a
-factor of 1.2 or 1.6."""
 USUAL_FRAME = Verdict("")
 """Verdict on a frame about which nothing strange is known."""
-FEWEST_VIEWED = 8
-ASSUMED_RADIUS, ASSUMED_MM, ASSUMED_DEG = 0.1, 0.015, 1.0
-"""Half widths for what a specification only assumes: share of a length, because all lengths are proportional to the radius; share of the
-radius; and angle. Simulated taps on a plate with a skin thinner by 0.3 or thicker by 0.4 mm, or a gel 2.5 times softer or stiffer, come out
-0.11 to 0.21 mm and 0.1 to 0.35 deg off (radius 20 mm)."""
-MOST_USUAL = 0.6
-"""Least share of contacts that must be usual but for a motion of the camera, for this motion to be estimated from them."""
-"""Least number of contacts whose median pins show the camera's view."""
-SIMULATED_FORCES = ("force_x", "force_y", "force_z", "torque_z")
-"""Labels that are proportional to the stiffness of the simulated sensor."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +107,7 @@ class PoseEstimator:
     Attributes
     ----------
     learnt_from : (m, 2) int64 or None
-        Marks of the frames from which the model learnt (``training.data.identity.frame_marks``); None if the run does not hold them.
+        Marks of the frames from which the model learnt (``training.runs.identity.frame_marks``); None if the run does not hold them.
     maps : MapModel or None
         Model of contact maps; None unless the run learnt it.
     slip : SlipModel or None
@@ -168,7 +162,7 @@ class PoseEstimator:
         run = folder_of(run)
         packed = (run / WEIGHTS).is_file()
         if not packed and not (run / TENSORS).is_file():
-            hint = "it was begun and not finished; continue it with 'twin train'" if (run / CHECKPOINT).is_file() else _instead_of(run)
+            hint = "it was begun and not finished; continue it with 'twin train'" if (run / CHECKPOINT).is_file() else instead_of(run)
             raise TrainingError(f"{run}: holds no trained model: {hint}")
         config = read_config(run)
         try:
@@ -209,54 +203,19 @@ class PoseEstimator:
         """
         if not self.counts_from_rest:
             raise FrameError(f"a no-contact frame serves only a model that counts pins from rest, {self.model} does not; leave it out")
-        reference = measure_reference(self.sensor, self.form, frame, known=self._known_rest)
-        view = self.require_view(reference.pins_px, frame.name or "frame")
-        found = self.counted_from(reference)
-        found._trained = replace(found._trained, touched=TouchAnswer(reference))
-        return found.noting(view.undecided())
+        reference, undecided = self.rest.measured(frame)
+        return self.counted_from(reference, measured=True).noting(undecided)
+
+    @property
+    def rest(self) -> RestPlaces:
+        """The pins at rest, and how they are found."""
+        return RestPlaces(self.sensor, self.form, self._known_rest, self.displacements, self.domain, self.counts_from_rest)
 
     @cached_property
     def _known_rest(self) -> Reference:
         """The pins at rest of the unit from which the weights were learnt."""
         known = self._known_rest_px
         return self._trained.reference if known is None else make_reference(known, self.sensor.pins)
-
-    def require_view_of_contacts(self, nodes_px: np.ndarray, rest: Reference | None, name: str) -> str:
-        """As ``require_view``, from the pins (M, N, 2) of contacts, and from the places at ``rest`` that were estimated from them.
-
-        Returns
-        -------
-        str
-            What these places do not decide about the view; "" if nothing.
-        """
-        if len(nodes_px) >= FEWEST_VIEWED:
-            self.require_view(np.median(nodes_px, axis=0), name, contacts=True)
-            motions, usual = self._common_camera(rest or self._known_rest, nodes_px)
-            if usual < MOST_USUAL and (rest is not None or motions.any()):
-                raise FrameError(
-                    f"{name}: {1 - usual:.0%} of them are no contacts that the weights of {self.sensor.name} know, and the camera is "
-                    "displaced: its picture may be turned, mirrored or stretched; give a frame without contact (init_0.png beside the "
-                    "frames, --no-contact FRAME)"
-                )
-        view = None if rest is None else self.require_view(rest.pins_px, name)
-        if view is not None and view.pressed:
-            raise FrameError(
-                f"{name}: no pins at rest of {self.sensor.name} explain them: the camera's picture may be turned or mirrored, or they are "
-                "of a kind that the weights do not know; give a frame without contact (init_0.png beside the frames, --no-contact FRAME)"
-            )
-        return "" if view is None else view.undecided()
-
-    def require_view(self, pins_px: np.ndarray, name: str, *, contacts: bool = False) -> View:
-        """The camera's view of pins at rest (N, 2), or of the median of ``contacts``, against the unit of the weights.
-
-        Raises
-        ------
-        FrameError
-            The picture ``name`` is displaced so far that estimates would be wrong.
-        """
-        view = view_of(pins_px, self._known_rest, self.sensor.pins, camera_modes(self.sensor, self.form))
-        view.require_small(name, f"the unit that the weights of {self.sensor.name} are for", contacts=contacts)
-        return view
 
     def remembering(self) -> "PoseEstimator":
         """The model for consecutive frames, which remembers earlier frames; the model itself if the run did not learn slip.
@@ -287,64 +246,33 @@ class PoseEstimator:
 
     def at_known_rest(self) -> "PoseEstimator":
         """The same model for frames without a no-contact frame, taken by the unit from which its weights were learnt."""
-        if self._known_rest_px is None:
-            return self
-        found = self.counted_from(self._known_rest)
-        found._trained = replace(found._trained, touched=TouchAnswer(found.pipeline.reference))
-        return found
-
-    def other_rest(self, start: Reference, nodes_px: np.ndarray) -> Reference | None:
-        """The rest layout estimated from contacts with pins (M, N, 2), if it differs from ``start``, the assumed one.
-
-        None if the difference is not significant, if there are fewer contacts than ``training.estimate.displacements.FEWEST_CONTACTS`` (8
-        for the place of the camera alone), or if the run did not learn how contacts displace the pins.
-        """
-        if not self.counts_from_rest:
-            return None
-        found = other_rest(self.displacements, start, nodes_px)
-        if found is None and self.domain is not None:
-            motions, usual = self._common_camera(start, nodes_px)
-            if motions.any() and usual >= MOST_USUAL:
-                found = start.pins_px + start.spacing_px.mean() * (motions @ self.domain.motions).reshape(-1, 2)
-        return None if found is None else make_reference(found, self.sensor.pins)
-
-    def _common_camera(self, start: Reference, nodes_px: np.ndarray) -> tuple[np.ndarray, float]:
-        """``Domain.common_camera`` of contacts (M, N, 2), px, with the pins at rest ``start``; no motion for few contacts or no domain."""
-        whole = nodes_px[np.isfinite(nodes_px).all(axis=(1, 2))]
-        if self.domain is None or len(whole) < FEWEST_VIEWED:
-            return np.zeros(4), 1.0
-        whole = whole[spread(len(whole), MOST_CONTACTS)]
-        return self.domain.common_camera((whole - start.pins_px) / start.spacing_px.mean())
+        return self if self._known_rest_px is None else self.counted_from(self._known_rest, measured=True)
 
     def at_rest_of(self, frames: Iterable[Frame]) -> tuple["PoseEstimator", bool]:
         """The model for the sensor that took ``frames`` of contacts, none of them without contact, and whether the sensor is another unit.
 
-        The rest places are those measured on the unit of the weights, unless the contacts show others: see ``other_rest``.
+        The rest places are those measured on the unit of the weights, unless the contacts show others: see ``RestPlaces.other``.
 
         Raises
         ------
         FrameError
             The camera's picture is displaced so far that estimates would be wrong.
         """
-        nodes_px = self.at_known_rest().nodes_in(frames)
-        found, other = self.told_rest(nodes_px)
-        undecided = self.require_view_of_contacts(nodes_px, found.pipeline.reference if other else None, "these contacts")
-        return found.noting(undecided), other
+        return self.told_rest(self.at_known_rest().nodes_in(frames), "these contacts")
+
+    def told_rest(self, nodes_px: np.ndarray, name: str) -> tuple["PoseEstimator", bool]:
+        """As ``at_rest_of``, from the pins (M, N, 2), px, of contacts; errors call them ``name``."""
+        rest, undecided = self.rest.of_contacts(nodes_px, name)
+        return self.counted_from_told(rest).noting(undecided), rest is not None
+
+    def counted_from_told(self, rest: Reference | None) -> "PoseEstimator":
+        """The same model with the rest places that contacts told, or with the known ones."""
+        return self.at_known_rest() if rest is None else self.counted_from(rest)
 
     def nodes_in(self, frames: Iterable[Frame]) -> np.ndarray:
         """The pins (M, N, 2), px, in the valid ones of some frames."""
         graphs = [seen.graph for frame in frames if (seen := self.pipeline(frame)).valid]
         return np.array([graph.nodes_px for graph in graphs if graph is not None]).reshape(-1, self.sensor.pins.count, 2)
-
-    def usual_share(self, nodes_px: np.ndarray) -> float:
-        """Share of contacts with pins (M, N, 2), px, that the model knows, wherever the camera sits; 0 if the run holds no domain."""
-        return 0.0 if self.domain is None else self._common_camera(self._known_rest, nodes_px)[1]
-
-    def told_rest(self, nodes_px: np.ndarray) -> tuple["PoseEstimator", bool]:
-        """As ``at_rest_of``, from the pins (M, N, 2), px, of contacts."""
-        estimator = self.at_known_rest()
-        other = estimator.other_rest(estimator.pipeline.reference, nodes_px)
-        return (estimator, False) if other is None else (estimator.counted_from(other), True)
 
     def seeking_rest(self) -> SensorModel:
         """The model for a camera's frames if no frame shows its sensor without contact. It works as ``at_rest_of``, while frames arrive.
@@ -354,7 +282,7 @@ class PoseEstimator:
         return RestSeeker(self) if self.counts_from_rest else self
 
     def with_intervals(self, intervals: Mapping[str, np.ndarray]) -> "PoseEstimator":
-        """The same model with other interval quantiles, as ``training.runs.evaluate.intervals_on`` finds them for one kind of its
+        """The same model with other interval quantiles, as ``training.studies.judging.intervals_on`` finds them for one kind of its
         frames."""
         found = copy(self)
         found.ensemble = copy(self.ensemble)
@@ -363,11 +291,15 @@ class PoseEstimator:
         found._trained = replace(self._trained, ensemble=found.ensemble)
         return found
 
-    def counted_from(self, reference: Reference) -> "PoseEstimator":
-        """The same model; it measures the pins' displacements from other pins at rest."""
+    def counted_from(self, reference: Reference, *, measured: bool = False) -> "PoseEstimator":
+        """The same model; it measures the pins' displacements from other pins at rest.
+
+        If these were ``measured`` without contact, it also estimates whether anything is touched.
+        """
         found = copy(self)
         found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
-        found._trained = replace(self._trained, pipeline=found.pipeline)
+        touched = TouchAnswer(reference) if measured else self._trained.touched
+        found._trained = replace(self._trained, pipeline=found.pipeline, touched=touched)
         return found if self._tracker is None else found.remembering()
 
     def noting(self, undecided: str) -> "PoseEstimator":
@@ -407,31 +339,7 @@ class PoseEstimator:
     @property
     def caveats(self) -> list[str]:
         """Reasons why the intervals of all frames are wider than the model's own, one line each."""
-        found = [self._undecided] if self._undecided else []
-        if self.domain is None:
-            found.append(
-                "the run does not hold the patterns of pins that it learnt from (an earlier version, or fewer frames than "
-                f"{FEWEST}): a strange frame gets an estimate like any other; train it again"
-            )
-        if self._unmeasured > 1:
-            found.append(
-                f"no frame without contact shows where the camera sits: all intervals are {self._unmeasured:g} times wider; give one "
-                "(--no-contact, --at-rest)"
-            )
-        if self._assumes:
-            mm = ASSUMED_MM * self.sensor.skin.outer_radius_mm
-            found.append(
-                "the model was trained on simulated contacts of a sensor whose contacts were never calibrated: radius, skin and gel are "
-                f"assumed; for that the intervals hold {ASSUMED_RADIUS:.0%} of each length, {mm:.2g} mm and {ASSUMED_DEG:g} deg; "
-                "'twin calibrate contact' with labelled contacts knows it better"
-            )
-        if self._force.any() and self._stiffness > 1:
-            skin, gel = self.sensor.skin.young_modulus_mpa, self.sensor.gel.young_modulus_mpa
-            found.append(
-                f"forces and torques assume a skin of {skin:.3g} MPa and a gel of {gel:.3g} MPa, and may be {self._stiffness:.3g} times "
-                "larger or smaller; their intervals hold that; 'twin calibrate contact' with 3 weighed presses or more knows it better"
-            )
-        return found
+        return [*([self._undecided] if self._undecided else []), *self._widening.caveats]
 
     @property
     def label_range(self) -> np.ndarray:
@@ -439,45 +347,10 @@ class PoseEstimator:
         return np.full(len(self.units), np.inf) if self.domain is None else self.domain.high - self.domain.low
 
     @property
-    def _assumes(self) -> bool:
-        """Whether the model was trained on simulated contacts of a sensor whose contacts were never calibrated."""
-        return self.domain is not None and self.domain.simulated and self.sensor.rig is None
-
-    def _assumed(self, value: np.ndarray) -> np.ndarray:
-        """Half widths (K,) that are due to what is only assumed of the sensor, for estimates (K,)."""
-        length = np.array([unit == "mm" for unit in self.units[: len(value)]])
-        lengths = ASSUMED_MM * self.sensor.skin.outer_radius_mm + ASSUMED_RADIUS * np.abs(value)
-        return float(self._assumes) * np.where(length, lengths, np.where(self._force, 0.0, ASSUMED_DEG))
-
-    @property
-    def _unmeasured(self) -> float:
-        """Factor on all intervals for a camera that may have moved."""
+    def _widening(self) -> Widening:
         alone = self.pipeline.reference is self._trained.reference
-        return self.part.unmeasured_widens if isinstance(self.part, PinModel) and alone else 1.0
-
-    @property
-    def _stiffness(self) -> float:
-        """Factor by which the true forces may be larger or smaller than the simulated ones."""
-        return self.sensor.skin.stiffness_factor
-
-    @property
-    def _force(self) -> np.ndarray:
-        """(K,) bool: labels that are forces or torques of simulated contacts. They are proportional to the sensor's stiffness."""
-        return np.array([name in SIMULATED_FORCES for name in self.config["columns"]])
-
-    def _widened(
-        self, value: np.ndarray, half: np.ndarray, lost_share: float, verdict: Verdict, excess: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-        """Low and high ends (K,) of the intervals with all unknown effects, and notes on this frame."""
-        lost = 1.0 + LOST_WIDENS * lost_share if lost_share > LOST_USUAL else 1.0
-        if verdict.notes and self.domain is not None:
-            half = np.maximum(half, self.domain.least) * verdict.factor + verdict.added
-        half = half * lost * self._unmeasured + excess + self._assumed(value)
-        more, less = value * (self._stiffness - 1), value * (1 / self._stiffness - 1)
-        low = value - half + np.where(self._force, np.minimum(more, less), 0.0)
-        high = value + half + np.where(self._force, np.maximum(more, less), 0.0)
-        notes = (f"{lost_share:.0%} of the pins were not found: intervals are {lost:.1f} times wider",) if lost > 1 else ()
-        return low, high, (*verdict.notes, *notes)
+        unmeasured = self.part.unmeasured_widens if isinstance(self.part, PinModel) and alone else 1.0
+        return Widening(self.sensor, self.domain, self.config["columns"], self.config["units"], unmeasured)
 
     def contact_maps(self, frame: Frame) -> tuple[PoseEstimate, ContactMaps | None]:
         """The estimate of one frame, with the pressure and shear over the skin; no maps if the estimate is not valid.
@@ -543,7 +416,7 @@ class PoseEstimator:
                 self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched, seen=made.seen
             )
         value, half, executed = made.mean[0], made.half_width[0], float(made.executed[0])
-        low, high, notes = self._widened(value, half, lost, verdict, excess)
+        low, high, notes = self._widening(value, half, lost, verdict, excess)
         value, low, high = (np.clip(each, *self._bounds) for each in (value, low, high))
         if slip is not None:
             value, low, high = (np.concatenate(pair) for pair in zip((value, low, high), slip.values, strict=True))
@@ -576,6 +449,11 @@ class PoseEstimator:
             seen = replace(seen, pins=replace(pins, nodes_px=places[0][None], area_px2=places[1][None]))
         slip = None if self._tracker is None else self._tracker(self.modes_of(seen.pins)[0])
         return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip, seen.lost_share, verdict)
+
+    @property
+    def trained_reference(self) -> Reference:
+        """The pins at rest from which the training counted displacements."""
+        return self._trained.reference
 
     def knows(self, pins: PinTable) -> np.ndarray:
         """(M,) bool: whether the pins of each row of a table are a pattern that the model was trained on."""
@@ -645,85 +523,6 @@ class PoseEstimator:
         if not isinstance(self.part, PinModel):
             raise TrainingError(f"{self.model} estimates from pictures, not from pins; give the frames themselves")
         return self.part
-
-
-def _instead_of(run: Path) -> str:
-    """Suggestion for a folder that holds no model: the shipped or neighbouring model with the most similar name, if there is one."""
-    shipped = shipped_names()
-    beside = [folder.name for folder in run.parent.iterdir() if (folder / "config.json").is_file()] if run.parent.is_dir() else []
-    near = get_close_matches(run.name, [*(shipped if run.name == str(run) else []), *beside], n=1)
-    if near:
-        return f"did you mean '{near[0] if near[0] in shipped and near[0] not in beside else run.with_name(near[0])}'?"
-    return f"'twin train' writes one; weights for {', '.join(shipped)} go with the package: give the name instead"
-
-
-def folder_of(run: str | Path) -> Path:
-    """The folder of a run: the given one, or that of the shipped weights if there is no such folder and ``run`` is a sensor's name."""
-    return SHIPPED / run if not Path(run).exists() and str(run) in shipped_names() else Path(run)
-
-
-def models_by_sensor(run: str | Path | None = None, first: str = "") -> Callable[[str], PoseEstimator | None]:
-    """A function from a sensor's name to a trained model of it: that of a run, else the shipped one, else None.
-
-    After the first model is loaded, the networks of this process run in one thread: for networks of this size, more threads cost more time
-    than they save.
-
-    Parameters
-    ----------
-    run : path, optional
-    first : str
-        Name of the sensor to which the run must belong; "" for any.
-
-    Raises
-    ------
-    TrainingError
-        The run holds no trained model, or one of another sensor than ``first``.
-    """
-    given = None if run is None else PoseEstimator.load(run)
-    if given is not None and first not in ("", given.sensor.name):
-        raise TrainingError(f"{run}: a model of '{given.sensor.name}', not of '{first}'; give its --sensor, or another --model")
-
-    def model_of(sensor: str) -> PoseEstimator | None:
-        torch.set_num_threads(1)
-        if given is not None and given.sensor.name == sensor:
-            return given
-        return PoseEstimator.load(sensor) if sensor in shipped_names() else None
-
-    return model_of
-
-
-def digest_of(run: str | Path) -> str:
-    """Digest of everything that affects a model's estimates: its weights, its configuration, and the code that runs it."""
-    folder, digest = folder_of(run), hashlib.sha256(fingerprint(PoseEstimator).encode())
-    for name in (CONFIG, WEIGHTS, TENSORS, DOMAIN):
-        if (folder / name).is_file():
-            digest.update(name.encode() + hashlib.sha256((folder / name).read_bytes()).digest())
-    return digest.hexdigest()
-
-
-def load_remembering(run: str | Path) -> PoseEstimator:
-    """A trained model for consecutive frames: ``PoseEstimator.load`` and ``PoseEstimator.remembering``.
-
-    Raises
-    ------
-    TrainingError
-        The folder holds no run.
-    """
-    return PoseEstimator.load(run).remembering()
-
-
-def load_by_name(runs: Sequence[Path]) -> dict[str, PoseEstimator]:
-    """Load several trained models. The keys are the names of their folders, or their whole paths if two folders have the same name.
-
-    Raises
-    ------
-    TrainingError
-        A folder holds no run.
-    """
-    names = [run.name for run in runs]
-    if len(set(names)) < len(names):
-        names = [str(run) for run in runs]
-    return {name: PoseEstimator.load(run) for name, run in zip(names, runs, strict=True)}
 
 
 def _ms(started: float) -> float:

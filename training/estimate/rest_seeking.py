@@ -11,7 +11,7 @@ from training.estimate.displacements import FEWEST_CONTACTS, MOST_CONTACTS, OTHE
 from training.models.part import Unseen
 from twin.errors import FrameError
 from twin.estimate import Estimate, SensorModel
-from twin.pins import Pipeline, Reference
+from twin.pins import Pipeline
 from twin.types import Form, Frame, Observation
 
 LOG = logging.getLogger(__name__)
@@ -27,9 +27,7 @@ class RestingModel(SensorModel, Protocol):
 
     def at_known_rest(self) -> "RestingModel": ...
 
-    def told_rest(self, nodes_px: np.ndarray) -> tuple["RestingModel", bool]: ...
-
-    def require_view_of_contacts(self, nodes_px: np.ndarray, rest: Reference | None, name: str) -> str: ...
+    def told_rest(self, nodes_px: np.ndarray, name: str) -> tuple["RestingModel", bool]: ...
 
     def unseen(self, seen: Unseen, started: float) -> Estimate: ...
 
@@ -84,10 +82,8 @@ class RestSeeker:
             return self._model.unseen(Unseen(self._refused), perf_counter())
         made = self._model(frame)
         if self._gathered(made.seen) and len(self._contacts_px) in (FEWEST_CONTACTS, MOST_CONTACTS):
-            contacts_px = np.array(self._contacts_px)
-            told, other = self._given.told_rest(contacts_px)
             try:
-                self._given.require_view_of_contacts(contacts_px, told.pipeline.reference if other else None, "the contacts so far")
+                told, other = self._given.told_rest(np.array(self._contacts_px), "the contacts so far")
             except FrameError as error:
                 self._refused = str(error)
                 LOG.warning("%s", error)

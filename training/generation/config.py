@@ -16,12 +16,10 @@ from twin.errors import ContactError, DatasetError
 from twin.frames.folders import pictures_folder
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
-from twin.types import FINE, Form
+from twin.types import FINE, Form, Quality
 
 Images = Literal["raw", "gray", "recording", "none"]
 States = Literal["end", "all"]
-Quality = Literal["drawn", "preview", "standard", "high"]
-
 
 MOST_CONTACTS = 1_000_000
 """Most contacts of a data set. At one second each, a core needs twelve days for them."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_object
-from training.generation.config import GenerationConfig, Images, Quality, States, require_count
+from training.generation.config import GenerationConfig, Images, States, require_count
 from training.generation.make import REST, make_contact
 from training.generation.store import CONFIG, FILES, Store, refuse_foreign
 from twin.errors import OptionError
@@ -15,7 +15,7 @@ from twin.records import KeptAlso
 from twin.rig.contact import friction_between
 from twin.store import output
 from twin.store.resume import MADE_BY
-from twin.types import FINE, Readable
+from twin.types import FINE, Quality, Readable
 from twin.workers import outcomes, require_scheduler
 
 

@@ -4,13 +4,14 @@ from dataclasses import asdict, fields
 
 from scenes.files import shown
 from scenes.plugins import others
+from training.errors import TrainingError
 from training.models.cnn.model import CNN_V1, CNN_V2
 from training.models.graphs.model import GNN, TAC_VGNN, TAC_VGNN_RELEASE
 from training.models.part import Model, Variant
+from training.models.recipes import Recipe
 from training.models.steered.model import STEERED
 from training.models.touch.model import TOUCH
 from training.models.vgnn.model import VGNN
-from training.runs.recipes import Recipe, TrainingError
 
 MODELS: dict[str, Model] = {}
 # Text between a model's name and the name of the ingredient that is left out.

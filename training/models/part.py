@@ -20,7 +20,8 @@ from scenes.sensor import SensorSpec
 from training.data.dataset import Dataset
 from training.data.label_code import LabelCode
 from training.data.pins import PinTable, cap_light
-from training.runs.recipes import Recipe, TrainingError
+from training.errors import TrainingError
+from training.models.recipes import Recipe
 from twin.pins import Pipeline
 from twin.pins.reference import Reference
 from twin.types import Frame, Observation

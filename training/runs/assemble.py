@@ -16,7 +16,9 @@ import torch
 
 from training.data.dataset import Dataset
 from training.data.label_code import LabelCode, label_error
+from training.models import model_named
 from training.models.part import Inputs, Model, Modes, Prediction, Prepared
+from training.runs.config import RunConfig, labels_learnt
 from training.runs.gaussian_process import SMOOTH_AND_LINEAR, TWO_FIDELITIES, Points, Processes, fit_processes, fit_smooth_processes
 from training.runs.networks import predict_rows
 from twin.errors import warn_once
@@ -120,19 +122,13 @@ def _scale_and_move(outs: list[dict[str, torch.Tensor]]) -> tuple[np.ndarray, np
 
 
 def calibrate(
-    model: Model,
+    config: RunConfig,
     data: Dataset,
     prepared: Prepared,
     train: np.ndarray,
     networks: list[dict],
     code: LabelCode,
     scaling: tuple[np.ndarray, np.ndarray],
-    *,
-    labels: str,
-    helpers: tuple[str, ...],
-    kernel: bool,
-    size: Mapping[str, int],
-    seed: int,
 ) -> dict:
     """Fit the Gaussian processes if the recipe has them, the weights of the average, and the intervals.
 
@@ -146,8 +142,6 @@ def calibrate(
         Code that writes the K labels as E numbers.
     scaling : (E,) float, (E,) float
         Shift and scale of these numbers.
-    labels, helpers, kernel, size, seed
-        As in ``RunConfig`` and its recipe.
 
     Returns
     -------
@@ -155,16 +149,16 @@ def calibrate(
         ``networks``, ``kernels``, ``circular``, ``shift``, ``scale``, ``blend``, ``quantile`` and ``raw_quantile``: the content of
         ``Ensemble``.
     """
-    shift, scale = scaling
-    learnt = data.targets.corrected if labels == "corrected" else data.targets.raw
+    (shift, scale), model, kernel = scaling, model_named(config.model), config.recipe.kernel
+    learnt = labels_learnt(data, config)
     y = (code.encode(learnt) - shift) / scale
     k, e, owner = learnt.shape[1], y.shape[1], code.label_of
-    helps = [name in helpers for name in data.targets.names]
+    helps = [name in config.helpers for name in data.targets.names]
     main = np.array([j for j in range(e) if not helps[owner[j]]], int)  # numbers that the processes estimate
     content: dict = {"networks": [network["weights"] for network in networks], "kernels": [], "shift": shift, "scale": scale}
     content |= {"blend": np.zeros(e), "quantile": np.ones(k), "raw_quantile": np.ones((2, k)), "kernel_labels": main.tolist()}
     content["circular"] = np.array(code.circular, np.int64)
-    single = [Ensemble(model, data.pins.reference, content | {"networks": [weights]}, size) for weights in content["networks"]]
+    single = [Ensemble(model, data.pins.reference, content | {"networks": [weights]}, config.size) for weights in content["networks"]]
     left_out = np.full(y.shape, np.nan)
     if kernel:
         group = None if data.group is None else data.group[train]
@@ -174,7 +168,7 @@ def calibrate(
             processes, left = (
                 fit_smooth_processes(modes.inputs, known, group=group)
                 if model.modes_scaled
-                else fit_processes(modes.inputs, known, seed=seed, group=group)
+                else fit_processes(modes.inputs, known, seed=config.seed, group=group)
             )
             content["kernels"].append(processes.arrays())
             if view == 0:

@@ -13,13 +13,14 @@ Each input has a length. With inputs a, b divided by these lengths, the covarian
 A row is of the first kind (simulated) or of the second kind (real). A term with ``second`` is 0 unless both rows are of the second
 kind: it describes the difference between two fidelities (Kennedy and O'Hagan 2000, eq. 1 with rho = 1). Each kind has its own noise.
 
-Lengths, sizes and noises maximise the log marginal likelihood (Rasmussen and Williams 2006, eq. 5.8); its gradient (eq. 5.9) is
-implemented in closed form, and so is the prediction of a row from all other rows (leave-one-out, eq. 5.12).
+Lengths, sizes and noises maximise the log marginal likelihood (Rasmussen and Williams 2006, eq. 5.8), along PyTorch's gradient of it.
+The prediction of a row from all other rows (leave-one-out) is eq. 5.12.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -35,10 +36,6 @@ FIT_ROWS = 1000
 CLIMB_STEPS = 60
 # Step size of Adam in the logarithms of the parameters: one step changes a parameter by a factor of 1.1 at most.
 CLIMB_RATE = 0.1
-# Decay rates of Adam's means of the gradient and of the squared gradient (Kingma and Ba 2015).
-ADAM_DECAYS = (0.9, 0.999)
-# Number that Adam adds to the root of the mean squared gradient (Kingma and Ba 2015).
-ADAM_LEAST = 1e-8
 # Common length of ``fit_smooth_processes``, in medians of the distance between two rows: such processes are nearly quadratic.
 SMOOTH_LENGTHS = 4.0
 # Sizes of its smooth and its linear term, in standard deviations of the label. The smooth term is large, because its length is large.
@@ -107,9 +104,9 @@ class Points:
 class Placed(NamedTuple):
     """Rows divided by a kernel's lengths: ``rows`` (M, D), their squared norms (M,), and 1 for rows of the second kind, else 0 (M,)."""
 
-    rows: np.ndarray
-    squares: np.ndarray
-    second: np.ndarray
+    rows: Any
+    squares: Any
+    second: Any
 
 
 @dataclass(frozen=True)
@@ -138,87 +135,60 @@ class Kernel:
 
     def __call__(self, a: Points, b: Points) -> np.ndarray:
         """(A, B) the covariance between rows, without noise."""
-        return self.between(self.placed(a), self.placed(b))
+        found: np.ndarray = self.between(self.placed(a), self.placed(b))
+        return found
 
     def placed(self, points: Points) -> Placed:
         """Rows divided by the lengths."""
-        rows = points.inputs / self.lengths
-        return Placed(rows, (rows**2).sum(axis=1), points.second)
+        rows = self._library.asarray(points.inputs) / self.lengths
+        return Placed(rows, (rows**2).sum(1), self._library.asarray(points.second))
 
-    def between(self, a: Placed, b: Placed) -> np.ndarray:
+    def between(self, a: Placed, b: Placed) -> Any:
         """(A, B) the covariance between rows, without noise."""
-        inner, squared = _products(a, b)
-        found = np.zeros_like(inner)
+        library, inner = self._library, a.rows @ b.rows.T
+        squared = (a.squares[:, None] + b.squares - 2 * inner).clip(0.0)
+        found = library.zeros_like(inner)
         for term, size in zip(self.terms, self.sizes, strict=True):
-            part = size**2 * self._shape(term, inner, squared)
-            found += part * np.outer(a.second, b.second) if term.second else part
+            if term.shape == "smooth":
+                part = library.exp(-0.5 * squared / (self.reach if term.reaches else 1.0) ** 2)
+            else:
+                part = inner if term.shape == "linear" else library.ones_like(inner)
+            found = found + size**2 * (part * library.outer(a.second, b.second) if term.second else part)
         return found
 
-    def noisy(self, points: Points) -> np.ndarray:
+    def noisy(self, points: Points) -> Any:
         """(M, M) the covariance of the rows' labels, including noise and ``JITTER``."""
-        return self(points, points) + np.diag(self._noise_of(points) ** 2 + JITTER)
+        noises = self.noises[points.second.astype(int) if len(self.noises) > 1 else np.zeros(len(points), int)]
+        placed = self.placed(points)
+        return self.between(placed, placed) + self._library.diag(noises**2 + JITTER)
 
     def logs(self) -> np.ndarray:
         """Logarithms of all parameters in one row: lengths, sizes, noises, and the reach if a term has one."""
         return np.log(np.concatenate([self.lengths, self.sizes, self.noises, [self.reach] if self._reaches else []]))
 
-    def with_logs(self, logs: np.ndarray) -> "Kernel":
-        """The kernel with other parameters, given in the order of ``logs``."""
-        values = np.exp(logs)
+    def with_logs(self, logs: np.ndarray | torch.Tensor) -> "Kernel":
+        """The kernel with other parameters, given in the order of ``logs``; they are tensors if these are."""
+        values: Any = logs.exp() if isinstance(logs, torch.Tensor) else np.exp(logs)
         ends = np.cumsum([len(self.lengths), len(self.sizes), len(self.noises)])
-        reach = float(values[-1]) if self._reaches else self.reach
+        reach = values[-1] if self._reaches else self.reach
         return replace(self, lengths=values[: ends[0]], sizes=values[ends[0] : ends[1]], noises=values[ends[1] : ends[2]], reach=reach)
 
-    def log_likelihood(self, points: Points, label: np.ndarray) -> tuple[float, np.ndarray]:
-        """Log marginal likelihood of a label (M,) with mean 0, and its gradient with respect to ``logs``.
+    def log_likelihood(self, points: Points, label: np.ndarray) -> torch.Tensor:
+        """Log marginal likelihood of a label (M,) with mean 0.
 
         Raises
         ------
-        numpy.linalg.LinAlgError
+        torch.linalg.LinAlgError
             The rows' covariance with ``JITTER`` is not positive definite.
         """
-        factor = cholesky(self.noisy(points), lower=True)
-        weight = cho_solve((factor, True), label)
-        value = -0.5 * label @ weight - np.log(np.diag(factor)).sum() - 0.5 * len(label) * np.log(2 * np.pi)
-        pull = 0.5 * (
-            np.outer(weight, weight) - cho_solve((factor, True), np.eye(len(label)))
-        )  # derivative of the likelihood by the covariance
-        return float(value), self._gradient(points, pull)
+        factor, known = torch.linalg.cholesky(torch.as_tensor(self.noisy(points))), torch.as_tensor(label)[:, None]
+        half = torch.linalg.solve_triangular(factor, known, upper=False)
+        return -0.5 * half.square().sum() - factor.diagonal().log().sum() - 0.5 * len(label) * math.log(2 * math.pi)
 
-    def _gradient(self, points: Points, pull: np.ndarray) -> np.ndarray:
-        """Derivatives by ``logs`` of a quantity whose derivatives by the elements of ``noisy(points)`` are ``pull`` (M, M)."""
-        here = self.placed(points)
-        a, (inner, squared) = here.rows, _products(here, here)
-        of_inner, of_squared = np.zeros_like(inner), np.zeros_like(inner)
-        sizes, reach = np.empty(len(self.terms)), 0.0
-        for k, (term, size) in enumerate(zip(self.terms, self.sizes, strict=True)):
-            part = pull * np.outer(points.second, points.second) if term.second else pull
-            shaped = size**2 * part * self._shape(term, inner, squared)
-            sizes[k] = 2 * shaped.sum()
-            if term.shape == "linear":
-                of_inner += size**2 * part
-            elif term.shape == "smooth":
-                of_squared -= 0.5 * shaped / self._reach_of(term) ** 2
-                if term.reaches:
-                    reach += (shaped * squared).sum() / self.reach**2
-        # a.b and |a - b|^2 are inversely proportional to the square of each length. For a column x of a and w the row sums of W,
-        # sum_ij W_ij (x_i - x_j)^2 = 2 (w.x^2 - x.W x).
-        twice = 2 * (of_squared.sum(axis=1) @ a**2 - (a * (of_squared @ a)).sum(axis=0))
-        lengths = -2 * twice - 2 * (a * (of_inner @ a)).sum(axis=0)
-        noise = 2 * self._noise_of(points) ** 2 * np.diag(pull)
-        noises = [noise.sum()] if len(self.noises) == 1 else [(noise * (1 - points.second)).sum(), (noise * points.second).sum()]
-        return np.concatenate([lengths, sizes, noises, [reach] if self._reaches else []])
-
-    def _shape(self, term: Term, inner: np.ndarray, squared: np.ndarray) -> np.ndarray:
-        if term.shape == "smooth":
-            return np.exp(-0.5 * squared / self._reach_of(term) ** 2)
-        return inner if term.shape == "linear" else np.ones_like(inner)
-
-    def _reach_of(self, term: Term) -> float:
-        return self.reach if term.reaches else 1.0
-
-    def _noise_of(self, points: Points) -> np.ndarray:
-        return self.noises[points.second.astype(int) if len(self.noises) > 1 else np.zeros(len(points), int)]
+    @property
+    def _library(self) -> Any:
+        """PyTorch for parameters that are tensors, which have derivatives; NumPy for arrays, which are faster for single frames."""
+        return torch if isinstance(self.lengths, torch.Tensor) else np
 
     @property
     def _reaches(self) -> bool:
@@ -231,32 +201,28 @@ def climbed(start: Kernel, points: Points, label: np.ndarray) -> Kernel:
     The search stops before the maximum, because with many lengths and few rows the maximum is overfitted: it explains these rows
     exactly, and other rows worse.
     """
-    logs, mean, square = start.logs(), np.zeros_like(start.logs()), np.zeros_like(start.logs())
-    first, second = ADAM_DECAYS
-    for step in range(1, CLIMB_STEPS + 1):
-        gradient = -start.with_logs(logs).log_likelihood(points, label)[1]
-        mean = first * mean + (1 - first) * gradient
-        square = second * square + (1 - second) * gradient**2
-        size = np.sqrt(square / (1 - second**step)) + ADAM_LEAST
-        logs = logs - CLIMB_RATE * mean / (1 - first**step) / size
-    return start.with_logs(logs)
+    logs = torch.from_numpy(start.logs()).requires_grad_()
+    optimiser = torch.optim.Adam([logs], lr=CLIMB_RATE)
+    for _ in range(CLIMB_STEPS):
+        optimiser.zero_grad()
+        (-start.with_logs(logs).log_likelihood(points, label)).backward()
+        optimiser.step()
+    return start.with_logs(logs.detach().numpy())
 
 
 def likeliest(start: Kernel, points: Points, label: np.ndarray, *, least: Kernel, most: Kernel) -> Kernel:
     """The kernel that maximises the likelihood of a label (M,), with every parameter between that of ``least`` and that of ``most``.
 
-    The method is L-BFGS-B (Byrd et al. 1995) from ``start``, in the logarithms of the lengths and of the variances.
+    The method is L-BFGS-B (Byrd et al. 1995) from ``start``, in the logarithms of the parameters.
     """
-    per_log = np.ones_like(start.logs())
-    per_log[len(start.lengths) : len(start.lengths) + len(start.sizes) + len(start.noises)] = 2.0  # variances
 
-    def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = start.with_logs(scaled / per_log).log_likelihood(points, label)
-        return -value, -gradient / per_log
+    def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
+        logs = torch.tensor(values, requires_grad=True)
+        value = -start.with_logs(logs).log_likelihood(points, label)
+        return value.item(), torch.autograd.grad(value, logs)[0].numpy()
 
-    bounds = np.column_stack([least.logs(), most.logs()]) * per_log[:, None]
-    found = minimize(objective, start.logs() * per_log, jac=True, method="L-BFGS-B", bounds=bounds)
-    return start.with_logs(found.x / per_log)
+    bounds = np.column_stack([least.logs(), most.logs()])
+    return start.with_logs(minimize(objective, start.logs(), jac=True, method="L-BFGS-B", bounds=bounds).x)
 
 
 class Posterior:
@@ -453,9 +419,3 @@ def _fitted(
 
 def _spread(inputs: np.ndarray) -> np.ndarray:
     return np.maximum(inputs.std(axis=0, ddof=1), LEAST_SPREAD)
-
-
-def _products(a: Placed, b: Placed) -> tuple[np.ndarray, np.ndarray]:
-    """(A, B) inner products and squared distances of rows."""
-    inner = a.rows @ b.rows.T
-    return inner, np.maximum(a.squares[:, None] + b.squares - 2 * inner, 0.0)

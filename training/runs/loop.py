@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from training.models.part import Inputs
+from training.models.recipes import Recipe
 from training.runs.networks import device_of, predict_rows
-from training.runs.recipes import Recipe
 from twin.progress import Step
 
 # Steps at the start in which the cosine schedule's learning rate rises from 0 to its full value.

@@ -3,8 +3,8 @@
 import torch
 from torch import nn
 
+from training.errors import TrainingError
 from training.models.part import Inputs
-from training.runs.recipes import TrainingError
 from twin.errors import OptionError
 
 

@@ -8,6 +8,7 @@ leaves out: see ``Model.pack``.
 import hashlib
 import json
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +17,10 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from scenes.sensor import SensorSpec
-from training.data.identity import ASIDE
-from training.estimate.displacements import DISPLACEMENTS
-from training.estimate.domain import DOMAIN
+from training.errors import TrainingError
 from training.models import model_named
-from training.runs.recipes import TrainingError
-from training.runs.run_files import CONFIG, TENSORS, read_config, read_tensors
-from training.touch.contact_maps import MAPS
-from training.touch.slip import SLIP
+from training.runs.identity import ASIDE
+from training.runs.run_files import BESIDE_FILES, CONFIG, TENSORS, read_config, read_tensors
 from twin.pins import make_reference
 from twin.store import write_bytes, write_text, writes
 
@@ -47,7 +44,22 @@ def shipped_names() -> list[str]:
     return sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS}"))
 
 
-@writes(WEIGHTS, "config.json", MAPS, SLIP, DISPLACEMENTS, DOMAIN)
+def folder_of(run: str | Path) -> Path:
+    """The folder of a run: the given one, or that of the shipped weights if there is no such folder and ``run`` is a sensor's name."""
+    return SHIPPED / run if not Path(run).exists() and str(run) in shipped_names() else Path(run)
+
+
+def instead_of(run: Path) -> str:
+    """Suggestion for a folder that holds no model: the shipped or neighbouring model with the most similar name, if there is one."""
+    shipped = shipped_names()
+    beside = [folder.name for folder in run.parent.iterdir() if (folder / "config.json").is_file()] if run.parent.is_dir() else []
+    near = get_close_matches(run.name, [*(shipped if run.name == str(run) else []), *beside], n=1)
+    if near:
+        return f"did you mean '{near[0] if near[0] in shipped and near[0] not in beside else run.with_name(near[0])}'?"
+    return f"'twin train' writes one; weights for {', '.join(shipped)} go with the package: give the name instead"
+
+
+@writes(WEIGHTS, CONFIG, *BESIDE_FILES)
 def pack(run: Path, out: Path) -> int:
     """Write the small copy of a finished run, and return its size in bytes.
 
@@ -83,7 +95,7 @@ def pack(run: Path, out: Path) -> int:
     about = {key: value for key, value in config.items() if key not in ASIDE} | {SHA256: hashlib.sha256(weights).hexdigest()}
     about |= {RECORDINGS: [Path(folder).name for folder in config.get("data", "").split(", ") if folder]}
     write_text(out / CONFIG, json.dumps(about) + "\n")
-    for name in (MAPS, SLIP, DISPLACEMENTS, DOMAIN):
+    for name in BESIDE_FILES:
         if (run / name).is_file():
             write_bytes(out / name, (run / name).read_bytes())
     return (out / WEIGHTS).stat().st_size

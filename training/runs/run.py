@@ -13,22 +13,24 @@ import csv
 import io
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 
 import numpy as np
 import torch
 
-from training.data.dataset import Dataset, split_rows
-from training.data.identity import ASIDE, difference, frame_marks, identity_of
+from training.data.dataset import Dataset
 from training.data.label_code import LabelCode, goes_round
+from training.errors import TrainingError
 from training.models import model_named
 from training.models.part import Prepared
+from training.models.recipes import as_dict
 from training.runs.assemble import calibrate
+from training.runs.config import RunConfig, labels_learnt, training_rows
+from training.runs.identity import ASIDE, difference, frame_marks, identity_of
 from training.runs.loop import Loop, Rows
 from training.runs.networks import parameter_count
-from training.runs.recipes import Recipe, TrainingError, as_dict
 from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, write_tensors
 from twin.frames.forms import blob_spec
 from twin.store import fingerprint, write_text, writes
@@ -37,50 +39,58 @@ RUN_FILES = (CONFIG, "curves.csv", TENSORS)
 FOLDS = 10  # parts of the training rows; each network of an ensemble holds out another part
 KEEP_EVERY_S = 20.0  # s between two checkpoints
 FEWEST_PARTS = 3  # least number of rows, or groups of rows: with fewer, almost no rows are left beside the held-out part
-MOST_SEED = 2**32 - 1  # largest seed. PyTorch takes seeds of 64 bits, and each network has its own seed
 BEGIN_ANEW = "remove it to begin anew, or give another `out`"  # remedy for a damaged checkpoint
 EXTRA_WEIGHT = 0.3  # weight of a helper label in the loss; requested labels have the weight 1
 
 
 @dataclass(frozen=True)
-class RunConfig:
-    """Settings of a run.
+class _Lesson:
+    """What the networks of a run are taught: data in order, training rows (m,), inputs, and the labels' numbers (M, E) as standardised."""
 
-    Attributes
-    ----------
-    model : str
-    recipe : Recipe
-    labels : {"corrected", "raw"}
-    seed : int
-        Seed of weights and order. It also shifts which fold is held out.
-    split : int or None
-        Seed of the validation fifth that is kept out of training; None trains on all rows.
-    helpers : tuple of str
-        Label columns that are learnt only because they help to learn the others; they have less weight.
-    size : dict
-        Sizes of the network that differ from the model's own.
-    labelled : dict
-        ``identity_of`` the real frames from which the errors of simulated pins were learnt, and their ``image_names``; empty for other
-        runs.
-    Raises
-    ------
-    TrainingError
-        A seed is out of range.
-    """
+    out: Path
+    resolved: dict
+    config: RunConfig
+    data: Dataset
+    train: np.ndarray
+    prepared: Prepared
+    code: LabelCode
+    scaled: torch.Tensor
+    scaling: tuple[np.ndarray, np.ndarray]
 
-    model: str
-    recipe: Recipe
-    labels: str = "corrected"
-    seed: int = 0
-    split: int | None = 0
-    helpers: tuple[str, ...] = ()
-    size: dict[str, int] = field(default_factory=dict)
-    labelled: Mapping[str, object] = field(default_factory=dict)
+    def member(self, member: int, device: str) -> Loop:
+        """The training of a network, from its beginning."""
+        config, data, views = self.config, self.data, self.prepared.views
+        seed, model = 1000 * config.seed + member, model_named(config.model)
+        torch.manual_seed(seed)
+        network = model.build(data.pins.reference, self.scaled.shape[1], config.size)
+        held, learnt = fold_rows(self.train, config.seed, member, data.group)
+        model.initialise(network, self.prepared.inputs, torch.from_numpy(self.train), self.scaled, self.code)
+        network.to(device)
+        weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])[self.code.label_of]
+        executed = torch.from_numpy(data.targets.executed.astype(np.float32)).repeat(views)
+        learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # held-out frames are used in view 0 only
+        rows = [torch.from_numpy(each) for each in (learnt, held)]
+        return Loop(
+            network, config.recipe, Rows(self.prepared.inputs, self.scaled.repeat(views, 1), weight, executed, *rows), seed, model.penalty
+        )
 
-    def __post_init__(self) -> None:
-        for name, seed in (("seed", self.seed), ("split", self.split)):
-            if seed is not None and not 0 <= seed <= MOST_SEED:
-                raise TrainingError(f"--{name} {seed}: give a whole number from 0 to {MOST_SEED}")
+    def keep(self, done: list, loop: Loop | None) -> None:
+        """Write the checkpoint and the curves."""
+        state = None if loop is None else loop.state()
+        write_tensors(self.out / CHECKPOINT, {"identity": _identity(self.resolved), "done": done, "loop": state})
+        write_curves(self.out, [network["curves"] for network in done] + ([] if loop is None else [loop.curves]))
+
+    def assemble(self, networks: list[dict]) -> None:
+        """Write the run's files from networks, trained or not to the end."""
+        data, config = self.data, self.config
+        content = calibrate(config, data, self.prepared, self.train, networks, self.code, self.scaling)
+        content |= {"aside": dict(self.prepared.learnt), "reference_px": data.pins.reference.pins_px}
+        content |= {"learnt_from": frame_marks(data)[self.train]}
+        network = model_named(config.model).build(data.pins.reference, len(self.code.label_of), config.size)
+        content["parameters"] = parameter_count(network)
+        write_tensors(self.out / TENSORS, content)
+        write_text(self.out / CONFIG, json.dumps(self.resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
+        write_curves(self.out, [network["curves"] for network in networks])
 
 
 @writes(*RUN_FILES, gone_on=(CHECKPOINT,))
@@ -121,22 +131,23 @@ def train_run(
     train = training_rows(config, data)
     parts = len(train if data.group is None else np.unique(data.group[train]))
     if parts < FEWEST_PARTS:
+        said = f" ({'; '.join(data.problems[:3])})" if data.problems else ""
         what = "frames" if data.group is None else "contacts"
         raise TrainingError(
             f"{', '.join(map(str, data.folders))}: {len(data)} usable frames, {parts} {what} of them to learn from, are too few; "
-            f"{FEWEST_PARTS} {what} to learn from are needed{_said(data.problems)}"
+            f"{FEWEST_PARTS} {what} to learn from are needed{said}"
         )
     resolved = resolve(config, data, train)
     state = _opened(out, resolved)
     prepared = model_named(config.model).prepare(data, train)
     code = LabelCode(goes_round(data.targets.units, labels_learnt(data, config)[train]))
-    scaled, shift, scale = scaled_labels(data, config, train, code)
+    scaled, *scaling = scaled_labels(data, config, train, code)
+    lesson = _Lesson(out, resolved, config, data, train, prepared, code, scaled, (scaling[0], scaling[1]))
     done: list = state["done"] if state else []
-    loop = None
     all_epochs = config.recipe.members * config.recipe.epochs
     while len(done) < config.recipe.members:
         member = len(done)
-        loop = _member(config, data, prepared, scaled, code, train, member, device)
+        loop = lesson.member(member, device)
         if state and state["loop"] is not None:
             loop.load(state["loop"])
         state, kept, out_of_time = None, monotonic(), False
@@ -146,18 +157,17 @@ def train_run(
                 progress(member * config.recipe.epochs + point["epoch"], all_epochs, point)
             out_of_time = max_minutes is not None and monotonic() - started > 60 * max_minutes
             if out_of_time or monotonic() - kept > KEEP_EVERY_S:
-                _keep(out, resolved, done, loop)
+                lesson.keep(done, loop)
                 kept = monotonic()
             if out_of_time and not loop.finished:
-                networks = [*done, _finished(loop)]
-                _assemble(out, resolved, config, data, prepared, train, networks, code, (shift, scale))
+                lesson.assemble([*done, _finished(loop)])
                 return False
         done.append(_finished(loop))
-        _keep(out, resolved, done, None)
+        lesson.keep(done, None)
         if out_of_time and len(done) < config.recipe.members:
-            _assemble(out, resolved, config, data, prepared, train, done, code, (shift, scale))
+            lesson.assemble(done)
             return False
-    _assemble(out, resolved, config, data, prepared, train, done, code, (shift, scale))
+    lesson.assemble(done)
     (out / CHECKPOINT).unlink(missing_ok=True)
     return True
 
@@ -177,11 +187,6 @@ def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
     wanted = resolve(config, data, training_rows(config, data))
     _require_same(out, wanted, read_config(out), "begun and not finished" if begun else "finished")
     return not begun
-
-
-def training_rows(config: RunConfig, data: Dataset) -> np.ndarray:
-    """Rows (m,) of a data set in order (``Dataset.in_order``) from which a run learns."""
-    return np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
 
 
 def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
@@ -213,11 +218,6 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
     } | ({"labelled": dict(config.labelled)} if config.labelled else {})
 
 
-def labels_learnt(data: Dataset, config: RunConfig) -> np.ndarray:
-    """Labels (M, K) of the kind that a run learns, mm and deg."""
-    return data.targets.corrected if config.labels == "corrected" else data.targets.raw
-
-
 def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: LabelCode) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
     """Labels (M, E) as the network learns them, float32, and shift and scale (E,) for the code's numbers: ``number = shift + scale x``."""
     labels = code.encode(labels_learnt(data, config))
@@ -232,29 +232,6 @@ def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: Lab
     pair = np.array(code.circular)[code.label_of]
     shift, scale = np.where(pair, 0.0, shift), np.where(pair, np.sqrt(0.5), scale)  # sine and cosine of a direction need a common scale
     return torch.from_numpy(((labels - shift) / scale).astype(np.float32)), shift, scale
-
-
-def _member(
-    config: RunConfig,
-    data: Dataset,
-    prepared: Prepared,
-    scaled: torch.Tensor,
-    code: LabelCode,
-    train: np.ndarray,
-    member: int,
-    device: str,
-) -> Loop:
-    seed, model, views = 1000 * config.seed + member, model_named(config.model), prepared.views
-    torch.manual_seed(seed)
-    network = model.build(data.pins.reference, scaled.shape[1], config.size)
-    held, learnt = fold_rows(train, config.seed, member, data.group)
-    model.initialise(network, prepared.inputs, torch.from_numpy(train), scaled, code)
-    network.to(device)
-    weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])[code.label_of]
-    executed = torch.from_numpy(data.targets.executed.astype(np.float32))
-    learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # held-out frames are used in view 0 only
-    rows = Rows(prepared.inputs, scaled.repeat(views, 1), weight, executed.repeat(views), torch.from_numpy(learnt), torch.from_numpy(held))
-    return Loop(network, config.recipe, rows, seed, model.penalty)
 
 
 def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -273,44 +250,6 @@ def _finished(loop: Loop) -> dict:
         "held": loop.rows.held,
         "curves": loop.curves,
     }
-
-
-def _assemble(
-    out: Path,
-    resolved: dict,
-    config: RunConfig,
-    data: Dataset,
-    prepared: Prepared,
-    train: np.ndarray,
-    networks: list[dict],
-    code: LabelCode,
-    scaling: tuple[np.ndarray, np.ndarray],
-) -> None:
-    model = model_named(config.model)
-    content = calibrate(
-        model,
-        data,
-        prepared,
-        train,
-        networks,
-        code,
-        scaling,
-        labels=config.labels,
-        helpers=config.helpers,
-        kernel=config.recipe.kernel,
-        size=config.size,
-        seed=config.seed,
-    )
-    content |= {"aside": dict(prepared.learnt), "reference_px": data.pins.reference.pins_px, "learnt_from": frame_marks(data)[train]}
-    content["parameters"] = parameter_count(model.build(data.pins.reference, len(code.label_of), config.size))
-    write_tensors(out / TENSORS, content)
-    write_text(out / CONFIG, json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
-    write_curves(out, [network["curves"] for network in networks])
-
-
-def _keep(out: Path, resolved: dict, done: list, loop: Loop | None) -> None:
-    write_tensors(out / CHECKPOINT, {"identity": _identity(resolved), "done": done, "loop": None if loop is None else loop.state()})
-    write_curves(out, [network["curves"] for network in done] + ([] if loop is None else [loop.curves]))
 
 
 def _opened(out: Path, resolved: dict) -> dict | None:
@@ -335,10 +274,6 @@ def _require_same(out: Path, wanted: dict, found: Mapping, state: str) -> None:
         raise TrainingError(
             f"{out}: holds a run with other settings or data, {state} ({differs}); give another `out`, or the same settings and data"
         )
-
-
-def _said(problems: list[str]) -> str:
-    return f" ({'; '.join(problems[:3])})" if problems else ""
 
 
 def write_curves(out: Path, curves: list[list[dict]]) -> None:

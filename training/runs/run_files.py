@@ -14,14 +14,19 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scenes.files import read_regular
 from scenes.load import explained
 from scenes.sensor import SensorSpec
+from training.errors import TrainingError
 from training.models import model_named
-from training.runs.recipes import TrainingError
 from twin.store import write_with
 from twin.types import Form
 
 CONFIG = "config.json"  # the resolved configuration of a run
 TENSORS = "weights.pt"  # the trained networks
 CHECKPOINT = "checkpoint.pt"  # the state of training while the run is in progress
+MAPS = "maps.safetensors"  # the model of contact maps
+SLIP = "slip.safetensors"  # the model of slip
+DISPLACEMENTS = "displacements.safetensors"  # the model of the pins' possible displacements
+DOMAIN = "domain.safetensors"  # the patterns of pins that the run was trained on
+BESIDE_FILES = (MAPS, SLIP, DISPLACEMENTS, DOMAIN)  # files that a run has beside its networks, if it learnt these models
 LARGEST_CONFIG = 100_000_000  # bytes; a configuration names the frames kept out of training, and a million names take 20 MB
 AGAIN = "train again, or copy the run's folder anew"
 

@@ -4,11 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scenes import SensorSpec
 from scenes.sensor import RecordingSpec
-from training.estimate.estimator import PoseEstimator, digest_of
 from twin.camera.capture import in_form
 from twin.judge.degradation.envelope import Envelope
 from twin.judge.degradation.plan import SweepPlan
@@ -19,6 +18,9 @@ from twin.judge.degradation.sweep import Answer
 from twin.progress import Progress, silent
 from twin.store import writes
 from twin.types import Frame, Readable
+
+if TYPE_CHECKING:
+    from training.estimate.estimator import PoseEstimator  # loads torch, which pipelines alone do not need
 
 # Pipelines that are judged if none are named.
 PIPELINES = ("twin", "legacy")
@@ -87,6 +89,8 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     check_pipelines(pipelines, tuple(each.name for each in runs))
     options: dict[str, Any] = {"jobs": plan.jobs, "progress": progress}
     if runs:
+        from training.estimate.loading import digest_of
+
         load_models(runs, plan.sensor)  # each worker process loads its own; loading here reports an error once, before the work starts
         options["models"] = partial(load_models, runs, plan.sensor)
         options["model_digests"] = {each.name: digest_of(each) for each in runs}
@@ -106,13 +110,15 @@ def load_models(
     return {each.name: partial(_estimates, _at_rest(_checked(each, sensor), source), sensor.recording) for each in runs}
 
 
-def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
+def _checked(run: Path, sensor: SensorSpec) -> "PoseEstimator":
+    from training.estimate.estimator import PoseEstimator
+
     estimator = PoseEstimator.load(run)
     estimator.check(sensor, estimator.form)
     return estimator
 
 
-def _at_rest(estimator: PoseEstimator, source: RenderedSource | RealSource | None) -> PoseEstimator:
+def _at_rest(estimator: "PoseEstimator", source: RenderedSource | RealSource | None) -> "PoseEstimator":
     if source is None or not estimator.counts_from_rest:
         return estimator
     recording, rest = source.spec.recording, source.rest_frame
@@ -122,6 +128,6 @@ def _at_rest(estimator: PoseEstimator, source: RenderedSource | RealSource | Non
     return estimator.at_rest_of(in_form(frame, estimator.form, recording) for frame in source.frames)[0]
 
 
-def _estimates(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Answer:
+def _estimates(estimator: "PoseEstimator", recording: RecordingSpec | None, frame: Frame) -> Answer:
     found = estimator(in_form(frame, estimator.form, recording))
     return Answer(found.value, found.low, found.high, found.units, estimator.label_range, found.valid)

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from training.data.dataset import Dataset, joined, load_dataset, told_apart
-from training.data.identity import changed_since, learnt_before
 from training.data.simulated import is_simulated
+from training.errors import TrainingError
 from training.estimate.contact_estimator import ContactEstimator, contacts_folder
 from training.estimate.displacements import OTHER_UNIT
-from training.estimate.estimator import PoseEstimator, folder_of
-from training.runs.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
-from training.runs.recipes import TrainingError
+from training.estimate.estimator import PoseEstimator
+from training.runs.identity import changed_since, learnt_before
+from training.runs.packed import folder_of
+from training.studies.judging import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
 from training.touch.contact_maps import judge_maps
 from training.touch.slip import Eyes, drags_of, gone_through, judge_slip, random_places
 from twin.frames import open_recording
@@ -73,8 +74,8 @@ def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
         return data
     if open_recording(data.folder, estimator.sensor, estimator.form).reference is not None:
         return data
-    other = estimator.other_rest(data.pins.reference, data.pins.nodes_px)
-    estimator.require_view_of_contacts(data.pins.nodes_px[data.pins.valid], other, f"the contacts of {data.folder.name}")
+    other = estimator.rest.other(data.pins.reference, data.pins.nodes_px)
+    estimator.rest.require_view_of_contacts(data.pins.nodes_px[data.pins.valid], other, f"the contacts of {data.folder.name}")
     if other is None:
         return data
     return replace(data, pins=replace(data.pins, reference=other, measured=True), problems=[*data.problems, OTHER_UNIT])
@@ -199,7 +200,7 @@ def evaluate_run(
         with stage(progress, f"frames of {folder.name}") as step:
             part = load_dataset(folder, estimator.recorded_sensor, estimator.names, form=estimator.form, progress=step)
             if estimator.counts_from_rest and part.pins.measured:
-                estimator.require_view(part.pins.reference.pins_px, folder.name)
+                estimator.rest.require_view(part.pins.reference.pins_px, folder.name)
             parts.append(at_own_rest(estimator, part))
     found = joined(parts)
     chosen = rows_to_judge(estimator, found, rows)

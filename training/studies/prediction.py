@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from training.errors import TrainingError
 from training.estimate.contact_estimator import ContactEstimator
 from training.estimate.displacements import MOST_CONTACTS, OTHER_UNIT
 from training.estimate.estimator import PoseEstimate, PoseEstimator
-from training.runs.recipes import TrainingError
 from training.studies.evaluation import models_of_kinds
 from twin.camera.projection import project
 from twin.errors import FrameError

@@ -11,10 +11,9 @@ from scenes import SensorSpec
 from training.data.two_sample import SMALL, TwoSample, accuracy_text, judged, judged_halves
 from twin.errors import OptionError
 from twin.judge.pictures.realism import run_realism
-from twin.optics.render import Quality
 from twin.progress import Progress, Step, silent
 from twin.store import writes
-from twin.types import Readable
+from twin.types import Quality, Readable
 
 IMAGES = ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip", "psnr_whole_db")
 

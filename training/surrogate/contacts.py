@@ -43,11 +43,11 @@ class SurrogateContacts:
         modes = surrogate.modes
         flat = len(modes), -1
         x, y, z = surrogate.node_mm.T
-        self._turns = np.zeros((len(x), 3, 6))  # of a force at each node: the force and the torque on the object
-        self._turns[:, range(3), range(3)] = -1.0
-        self._turns[:, 0, 4:], self._turns[:, 1, 3], self._turns[:, 1, 5] = np.stack([-z, y], axis=1), z, -x
-        self._turns[:, 2, 3:5] = np.stack([-y, x], axis=1)
-        self._turns = self._turns.reshape(-1, 6)
+        turns = np.zeros((len(x), 3, 6))  # of a force at each node: the force and the torque on the object
+        turns[:, range(3), range(3)] = -1.0
+        turns[:, 0, 4:], turns[:, 1, 3], turns[:, 1, 5] = np.stack([-z, y], axis=1), z, -x
+        turns[:, 2, 3:5] = np.stack([-y, x], axis=1)
+        self._turns = turns.reshape(-1, 6)
         self._cap_modes = np.ascontiguousarray((modes[:, :, 0] + self._cap_mm * modes[:, :, 1]).reshape(flat), np.float32)
         self._caps_rest = self._rest[:, 0] + self._cap_mm * self._rest[:, 1]
         self._linear = LinearContacts.at_rest(surrogate.node_mm, surrogate.answer, count, bending=surrogate.bending.kernel(surrogate.read))

@@ -16,13 +16,12 @@ from torch import nn
 
 from scenes.sensor import GeometrySpec
 from training.data.dataset import Dataset, told_apart
-from training.runs.recipes import TrainingError
+from training.errors import TrainingError
 from training.runs.run_files import AGAIN
 from twin.frames.truth import arrays_of, open_truth, row_of
 from twin.mechanics.skin_map import SIDE, ContactMaps, between_nodes, skin_grid
 from twin.store import ArrayFile, Layers, layers_from, layers_to
 
-MAPS = "maps.safetensors"
 """File of a run with its maps."""
 FILE = ArrayFile("file of contact maps", "twin train", version=1, error=TrainingError, again=AGAIN)
 DETAIL_MM = 1.0

@@ -25,8 +25,8 @@ from torch import nn
 from scenes.sensor import SensorSpec
 from training.data.dataset import Dataset
 from training.data.pins import PinTable
+from training.errors import TrainingError
 from training.runs.assemble import COVERAGE, conformal_quantile
-from training.runs.recipes import TrainingError
 from training.runs.run_files import AGAIN
 from training.surrogate.symmetry import Symmetry, symmetries
 from training.touch.contact_maps import HEADROOM
@@ -38,7 +38,6 @@ from twin.mechanics.path import carried
 from twin.mechanics.skin_map import skin_grid
 from twin.store import ArrayFile
 
-SLIP = "slip.safetensors"
 """File of a run with its network for slip."""
 FILE = ArrayFile("network for slip", "twin train", version=1, error=TrainingError, again=AGAIN)
 BEGINS, WHOLE = 0.1, 0.95

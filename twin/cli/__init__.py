@@ -8,10 +8,8 @@ import errno
 import io
 import logging
 import os
-import signal
 import sys
 import tempfile
-import threading
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
@@ -25,6 +23,7 @@ from typer.core import TyperGroup
 from twin.cli.command import App
 from twin.cli.options import as_options
 from twin.errors import OptionError, StoreError, TwinError
+from twin.signals import end_interrupted, end_on_sigterm
 
 # Modules of commands, in the order in which 'twin --help' lists them, each with the title above its commands.
 COMMANDS = {
@@ -38,10 +37,8 @@ COMMANDS = {
     "live": "Cameras and arms",
 }
 
-# Exit codes: a failure, a wrong command line, an end by Ctrl-C (128 + the signal's number, as in shells).
-FAILED, MISUSED, INTERRUPTED = 1, 2, 130
-# Longest line about an arm or a camera, in characters. Longer messages, and notes, go to a file.
-LONGEST_LINE = 160
+# Exit codes: a failure, a wrong command line.
+FAILED, MISUSED = 1, 2
 
 
 class _Commands(TyperGroup):
@@ -73,7 +70,7 @@ class _Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as interrupt:
-            _end_interrupted(interrupt)
+            end_interrupted(interrupt, _print_notes)
         except typer.BadParameter as error:
             numbers = error.param.nargs if error.param is not None else 1
             if numbers > 1:
@@ -137,13 +134,13 @@ def main() -> None:
         reason = error if isinstance(error, ImportError) else "the working folder was deleted; change into a folder that exists"
         print(f"twin: error: {reason}", file=sys.stderr)
         sys.exit(FAILED)
-    _end_on_sigterm()
+    end_on_sigterm()
     warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {as_options(' '.join(str(message).split()))}\n"
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # without a writable home directory it prints four lines of warnings
     try:
         command_line()(prog_name="twin")
     except KeyboardInterrupt as interrupt:  # before a command runs
-        _end_interrupted(interrupt)
+        end_interrupted(interrupt, _print_notes)
     except Exception as error:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             _end_without_room(error)
@@ -155,33 +152,12 @@ def main() -> None:
         sys.exit(MISUSED if isinstance(error, OptionError) else FAILED)
 
 
-def _end_on_sigterm() -> None:
-    """Make SIGTERM end this process as Ctrl-C does, with its own exit code. Forked processes end at once."""
-    program = os.getpid()
-
-    def end(number: int, _: object) -> None:
-        if os.getpid() != program:
-            os._exit(128 + number)
-        raise KeyboardInterrupt(number)
-
-    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, end)
-
-
-def _end_interrupted(interrupt: KeyboardInterrupt) -> NoReturn:
-    for number in (signal.SIGINT, signal.SIGTERM):  # a second one must not end the end
-        signal.signal(number, signal.SIG_IGN)
-    print("twin: interrupted", file=sys.stderr)
-    _print_notes(interrupt)
-    sys.exit(128 + interrupt.args[0] if interrupt.args else INTERRUPTED)
-
-
 def _print_error(error: Exception) -> None:
     """Print an error as one line, and its notes. Of a device's error the line is short, and what is left out goes to a file."""
     text = as_options(" ".join(str(error).split()))
     devices = sys.modules.get("hardware.errors")  # loaded if there is a device
     notes = [as_options(note) for note in getattr(error, "__notes__", ())]
-    if devices is None or not isinstance(error, devices.DeviceError) or (len(text) <= LONGEST_LINE and not notes):
+    if devices is None or not isinstance(error, devices.DeviceError) or (len(text) <= devices.LONGEST_LINE and not notes):
         print(f"twin: error: {text}", file=sys.stderr)
         _print_notes(error)
         return
@@ -191,7 +167,7 @@ def _print_error(error: Exception) -> None:
     with suppress(OSError):
         log.write_text(whole + "\n", encoding="utf-8")
         told = f"; details: {log}"
-    print(f"twin: error: {devices.in_short(whole, LONGEST_LINE - len('twin: error: ') - len(told))}{told}", file=sys.stderr)
+    print(f"twin: error: {devices.in_short(whole, devices.LONGEST_LINE - len('twin: error: ') - len(told))}{told}", file=sys.stderr)
 
 
 def _end_without_room(error: OSError) -> NoReturn:

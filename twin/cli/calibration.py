@@ -22,7 +22,6 @@ from twin.cli.options import (
     FormOrAuto,
     NoContact,
     Out,
-    Quality,
     Residual,
     Sensor,
     Table,
@@ -35,7 +34,7 @@ from twin.cli.options import (
 )
 from twin.errors import OptionError
 from twin.progress import Progress
-from twin.types import FINE
+from twin.types import FINE, Quality
 
 if TYPE_CHECKING:
     from training.studies.degradation import Result

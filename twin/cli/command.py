@@ -10,6 +10,7 @@ import math
 import os
 import re
 from collections.abc import Callable
+from contextlib import ExitStack
 from enum import Enum
 from functools import wraps
 from inspect import Parameter
@@ -22,7 +23,7 @@ import typer
 from typer.models import ArgumentInfo, ParameterInfo
 
 from twin.cli.options import Force, tell
-from twin.errors import OptionError
+from twin.errors import OptionError, extras_named
 from twin.progress import Progress, silent
 
 Made = TypeVar("Made")
@@ -74,14 +75,14 @@ class App(typer.Typer):
 
 def _done(work: Callable[..., Made], given: dict[str, Any], *, progress: Progress | bool | None, goes_on: bool = False) -> Made:
     """Do the work, which reports to ``progress`` if it reports at all: True shows bars."""
-    if "progress" not in inspect.signature(work).parameters:
-        return work(**given)
-    if progress is not True:
-        return work(**given, progress=progress or silent)
-    from twin.cli.progress import shown
+    with extras_named(), ExitStack() as stack:
+        if "progress" in inspect.signature(work).parameters:
+            if progress is True:
+                from twin.cli.progress import shown
 
-    with shown(goes_on=goes_on) as bars:
-        return work(**given, progress=bars)
+                progress = stack.enter_context(shown(goes_on=goes_on))
+            given = {**given, "progress": progress or silent}
+        return work(**given)
 
 
 def writes(options: Any) -> bool:

@@ -25,7 +25,6 @@ from twin.cli.options import (
     FormOrAuto,
     NoContact,
     Out,
-    Quality,
     Residual,
     Sensor,
     Split,
@@ -44,14 +43,14 @@ from twin.cli.options import (
     sensor_with,
 )
 from twin.progress import Progress
-from twin.types import FINE
+from twin.types import FINE, Quality
 
 if TYPE_CHECKING:
     from training.environments.learn import Learnt
     from training.generation.run import Simulated
-    from training.runs.train import Trained
     from training.studies.evaluation import Evaluation
     from training.studies.prediction import Predictions
+    from training.studies.train import Trained
     from training.surrogate.fit import Distilled
 
 
@@ -61,6 +60,7 @@ def make_dataset(
     sensor: Sensor,
     count: Annotated[int, typer.Option("--count", min=1, metavar="N", help="contacts")],
     out: Out,
+    wide: Annotated[bool, typer.Option("--wide", help="the experiment's slightly larger ranges, for a data set to train on")] = False,
     obj: Annotated[
         str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
     ] = None,
@@ -129,7 +129,7 @@ def make_dataset(
 
     config = config_for(
         refined_if(residual, load_sensor(sensor)),
-        load_experiment(experiment),
+        load_experiment(experiment, wide=wide),
         touched=if_given(load_object, obj),
         images=images,
         states=states,
@@ -215,7 +215,7 @@ def train(
       twin train --model vgnn --sensor mg400-331 --data recordings/mine \\
           --target surface-2d --out runs/mine
     """
-    from training.runs.train import train_model
+    from training.studies.train import train_model
 
     return train_model(
         model,
@@ -328,7 +328,7 @@ def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, 
     \b
     Example:
       twin study sim-to-real --sensor mg400-331 --frames DIR \\
-          --contacts surface-2d-wide --draws 2 --epochs 60 --out study
+          --draws 2 --epochs 60 --out study
       twin pack study/sim_only --out training/weights/mg400-331 --force
     """
     from training.estimate.estimator import PoseEstimator

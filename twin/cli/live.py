@@ -8,6 +8,7 @@
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -38,6 +39,7 @@ from twin.cli.options import (
     say,
 )
 from twin.progress import Progress
+from twin.signals import signals_as_ctrl_c
 from twin.types import FIRST, NONE
 
 if TYPE_CHECKING:
@@ -85,8 +87,7 @@ def live(
       twin live --replay out/session --model RUN --headless
     """
     from hardware.live.live import WatchPlan, watch
-    from hardware.rig.rig import signals_as_ctrl_c
-    from training.estimate.estimator import load_remembering
+    from training.estimate.loading import load_remembering
 
     plan = WatchPlan(
         camera=camera,
@@ -124,7 +125,7 @@ def collect(
     form: FormOrAuto = None,
     limits: Limits = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of the drawn contacts; the experiment's own if not given")] = None,
-    design: Annotated[str, typer.Option("--design", help="random, even (fill the ranges) or unsure (where they tell most)")] = "random",
+    design: Annotated[str, typer.Option("--design", help="random, or even (fill the ranges)")] = "random",
     plain_light: PlainLight = False,
     also: Also = None,
     dry_run: DryRun = False,
@@ -134,9 +135,8 @@ def collect(
     """Collect labelled frames with a camera and an arm.
 
     Each contact has a random pose and shear, a tap, and one frame. With --design even the first contacts fill the experiment's ranges
-    evenly, however many are made: choose it where each label costs time. With --design unsure the later contacts are made where those so
-    far leave a model of the pins least sure. The frame was exposed after the arm reported that it stands at the commanded pose. The label
-    is the reported pose.
+    evenly, however many are made: choose it where each label costs time. The frame was exposed after the arm reported that it stands at the
+    commanded pose. The label is the reported pose.
 
     The arm goes around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm goes straight and
     stays in front of it. It lifts off between contacts; at the end it stands 50 mm away, disabled. The program does not know the arm's
@@ -154,13 +154,11 @@ def collect(
           --experiment surface-2d --count 5000 --out data/real
     """
     from hardware.collect.collect import CollectPlan, collect_frames
-    from hardware.rig.rig import signals_as_ctrl_c
     from scenes import load_experiment, load_object, load_sensor, load_servo
-    from training.data.design import LeastSure
 
-    asked, spec = load_experiment(experiment), load_sensor(sensor)
+    asked = load_experiment(experiment)
     plan = CollectPlan(
-        sensor=spec,
+        sensor=load_sensor(sensor),
         stimulus=load_object(obj or asked.object),
         experiment=asked,
         servo=load_servo(servo),
@@ -169,7 +167,6 @@ def collect(
         count=count,
         seed=seed,
         design=design,
-        chooser=LeastSure(spec) if design == "unsure" else None,
         form=form,
         limits=limits,
         plain_light=plain_light,
@@ -242,7 +239,7 @@ def servo(
     The exit code is 1 if it ended early.
     """
     from hardware.servo.following import follow
-    from training.estimate.estimator import load_remembering
+    from training.estimate.loading import load_remembering
 
     return run_along(
         follow,
@@ -294,7 +291,6 @@ def run_along(
     **options
         The other fields of ``FollowPlan``.
     """
-    from hardware.rig.rig import signals_as_ctrl_c
     from hardware.servo.following import FollowPlan
     from scenes import load_object, load_servo
 
@@ -338,10 +334,11 @@ def run_policy(
     """
     from hardware.servo.following import follow
     from hardware.servo.policy_law import load_for_outlines
+    from training.environments.policy_domain import contacts_of
 
     return run_along(
         follow,
-        load_for_outlines,
+        partial(load_for_outlines, contacts_of=contacts_of),
         policy,
         out,
         kept_as="policy",

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -26,13 +26,11 @@ def usable_cores() -> int:
 
 
 CORES = usable_cores()
-# The largest seed of weights and splits. It is the constant of training.runs.run, which is not imported because it would load PyTorch.
+# The largest seed of weights and splits. It is the constant of training.runs.config, which is not imported because it would load PyTorch.
 MOST_SEED = 2**32 - 1
 # Largest number of CPU threads. More threads have never made a training faster, and many more can't be started.
 MOST_THREADS = 256
 
-Quality = Literal["drawn", "preview", "standard", "high"]
-"""Presets of the renderer, as in ``twin.optics.render.Quality``. They are repeated here, because that import would load the renderer."""
 QUALITY = "drawn without noise, or path-traced with more and more samples"
 
 Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]

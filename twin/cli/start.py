@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import QUALITY, Object, Out, Pair, Quality, Sensor, say
+from twin.cli.options import QUALITY, Object, Out, Pair, Sensor, say
 from twin.progress import Progress
-from twin.types import Form
+from twin.types import Form, Quality
 
 if TYPE_CHECKING:
     from hardware.live.doctor import Machine

@@ -70,7 +70,7 @@ def study_servo_command(
     """
     from hardware.servo.study import ServoStudyPlan, study_servo
     from scenes import load_object, load_servo
-    from training.estimate.estimator import load_by_name
+    from training.estimate.loading import load_by_name
 
     plan = ServoStudyPlan(
         models=load_by_name(models),
@@ -117,7 +117,7 @@ def study_objects(
 
     Labels mean the same on every object. The depth is the indentation along the surface's normal at the place nearest to the dome's
     centre, and the angle is measured from this normal, as if a flat plate were touched there. --experiment gives the ranges in which the
-    models are judged; they are trained on the experiment that it names as wider.
+    models are judged; they are trained on its wider ranges.
 
     The same command continues an interrupted study. The run that learnt several objects can be given wherever a RUN is asked for:
 
@@ -286,8 +286,8 @@ def study_tac_vgnn(
     curves.png, efficiency.png, contacts.png, index.html, runs/.
     """
     from scenes import load_sensor
-    from training.runs.train import columns_of
     from training.studies import tac_vgnn
+    from training.studies.train import columns_of
 
     plan = tac_vgnn.Plan(
         data=data,

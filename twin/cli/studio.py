@@ -8,6 +8,8 @@ import typer
 
 from twin.cli import app
 from twin.cli.options import say
+from twin.errors import extras_named
+from twin.signals import signals_as_ctrl_c
 
 if TYPE_CHECKING:
     from training.estimate.estimator import PoseEstimator
@@ -57,7 +59,6 @@ def studio(
       twin studio --state '?sensor=mg400-331&object=edge&depth_mm=3'
     """
     from hardware.live.feed import CameraFeed, require_feed
-    from hardware.rig.rig import signals_as_ctrl_c
     from scenes import load_sensor
     from twin.studio.state import first_state
     from twin.studio.studio import StudioPlan, run_studio
@@ -80,12 +81,13 @@ def models_when_asked(run: Path | None, sensor: str) -> Callable[[str], "PoseEst
     """``models_by_sensor``. If no run is given, it loads when the first model is requested, so that the page does not wait for PyTorch."""
 
     def model_of(name: str) -> "PoseEstimator | None":
-        from training.estimate.estimator import models_by_sensor
+        with extras_named():  # called in a thread of the page, which shows the error
+            from training.estimate.loading import models_by_sensor
 
-        return models_by_sensor()(name)
+            return models_by_sensor()(name)
 
     if run is None:
         return model_of
-    from training.estimate.estimator import models_by_sensor
+    from training.estimate.loading import models_by_sensor
 
     return models_by_sensor(run, sensor)

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
-from typing import Literal
 
 import numpy as np
 
@@ -25,10 +24,8 @@ from twin.optics.tracer import GelTracer, luminance
 from twin.optics.variant import DrJit, VariantChoice, choose_variant, use_variant
 from twin.optics.window import Window
 from twin.store import cached_arrays, write_bytes
-from twin.types import FloatArray, IntArray, PinState
+from twin.types import FloatArray, IntArray, PinState, Quality
 
-Quality = Literal["drawn", "preview", "standard", "high"]
-"""Quality of a render: drawn with exact edges and without noise (`Preview`), or path-traced with an increasing number of samples."""
 SAMPLES = {"drawn": 0, "preview": 4, "standard": 16, "high": 64}
 """Number of samples per pixel, by quality."""
 SCALAR_SAMPLES = {"drawn": 0, "preview": 1, "standard": 4, "high": 16}

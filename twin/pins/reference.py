@@ -54,6 +54,12 @@ class Reference:
     slots: np.ndarray
     ring_ends: np.ndarray
 
+    def map_to(self, other: "Reference") -> np.ndarray:
+        """Linear map (2, 2) of the same pins about their middle in another view: ``displacements @ map`` are those in that view."""
+        here, there = (each.pins_px - each.pins_px.mean(axis=0) for each in (self, other))
+        linear: np.ndarray = np.linalg.lstsq(here, there, rcond=None)[0]
+        return linear
+
 
 def spread_out(pins_px: np.ndarray) -> bool:
     """Whether pins (N, 2) spread over an area, as in every real frame. They do not if they lie at one place, on a line, or too far away."""

@@ -190,6 +190,14 @@ def read_json(path: Path) -> dict[str, Any]:
     return found
 
 
+def read_facts(path: Path) -> list[dict[str, Any]]:
+    """The facts of the episodes that a JSON file lists; raises as ``read_json``."""
+    facts = read_json(path).get("episodes")
+    if not isinstance(facts, list) or not all(isinstance(each, dict) for each in facts):
+        raise RecordError(f"{path}: damaged; {AGAIN}")
+    return facts
+
+
 def require_numbered(files: Sequence[Path], name: Callable[[int], str]) -> None:
     """Raise ``RecordError`` if the files, in order, do not have the names for the numbers 0, 1, 2 and so on."""
     for number, path in enumerate(files):

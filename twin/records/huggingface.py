@@ -17,7 +17,7 @@ import numpy as np
 from twin.errors import FrameError
 from twin.frames.images import read_image, write_image
 from twin.frames.tables import base_name
-from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, read_json, records_in, require_numbered
+from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, read_facts, records_in, require_numbered
 from twin.records.record import CHANNELS, TIME, About, Episode, RecordError, Records, Step, library
 from twin.store import remove_parts, replace_folder, write_json, write_text, write_with
 from twin.store.atomic import PART
@@ -157,10 +157,4 @@ def _listed(folder: Path) -> list[Path]:
 
 def _facts_in(folder: Path) -> list[tuple[str, dict[str, Any]]]:
     """Folder and facts of each episode."""
-    found = []
-    for path in _listed(folder):
-        episodes = read_json(path).get("episodes")
-        if not isinstance(episodes, list) or not all(isinstance(each, dict) for each in episodes):
-            raise RecordError(f"{path}: damaged; {AGAIN}")
-        found += [(path.stem, facts) for facts in episodes]
-    return found
+    return [(path.stem, facts) for path in _listed(folder) for facts in read_facts(path)]

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.errors import TwinError
+from twin.errors import TwinError, extras_named
 from twin.types import Form, ImageArray
 
 POSE_AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -305,12 +305,8 @@ def library(name: str) -> ModuleType:
 
     Raises
     ------
-    RecordError
+    ExtraError
         The library is not installed.
     """
-    try:
+    with extras_named():
         return import_module(name)
-    except ImportError as error:
-        raise RecordError(
-            f"this format needs the library {name.partition('.')[0]}, which is not installed; pip install 'tactip-twin[records]'"
-        ) from error

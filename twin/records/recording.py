@@ -24,7 +24,7 @@ from twin.frames import Recording, open_recording
 from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
 from twin.frames.tables import numbers
-from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, episode_of, format_of, read_json, read_sidecar
+from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, episode_of, format_of, read_facts, read_json, read_sidecar
 from twin.records.record import CHANNELS, NOMINAL_HZ, About, Channel, Episode, RecordError, Records, Step, digest, float32, seconds
 from twin.rig.labels import as_executed, read_executed
 from twin.rig.mounting import Mounting
@@ -90,7 +90,7 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
     notes += [f"columns {', '.join(left)} are not taken over"] if left else []
     records = Records(about, [], notes)
     rest = None if recording.reference is None else recording.reference.image
-    facts = _own_facts(path) if own else []
+    facts = read_facts(path / EPISODES) if own else []
     for number, rows in enumerate(_paths(recording)):
         times_s = _times(recording, rows, notes)
         steps = partial(_steps_of, recording, values, rows, times_s, notes)
@@ -240,13 +240,6 @@ def _said_beside(path: Path) -> dict[str, Any]:
     return told
 
 
-def _own_facts(path: Path) -> list[dict[str, Any]]:
-    facts = read_json(path / EPISODES).get("episodes")
-    if not isinstance(facts, list) or not all(isinstance(each, dict) for each in facts):
-        raise RecordError(f"{path / EPISODES}: damaged; {AGAIN}")
-    return facts
-
-
 class RecordingWriter(FolderWriter):
     """Writes records as a recording. Numbers that recordings do not have go into further columns and into ``pins.npz``.
 
@@ -281,7 +274,7 @@ class RecordingWriter(FolderWriter):
         self._begin()
         if not (self.folder / EPISODES).is_file():
             return []
-        facts = _own_facts(self.folder)
+        facts = read_facts(self.folder / EPISODES)
         length = sum(int(each["length"]) for each in facts)
         try:
             with (self.folder / TABLE).open(newline="", encoding="utf-8") as file:

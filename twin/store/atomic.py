@@ -7,25 +7,28 @@ before that, the old file is unchanged, and the temporary file stays until ``rem
 """
 
 import errno
+import fcntl
 import io
 import json
 import os
 import secrets
 import shutil
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from filelock import FileLock, Timeout
 
 from twin.errors import StoreError
 
 PART = ".part"
 """End of the name of a temporary file. The name begins with a dot."""
 LOCK = ".lock"
-"""Name of the file that is locked by the operating system. It may remain after the run."""
+"""Name of the file that is locked where the file system (NFS) can't lock a folder itself. Earlier versions left one in each folder."""
+LOOK_S = 0.05
+"""Interval, s, at which a run that waits for another one looks again."""
 
 _REMEDIES = {
     errno.ENOSPC: "free some space and give the same command again",
@@ -168,17 +171,32 @@ def locked(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     StoreError
         Another run has reserved the folder, or it cannot be written to.
     """
+    until_s = time.monotonic() + wait_s
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder / LOCK)
-        lock.acquire(timeout=wait_s)
-    except Timeout as error:
-        if not (folder / LOCK).is_file():  # the lock's own file could not be made
-            raise StoreError(f"{folder}: no file can be made there; give another folder") from error
-        raise StoreError(f"{folder}: another run is at work there; wait until it has ended, or give another `out`") from error
+        while (place := _lock(folder)) is None:
+            if time.monotonic() >= until_s:
+                raise StoreError(f"{folder}: another run is at work there; wait until it has ended, or give another `out`")
+            time.sleep(LOOK_S)
     except OSError as error:
         raise unwritten(folder, error) from error
     try:
         yield
     finally:
-        lock.release()
+        fcntl.flock(place, fcntl.LOCK_UN)  # forked processes have the descriptor too, and may live longer
+        os.close(place)
+
+
+def _lock(folder: Path) -> int | None:
+    """Descriptor of a locked folder, or if the file system locks no folders, of a file in it. None if another run has locked it."""
+    for path, flags in ((folder, os.O_RDONLY), (folder / LOCK, os.O_RDWR | os.O_CREAT)):
+        place = os.open(path, flags)
+        try:
+            fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return place
+        except OSError as error:
+            os.close(place)
+            failure = error
+        if isinstance(failure, BlockingIOError):
+            return None
+    raise failure

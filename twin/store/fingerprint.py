@@ -71,15 +71,13 @@ class Code:
 
     def changes(self, record: Mapping[str, Mapping[str, str]]) -> list[str]:
         """Differences from the code of a record, each in a few words; empty if there are none."""
-        before, now = record.get("modules", {}), self.modules
-        found = [f"{name} changed" for name in sorted(now) if name in before and before[name] != now[name]]
-        found += [f"{name} is new" for name in sorted(now) if name not in before]
-        found += [f"{name} is gone" for name in sorted(before) if name not in now]
-        had = record.get("libraries", {})
-        return found + [
-            f"{name} {self.libraries.get(name, 'not used')}, was {had.get(name, 'not used')}"
-            for name in sorted({*had, *self.libraries})
-            if had.get(name) != self.libraries.get(name)
+        before, now = record["modules"], self.modules
+        kinds = {"is gone": before.keys() - now.keys(), "is new": now.keys() - before.keys()}
+        kinds["changed"] = {name for name in before.keys() & now.keys() if before[name] != now[name]}
+        had, has = record["libraries"], self.libraries
+        libraries = [(name, has.get(name, "not used"), had.get(name, "not used")) for name in sorted({*had, *has})]
+        return [f"{name} {kind}" for kind in reversed(kinds) for name in sorted(kinds[kind])] + [
+            f"{name} {new}, was {old}" for name, new, old in libraries if new != old
         ]
 
 
@@ -197,15 +195,14 @@ def _read(root: Path, file: Path, name: str) -> _Module:
     gc.disable()  # a syntax tree has many small objects, and garbage collection would double the time
     try:
         tree = ast.parse(source_text(file))
-        lines: list[str] = []
-        _flatten(tree, lines)
         imports, names = _imports(tree, name, file.name == "__init__.py")
+        digest = hashlib.sha256(_bare(tree).encode()).hexdigest()
     except (OSError, SyntaxError, UnicodeDecodeError) as error:
         raise UnknownCodeError(f"{file}: not readable ({error}); install the program again") from error
     finally:
         if collecting:
             gc.enable()
-    return _Module(hashlib.sha256("".join(lines).encode()).hexdigest()[:16], imports, names)
+    return _Module(digest[:16], imports, names)
 
 
 def _imports(tree: ast.Module, module: str, is_package: bool) -> tuple[tuple[_From, ...], dict[str, _From]]:
@@ -232,29 +229,16 @@ def _imports(tree: ast.Module, module: str, is_package: bool) -> tuple[tuple[_Fr
     return tuple(found), names
 
 
-def _flatten(node: ast.AST, lines: list[str]) -> None:
-    """Append a syntax tree as text, without strings that stand alone, what raised errors say, line numbers and empty fields."""
-    if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-        given = [part for part in node.exc.args if not _is_words(part)]
-        node = ast.Raise(ast.Call(node.exc.func, given, node.exc.keywords), node.cause)
-    lines.append(f"({type(node).__name__}")
-    for name in node._fields:
-        value = getattr(node, name, None)
-        if isinstance(value, list):
-            parts = [part for part in value if not _is_text(part)]
-            lines += [f" {name}["] if parts else []  # empty lists are left out, because later versions of Python have additional fields
-            for part in parts:
-                if isinstance(part, ast.AST):
-                    _flatten(part, lines)
-                else:
-                    lines.append(repr(part))
-            lines += ["]"] if parts else []
-        elif isinstance(value, ast.AST):
-            lines.append(f" {name}")
-            _flatten(value, lines)
-        elif value is not None:
-            lines.append(f" {name}={value!r}")
-    lines.append(")")
+def _bare(tree: ast.Module) -> str:
+    """A syntax tree as text, without strings that stand alone, what raised errors say, and line numbers. The tree is changed."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+            node.exc.args = [part for part in node.exc.args if not _is_words(part)]
+        for name in ("body", "orelse", "finalbody"):
+            block = getattr(node, name, None)
+            if isinstance(block, list):
+                setattr(node, name, [part for part in block if not _is_text(part)])
+    return ast.dump(tree)
 
 
 def _is_words(part: ast.expr) -> bool:

@@ -2,7 +2,8 @@
 
 A folder of results contains a list of the files that this program wrote into it, with a digest of each. A file that is not in the list, or
 that has changed since, is not overwritten unless the user requests it (``overwriting``). During a run, the list contains the names that the
-run may write without a digest, so that the same command can continue after a run that was killed.
+run may write without a digest, so that the same command can continue after a run that was killed. The list of single files, which may be
+written into the user's working folder, is in the user's home, not beside them.
 """
 
 import errno
@@ -12,6 +13,7 @@ import hashlib
 import inspect
 import json
 import os
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar
@@ -19,8 +21,11 @@ from functools import wraps
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
+import platformdirs
+
 from twin.errors import StoreError
 from twin.store.atomic import LOCK, PART, locked, unwritten, write_json
+from twin.store.made import PROGRAM
 
 WRITTEN = ".written.json"
 """Name of the list of files that this program wrote into a folder."""
@@ -70,7 +75,7 @@ def output(folder: Path, *names: str, gone_on: tuple[str, ...] = ()) -> Iterator
     with _unmade_if_empty(folder), _held_once(folder), _told(folder):
         every = (*names, *gone_on)
         written = _require_ours(folder, every)
-        _write_list(folder, written | dict.fromkeys(every, _ANY))
+        _write_list(folder / WRITTEN, written | dict.fromkeys(every, _ANY))
         try:
             yield
         finally:
@@ -80,7 +85,7 @@ def output(folder: Path, *names: str, gone_on: tuple[str, ...] = ()) -> Iterator
 
 @contextmanager
 def output_file(path: Path, *beside: str) -> Iterator[None]:
-    """Context that checks first that a file can be written, and enters it into the list of its folder at the end.
+    """Context that checks first that a file can be written, and enters it into a list at the end.
 
     The folder is created if missing, and removed if it is still empty after an error. It is not reserved in between, because it may be the
     user's working folder.
@@ -99,11 +104,12 @@ def output_file(path: Path, *beside: str) -> Iterator[None]:
     folder, names = path.parent, [glob.escape(path.name), *(glob.escape(path.stem) + ending for ending in beside)]
     with _unmade_if_empty(folder), _told(path):
         with _held_once(folder, wait_s=_WAIT_S):
-            _write_list(folder, _require_ours(folder, names))
+            _require_ours(folder, names)
+            _require_room(folder)
         try:
             yield
         finally:
-            with suppress(StoreError), _held_once(folder, wait_s=_WAIT_S):
+            with suppress(StoreError, OSError), _held_once(folder, wait_s=_WAIT_S):
                 _enter(folder, names, alone=False)
 
 
@@ -201,10 +207,11 @@ def _enter(folder: Path, names: Sequence[str], gone_on: Sequence[str] = (), *, a
 
     Names of other runs without a file are removed if this run is ``alone``: those runs were killed. Otherwise they may be at work.
     """
-    known = {name: digest for name, digest in _read_list(folder).items() if name not in names}
+    path, known = _list_of(folder), {name: digest for name, digest in _read_list(folder).items() if name not in names}
     if alone:
         known = {name: digest for name, digest in known.items() if digest != _ANY or (folder / name).exists()}
-    _write_list(folder, known | {name: _ANY if name in gone_on else _digest(folder / name) for name in _there(folder, names)})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write_list(path, known | {name: _ANY if name in gone_on else _digest(folder / name) for name in _there(folder, names)})
 
 
 def _digest(path: Path) -> str:
@@ -218,24 +225,39 @@ def _digest(path: Path) -> str:
         return _ANY
 
 
+def _list_of(folder: Path) -> Path:
+    """The file of a folder's list: in the folder if results are there, else in the user's home."""
+    inside = folder / WRITTEN
+    if os.path.lexists(inside):
+        return inside
+    name = hashlib.sha256(os.fsencode(os.path.realpath(folder))).hexdigest()
+    return Path(platformdirs.user_state_dir(PROGRAM)) / "written" / f"{name}.json"
+
+
 def _read_list(folder: Path) -> dict[str, str]:
     """The files that this program wrote, with their digests; empty if the list is damaged."""
-    path = folder / WRITTEN
+    path = _list_of(folder)
     if path.is_symlink() or not path.is_file():
         return {}
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
-    if not isinstance(content, dict):
-        return {}
-    return {name: digest for name, digest in content.items() if isinstance(digest, str)}
+    return {name: digest for name, digest in content.items() if isinstance(digest, str)} if isinstance(content, dict) else {}
 
 
-def _write_list(folder: Path, content: dict[str, str]) -> None:
-    path = write_json(folder / WRITTEN, dict(sorted(content.items())))
-    if not content:  # the list was still written, because this tests whether the folder can be written
+def _write_list(path: Path, content: dict[str, str]) -> None:
+    if content:
+        write_json(path, dict(sorted(content.items())))
+    else:
         path.unlink(missing_ok=True)
+
+
+def _require_room(folder: Path) -> None:
+    """Raise OSError if no file can be written into a folder."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(b" ")
+        file.flush()
 
 
 @contextmanager
@@ -246,10 +268,9 @@ def _unmade_if_empty(folder: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        with suppress(StoreError, OSError):  # another run is at work there, or a parent holds something
-            if made and not contents(folder) and not _read_list(folder):  # a list has the names that another run may still write
+        with suppress(StoreError, OSError):  # another run is at work there, or a folder holds something
+            if made:
                 with locked(folder):
-                    (folder / LOCK).unlink()
                     for each in made:
                         each.rmdir()
         raise

@@ -212,7 +212,8 @@ def _measures(judged: Judged, limits: dict[str, float]) -> str:
     """HTML of the measures with their limits."""
     rows = []
     for m in MEASURES:
-        value, kind = judged.figures[m.name], "bad" if m.title in judged.failed else "good"
+        value = judged.figures[m.name]
+        kind = "bad" if m.title in judged.failed else "" if np.isnan(value) else "good"
         limit = f"{'at least' if m.least else 'at most'} {limits[m.name]:.3g} {m.unit}"
         shown = "-" if np.isnan(value) else f"{value:.3f}"
         rows.append(f"<tr><td>{m.title}</td><td class='{kind}'>{shown}</td><td>{limit}</td></tr>")

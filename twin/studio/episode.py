@@ -3,7 +3,6 @@
 The caller hands in the steps; this package does not depend on the environments.
 """
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,9 +81,7 @@ class EpisodeMode(PageMode):
         self._middle_mm = np.zeros(3)  # of the part of the object that is shown
         self._last: EpisodeStep | None = None
         self._steps = self.newest(self._show, "episode")
-        with page.charts_tab:
-            self._rewards = Chart(page.gui, "reward of a step", ("reward",))
-            self._forces = Chart(page.gui, "force on the object, N", ("x", "y", "z"))
+        self._rewards, self._forces = Chart(page, "reward of a step"), Chart(page, "force on the object, N")
 
     def give(self, step: EpisodeStep) -> None:
         """Give the next step to show. Returns at once."""
@@ -117,15 +114,15 @@ class EpisodeMode(PageMode):
             self._scene.show_pins(step.pins, self._skin.vertices(step.pins.base_mm).astype(np.float32), colours(way_mm, Shown.DISPLACEMENT))
             self._scene.show_object(step.T_sensor_object)
             self._scene.show_force(step.foot_mm, step.force_n)
-            self._rewards.add([step.reward])
-            self._forces.add(step.force_n.tolist())
+            self._rewards.add({"reward": step.reward})
+            self._forces.add(dict(zip("xyz", step.force_n.tolist(), strict=True)))
 
         numbers = [f"<span data-number='{step.number}' data-depth='0'></span>", badge("episode", "moving"), number_table(rows | step.told)]
         pictures = shot_pictures(self._sensor, self._reference, step.frame, seen)
         self.put_up(pictures, f"camera, {step.frame.form} frame", numbers, also=scene)
 
 
-class EpisodePage:
+class EpisodePage(Page):
     """A page that shows the steps of episodes to any number of browsers. A context manager.
 
     Parameters
@@ -137,34 +134,22 @@ class EpisodePage:
     host, port : str, int
         As for ``Page``.
 
-    Attributes
-    ----------
-    url : str
-        The page's address.
-
     Raises
     ------
     TwinError
-        When the context is entered: the server can't listen on this host and port.
+        The server can't listen on this host and port.
     """
 
     def __init__(self, title: str, sensor: SensorSpec, form: Form, *, host: str = "127.0.0.1", port: int = 0) -> None:
-        self._title, self._sensor, self._form, self._host, self._port = title, sensor, form, host, port
-        self._stack = ExitStack()
-        self.url = ""
-
-    def __enter__(self) -> "EpisodePage":
-        page = self._stack.enter_context(Page(self._title, host=self._host, port=self._port))
-        self._mode = EpisodeMode(page, self._sensor, self._form)
-        page.set_modes([self._mode])
-        self._stack.callback(self._mode.stop)
-        self._mode.start()
-        self.url = page.url
-        return self
+        super().__init__(title, host=host, port=port)
+        self._episode = EpisodeMode(self, sensor, form)
+        self.set_modes([self._episode])
+        self._episode.start()
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self._episode.stop()
+        super().__exit__()
 
     def show(self, step: EpisodeStep) -> None:
         """Show a step; returns at once."""
-        self._mode.give(step)
+        self._episode.give(step)

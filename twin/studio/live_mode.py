@@ -13,9 +13,9 @@ from twin.errors import TwinError
 from twin.estimate import SensorModel, seen_in
 from twin.pins.check import Grade, examine
 from twin.pins.pipeline import Pipeline
-from twin.studio.live_page import LiveShot, charted, live_chart, shot_numbers, shot_pictures
+from twin.studio.live_page import LiveShot, charted, shot_numbers, shot_pictures
 from twin.studio.mode import PageMode
-from twin.studio.page import Page, put
+from twin.studio.page import Chart, Page, put
 from twin.studio.pictures import badge, paragraph
 from twin.studio.twin_mode import TwinMode
 
@@ -38,8 +38,8 @@ class LiveArm(Protocol):
     def limits(self) -> str:
         """The arm's limits once it is armed, as text."""
 
-    def arm(self) -> None:
-        """Enable it. Raises ``TwinError`` if it refuses."""
+    def arm(self) -> list[str]:
+        """Check camera and arm, and enable it. Returns what was checked, as lines of text. Raises ``TwinError`` if a check fails."""
 
     def disarm(self) -> None:
         """Stop and disable it."""
@@ -125,7 +125,7 @@ class LiveMode(PageMode):
         self._armed.on_update(page.guarded(self._toggle_armed))
         nudges.on_click(page.guarded(lambda: self._nudge(nudges.value)))
         gui.add_command("Emergency stop of the arm", hotkey="space", modifier="shift").on_trigger(page.guarded(self.emergency_stop))
-        self._chart = live_chart(page)
+        self._chart = Chart(page, "live estimates")
 
     def stop(self) -> None:
         """End, and release camera and arm."""
@@ -212,7 +212,10 @@ class LiveMode(PageMode):
     def _toggle_armed(self) -> None:
         robot = self._robot()
         try:
-            robot.arm() if self._armed.value else robot.disarm()
+            if self._armed.value:
+                self._page.say("; ".join(robot.arm()))
+            else:
+                robot.disarm()
         finally:
             put(self._armed, robot.armed)
             self._nudges.visible = robot.armed

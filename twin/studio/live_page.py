@@ -4,7 +4,6 @@ same.
 Frames and estimates are handed in; this package does not depend on the devices.
 """
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 
 from scenes.sensor import SensorSpec
@@ -12,7 +11,7 @@ from twin.estimate import Estimate
 from twin.pins.reference import Reference
 from twin.studio.camera import dome_part
 from twin.studio.page import Chart, Page
-from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, paragraph
+from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, label_name, paragraph
 from twin.types import Frame, ImageArray, Observation
 
 CHARTED = 3
@@ -41,19 +40,13 @@ def shot_numbers(shot: LiveShot, seen: Observation) -> list[str]:
     return [estimate_table(shot.estimate, {}), *(paragraph(line, "note") for line in (found, *shot.lines))]
 
 
-def charted(estimate: Estimate) -> list[float]:
-    """The values for the chart; NaN where there is none."""
-    values = [float(value) for value in estimate.value[:CHARTED]] if estimate.valid else []
-    return values + [float("nan")] * (CHARTED - len(values))
+def charted(estimate: Estimate) -> dict[str, float]:
+    """The values for the chart, by label; none without an estimate."""
+    named = zip(estimate.names[:CHARTED], estimate.value, strict=False)
+    return {label_name(name)[0]: float(value) for name, value in named} if estimate.valid else {}
 
 
-def live_chart(page: Page) -> Chart:
-    """A chart of the first labels over the last seconds."""
-    with page.charts_tab:
-        return Chart(page.gui, "live estimates", [str(k + 1) for k in range(CHARTED)])
-
-
-class LivePage:
+class LivePage(Page):
     """A page that shows live frames to any number of browsers. A context manager.
 
     Parameters
@@ -68,24 +61,14 @@ class LivePage:
     Raises
     ------
     TwinError
-        When the context is entered: the server can't listen on this host and port.
+        The server can't listen on this host and port.
     """
 
     def __init__(self, title: str, sensor: SensorSpec, reference: Reference, *, host: str = "127.0.0.1", port: int = 0) -> None:
+        super().__init__(title, host=host, port=port)
         self._title, self._sensor, self._reference = title, sensor, reference
-        self._host, self._port = host, port
-        self._stack = ExitStack()
-        self.url = ""
-
-    def __enter__(self) -> "LivePage":
-        self._page = self._stack.enter_context(Page(self._title, host=self._host, port=self._port))
-        self._chart = live_chart(self._page)
-        self._page.show_nothing("Waiting for the first frame.")
-        self.url = self._page.url
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self._chart = Chart(self, "live estimates")
+        self.show_nothing("Waiting for the first frame.")
 
     def show(self, shot: LiveShot, seen: Observation) -> None:
         """Show a frame with the pipeline's observation of it. Browsers get pictures and numbers together."""
@@ -93,8 +76,8 @@ class LivePage:
         numbers = [badge("live", "moving"), paragraph(self._title, "note"), *shot_numbers(shot, seen)]
 
         def change() -> None:
-            self._page.show_pictures(*pictures, f"live {shot.frame.form} frame {shot.frame.sequence}")
-            self._page.show_numbers(*numbers)
+            self.show_pictures(*pictures, f"live {shot.frame.form} frame {shot.frame.sequence}")
+            self.show_numbers(*numbers)
             self._chart.add(charted(shot.estimate))
 
-        self._page.together(change)
+        self.together(change)

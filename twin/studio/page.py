@@ -4,12 +4,13 @@ import errno
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, redirect_stdout
 from http import HTTPStatus
 from io import StringIO
-from typing import Any, Protocol, TypeVar
+from itertools import count
+from typing import Any, Protocol, Self, TypeVar
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -167,51 +168,57 @@ def free_port(host: str, port: int) -> int:
 
 
 class Chart:
-    """Chart of lines over the last seconds.
+    """Chart of lines over the last seconds. It appears with its first values.
 
     Parameters
     ----------
-    gui : viser.GuiApi
+    page : Page
     title : str
-    names : sequence of str
-    dashed : sequence of str
-        Names of the lines that are drawn dashed.
     """
 
-    def __init__(self, gui: viser.GuiApi, title: str, names: Sequence[str], *, dashed: Sequence[str] = ()) -> None:
-        self._points: deque[tuple[float, list[float]]] = deque()
+    def __init__(self, page: "Page", title: str) -> None:
+        self._page, self._title = page, title
+        self._order = page.next_chart()
+        self._plot: viser.GuiUplotHandle | None = None
+        self._names: tuple[str, ...] = ()
+        self._points: deque[tuple[float, ...]] = deque()
         self._drawn_s = 0.0
-        lines: list[uplot.Series] = [{"label": "s"}]
-        for name, colour in zip(names, LINES, strict=False):
-            lines.append({"label": name, "stroke": colour, "width": 2, **({"dash": (6, 4)} if name in dashed else {})})
-        axis: uplot.Axis = {"stroke": "#8a93a3", "size": 34, "grid": {"stroke": "#8a93a333", "width": 1}}
-        self._plot = gui.add_uplot(
-            self._arrays(len(names)),
-            tuple(lines),
-            title=title,
-            height=CHART_PX,
-            axes=({**axis, "size": 26}, axis),
-            scales={"x": {"time": False, "range": (-SPAN_S, 0.0)}},
-            legend={"show": True},
-        )
-        self._count = len(names)
 
-    def add(self, values: Sequence[float]) -> None:
-        """Add the present values, NaN where there is none."""
+    def add(self, values: Mapping[str, float]) -> None:
+        """Add the present value of each line. Other lines than before begin a new chart; without values nothing changes."""
+        if not values:
+            return
         now = time.monotonic()
-        self._points.append((now, list(values)))
+        if tuple(values) != self._names:
+            self._names = tuple(values)
+            self._points.clear()
+            self._draw_anew()
+        self._points.append((now, *values.values()))
         while self._points[0][0] < now - SPAN_S:
             self._points.popleft()
-        if now - self._drawn_s > CHART_S:
+        if self._plot is not None and now - self._drawn_s > CHART_S:
             self._drawn_s = now
-            self._plot.data = self._arrays(self._count)
+            times, *lines = np.array(self._points).T
+            self._plot.data = (times - now, *lines)
 
-    def _arrays(self, count: int) -> tuple[np.ndarray, ...]:
-        if not self._points:
-            return tuple(np.zeros(1) for _ in range(count + 1))
-        now = self._points[-1][0]
-        times, values = zip(*self._points, strict=True)
-        return (np.array(times) - now, *np.array(values, float).T)
+    def _draw_anew(self) -> None:
+        if self._plot is not None:
+            self._plot.remove()
+        lines: list[uplot.Series] = [
+            {"label": name, "stroke": colour, "width": 2} for name, colour in zip(self._names, LINES, strict=False)
+        ]
+        axis: uplot.Axis = {"stroke": "#8a93a3", "size": 34, "grid": {"stroke": "#8a93a333", "width": 1}}
+        with self._page.charts_tab:
+            self._plot = self._page.gui.add_uplot(
+                (np.zeros(1),) * (len(lines) + 1),
+                ({"label": "s"}, *lines),
+                title=self._title,
+                height=CHART_PX,
+                axes=({**axis, "size": 26}, axis),
+                scales={"x": {"time": False, "range": (-SPAN_S, 0.0)}},
+                legend={"show": True},
+                order=self._order,
+            )
 
 
 class Page:
@@ -252,6 +259,7 @@ class Page:
             self._camera = gui.add_image(empty, label="camera", format="jpeg", jpeg_quality=JPEG_QUALITY)
             self._cells = gui.add_image(empty, label=CELLS, format="jpeg", jpeg_quality=JPEG_QUALITY)
         self.charts_tab = pictures.add_tab("Charts")
+        self.next_chart = count().__next__
         pictures.dock_left()
         pictures.set_width(PICTURES_PX)
         gui.main_panel.dock_right()
@@ -365,7 +373,7 @@ class Page:
         """Hide the message: the user does something else."""
         self._said.visible = False
 
-    def __enter__(self) -> "Page":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

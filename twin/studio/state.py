@@ -140,6 +140,11 @@ def first_state(saved: str | Path | None, sensor: str, touched: str) -> StudioSt
     return state
 
 
+def heading(state: StudioState) -> str:
+    """The page's heading."""
+    return f"TacTip studio: {state.sensor}"
+
+
 Way = list[tuple[float, ObjectPose]]
 """Poses with their times in s, increasing from 0."""
 

@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,10 @@ from twin.pins import nominal_reference
 from twin.studio.contact import Answer, Light, MovingContact, Setup
 from twin.studio.mode import PageMode
 from twin.studio.page import Chart, Page, put, value_of
-from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
+from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, label_name, number_table, paragraph
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, spoken, unit_of
 from twin.studio.scene import FULL_SCALE, Scene, Shown
-from twin.studio.state import StudioState, Way, next_path, read_way, save_way, tap_and_shear
+from twin.studio.state import StudioState, Way, heading, next_path, read_way, save_way, tap_and_shear
 from twin.studio.tracing import Tracer
 from twin.studio.video import FilmWriter
 from twin.studio.worker import Worker
@@ -32,24 +33,10 @@ ModelOf = Callable[[str], SensorModel | None]
 
 STEPS = {"mm": 0.25, "deg": 1.0}
 """Step by which a key moves or turns the object, mm and deg."""
-KEYS = {
-    "arrowleft": ("x_mm", -1),
-    "arrowright": ("x_mm", +1),
-    "arrowup": ("y_mm", -1),
-    "arrowdown": ("y_mm", +1),
-    "pageup": ("depth_mm", -1),
-    "pagedown": ("depth_mm", +1),
-}
-"""Keys that move the object together with shift: the number that changes, and its direction."""
-TURN_KEYS = {
-    "arrowleft": ("tilt_y_deg", -1),
-    "arrowright": ("tilt_y_deg", +1),
-    "arrowup": ("tilt_x_deg", -1),
-    "arrowdown": ("tilt_x_deg", +1),
-    "pageup": ("twist_deg", -1),
-    "pagedown": ("twist_deg", +1),
-}
-"""Keys that turn the object together with ctrl (or cmd) and shift: the angle that changes, and its direction."""
+KEYS = (("arrowleft", "arrowright"), ("arrowup", "arrowdown"), ("pageup", "pagedown"))
+"""Pairs of keys that change one of the object's numbers, the first to smaller values."""
+CHANGED = {"shift": ("x_mm", "y_mm", "depth_mm"), "cmd/ctrl+shift": ("tilt_y_deg", "tilt_x_deg", "twist_deg")}
+"""The number that each pair of keys changes together with a modifier."""
 ONE_GESTURE_S = 0.8
 """Longest time, s, between two wishes of one gesture. 'Undo' takes back a whole gesture."""
 MOST_UNDO = 100
@@ -92,17 +79,16 @@ class TwinMode(PageMode):
         self._path_s = 0.0
         self._film: FilmWriter | None = None
         self.followers: list[Callable[[Answer], None]] = []
-        self._rebuilding = threading.Lock()
+        self._rebuilding = threading.RLock()
         self._showing = threading.Lock()  # held while the scene is changed or built again
         self._take_up(*self._prepare(state))
         self._publisher = self.newest(self._publish, "page")
         self._links = self.newest(self._open_link, "link")
         page.on_address = self._links.give
         self._build_controls()
-        with page.charts_tab:
-            self._forces = Chart(page.gui, "force on the object, N", ("x", "y", "z"))
-            self._estimates = Chart(page.gui, "estimates less truth", ("1", "2", "3"))
-            self._depths = Chart(page.gui, "indentation, mm", ("indentation",))
+        self._forces, self._estimates, self._depths = (
+            Chart(page, title) for title in ("force on the object, N", "estimates less truth", "indentation, mm")
+        )
 
     # start and end
 
@@ -265,11 +251,12 @@ class TwinMode(PageMode):
         self._link.on_update(guarded(lambda: self._links.give(self._link.value)))
         self._record_way.on_update(guarded(self._toggle_way))
         self._filming.on_update(guarded(self._toggle_film))
-        for modifier, keys in (("shift", KEYS), ("cmd/ctrl+shift", TURN_KEYS)):
-            for key, (name, sign) in keys.items():
-                label = f"{spoken(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
-                command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # viser defines it as a literal
-                command.on_trigger(self._key(name, sign))
+        for modifier, names in CHANGED.items():
+            for keys, name in zip(KEYS, names, strict=True):
+                for key, sign in zip(keys, (-1, +1), strict=True):
+                    label = f"{spoken(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
+                    command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # viser defines it as a literal
+                    command.on_trigger(partial(self._keyed, name, sign))
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
         gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(lambda: self.play(tap_and_shear(self._wish))))
 
@@ -280,8 +267,8 @@ class TwinMode(PageMode):
 
         return moved
 
-    def _key(self, name: str, sign: int) -> Callable[[object], None]:
-        return lambda event: self.nudge(name, sign)
+    def _keyed(self, name: str, sign: int, event: object) -> None:
+        self.nudge(name, sign)
 
     def _own_friction(self) -> float:
         setup = self.contact.setup
@@ -317,12 +304,18 @@ class TwinMode(PageMode):
         self.worker.ask(self._wish)
 
     def _change_object(self) -> None:
+        chosen = self._object.value
+        with self._rebuilding:  # another sensor may just be opened; it keeps this choice
+            self._touch(chosen)
+
+    def _touch(self, name: str) -> None:
         try:
-            touched = load_object(self._object.value)
+            touched = load_object(name)
         except SpecError:
             put(self._object, self._state.object)
             raise
-        self._state = self._state.model_copy(update={"object": self._object.value})
+        put(self._object, name)
+        self._state = self._state.model_copy(update={"object": name})
 
         def change() -> None:
             self.contact.change(touched=touched)
@@ -334,11 +327,13 @@ class TwinMode(PageMode):
         self.worker.ask(self._wish)
 
     def _change_sensor(self) -> None:
-        try:
-            self.open(self.state.model_copy(update={"sensor": self._sensor.value, "form": str(Form.RAW)}))
-        except (TwinError, SpecError):
-            put(self._sensor, self._state.sensor)
-            raise
+        chosen = self._sensor.value
+        with self._rebuilding:
+            try:
+                self.open(self.state.model_copy(update={"sensor": chosen, "form": str(Form.RAW)}))
+            except (TwinError, SpecError):
+                put(self._sensor, self._state.sensor)
+                raise
 
     def open(self, state: StudioState) -> None:
         """Show another state. With another sensor everything is built again, which takes some seconds.
@@ -354,6 +349,7 @@ class TwinMode(PageMode):
             self.worker.__exit__(None, None, None)
             if self._tracer is not None:
                 self._tracer.__exit__(None, None, None)
+            self._page.gui.set_panel_label(heading(state))
             self._state, self._wish = state, state.object_pose()
             self._shown, self._drawn = Shown(state.colour), Drawn(state.drawn)
             self._model_note = "the model is being loaded"
@@ -476,13 +472,12 @@ class TwinMode(PageMode):
         ]
 
     def _draw_charts(self, answer: Answer) -> None:
-        self._forces.add(answer.state.force_n.tolist())
-        self._depths.add([answer.indent_mm])
-        errors = [np.nan] * 3
-        if answer.estimate is not None and answer.estimate.valid:
-            for k, (name, value) in enumerate(zip(answer.estimate.names[:3], answer.estimate.value, strict=False)):
-                errors[k] = float(value) - answer.labels.get(name, np.nan)
-        self._estimates.add(errors)
+        self._forces.add(dict(zip("xyz", answer.state.force_n.tolist(), strict=True)))
+        self._depths.add({"indentation": answer.indent_mm})
+        estimate = answer.estimate
+        if estimate is not None and estimate.valid:
+            known = zip(estimate.names, estimate.value, strict=True)
+            self._estimates.add({label_name(name)[0]: float(value) - answer.labels[name] for name, value in known if name in answer.labels})
 
     # saving
 

@@ -17,9 +17,9 @@ from hardware.arms.cri.transforms import Numbers, euler2mat, mat2euler, mat2quat
 from hardware.arms.mg400 import MG400
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, MAX_JOINT_DEG_S, MAX_LINEAR_MM_S
 from hardware.arms.motion import circle, turn_between_deg
+from hardware.arms.newest import NewestTarget
 from hardware.arms.open_arm import open_arm
 from hardware.errors import DeviceError, leave
-from hardware.rig.newest import NewestTarget
 
 # Speeds at the start, as in cri: % of the MG400's largest speed, mm/s and deg/s for other arms.
 START_SPEED = 20.0

@@ -5,6 +5,7 @@
 
 from collections.abc import Callable
 from threading import Thread
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +37,19 @@ class AsyncBusy(DeviceError):  # noqa: N818  (cri's name)
 
 class AsyncNotBusy(DeviceError):  # noqa: N818  (cri's name)
     """No move was started."""
+
+
+class _OfController:
+    """A property of a robot that is its controller's property of the same name."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, robot: "SyncRobot | None", owner: type | None = None) -> Any:
+        return self if robot is None else getattr(robot.controller, self._name)
+
+    def __set__(self, robot: "SyncRobot", value: float) -> None:
+        setattr(robot.controller, self._name, value)
 
 
 class SyncRobot(Closing):
@@ -93,37 +107,9 @@ class SyncRobot(Closing):
     def coord_frame(self, frame: Numbers) -> None:
         self._T_base_work = euler2mat(frame, self._axes)
 
-    @property
-    def linear_speed(self) -> float:
-        return self.controller.linear_speed
-
-    @linear_speed.setter
-    def linear_speed(self, speed: float) -> None:
-        self.controller.linear_speed = speed
-
-    @property
-    def angular_speed(self) -> float:
-        return self.controller.angular_speed
-
-    @angular_speed.setter
-    def angular_speed(self, speed: float) -> None:
-        self.controller.angular_speed = speed
-
-    @property
-    def speed(self) -> float:
-        return self.controller.speed
-
-    @speed.setter
-    def speed(self, speed: float) -> None:
-        self.controller.speed = speed
-
-    @property
-    def blend_radius(self) -> float:
-        return self.controller.blend_radius
-
-    @blend_radius.setter
-    def blend_radius(self, blend_radius: float) -> None:
-        self.controller.blend_radius = blend_radius
+    linear_speed, angular_speed = _OfController(), _OfController()
+    speed, blend_radius = _OfController(), _OfController()
+    joint_angles = _OfController()  # present joints (J,), deg
 
     @property
     def pose(self) -> np.ndarray:
@@ -134,11 +120,6 @@ class SyncRobot(Closing):
         """The last requested pose; None before the first one."""
         commanded = self.controller.commanded_pose
         return None if commanded is None else self._seen(commanded)
-
-    @property
-    def joint_angles(self) -> np.ndarray:
-        """Present joints (J,), deg."""
-        return self.controller.joint_angles
 
     @property
     def target_joint_angles(self) -> np.ndarray | None:

@@ -12,7 +12,7 @@ from training.data.dataset import Dataset
 from training.models.cnn.inputs import ImageInputs, image_inputs, small_image
 from training.models.cnn.network import Cnn
 from training.models.part import Model, Prediction, Prepared, Trained, refuse_sizes
-from training.runs.recipes import Recipe
+from training.models.recipes import Recipe
 from twin.pins.reference import Reference
 from twin.types import Frame
 

@@ -8,7 +8,7 @@ from training.data.pins import PinTable
 from training.models.graphs.inputs import GraphInputs, frame_edges, pixel_features
 from training.models.graphs.network import Gcn
 from training.models.part import Learnt, PinModel, refuse_sizes
-from training.runs.recipes import Recipe
+from training.models.recipes import Recipe
 from twin.frames.forms import frame_size
 from twin.pins.reference import Reference
 

@@ -10,10 +10,11 @@ from torch import nn
 
 from training.data.label_code import LabelCode
 from training.data.pins import PinTable
+from training.errors import TrainingError
 from training.models.part import Inputs, Learnt, Modes, PinModel, Weights, refuse_sizes
+from training.models.recipes import Recipe
 from training.models.steered.field import waves_of
 from training.models.steered.network import Steered, SteeredSize
-from training.runs.recipes import Recipe, TrainingError
 from twin.pins.reference import Reference
 
 # Buffers that a small copy leaves out, because they follow from the pins at rest.

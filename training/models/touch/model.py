@@ -13,11 +13,12 @@ import torch
 from training.data.dataset import Dataset
 from training.data.label_code import LabelCode
 from training.data.pins import PinTable
+from training.errors import TrainingError
 from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Weights, refuse_sizes
+from training.models.recipes import Recipe
 from training.models.touch.features import Bases
 from training.models.touch.network import TouchNetwork
 from training.models.vgnn.registration import Registration, align, fit_registration
-from training.runs.recipes import Recipe, TrainingError
 from twin.pins.reference import Reference
 
 SIZES = {"modes": 40, "light_modes": 20, "width": 256, "depth": 3}

@@ -10,11 +10,12 @@ from torch import nn
 
 from training.data.label_code import LabelCode
 from training.data.pins import PinTable
+from training.errors import TrainingError
 from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Variant, Weights, refuse_sizes
+from training.models.recipes import Recipe
 from training.models.vgnn.inputs import PinInputs, filled, pin_features, seated_inputs
 from training.models.vgnn.network import Vgnn, VgnnSize
 from training.models.vgnn.registration import Registration, fit_registration
-from training.runs.recipes import Recipe, TrainingError
 from twin.pins.reference import Reference
 from twin.pins.voronoi import directed_edges, triangulate
 

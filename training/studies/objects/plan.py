@@ -6,8 +6,8 @@ import numpy as np
 
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_experiment
 from training.data.dataset import Dataset, joined
+from training.errors import TrainingError
 from training.generation import GenerationConfig, require_count
-from training.runs.recipes import TrainingError
 from training.studies.sim_to_real.twins import contact_of
 from twin.types import FINE
 
@@ -27,7 +27,7 @@ class Plan:
     ----------
     sensor : SensorSpec
     experiment : ExperimentSpec
-        Its ranges contain the labels of the judged contacts. Training uses the experiment that it names as wider, else itself.
+        Its ranges contain the labels of the judged contacts. Training uses its wide form, if it has one.
     randomisation : RandomisationSpec
     train, unseen : tuple of ObjectSpec
         Objects. The first of ``train`` is also trained on alone.
@@ -64,7 +64,7 @@ class Plan:
     @property
     def wider(self) -> ExperimentSpec:
         """The experiment that is trained on."""
-        return load_experiment(self.experiment.wider) if self.experiment.wider else self.experiment
+        return load_experiment(self.experiment, wide=bool(self.experiment.wide or self.experiment.wider))
 
     @property
     def alone(self) -> ObjectSpec:

@@ -13,9 +13,9 @@ import numpy as np
 from scenes import ExperimentSpec
 from training.data.dataset import Dataset, load_dataset
 from training.data.label_code import label_error
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.generation import GenerationConfig, generate
-from training.runs.recipes import TrainingError
 from training.studies.objects.page import write_page
 from training.studies.objects.plan import MIXED, TIMES, Plan
 from training.studies.sim_to_real.steps import train_in_twin

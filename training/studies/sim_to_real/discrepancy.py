@@ -19,8 +19,8 @@ import numpy as np
 
 from scenes.randomisation import FrictionSpread
 from training.data.audit import LabelColumns
+from training.errors import TrainingError
 from training.runs.gaussian_process import CONSTANT_AND_SMOOTH, Kernel, Points, Posterior, likeliest
-from training.runs.recipes import TrainingError
 from twin.fit.contact.fit import expect, mean_squared, simulate
 from twin.fit.contact.parameters import PARAMETERS
 from twin.fit.contact.simulate import Setup

@@ -78,12 +78,11 @@ class TwinField:
         own = seen * self.turned(self.known, back=True)
         self._mean = own.mean(axis=0)
         left = parts(own - self._mean)
-        points = Points.of(self._inputs(self.known))
-        self._kernel = _likeliest(points, left, rng)
-        self._placed = self._kernel.placed(points)
-        weight = np.linalg.solve(self._kernel.noisy(points), left)
+        self._points = Points.of(self._inputs(self.known))
+        self._kernel = _likeliest(self._points, left, rng)
+        weight = np.linalg.solve(self._kernel.noisy(self._points), left)
         # The fitted displacements need few components: what else the simulated ones have is the noise of their simulation.
-        _, sizes, components = np.linalg.svd(self._kernel.between(self._placed, self._placed) @ weight, full_matrices=False)
+        _, sizes, components = np.linalg.svd(self._kernel(self._points, self._points) @ weight, full_matrices=False)
         rest = np.cumsum(sizes[::-1] ** 2)[::-1]
         self._components = components[: int((rest > NEGLIGIBLE * rest[0]).sum())]
         self._weight = weight @ self._components.T
@@ -92,7 +91,7 @@ class TwinField:
         """Expected waves (B, C) of contacts (B, 12) in the object's frame."""
         if len(known) > AT_ONCE:
             return np.concatenate([self.own(known[first : first + AT_ONCE]) for first in range(0, len(known), AT_ONCE)])
-        near = self._kernel.between(self._kernel.placed(Points.of(self._inputs(known))), self._placed)
+        near = self._kernel(Points.of(self._inputs(known)), self._points)
         found = near @ self._weight @ self._components
         real, imaginary = np.split(found, 2, axis=1)
         expected: np.ndarray = self._mean + real + 1j * imaginary

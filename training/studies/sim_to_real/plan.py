@@ -5,8 +5,8 @@ from pathlib import Path
 
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_experiment, load_object
 from training.data.simulated import is_simulated
+from training.errors import TrainingError
 from training.generation import require_count
-from training.runs.recipes import TrainingError
 from twin.errors import DatasetError
 from twin.types import FINE
 
@@ -34,7 +34,7 @@ class Plan:
     experiment : ExperimentSpec
         The experiment that the recording was made with. It also names the labels that are learnt.
     contacts : ExperimentSpec or None
-        The experiment that is simulated; None: the one that ``experiment`` names as wider, else ``experiment``.
+        The experiment that is simulated; None: ``experiment`` with its wider ranges.
     labels : int
         Number of labelled frames that are used with the simulated contacts.
     seed : int
@@ -97,4 +97,4 @@ class Plan:
         """The experiment that is simulated."""
         if self.contacts is not None:
             return self.contacts
-        return load_experiment(self.experiment.wider) if self.experiment.wider else self.experiment
+        return load_experiment(self.experiment, wide=bool(self.experiment.wide or self.experiment.wider))

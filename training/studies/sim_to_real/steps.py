@@ -11,21 +11,22 @@ import numpy as np
 from scenes.object import ObjectSpec
 from training.data.dataset import Dataset, joined, split_rows
 from training.data.design import nearest_to_even
-from training.data.identity import frame_marks, identity_of
 from training.data.label_code import LabelCode, goes_round, label_error
 from training.data.pins import voronoi_areas
 from training.data.simulated import config_of, is_pins_only, open_simulated
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models import model_named, recipe_of
 from training.models.steered.model import STEERED
 from training.models.vgnn.model import VGNN
 from training.runs.assemble import intervals
-from training.runs.evaluate import judge, leak_check
+from training.runs.config import RunConfig
 from training.runs.gaussian_process import fit_two_fidelities
+from training.runs.identity import frame_marks, identity_of
 from training.runs.loop import epoch_step
-from training.runs.recipes import TrainingError
-from training.runs.run import RunConfig, is_finished, train_run
+from training.runs.run import is_finished, train_run
 from training.runs.run_files import CONFIG, TENSORS, read_tensors, write_tensors
+from training.studies.judging import judge, leak_check
 from training.studies.sim_to_real.discrepancy import Discrepancy
 from training.studies.sim_to_real.twins import contact_of
 from twin.frames import open_recording

@@ -11,8 +11,8 @@ from scenes.randomisation import RandomisationSpec
 from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
 from training.data.dataset import Dataset
+from training.errors import TrainingError
 from training.generation import GenerationConfig
-from training.runs.recipes import TrainingError
 from training.studies.sim_to_real.discrepancy import FRICTIONS
 from twin.rig.kinematics import rig_of
 

@@ -16,6 +16,7 @@ from scenes import load_object
 from scenes.sensor import SensorSpec
 from training.data.dataset import Dataset
 from training.data.pins import PinTable
+from training.data.targets import ANGLE, DEPTH
 from twin.errors import TwinError
 from twin.mechanics.path import ContactPath, ContactPose, plan_path
 from twin.objects import build_field
@@ -165,12 +166,12 @@ def recorded_contacts(data: Dataset) -> list[AreaChange]:
     The depth beyond first touch is ``pose_2`` + tap + the rig's contact offset, which is 0 for a rig that was never calibrated.
     """
     targets = data.targets
-    if not {"pose_2", "pose_6"} <= set(targets.names) or not np.isfinite(targets.move).all():
+    if not {DEPTH, ANGLE} <= set(targets.names) or not np.isfinite(targets.move).all():
         return []
     rig = data.pins.sensor.rig
     offset_mm, offset_deg = (rig.contact_offset_mm, rig.turn_offset_deg[2]) if rig else (0.0, 0.0)
-    depth = targets.corrected[:, targets.names.index("pose_2")] + TAP_MM + offset_mm
-    angle = targets.corrected[:, targets.names.index("pose_6")] + offset_deg
+    depth = targets.corrected[:, targets.names.index(DEPTH)] + TAP_MM + offset_mm
+    angle = targets.corrected[:, targets.names.index(ANGLE)] + offset_deg
     shear = targets.move * np.nan_to_num(targets.executed, nan=1.0)[:, None]
     found = []
     for wanted in DEPTHS_MM:

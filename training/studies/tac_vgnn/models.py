@@ -19,11 +19,12 @@ from training.data.pins import PinTable
 from training.estimate.estimator import PoseEstimator
 from training.models import model_named, recipe_of, variant_named
 from training.models.part import Inputs
-from training.runs.evaluate import judge, rows_to_judge
+from training.runs.config import RunConfig
 from training.runs.loop import Loop, Rows, epoch_step
 from training.runs.networks import parameter_count
-from training.runs.run import RunConfig, is_finished, train_run
+from training.runs.run import is_finished, train_run
 from training.runs.run_files import CHECKPOINT, TENSORS, read_config
+from training.studies.judging import judge, rows_to_judge
 from twin.progress import Progress, silent, stage
 
 # Number of rows from which a timed network takes its scales and modes. Its speed does not depend on this number.

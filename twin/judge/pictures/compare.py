@@ -1,7 +1,6 @@
 """The steps of the comparison: read, align, render, measure."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -33,9 +32,7 @@ from twin.optics.render import Renderer
 from twin.pins.pipeline import Pipeline
 from twin.progress import Bar, Step
 from twin.rig.kinematics import rig_of
-from twin.types import ContactState, Form
-
-Quality = Literal["drawn", "preview", "standard", "high"]
+from twin.types import ContactState, Form, Quality
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.camera.projection import lens_disc
-from twin.judge.pictures.compare import Quality, fixed_residual, pin_aligned, pose_aligned, statistics
+from twin.judge.pictures.compare import fixed_residual, pin_aligned, pose_aligned, statistics
 from twin.judge.pictures.frames import FEW_LOST, read_real
 from twin.judge.pictures.report import (
     image_summary,
@@ -23,6 +23,7 @@ from twin.judge.pictures.report import (
 )
 from twin.optics.relief import without as plain_of
 from twin.progress import Progress, Step, silent, stage
+from twin.types import Quality
 
 
 class TwoSample(Protocol):

@@ -10,19 +10,20 @@ import torch
 from scenes import SensorSpec
 from training.data.dataset import Dataset, joined, load_dataset, told_apart, with_common_labels
 from training.data.simulated import is_simulated
-from training.data.targets import CONTACT, PRESETS
-from training.estimate.displacements import DISPLACEMENTS, learn_displacements, write_displacements
-from training.estimate.domain import DOMAIN, learn_domain, write_domain
+from training.data.targets import CONTACT, PRESETS, SHEAR, TURN
+from training.estimate.displacements import learn_displacements, write_displacements
+from training.estimate.domain import learn_domain, write_domain
 from training.estimate.estimator import PoseEstimator
 from training.models import model_named, recipe_of
 from training.models.part import LIKELY
 from training.models.touch.model import TOUCH
+from training.runs.config import RunConfig, labels_learnt, training_rows
 from training.runs.loop import epoch_step
 from training.runs.networks import choose_device
-from training.runs.run import RUN_FILES, RunConfig, train_run, training_rows
-from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS
-from training.touch.contact_maps import FEWEST_STATES, MAPS, learn_maps, write_maps
-from training.touch.slip import FEWEST_DRAGS, SLIP, Eyes, drags_of, learn_slip, write_slip
+from training.runs.run import RUN_FILES, train_run
+from training.runs.run_files import BESIDE_FILES, CHECKPOINT, DISPLACEMENTS, DOMAIN, MAPS, SLIP
+from training.touch.contact_maps import FEWEST_STATES, learn_maps, write_maps
+from training.touch.slip import FEWEST_DRAGS, Eyes, drags_of, learn_slip, write_slip
 from training.touch.touched import TouchAnswer
 from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
@@ -30,8 +31,7 @@ from twin.store import writes
 from twin.types import Form, Readable
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helper labels
-SHEAR_HELPERS = ("move_1", "move_6")  # these moves
-FILES = (CONFIG, "curves.csv", TENSORS, MAPS, SLIP, DISPLACEMENTS, DOMAIN)  # files of a finished run
+FILES = (*RUN_FILES, *BESIDE_FILES)  # files of a finished run
 
 
 @dataclass(frozen=True, repr=False)
@@ -75,7 +75,7 @@ class Trained(Readable):
         return lines
 
 
-@writes(*RUN_FILES, MAPS, SLIP, DISPLACEMENTS, gone_on=(CHECKPOINT,))
+@writes(*FILES, gone_on=(CHECKPOINT,))
 def train_model(
     model: str,
     sensor: SensorSpec,
@@ -140,7 +140,7 @@ def train_model(
         with stage(progress, f"frames of {folder.name}") as step:
             parts.append(load_dataset(folder, sensor, columns_of(target), form=form, progress=step))
     found = joined(with_common_labels(parts) if target == CONTACT else parts)
-    config = RunConfig(model, recipe, labels, seed, split, SHEAR_HELPERS if target == SHEAR_PRESET else ())
+    config = RunConfig(model, recipe, labels, seed, split, (SHEAR, TURN) if target == SHEAR_PRESET else ())
     with stage(progress, model) as step:
         finished = train_run(config, found, out, max_minutes=max_minutes, device=chosen, progress=epoch_step(step))
     if finished and config.model == TOUCH.name and all(is_simulated(folder) for folder in found.folders):
@@ -192,10 +192,11 @@ def add_domain(run: Path, config: RunConfig, data: Dataset) -> None:
     pins, targets = data.pins.rows(rows), data.targets.rows(rows)
     moved = (pins.nodes_px - pins.reference.pins_px) / pins.reference.spacing_px.mean()
     least = np.median(estimator.predict_rows(data, rows).half_width, axis=0)
-    labels = targets.corrected if config.labels == "corrected" else targets.raw
     touched = TouchAnswer(pins.reference)
     apart = np.array([touched(nodes_px, lost) < LIKELY for nodes_px, lost in zip(pins.nodes_px, pins.lost, strict=True)])
-    labels = np.where(apart[:, None], np.nan, labels)  # a state before first touch has a label, but no pattern of its own
+    labels = np.where(
+        apart[:, None], np.nan, labels_learnt(data, config)[rows]
+    )  # a state before first touch has a label, but no pattern of its own
     group = None if data.group is None else data.group[rows]
     simulated = not config.labelled and all(is_simulated(folder) for folder in data.folders)
     known = learn_domain(

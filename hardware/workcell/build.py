@@ -1,13 +1,9 @@
 """The composition root of live work: the only module that decides whether a device is simulated, recorded or real.
 
 ``build_rig`` builds a camera and an arm in front of an object from the user's options. ``given_frame`` selects the no-contact frame from
-which a model measures the pins' displacements. ``signals_as_ctrl_c`` makes signals end work that moves an arm as Ctrl-C does.
+which a model measures the pins' displacements.
 """
 
-import signal
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -21,51 +17,25 @@ from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
 from hardware.errors import leave
-from hardware.rig.approach import way_around
 from hardware.rig.geometry import PlacedObject
 from hardware.safety.decide import load_limits
-from hardware.safety.safe_arm import NoWayBackError, SafeArm
-from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopSettings, StepRecord
-from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
+from hardware.safety.safe_arm import SafeArm
+from scenes import ObjectSpec, PlacementSpec, SensorSpec
 from scenes.experiment import ExperimentSpec
 from twin.errors import FrameError, RenderError
-from twin.estimate import Estimate, Estimator, SensorModel
+from twin.estimate import SensorModel
 from twin.frames import open_recording
 from twin.optics.preview import Preview
 from twin.optics.render import traced_shading
 from twin.rig.mounting import Mounting
 from twin.types import FIRST, NONE, Form, Frame
 
-# Value of the option --camera that selects the twin.
+# Value of ``camera`` that selects the twin.
 TWIN = "twin"
 # Longest wait in s for a real camera's frame while the arm stands still.
 FRAME_S = 5.0
 # Longest wait in s for a frame of the twin while the arm stands still. The twin may take longer to draw a frame than a camera.
 TWIN_FRAME_S = 60.0
-
-
-@contextmanager
-def signals_as_ctrl_c() -> Iterator[None]:
-    """Context in which SIGTERM and a closed terminal (SIGHUP) raise ``KeyboardInterrupt`` as Ctrl-C does.
-
-    So the arm is stopped, withdrawn and disabled after these signals, too. In another thread than the main one it changes nothing. A
-    signal that was ignored before (``nohup``) stays ignored. The former handlers are restored at the end.
-    """
-
-    def interrupt(number: int, _: object) -> None:
-        raise KeyboardInterrupt(number)
-
-    handled = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
-    before = {ended: signal.getsignal(ended) for ended in handled}
-    for ended, handler in before.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(ended, interrupt)
-    try:
-        yield
-    finally:
-        for ended, handler in before.items():
-            signal.signal(ended, handler)
 
 
 def given_frame(at_rest: str, model: SensorModel) -> Frame | None:
@@ -205,43 +175,3 @@ def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
     except RenderError as error:
         raise RenderError(f"{error}; or draw with `plain_light`, which needs no path tracing") from error
     return preview
-
-
-def servo_loop(
-    rig: Rig,
-    servo: ServoSpec,
-    estimator: Estimator,
-    settings: LoopSettings,
-    on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None,
-) -> ServoLoop:
-    """The servo loop of a connected rig. A ``SafeArm`` gets the estimated contact, and retreats as far as its limits allow."""
-    loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, on_step=on_step)
-    loop.contact_mm = lambda pose: float(rig.placed.touch(pose).indent_mm)
-    loop.way = lambda start, clear: way_around(rig.placed, start, clear)
-    if isinstance(rig.arm, SafeArm):
-        arm = rig.arm
-        loop.sense = arm.sense
-        loop.forget = arm.forget_contact
-        loop.retreat = lambda away: _retreat(arm, away)
-    return loop
-
-
-def _retreat(arm: SafeArm, away: np.ndarray) -> None:
-    """Withdraw an arm in a direction (3,) of the base frame; ``NoWayBackError`` if the limits do not allow it."""
-    arm.normal = away
-    if arm.retreat() is None:
-        raise NoWayBackError(f"the limits allow no way back: {arm.decisions[-1].decision.reason}; free the sensor by hand")
-
-
-def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[int, float]:
-    """The number of steps for ``rounds`` around the object, and the distance along its outline in mm.
-
-    The tool stands off the surface, so its path around a closed outline is longer than the outline. The number of steps takes this into
-    account.
-    """
-    outline = placed.outline()
-    length_mm = float(np.linalg.norm(np.diff(outline, axis=0), axis=1).sum())
-    tool_mm = placed.mounting.apex_mm @ placed.mounting.axis - servo.indent_mm  # distance of the tool from the surface
-    closed = bool(np.allclose(outline[0], outline[-1]))
-    way_mm = rounds * (length_mm + closed * 2 * np.pi * max(tool_mm, 0.0))
-    return int(np.ceil(way_mm / servo.feed_mm)), rounds * length_mm

@@ -7,8 +7,8 @@ import numpy as np
 
 from training.data.dataset import Dataset
 from training.data.targets import TARGET_COLUMNS
+from training.errors import TrainingError
 from training.models.part import SEEN_DECIMALS, Model
-from training.runs.recipes import TrainingError
 from twin.store import inputs_digest
 
 DIGESTS = {  # keys of the digests in a run's configuration, with the words for a message about a difference

@@ -16,14 +16,14 @@ import numpy as np
 import torch
 
 from training.data.dataset import Dataset, split_rows
-from training.data.identity import rows_named
 from training.data.label_code import label_error
 from training.data.simulated import is_pins_only
-from training.data.targets import Targets, limits_of
+from training.data.targets import ANGLE, DEPTH, TURN, Targets, limits_of
+from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
 from training.runs.assemble import conformal_quantile
-from training.runs.recipes import TrainingError
+from training.runs.identity import rows_named
 from twin.frames import open_recording
 from twin.progress import Step
 from twin.report.charts import new_figure, save_figure
@@ -39,10 +39,6 @@ SHEAR_EDGES_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 LARGE_MOVE = 1.0
 # Number of frames, spread evenly over the recording, whose time to a pose is measured.
 TIMED_FRAMES = 100
-# Label of the leak check: the angle in deg.
-LEAK_LABEL = "pose_6"
-# Move that belongs to this label, in deg.
-LEAK_MOVE = "move_6"
 # Least number of frames of the leak check. Fewer frames give no reliable slope.
 LEAK_FRAMES = 3
 # Share by which a changed image is larger or smaller.
@@ -140,24 +136,24 @@ class Leak:
 
 def leak_check(mean: np.ndarray, targets: Targets) -> Leak:
     """Make the leak check on predicted labels (M, K) of M frames with known targets."""
-    if LEAK_LABEL not in targets.names:
-        return Leak(None, f"it needs the angle label {LEAK_LABEL} and its {LEAK_MOVE}; the labels are {', '.join(targets.names)}")
+    if ANGLE not in targets.names:
+        return Leak(None, f"it needs the angle label {ANGLE} and its {TURN}; the labels are {', '.join(targets.names)}")
     if not np.isfinite(targets.executed).any():
         return Leak(None, f"no file beside the table tells which moves were executed ({', '.join(EXECUTED_FILES)}; 'twin audit' makes one)")
-    k = targets.names.index(LEAK_LABEL)
+    k = targets.names.index(ANGLE)
     turn, error = targets.move[:, 1], label_error(mean, targets.corrected, targets.units)[:, k]
     usable = (targets.executed < 0.5) & np.isfinite(turn) & np.isfinite(error)
     if usable.sum() < LEAK_FRAMES:
         return Leak(None, f"{usable.sum()} frames with a prediction and a move that was not executed; {LEAK_FRAMES} are needed")
     if np.ptp(turn[usable]) == 0:
-        return Leak(None, f"{LEAK_MOVE} is the same in all frames whose move was not executed")
+        return Leak(None, f"{TURN} is the same in all frames whose move was not executed")
     return Leak(float(np.polyfit(turn[usable], error[usable], 1)[0]))
 
 
 def _bins(error: np.ndarray, targets: Targets) -> dict[str, list[dict]]:
     """MAE of each label by depth, angle and shear, as ``{by: [{from, to, frames, label: mae, ...}]}``."""
     found: dict[str, list[dict]] = {}
-    axes = {"depth_mm": ("pose_2", DEPTH_EDGES_MM, False), "angle_deg": ("pose_6", ANGLE_EDGES_DEG, True)}
+    axes = {"depth_mm": (DEPTH, DEPTH_EDGES_MM, False), "angle_deg": (ANGLE, ANGLE_EDGES_DEG, True)}
     values = {
         key: (targets.corrected[:, targets.names.index(name)], edges, size)
         for key, (name, edges, size) in axes.items()

@@ -14,7 +14,6 @@ from hardware.arms.arm import Arm
 from hardware.arms.kinematics import Kinematics, StageKinematics
 from hardware.arms.motion import between, turn_between_deg
 from hardware.errors import DeviceError
-from hardware.safety.safe_arm import SafeArm
 
 # Longest duration of a piece, in s. It is also the longest delay until the arm turns to a newer target.
 PIECE_S = 0.2
@@ -79,7 +78,8 @@ class NewestTarget:
                 error, self._error, self._sent = self._error, None, None
                 raise error
             target = self._kinematics.nearest_pose(target)
-            self._target = self._arm.clipped(target) if isinstance(self._arm, SafeArm) else target
+            clipped = getattr(self._arm, "clipped", None)  # of a ``SafeArm``
+            self._target = target if clipped is None else clipped(target)
             try:
                 self._step()
             except BaseException:

@@ -2,12 +2,6 @@
 
 from dataclasses import asdict, dataclass
 
-from twin.errors import TwinError
-
-
-class TrainingError(TwinError):
-    """A training run can't be started, continued or used as asked."""
-
 
 @dataclass(frozen=True)
 class Recipe:

@@ -82,7 +82,7 @@ def test_commands_know_the_parts_and_the_doctor_names_the_broken_one(installed, 
     doctor = run(installed, "-m", "twin", "doctor", cwd=tmp_path).stdout.split("Parts of other packages\n")[1].split("\n\n")[0].splitlines()
     assert len(doctor) == PARTS and sum("LEFT OUT" in line for line in doctor) == 2
     assert "  arms: broken of tactip-example 0.1; LEFT OUT: RuntimeError: its maker has left" in doctor
-    unknown = run(installed, "-m", "twin", "new", "--frames", "frames", "--layout", "star:4", "--out", "made.toml", cwd=tmp_path)
+    unknown = run(installed, "-m", "twin", "new", "frames", "--layout", "star:4", "--out", "made.toml", cwd=tmp_path)
     assert "example-spiral:91" in unknown.stderr
     assert "example-tip" in run(installed, "-m", "twin", "sensors", cwd=tmp_path).stdout
     assert "example-haze" in run(installed, "-m", "twin", "robustness", "--list", cwd=tmp_path).stdout

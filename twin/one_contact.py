@@ -10,6 +10,7 @@ from twin.frames.images import write_image
 from twin.mechanics.path import ContactPose
 from twin.objects import build_field
 from twin.optics.render import write_exr
+from twin.pins.graph import make_graph
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.report.charts import save_figure
@@ -128,10 +129,10 @@ def contact_arrays(state: ContactState) -> dict[str, FloatArray]:
 
 
 def look_at(simulator: Simulator, rendered: RenderedFrame) -> Look:
-    """Run the pipeline on a rendered frame, and on the frame without contact of the same sensor."""
-    form = rendered.frame.form
-    pipeline = Pipeline(simulator.spec, form)
-    rest = pipeline(simulator.render_rest(form).frame)  # first: it loads compiled code, which must not count in its times
+    """Run the pipeline on a rendered frame. The graph without contact is that of the pins' true places at rest."""
+    pipeline = Pipeline(simulator.spec, rendered.frame.form)
+    pipeline(rendered.frame)  # first: it loads compiled code, which must not count in its times
+    rest = make_graph(pipeline.graph, rendered.truth.rest_px, outmost=pipeline.reference.outmost)
     return Look(rendered.frame, pipeline(rendered.frame), rest)
 
 

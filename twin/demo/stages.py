@@ -68,7 +68,7 @@ class ContactResult:
 
 
 def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form: Form, *, progress: Step | None = None) -> ContactResult:
-    """Press, render, capture, detect, and build the graph, for one contact and for no contact."""
+    """Press, render, capture, detect, and build the graph, for one contact."""
     form, timed = form_named(form), Timed()
     state = timed.run("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
     raw = timed.run("render", lambda: simulator.render(state))

@@ -117,14 +117,11 @@ def area_surface_figure(rest: PinGraph, contact: PinGraph) -> Figure:
 
 @dataclass(frozen=True)
 class Look:
-    """A frame with its observation, and the observation of the same sensor without contact.
-
-    ``rest`` is the observation of a frame without contact of the same form.
-    """
+    """A frame with its observation, and the graph of the same sensor's pins without contact."""
 
     frame: Frame
     observation: Observation
-    rest: Observation
+    rest: PinGraph
 
     def graphs(self) -> tuple[PinGraph, PinGraph]:
         """The graphs of the frame and of the frame without contact.
@@ -132,11 +129,11 @@ class Look:
         Raises
         ------
         FrameError
-            The pipeline found no graph in one of them.
+            The pipeline found no graph in the frame.
         """
-        if self.observation.graph is None or self.rest.graph is None:
-            raise FrameError(f"{self.frame.name}: no graph of its pins: {self.observation.reason or self.rest.reason}")
-        return self.observation.graph, self.rest.graph
+        if self.observation.graph is None:
+            raise FrameError(f"{self.frame.name}: no graph of its pins: {self.observation.reason}")
+        return self.observation.graph, self.rest
 
 
 def contact_panel(skin_picture: Path, look: Look, title: str) -> Figure:
@@ -146,19 +143,19 @@ def contact_panel(skin_picture: Path, look: Look, title: str) -> Figure:
     axes[0].imshow(imread(skin_picture))
     axes[0].set(title="deformed skin, cut open", xticks=[], yticks=[])
     draw_frame(axes[1], look.frame.image, "what the camera sees")
-    around_px = None if look.rest.graph is None else look.rest.graph.nodes_px
+    around_px = look.rest.nodes_px
     draw_frame(axes[2], look.frame.image, f"{look.observation.found} pins found", around_px=around_px)
     draw_pins(axes[2], look.observation)
     graph = look.observation.graph
-    if graph is None or look.rest.graph is None:
+    if graph is None:
         for ax in axes[3:]:
-            ax.text(0.5, 0.5, look.observation.reason or look.rest.reason, ha="center", wrap=True)
+            ax.text(0.5, 0.5, look.observation.reason, ha="center", wrap=True)
             ax.set_axis_off()
         return figure
     draw_frame(axes[3], look.frame.image, f"Voronoi graph: {len(graph.edges)} directed edges", around_px=around_px)
     draw_graph(axes[3], graph)
-    draw_area_change(axes[4], graph, look.rest.graph.area_px2, "Voronoi areas against no contact")
-    draw_displacement(axes[5], look.rest.graph.nodes_px, graph.nodes_px, "pin displacement")
+    draw_area_change(axes[4], graph, look.rest.area_px2, "Voronoi areas against no contact")
+    draw_displacement(axes[5], around_px, graph.nodes_px, "pin displacement")
     return figure
 
 

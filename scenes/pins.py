@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from scenes.base import OpenSection, Positive, SpecError
+from scenes.layouts import MOST_PINS
 from scenes.plugins import classes
 
 if TYPE_CHECKING:
     from scenes.layouts.base import Layout
-
-MOST_PINS = 5000
-"""Largest number of pins. The finest printed sensors have about 3000."""
 
 
 class PinsSpec(OpenSection):

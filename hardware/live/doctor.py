@@ -12,7 +12,7 @@ from serial.tools import list_ports
 from scenes import list_experiments, list_objects, list_randomisations, list_sensors
 from scenes.plugins import plugin_lines
 from twin.errors import EXTRAS, RenderError
-from twin.optics.variant import report
+from twin.optics.variants.variant import report
 from twin.report.skin3d import probe_offscreen
 from twin.store import cache_folder
 from twin.types import Readable

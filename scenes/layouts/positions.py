@@ -9,8 +9,8 @@ from pydantic import Field, model_validator
 
 from scenes.base import SpecError
 from scenes.files import read_regular
+from scenes.layouts import MOST_PINS
 from scenes.layouts.base import Layout
-from scenes.pins import MOST_PINS
 
 LARGEST_PLACES = 1_000_000
 """Largest size, in bytes, of a file of pins' positions. ``MOST_PINS`` positions in full precision need less."""

@@ -11,8 +11,8 @@ from scenes.load import load_sensor
 from twin.geometry.bspline import Basis
 from twin.geometry.solid import Cells, _local, joined_cells, spline_cells
 from twin.mechanics import SkinSolver
-from twin.mechanics.elements import PAIRS, Elements
-from twin.mechanics.material import law_coefficients
+from twin.mechanics.body.elements import PAIRS, Elements
+from twin.mechanics.body.material import law_coefficients
 
 LAWS = {
     "neo-hookean": {},

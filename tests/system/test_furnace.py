@@ -13,9 +13,9 @@ from scipy import stats
 from scenes.sensor import SensorSpec
 from twin.camera.capture import expose
 from twin.optics import static_layer, tracer
+from twin.optics.glass.window import Window
 from twin.optics.lights import Patch
 from twin.optics.render import Renderer
-from twin.optics.window import Window
 
 WHITE = (1.0, 1.0, 1.0)
 SIZE_PX, SPP = 24, 196

@@ -8,10 +8,10 @@ from plain_sensor import plain
 
 from twin.camera.capture import expose
 from twin.camera.projection import lens_disc, project
-from twin.fit.caps import ORDERS, fit_caps, outline_steps
-from twin.fit.photometry import fit_photometry
-from twin.fit.response import apparent_mm, defocus_px, fit_blur, fit_focus, fit_haze, fit_noise, fit_response, sharpness
-from twin.fit.rim import fit_rim
+from twin.fit.light.caps import ORDERS, fit_caps, outline_steps
+from twin.fit.light.photometry import fit_photometry
+from twin.fit.light.response import apparent_mm, defocus_px, fit_blur, fit_focus, fit_haze, fit_noise, fit_response, sharpness
+from twin.fit.light.rim import fit_rim
 from twin.frames.forms import gray_levels
 from twin.geometry.pins import rest_pins
 from twin.judge.pictures.aligned import Aligned, levels_slope, revised, to_levels, to_light
@@ -177,7 +177,7 @@ def test_aperture_and_focus_follow_from_edges_that_widen_with_distance(known):
 
 
 def sharpness_of(distance):
-    from twin.fit.response import Sharpness
+    from twin.fit.light.response import Sharpness
 
     return Sharpness(distance, np.full(len(distance), 1.5), np.full(len(distance), 1.5))
 

@@ -10,9 +10,9 @@ from plain_sensor import plain
 from twin.camera.capture import expose
 from twin.camera.projection import lens_disc, project
 from twin.errors import FrameError
+from twin.fit.light.photometry import fit_photometry
+from twin.fit.light.surroundings import fit_surroundings
 from twin.fit.optics import _stages
-from twin.fit.photometry import fit_photometry
-from twin.fit.surroundings import fit_surroundings
 from twin.geometry.pins import rest_pins
 from twin.judge.pictures.aligned import Aligned, read_frames, require_cameras_own, revised
 from twin.mechanics.skin_fit import FittedPins

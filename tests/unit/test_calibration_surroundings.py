@@ -8,9 +8,9 @@ from plain_sensor import plain
 from twin.camera.capture import expose
 from twin.camera.projection import project
 from twin.errors import FrameError
-from twin.fit.leds import fit_reflections
-from twin.fit.still import median_still
-from twin.fit.surroundings import fit_surroundings
+from twin.fit.light.leds import fit_reflections
+from twin.fit.light.still import median_still
+from twin.fit.light.surroundings import fit_surroundings
 from twin.geometry.pins import rest_pins
 from twin.judge.pictures.aligned import SATURATED, revised
 from twin.optics.static_layer import static_layer

@@ -8,8 +8,8 @@ from scipy.sparse.linalg import spsolve
 from scenes.load import load_sensor
 from twin.geometry.chart import Focus
 from twin.geometry.solid import Resolution, build_solid
-from twin.mechanics.elements import Elements, KeptStiffness
-from twin.mechanics.material import add_second_stress, determinant, distortion_stiffness, first_piola, invariants, law_coefficients
+from twin.mechanics.body.elements import Elements, KeptStiffness
+from twin.mechanics.body.material import add_second_stress, determinant, distortion_stiffness, first_piola, invariants, law_coefficients
 
 UNEVEN = [0.0, 0.2, 0.5, 0.6, 1.0]
 STRETCH = np.array([[1.2, 0.1, 0.0], [-0.05, 0.9, 0.2], [0.1, 0.0, 1.05]])

@@ -6,9 +6,9 @@ from block import assembled, material, stiffness_blocks
 
 from scenes.load import load_sensor
 from twin.geometry.solid import Resolution, build_solid
-from twin.mechanics.elements import Elements
-from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite
-from twin.mechanics.material import law_coefficients
+from twin.mechanics.body.elements import Elements
+from twin.mechanics.body.linear import FrontalSolver, NotPositiveDefinite
+from twin.mechanics.body.material import law_coefficients
 
 SINGLE = 2e-3  # relative: single precision times the matrix's condition, 3e4 (measured 1e-5 to 1e-4)
 BACKWARD = 3e-6  # residual over matrix and solution: single precision, some ten operations deep

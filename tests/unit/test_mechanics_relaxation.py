@@ -8,8 +8,8 @@ from scenes.body import RelaxationTerm
 from scenes.load import load_object
 from twin.geometry.solid import Resolution
 from twin.mechanics import ContactPath
-from twin.mechanics.elements import Elements
-from twin.mechanics.relaxation import History
+from twin.mechanics.body.elements import Elements
+from twin.mechanics.body.relaxation import History
 
 TERMS = (RelaxationTerm(fraction=0.3, time_s=0.5), RelaxationTerm(fraction=0.2, time_s=5.0))
 STRETCH = np.array([[1.2, 0.1, 0.0], [-0.05, 0.9, 0.2], [0.1, 0.0, 1.05]])

@@ -11,10 +11,10 @@ from twin.geometry.shapes import shape_of
 from twin.geometry.solid import Resolution, build_solid
 from twin.mechanics import ContactPose, SkinSolver
 from twin.mechanics.balance import Body
+from twin.mechanics.body.elements import Elements
+from twin.mechanics.body.material import law_coefficients
 from twin.mechanics.contact import contact_points
-from twin.mechanics.elements import Elements
 from twin.mechanics.law import ContactLaw
-from twin.mechanics.material import law_coefficients
 from twin.mechanics.path import plan_path
 from twin.mechanics.turns import Turns, turned, turned_back, turned_matrix
 from twin.objects import build_field

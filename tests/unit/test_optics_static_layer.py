@@ -6,7 +6,7 @@ from plain_sensor import changed, plain
 
 from scenes.sensor import RimSpec, SensorSpec, SpeckSpec
 from twin.camera.projection import project
-from twin.optics.lens import ray_table
+from twin.optics.glass.lens import ray_table
 from twin.optics.lights import led_patches
 from twin.optics.static_layer import ACROSS, static_layer
 

@@ -7,7 +7,7 @@ import pytest
 
 from scenes import load_object, load_sensor
 from twin.geometry.solid import Resolution
-from twin.mechanics.elements import Elements
+from twin.mechanics.body.elements import Elements
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 

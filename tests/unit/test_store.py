@@ -22,8 +22,8 @@ from twin.errors import StoreError
 from twin.fit.optics import _Log
 from twin.mechanics.skin_fit import FittedPins
 from twin.mechanics.solver import SkinSolver
-from twin.optics import probes
-from twin.optics.probes import Verdict
+from twin.optics.variants import probes
+from twin.optics.variants.probes import Verdict
 from twin.store import (
     ArrayFile,
     Item,
@@ -58,7 +58,7 @@ KEEPERS = (  # the module of every function whose results are kept between runs
     "twin.mechanics.skin_fit",
     "twin.geometry.solid",
     "twin.optics.preview",
-    "twin.optics.probes",
+    "twin.optics.variants.probes",
     "twin.optics.render",
     "twin.judge.degradation.shots",
     "twin.judge.degradation.sweep",

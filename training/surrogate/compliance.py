@@ -9,8 +9,8 @@ from scenes.sensor import SensorSpec
 from training.surrogate.symmetry import ring_directions
 from twin.geometry.shapes import shape_of
 from twin.geometry.solid import Resolution, Solid, build_solid, pin_pose, surface_operators
-from twin.mechanics.elements import PAIRS, Elements
-from twin.mechanics.material import law_coefficients
+from twin.mechanics.body.elements import PAIRS, Elements
+from twin.mechanics.body.material import law_coefficients
 from twin.types import FloatArray
 
 NODE_RINGS = 9

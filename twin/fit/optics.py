@@ -16,14 +16,14 @@ from twin.camera.capture import expose
 from twin.camera.projection import lens_disc
 from twin.errors import FrameError
 from twin.fit.camera_pose import fit_camera
-from twin.fit.caps import fit_caps
 from twin.fit.details import fit_details, undetermined_tiles
-from twin.fit.photometry import fit_photometry
-from twin.fit.response import fit_blur, fit_focus, fit_haze, fit_noise, fit_response, sharpness
-from twin.fit.rim import fit_rim
-from twin.fit.ring import NoRing
+from twin.fit.light.caps import fit_caps
+from twin.fit.light.photometry import fit_photometry
+from twin.fit.light.response import fit_blur, fit_focus, fit_haze, fit_noise, fit_response, sharpness
+from twin.fit.light.rim import fit_rim
+from twin.fit.light.ring import NoRing
+from twin.fit.light.surroundings import fit_surroundings
 from twin.fit.sensor_file import folder_beside, write_sensor
-from twin.fit.surroundings import fit_surroundings
 from twin.frames import distinct_stems
 from twin.frames.images import read_image, write_image
 from twin.judge.pictures.aligned import Aligned, read_frames, revised

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.errors import ContactError
+from twin.mechanics.body.elements import Elements, KeptStiffness
 from twin.mechanics.contact import ContactForces, ContactPoints, contact_forces, positions, spread_forces
-from twin.mechanics.elements import Elements, KeptStiffness
 from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 

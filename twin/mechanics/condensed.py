@@ -7,8 +7,8 @@ from scipy.linalg import blas, lapack
 
 from twin.compiled import compiled
 from twin.mechanics.balance import FORCE_FLOOR_N, Balance, Problem
+from twin.mechanics.body.linear import Eliminated, split
 from twin.mechanics.contact import ContactForces, positions, spread_forces, spread_stiffness
-from twin.mechanics.linear import Eliminated, split
 from twin.mechanics.turns import turned, turned_back, turned_matrix
 from twin.types import FloatArray, IntArray
 

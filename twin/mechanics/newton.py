@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, in_object
+from twin.mechanics.body.elements import KeptStiffness
+from twin.mechanics.body.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
 from twin.mechanics.contact import touching_mm2
-from twin.mechanics.elements import KeptStiffness
-from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
 from twin.mechanics.rubbing import met, rub, rubbed, substeps
 from twin.mechanics.turns import Turns, turned, turned_back

@@ -11,8 +11,8 @@ from twin.errors import ContactError
 from twin.geometry.mesh import NodeView
 from twin.geometry.solid import Solid, pin_pose
 from twin.mechanics.balance import Balance, Body, LoadState
+from twin.mechanics.body.relaxation import History
 from twin.mechanics.newton import RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
-from twin.mechanics.relaxation import History
 from twin.types import ContactState, FloatArray, IntArray
 
 _PENALTY_MPA_MM = 30.0

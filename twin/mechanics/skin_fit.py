@@ -25,8 +25,8 @@ from scenes.body import GelSpec
 from scenes.sensor import GeometrySpec, SensorSpec, ViewSpec
 from twin.camera.projection import pixel_rays, project
 from twin.geometry.solid import build_solid, pin_pose, surface_operators
-from twin.mechanics.elements import PAIRS, Elements
-from twin.mechanics.material import law_coefficients
+from twin.mechanics.body.elements import PAIRS, Elements
+from twin.mechanics.body.material import law_coefficients
 from twin.types import BoolArray, FloatArray, IntArray
 
 NO_STRESS = np.zeros((0, 8, 3, 3))

@@ -17,10 +17,10 @@ from twin.geometry.mesh import NodeView, build_mesh
 from twin.geometry.shapes import shape_of
 from twin.geometry.solid import Resolution, build_solid, pin_pose
 from twin.mechanics.balance import Body, Friction
+from twin.mechanics.body.elements import Elements
+from twin.mechanics.body.material import law_coefficients
 from twin.mechanics.contact import contact_points
-from twin.mechanics.elements import Elements
 from twin.mechanics.law import ContactLaw
-from twin.mechanics.material import law_coefficients
 from twin.mechanics.newton import LoadStepper
 from twin.mechanics.ongoing import OngoingContact, Setting
 from twin.mechanics.path import ContactPath, ContactPose, carried, deepest_mm, plan_path

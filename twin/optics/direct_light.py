@@ -10,8 +10,8 @@ import numpy as np
 from scenes.body import GelSpec
 from scenes.sensor import LensSpec
 from twin.compiled import compiled
+from twin.optics.glass.window import NEWTON_STEPS, fresnel
 from twin.optics.lights import Patch
-from twin.optics.window import NEWTON_STEPS, fresnel
 from twin.types import FloatArray
 
 RING_PLACES = 24

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.errors import RenderError
-from twin.optics.arrays import with_room
 from twin.optics.render import BOUNCES, GelView, Renderer
 from twin.optics.tracer import spectrum
-from twin.optics.variant import DrJit, use_variant
+from twin.optics.variants.arrays import with_room
+from twin.optics.variants.variant import DrJit, use_variant
 from twin.types import FloatArray, IntArray, PinState
 
 SAMPLES = 32

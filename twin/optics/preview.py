@@ -21,14 +21,14 @@ from twin.geometry.pins import rest_pins
 from twin.geometry.shapes import shape_of
 from twin.optics.defocus import circles_px, defocused
 from twin.optics.direct_light import DirectLight
-from twin.optics.lens import ray_table
+from twin.optics.glass.lens import ray_table
+from twin.optics.glass.window import Window
 from twin.optics.lights import lights
 from twin.optics.raster import PinOutlines, draw_pins, draw_triangles, side_normals
 from twin.optics.relief import Relief
 from twin.optics.static_layer import static_layer
 from twin.optics.surfaces import cap_albedo, unit
 from twin.optics.tracer import luminance
-from twin.optics.window import Window
 from twin.types import BoolArray, FloatArray, IntArray, PinState
 
 Lamp: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]

@@ -11,8 +11,8 @@ from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.mesh import SensorMesh
 from twin.geometry.pins import rest_pins
-from twin.optics.arrays import with_room
-from twin.optics.lens import CameraRays
+from twin.optics.glass.lens import CameraRays
+from twin.optics.glass.window import Window
 from twin.optics.preview import Preview, Shading
 from twin.optics.relief import Relief
 from twin.optics.sampling import SKIN_SAVING, PixelSamples, near_pins
@@ -21,8 +21,8 @@ from twin.optics.scene import build_scene, move_meshes
 from twin.optics.static_layer import static_layer
 from twin.optics.surfaces import SkinSurface, Surface, caps, stems
 from twin.optics.tracer import GelTracer, luminance
-from twin.optics.variant import DrJit, VariantChoice, choose_variant, use_variant
-from twin.optics.window import Window
+from twin.optics.variants.arrays import with_room
+from twin.optics.variants.variant import DrJit, VariantChoice, choose_variant, use_variant
 from twin.store import cached_arrays, write_bytes
 from twin.types import FloatArray, IntArray, PinState, Quality
 
@@ -49,7 +49,7 @@ class Renderer:
     ----------
     spec : SensorSpec
     variant : str or VariantChoice, optional
-        Variant for `twin.optics.variant.choose_variant`. Default: the fastest variant that works.
+        Variant for `twin.optics.variants.variant.choose_variant`. Default: the fastest variant that works.
     quality : {"drawn", "preview", "standard", "high"}
         A drawn picture costs a small part of a traced one. Its light is the lamps' direct light, with the shading of a traced frame.
     mesh : SensorMesh, optional

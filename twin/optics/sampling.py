@@ -11,7 +11,7 @@ import numpy as np
 
 from scenes.sensor import AppearanceSpec, PinsSpec, ViewSpec
 from twin.camera.projection import project
-from twin.optics.variant import DrJit
+from twin.optics.variants.variant import DrJit
 from twin.types import BoolArray, PinState
 
 SKIN_SAVING = 4

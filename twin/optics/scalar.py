@@ -18,7 +18,7 @@ from twin.geometry.pins import rest_pins
 from twin.optics.lights import Patch, lights
 from twin.optics.scene import build_pinhole_camera, build_scene, mesh, move_meshes
 from twin.optics.surfaces import Surface
-from twin.optics.variant import DrJit
+from twin.optics.variants.variant import DrJit
 from twin.types import FloatArray, IntArray, PinState
 
 OVERSAMPLING = 1.3

@@ -6,10 +6,10 @@ from types import ModuleType
 import numpy as np
 
 from scenes.sensor import AppearanceSpec
-from twin.optics.arrays import with_room
 from twin.optics.surfaces import Surface, vertex_normals
 from twin.optics.tracer import luminance
-from twin.optics.variant import DrJit
+from twin.optics.variants.arrays import with_room
+from twin.optics.variants.variant import DrJit
 from twin.types import FloatArray
 
 # Refractive index of the skin and the caps (acrylate rubber).

@@ -12,10 +12,10 @@ from scipy.ndimage import map_coordinates
 
 from scenes.sensor import HousingSpec, LedRingSpec, SensorSpec, SpeckSpec, ViewSpec
 from twin.camera.projection import sensor_to_camera
-from twin.optics.lens import ray_table, subpixel_rays
+from twin.optics.glass.lens import ray_table, subpixel_rays
+from twin.optics.glass.window import fresnel
 from twin.optics.lights import Patch, led_patches, lights
 from twin.optics.measured import values_of
-from twin.optics.window import fresnel
 from twin.types import FloatArray
 
 ACROSS = 4

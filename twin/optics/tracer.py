@@ -11,10 +11,10 @@ from types import ModuleType
 import numpy as np
 
 from scenes.sensor import SensorSpec
+from twin.optics.glass.window import Window
 from twin.optics.lights import Patch, lights
 from twin.optics.sampling import PixelSamples
-from twin.optics.variant import DrJit
-from twin.optics.window import Window
+from twin.optics.variants.variant import DrJit
 from twin.types import FloatArray
 
 SURVIVAL_GAIN = 4.0

@@ -10,10 +10,10 @@ import numpy as np
 
 from scenes.sensor import CameraSpec
 from twin.camera.projection import distort, sensor_to_camera, undistort
-from twin.optics.arrays import with_room
+from twin.optics.glass.window import Window
 from twin.optics.sampling import PixelSamples
-from twin.optics.variant import DrJit
-from twin.optics.window import Window
+from twin.optics.variants.arrays import with_room
+from twin.optics.variants.variant import DrJit
 from twin.types import FloatArray
 
 FIELD_MARGIN = 0.97

@@ -8,7 +8,7 @@ import numpy as np
 from scenes.sensor import ResponseSpec, SensorSpec, SpeckSpec
 from twin.camera.capture import blurred
 from twin.camera.projection import lens_disc
-from twin.fit.still import Still, fit_bounded, level_misfit, sampled, subpixel_offsets
+from twin.fit.light.still import Still, fit_bounded, level_misfit, sampled, subpixel_offsets
 from twin.frames.forms import gray_levels
 from twin.geometry.pins import usual_spacing
 from twin.judge.pictures.aligned import revised, to_light

@@ -2,7 +2,7 @@
 
 Only the product of LED power, exposure and reflectance can be measured. Therefore the caps' largest reflectance is held at ``CAP_ALBEDO``
 (printed white) and the exposure is not changed; the power is fitted. Caps that differ from the others have smaller (robust) weights;
-``twin.fit.caps`` fits their individual reflectance afterwards.
+``twin.fit.light.caps`` fits their individual reflectance afterwards.
 """
 
 from dataclasses import dataclass

@@ -19,7 +19,7 @@ from types import ModuleType
 from typing import Any, TypeAlias, TypedDict
 
 from twin.errors import RenderError
-from twin.optics.probes import load_needed_libraries, probe
+from twin.optics.variants.probes import load_needed_libraries, probe
 
 DrJit: TypeAlias = Any
 """A value of Dr.Jit or an object of Mitsuba. Their classes belong to the variant, which is chosen while the program runs."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from types import ModuleType
 
 from scenes.sensor import ViewSpec
-from twin.optics.variant import DrJit
+from twin.optics.variants.variant import DrJit
 
 NEWTON_STEPS = 5
 """Steps of Newton's method from the paraxial start; a sixth step changes a direction by less than 1e-5."""

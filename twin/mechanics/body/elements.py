@@ -29,7 +29,7 @@ import numpy as np
 
 from twin.compiled import compiled
 from twin.geometry.solid import Cells
-from twin.mechanics.material import add_second_stress, determinant, distortion_stiffness, first_piola, invariants
+from twin.mechanics.body.material import add_second_stress, determinant, distortion_stiffness, first_piola, invariants
 from twin.types import BoolArray, FloatArray, IntArray
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # directions (i, k) of the stored stiffness blocks

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from scenes.sensor import HousingSpec, LedRingSpec, ResponseSpec, SensorSpec
 from twin.camera.capture import blurred
 from twin.camera.projection import Disc, lens_disc
-from twin.fit.still import Still, fit_bounded, level_misfit, sampled, subpixel_offsets
+from twin.fit.light.still import Still, fit_bounded, level_misfit, sampled, subpixel_offsets
 from twin.judge.pictures.aligned import revised, to_light
 from twin.optics.static_layer import reflections
 

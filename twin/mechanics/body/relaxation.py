@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scenes.body import RelaxationTerm
-from twin.mechanics.elements import Elements
+from twin.mechanics.body.elements import Elements
 from twin.types import FloatArray
 
 

@@ -14,7 +14,7 @@ from scenes.sensor import HousingSpec, SensorSpec
 from twin.camera.capture import hazed, vignetted
 from twin.camera.projection import lens_disc, round_disc
 from twin.errors import FrameError
-from twin.fit.still import ROBUST_LEVELS, Still, fit_bounded, level_misfit, sampled
+from twin.fit.light.still import ROBUST_LEVELS, Still, fit_bounded, level_misfit, sampled
 from twin.judge.pictures.aligned import revised, to_light
 from twin.optics.static_layer import housing_light
 

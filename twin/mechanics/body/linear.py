@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from twin.compiled import compiled
-from twin.mechanics.elements import PAIRS
+from twin.mechanics.body.elements import PAIRS
 from twin.types import BoolArray, FloatArray, IntArray
 
 Box: TypeAlias = tuple[int, int, int, int]  # first row, last row + 1, first column, last column + 1

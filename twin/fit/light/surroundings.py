@@ -10,10 +10,10 @@ import numpy as np
 
 from scenes.sensor import CameraSpec, SensorSpec
 from twin.errors import FrameError
-from twin.fit.leds import fit_reflections, turn_leds
-from twin.fit.ring import fit_disc_edge, fit_ring
-from twin.fit.specks import fit_specks
-from twin.fit.still import Still, median_still
+from twin.fit.light.leds import fit_reflections, turn_leds
+from twin.fit.light.ring import fit_disc_edge, fit_ring
+from twin.fit.light.specks import fit_specks
+from twin.fit.light.still import Still, median_still
 from twin.progress import Step
 
 # Share of pixels at exactly 0 or 255 above which frames count as thresholded. Raw frames are saturated only on the ring.

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares, minimize_scalar
 from scenes.sensor import CameraSpec, LensSpec, ResponseSpec, SensorSpec
 from twin.camera.capture import expose, hazed, luma_weights, stream_of
 from twin.camera.projection import lens_disc, project
-from twin.fit.photometry import MOST_HAZE
+from twin.fit.light.photometry import MOST_HAZE
 from twin.frames.forms import gray_levels
 from twin.judge.pictures.aligned import SATURATED, Aligned, revised
 from twin.judge.pictures.spectra import bin_of, equal_count_edges, noise_sd

@@ -1,0 +1,1 @@
+"""The soft body: its elements, their law, and its stiffness."""

@@ -10,8 +10,7 @@ from twin.errors import MeshError
 from twin.objects import build_field, mesh_field
 from twin.objects.analytic import Cylinder, Edge, Plane, Prism, Sphere
 from twin.objects.build import WireMesh
-from twin.objects.mesh_distance import signed_distance
-from twin.objects.mesh_field import MeshField, place_mesh, read_mesh, sample_mesh
+from twin.objects.mesh_field import MeshField, place_mesh, read_mesh, sample_mesh, signed_distance
 
 STEP_MM = 1e-5
 EXACT = {

@@ -5,21 +5,13 @@ Every solid has ``probe`` (and therefore ``distance`` and ``gradient``) and ``un
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
-
-import numpy as np
 
 from twin.objects import kernels
 from twin.objects.level_set import Probe, Wrapped, rows
 from twin.types import FloatArray
-
-
-def project_on_xy(points_mm: FloatArray) -> Probe:
-    """Texture coordinates of a pattern projected along z."""
-    slopes = np.zeros((len(points_mm), 2, 3))
-    slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
-    return points_mm[:, :2].copy(), slopes, np.zeros((len(points_mm), 2, 3, 3))
 
 
 class Solid(Wrapped):
@@ -29,31 +21,31 @@ class Solid(Wrapped):
     ----------
     kind : int
         See ``kernels.solid``.
+    kernel : callable
+        Function of the points and the ``sizes``.
     """
 
     kind: ClassVar[int]
+    kernel: ClassVar[Callable[..., Probe]]
 
     @property
     @abstractmethod
     def sizes(self) -> tuple[float, ...]:
-        """The numbers that ``kernels.solid`` takes."""
+        """The numbers that ``kernel`` takes."""
+
+    def probe(self, points_mm: FloatArray) -> Probe:
+        return type(self).kernel(rows(points_mm), *self.sizes)
 
 
 @dataclass(frozen=True)
 class Plane(Solid):
     """Half space z >= 0."""
 
-    kind = kernels.PLANE
+    kind, kernel = kernels.PLANE, staticmethod(kernels.plane)
 
     @property
     def sizes(self) -> tuple[float, ...]:
         return ()
-
-    def probe(self, points_mm: FloatArray) -> Probe:
-        return kernels.plane(rows(points_mm))
-
-    def unroll(self, points_mm: FloatArray) -> Probe:
-        return project_on_xy(points_mm)
 
 
 @dataclass(frozen=True)
@@ -62,17 +54,11 @@ class Sphere(Solid):
 
     radius_mm: float
 
-    kind = kernels.ROUND
+    kind, kernel = kernels.ROUND, staticmethod(kernels.round_solid)
 
     @property
     def sizes(self) -> tuple[float, ...]:
         return self.radius_mm, 0.0
-
-    def probe(self, points_mm: FloatArray) -> Probe:
-        return kernels.round_solid(rows(points_mm), self.radius_mm, 0.0)
-
-    def unroll(self, points_mm: FloatArray) -> Probe:
-        return project_on_xy(points_mm)
 
 
 @dataclass(frozen=True)
@@ -81,14 +67,11 @@ class Cylinder(Solid):
 
     radius_mm: float
 
-    kind = kernels.ROUND
+    kind, kernel = kernels.ROUND, staticmethod(kernels.round_solid)
 
     @property
     def sizes(self) -> tuple[float, ...]:
         return self.radius_mm, 1.0
-
-    def probe(self, points_mm: FloatArray) -> Probe:
-        return kernels.round_solid(rows(points_mm), self.radius_mm, 1.0)
 
     def unroll(self, points_mm: FloatArray) -> Probe:
         return kernels.unroll_cylinder(rows(points_mm), self.radius_mm)
@@ -100,17 +83,11 @@ class Edge(Solid):
 
     fillet_mm: float
 
-    kind = kernels.EDGE
+    kind, kernel = kernels.EDGE, staticmethod(kernels.edge)
 
     @property
     def sizes(self) -> tuple[float, ...]:
         return (self.fillet_mm,)
-
-    def probe(self, points_mm: FloatArray) -> Probe:
-        return kernels.edge(rows(points_mm), self.fillet_mm)
-
-    def unroll(self, points_mm: FloatArray) -> Probe:
-        return project_on_xy(points_mm)
 
 
 @dataclass(frozen=True)
@@ -126,14 +103,11 @@ class Prism(Solid):
     fillet_mm: float
     taper_rad: float
 
-    kind = kernels.PRISM
+    kind, kernel = kernels.PRISM, staticmethod(kernels.prism)
 
     @property
     def sizes(self) -> tuple[float, ...]:
         return self.sides, self.inradius_mm, self.fillet_mm, self.taper_rad
-
-    def probe(self, points_mm: FloatArray) -> Probe:
-        return kernels.prism(rows(points_mm), self.sides, self.inradius_mm, self.fillet_mm, self.taper_rad)
 
     def unroll(self, points_mm: FloatArray) -> Probe:
         return kernels.unroll_prism(rows(points_mm), self.sides, self.inradius_mm)

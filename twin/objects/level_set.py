@@ -35,9 +35,14 @@ class Probed(ABC):
 class Wrapped(Probed):
     """A field on whose surface a texture can be laid."""
 
-    @abstractmethod
     def unroll(self, points_mm: FloatArray) -> Probe:
-        """Two coordinates (k, 2) in mm along the surface, their gradients (k, 2, 3) and their Hessians (k, 2, 3, 3) in 1/mm."""
+        """Two coordinates (k, 2) in mm along the surface, their gradients (k, 2, 3) and their Hessians (k, 2, 3, 3) in 1/mm.
+
+        By default they are x and y: a pattern is projected along z.
+        """
+        slopes = np.zeros((len(points_mm), 2, 3))
+        slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
+        return points_mm[:, :2].copy(), slopes, np.zeros((len(points_mm), 2, 3, 3))
 
 
 def rows(points_mm: FloatArray) -> FloatArray:

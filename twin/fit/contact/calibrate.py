@@ -14,13 +14,13 @@ from scenes.sensor import SensorSpec
 from twin.errors import OptionError
 from twin.fit.contact.fit import fit_contact, held_out_px, simulate
 from twin.fit.contact.newtons import MOST_PRESSES, Newtons, assumed, compared, pressed_n, simulated_n
-from twin.fit.contact.parameters import PARAMETERS, Parameter
+from twin.fit.contact.parameters import PARAMETERS
 from twin.fit.contact.report import summary_of, write_calibration
 from twin.fit.contact.simulate import Setup
 from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.frames import open_recording
 from twin.judge.labelled.model import MeasuredFrames, measure_frames
-from twin.progress import Progress, Step, silent, stage
+from twin.progress import Progress, silent, stage
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import read_arm_labels
 from twin.store import output, writes_file
@@ -30,50 +30,6 @@ LABELS = 20
 """Number of frames to which the contact is fitted."""
 MOST_HELD_OUT = 20
 """Most frames that are kept out of the fit. The report states the error on them."""
-
-
-def calibrate_contact(
-    folder: Path,
-    frames: Path,
-    spec: SensorSpec,
-    experiment: ExperimentSpec,
-    touched: ObjectSpec,
-    count: int,
-    seed: int,
-    *,
-    parameters: tuple[Parameter, ...] = PARAMETERS,
-    workers: int = 1,
-    across: int = FINE,
-    form: Form | None = None,
-    progress: Step | None = None,
-) -> tuple[SensorSpec, dict, Path]:
-    """Fit ``parameters`` to ``count`` random frames of a recording, and judge the result on other frames.
-
-    Everything is written to ``folder``. Contacts that an earlier run stored there are not computed again.
-
-    Returns
-    -------
-    SensorSpec, dict, Path
-        The fitted sensor, all figures, the page.
-
-    Raises
-    ------
-    FrameError
-        There are no labels, no pins or too few frames.
-    """
-    measured = measure_frames(frames, spec, count + min(count, MOST_HELD_OUT), seed, experiment=experiment, form=form)
-    order = np.random.default_rng(seed).permutation(len(measured))  # the frames come in the order of the recording's table
-    fitted, held = _part(measured, np.sort(order[:count])), _part(measured, np.sort(order[count:]))
-    spec = spec.model_copy(update={"rig": rig_of(spec, touched.name)})
-    setup = Setup(spec, experiment, touched, measured.form, across, folder / "contacts", workers, parameters)
-    fit = fit_contact(setup, fitted, progress=progress)
-    error = held_out_px(setup, fit, held, progress=progress) if len(held) else None
-    newtons = weighed(frames, fit.sensor, experiment, touched, seed, across=across, form=form)
-    summary = summary_of(setup, fitted, fit, error, len(held)) | {"newtons": asdict(newtons)}
-    pairs = ((fit.start, rig_of(spec).turn_sign), (fit.value, rig_of(fit.sensor).turn_sign))
-    moved = np.stack([simulate(setup, fitted, [values], sign)[0] for values, sign in pairs]).swapaxes(1, 2)
-    fitted = replace(fitted, no_contact_px=fit.rest_px)
-    return newtons.of(fit.sensor), summary, write_calibration(folder, fitted, moved, fit, summary)
 
 
 def weighed(
@@ -180,22 +136,21 @@ def calibrate_to_file(
         raise OptionError(f"`hold` {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
     folder = folder_beside(out, "contact")
     parameters = tuple(parameter for parameter in PARAMETERS if parameter.name not in hold)
+    touched = touched or load_object(experiment.object)
     with output(folder, "index.html", "calibration.json", "*.png", "contacts"), stage(progress, "contacts") as step:
-        thing = touched or load_object(experiment.object)
-        fitted, summary, page = calibrate_contact(
-            folder,
-            frames,
-            sensor,
-            experiment,
-            thing,
-            labels,
-            seed,
-            parameters=parameters,
-            workers=workers,
-            across=across,
-            form=form,
-            progress=step,
-        )
+        measured = measure_frames(frames, sensor, labels + min(labels, MOST_HELD_OUT), seed, experiment=experiment, form=form)
+        order = np.random.default_rng(seed).permutation(len(measured))  # the frames come in the order of the recording's table
+        fitted, held = _part(measured, np.sort(order[:labels])), _part(measured, np.sort(order[labels:]))
+        spec = sensor.model_copy(update={"rig": rig_of(sensor, touched.name)})
+        setup = Setup(spec, experiment, touched, measured.form, across, folder / "contacts", workers, parameters)
+        fit = fit_contact(setup, fitted, progress=step)
+        error = held_out_px(setup, fit, held, progress=step) if len(held) else None
+        newtons = weighed(frames, fit.sensor, experiment, touched, seed, across=across, form=form)
+        summary = summary_of(setup, fitted, fit, error, len(held)) | {"newtons": asdict(newtons)}
+        pairs = ((fit.start, rig_of(spec).turn_sign), (fit.value, rig_of(fit.sensor).turn_sign))
+        moved = np.stack([simulate(setup, fitted, [values], sign)[0] for values, sign in pairs]).swapaxes(1, 2)
+        page = write_calibration(folder, replace(fitted, no_contact_px=fit.rest_px), moved, fit, summary)
+    found = newtons.of(fit.sensor)
     said = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."
-    write_sensor(out, fitted, "\n".join([said, summary["newtons"]["said"], *summary["warnings"]]))
-    return ContactCalibration(fitted, summary, [out, page])
+    write_sensor(out, found, "\n".join([said, summary["newtons"]["said"], *summary["warnings"]]))
+    return ContactCalibration(found, summary, [out, page])

@@ -73,10 +73,11 @@ class Grid(LatticeLayout):
         there = labelled.reshape(SIDE, SIDE)
         gain = np.where(there, 1, np.where(shown.reshape(SIDE, SIDE), -1, 0))
         sums = np.pad(gain.cumsum(axis=0), ((1, 0), (0, 0)))
-        best, most = None, 0
-        rows = np.flatnonzero(there.any(axis=1))
-        for top in rows:
-            for bottom in rows[rows > top]:
+        best: tuple[int, int, int, int] | None = None
+        most = 0
+        rows = np.flatnonzero(there.any(axis=1)).tolist()
+        for k, top in enumerate(rows):
+            for bottom in rows[k + 1 :]:
                 line = sums[bottom + 1] - sums[top]  # the range of columns with the largest sum (Kadane's algorithm)
                 run, first = 0, 0
                 for column in range(SIDE):
@@ -84,11 +85,8 @@ class Grid(LatticeLayout):
                         run, first = 0, column
                     run += int(line[column])
                     if run > most and column > first:
-                        best, most = (int(top), first, int(bottom - top + 1), column - first + 1), run
-        if best is None:
-            return None
-        first_row, left, height, width = best
-        return cls(columns=width, rows=height), _rectangle(first_row, left, height, width)
+                        best, most = (top, first, bottom - top + 1, column - first + 1), run
+        return None if best is None else (cls(columns=best[3], rows=best[2]), _rectangle(*best))
 
     def at_most_labels(self, labelled: NDArray[np.bool_]) -> NDArray[np.intp] | None:
         if max(self.columns, self.rows) > SIDE:

@@ -56,7 +56,7 @@ class Hexagon(RingedLayout):
 
     def at_most_labels(self, labelled: NDArray[np.bool_]) -> NDArray[np.intp] | None:
         q, taken = self.axial(), np.flatnonzero(labelled)
-        fitting = [m for m in taken if self.ring_of_place()[m] + self.rings <= MOST_RINGS]
+        fitting = [m for m in taken.tolist() if self.ring_of_place()[m] + self.rings <= MOST_RINGS]
         if not fitting:
             return None
         return self._around(int(max(fitting, key=lambda m: int((_steps(q[taken] - q[m]) <= self.rings).sum()))))

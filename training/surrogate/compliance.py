@@ -9,8 +9,7 @@ from scenes.sensor import SensorSpec
 from training.surrogate.symmetry import ring_directions
 from twin.geometry.shapes import shape_of
 from twin.geometry.solid import Resolution, Solid, build_solid, pin_pose, surface_operators
-from twin.mechanics.body.elements import PAIRS, Elements
-from twin.mechanics.body.material import law_coefficients
+from twin.mechanics.body.elements import PAIRS, soft_body
 from twin.types import FloatArray
 
 NODE_RINGS = 9
@@ -68,12 +67,7 @@ def compliance_of(sensor: SensorSpec, *, resolution: Resolution | None = None) -
 
 def _stiffness(sensor: SensorSpec, solid: Solid) -> FloatArray:
     """Stiffness (n, n) of the free controls' unknowns at rest, N/mm."""
-    gel = law_coefficients(sensor.gel, layer=False)
-    kinds = (
-        Elements(solid.skin, law_coefficients(sensor.skin, layer=True)),
-        Elements(solid.gel_top, gel),
-        Elements(solid.gel_deep, gel),
-    )
+    kinds = soft_body(solid, sensor.skin, sensor.gel)
     free = ~solid.fixed
     size = 3 * int(free.sum())
     first = np.where(free, 3 * (np.cumsum(free) - 1), size)  # clamped controls go to rows beyond the end

@@ -133,12 +133,12 @@ class OpticsCalibration(Readable):
 class _Studio:
     """Renders the states of frames with different specifications."""
 
-    def __init__(self, bar: Bar, samples: int = SAMPLES) -> None:
-        self._bar, self._samples = bar, samples
+    def __init__(self, bar: Bar) -> None:
+        self._bar = bar
 
     def light(self, spec: SensorSpec, frames: list[Aligned], title: str) -> list[np.ndarray]:
         """Linear light (H, W[, channels]) of every frame's state."""
-        renderer, light = Renderer(spec, spp=self._samples), []
+        renderer, light = Renderer(spec, spp=SAMPLES), []
         with self._bar(title) as progress:
             for done, frame in enumerate(frames):
                 light.append(renderer.render(frame.state, seed=done))

@@ -230,6 +230,16 @@ class Pad(SkinShape):
         turned = layout @ [1, 1j] * pins.reach_mm * np.exp(1j * np.radians(pins.phase_deg))
         return np.column_stack([turned.real, turned.imag])
 
+    @abstractmethod
+    def _surface(self, place: ComplexArray, edge_mm: float, drop_mm: float) -> FloatArray:
+        """Points (n, 3) of a surface whose edge has this radius, and whose flat part lies this deep."""
+
+    def outside(self, place: ComplexArray) -> FloatArray:
+        return self._surface(place, self.edge_mm, 0.0)
+
+    def inside(self, place: ComplexArray) -> FloatArray:
+        return self._surface(place, self._inner_edge_mm, self.skin.thickness_mm)
+
     def on_outside(self, near_mm: FloatArray) -> FloatArray:
         return self.outside(self._outside_place(near_mm))
 
@@ -256,12 +266,6 @@ class RoundPad(Pad):
         far, height = self._profile(np.abs(place), self.skin.outer_radius_mm, edge_mm)
         at = far * np.exp(1j * np.angle(place))
         return np.column_stack([at.real, at.imag, edge_mm * (height - 1) - drop_mm])
-
-    def outside(self, place: ComplexArray) -> FloatArray:
-        return self._surface(place, self.edge_mm, 0.0)
-
-    def inside(self, place: ComplexArray) -> FloatArray:
-        return self._surface(place, self._inner_edge_mm, self.skin.thickness_mm)
 
     def flat(self, place: ComplexArray) -> FloatArray:
         ends = (self.skin.outer_radius_mm - self.edge_mm + self._inner_edge_mm) * place
@@ -316,12 +320,6 @@ class RectangularPad(Pad):
             self._profile(part, half, edge_mm) for part, half in zip((place.real, place.imag), self.skin.half_size_mm, strict=True)
         )
         return np.column_stack([x, y, edge_mm * (high_x * high_y - 1) - drop_mm])
-
-    def outside(self, place: ComplexArray) -> FloatArray:
-        return self._surface(place, self.edge_mm, 0.0)
-
-    def inside(self, place: ComplexArray) -> FloatArray:
-        return self._surface(place, self._inner_edge_mm, self.skin.thickness_mm)
 
     def flat(self, place: ComplexArray) -> FloatArray:
         shrunk = self._inner_edge_mm - self.edge_mm

@@ -388,9 +388,8 @@ class LoadStepper:
         column = np.zeros_like(control)
         problem.volume(control, column)
         column = eliminated.forward(column[self._body.free].ravel())
-        inner = np.ones(len(column), bool)
-        inner[eliminated.kept] = False
-        return Tangent(eliminated, matrix, column, -float(column[inner] @ column[inner]), strains)
+        inner = eliminated.inner(column)
+        return Tangent(eliminated, matrix, column, -float(inner @ inner), strains)
 
     def _eliminated(self, tangent: Tangent, elastic: FloatArray) -> FloatArray:
         """Elastic force (unknowns,), rotated back to the state of the tangent, after forward elimination. The last result is stored."""
@@ -416,9 +415,7 @@ class LoadStepper:
         forward, turns = self._eliminated(tangent, elastic), self._turned
         volume_residual, near = balance.border_residual[1], self._nearest(problem, tangent)
         if tangent.volume_column is not None:
-            inner = np.ones(len(forward), bool)
-            inner[kept] = False
-            volume_residual = volume_residual - tangent.volume_column[inner] @ forward[inner]
+            volume_residual = volume_residual - eliminated.inner(tangent.volume_column) @ eliminated.inner(forward)
         small = SmallContact(problem, near, tangent.volume_pivot, forward[kept], volume_residual, control, border)
         kept_move, border_move = small.solve(balance, soften=soften, least=0.1 * RESIDUAL_TOLERANCE)
         self.inner_iterations += small.iterations

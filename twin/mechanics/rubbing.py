@@ -102,9 +102,7 @@ def rubbed(
     residual, volume_start = forward[kept], 0.0
     residual_start = (spread[:-1].ravel() if turns is None else turned_back(turns, spread[:-1].ravel())) - tangent.matrix @ start
     if tangent.volume_column is not None:
-        inner = np.ones(len(forward), bool)
-        inner[kept] = False
-        volume = volume - tangent.volume_column[inner] @ forward[inner]
+        volume = volume - tangent.eliminated.inner(tangent.volume_column) @ tangent.eliminated.inner(forward)
         pressure = state.border[1] - border[1]
         residual_start -= tangent.volume_column[kept] * pressure
         volume_start = -float(tangent.volume_column[kept] @ start + tangent.volume_pivot * pressure)

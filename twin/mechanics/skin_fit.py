@@ -25,8 +25,7 @@ from scenes.body import GelSpec
 from scenes.sensor import GeometrySpec, SensorSpec, ViewSpec
 from twin.camera.projection import pixel_rays, project
 from twin.geometry.solid import build_solid, pin_pose, surface_operators
-from twin.mechanics.body.elements import PAIRS, Elements
-from twin.mechanics.body.material import law_coefficients
+from twin.mechanics.body.elements import PAIRS, soft_body
 from twin.types import BoolArray, FloatArray, IntArray
 
 NO_STRESS = np.zeros((0, 8, 3, 3))
@@ -240,9 +239,7 @@ class SoftBody:
 
     def __init__(self, geometry: GeometrySpec, gel: GelSpec) -> None:
         solid = self.solid = build_solid(geometry)
-        soft = law_coefficients(gel, layer=False)
-        skin = Elements(solid.skin, law_coefficients(geometry.skin, layer=True))
-        self._kinds = skin, Elements(solid.gel_top, soft), Elements(solid.gel_deep, soft)
+        self._kinds = soft_body(solid, geometry.skin, gel)
         self.free = np.flatnonzero(~solid.fixed)
         self.unknown = np.full((len(solid.fixed), 3), -1)
         self.unknown[self.free] = np.arange(3 * len(self.free)).reshape(-1, 3)

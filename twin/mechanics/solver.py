@@ -17,8 +17,7 @@ from twin.geometry.mesh import NodeView, build_mesh
 from twin.geometry.shapes import shape_of
 from twin.geometry.solid import Resolution, build_solid, pin_pose
 from twin.mechanics.balance import Body, Friction
-from twin.mechanics.body.elements import Elements
-from twin.mechanics.body.material import law_coefficients
+from twin.mechanics.body.elements import soft_body
 from twin.mechanics.contact import contact_points
 from twin.mechanics.law import ContactLaw
 from twin.mechanics.newton import LoadStepper
@@ -189,14 +188,8 @@ class SkinSolver:
     def _set_up(self, focus: Focus) -> Setting:
         spec = self.spec
         solid = build_solid(spec.geometry, resolution=self.resolution, focus=focus)
-        gel = law_coefficients(spec.gel, layer=False)
-        kinds = (
-            Elements(solid.skin, law_coefficients(spec.skin, layer=True)),
-            Elements(solid.gel_top, gel),
-            Elements(solid.gel_deep, gel),
-        )
         points = contact_points(solid, self.shape)
-        body = Body(kinds, points, ~solid.fixed, spec.gel.sealed)
+        body = Body(soft_body(solid, spec.skin, spec.gel), points, ~solid.fixed, spec.gel.sealed)
         relaxation = spec.skin.relaxation, spec.gel.relaxation, spec.gel.relaxation
         return Setting(solid, body, NodeView.of(self.mesh, solid), relaxation)
 

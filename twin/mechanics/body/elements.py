@@ -27,9 +27,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from scenes.body import GelSpec, SkinSpec
 from twin.compiled import compiled
-from twin.geometry.solid import Cells
-from twin.mechanics.body.material import add_second_stress, determinant, distortion_stiffness, first_piola, invariants
+from twin.geometry.solid import Cells, Solid
+from twin.mechanics.body.material import add_second_stress, determinant, distortion_stiffness, first_piola, invariants, law_coefficients
 from twin.types import BoolArray, FloatArray, IntArray
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # directions (i, k) of the stored stiffness blocks
@@ -106,6 +107,12 @@ class Elements:
     @property
     def _arrays(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         return self.cells.controls, self.cells.gradients, self.cells.weights_mm3, self.law, self.difference_mpa
+
+
+def soft_body(solid: Solid, skin: SkinSpec, gel: GelSpec) -> tuple[Elements, Elements, Elements]:
+    """The elements of the skin, of the gel's top layer and of the gel below."""
+    soft = law_coefficients(gel, layer=False)
+    return Elements(solid.skin, law_coefficients(skin, layer=True)), Elements(solid.gel_top, soft), Elements(solid.gel_deep, soft)
 
 
 class KeptStiffness:

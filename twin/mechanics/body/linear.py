@@ -196,6 +196,10 @@ class Eliminated:
         self._fronts = [front for front in fronts if len(front.own)]
         self.kept, self.matrix = kept, fronts[-1].rest
 
+    def inner(self, values: FloatArray) -> FloatArray:
+        """The part of values (unknowns,) at the eliminated unknowns."""
+        return np.delete(values, self.kept)
+
     def forward(self, right_side: FloatArray) -> FloatArray:
         """Forward elimination of a right side (unknowns,). Its entries at ``kept`` are then the right side for ``matrix``."""
         x = np.array(right_side, np.float32)

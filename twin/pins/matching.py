@@ -23,7 +23,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from twin.compiled import compiled
-from twin.pins.reference import Reference
+from twin.pins.drift import drifted
+from twin.pins.reference import Reference, turned_over
 
 RIDGE = 0.25
 """Penalty of the local gradient, which draws it towards zero. It is equivalent to this many neighbours at a distance of one spacing."""
@@ -121,12 +122,15 @@ class Match:
     lead : float
         Difference between the scores of this and the best quite different labelling, each less the cost of its displacement from the
         places at rest; infinite if none had to be tried.
+    drifted : bool
+        Whether the labelling is one of `twin.pins.drift`. Its predictions are the places to which the pins drifted.
     """
 
     blob: np.ndarray
     predicted_px: np.ndarray
     score: float
     lead: float = float("inf")
+    drifted: bool = False
 
 
 def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
@@ -143,8 +147,36 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
     Returns
     -------
     Match
-        The best labelling that was found. Its score states how good it is.
+        The best labelling that was found. Its score states how good it is. If the grown one does not prove itself, the pins drift.
     """
+    found = _grown(reference, px, area_px2)
+    return found if _proven(reference, px, found.blob) else _drifted(reference, px, area_px2, found)
+
+
+def _proven(reference: Reference, px: np.ndarray, blob: np.ndarray) -> bool:
+    """Whether a labelling (N,) turns no triangle over and leaves no pin lost, or no blob."""
+    known = blob >= 0
+    if known.sum() < min(len(blob), len(px)):
+        return False
+    return not known.any() or not turned_over(reference, px[blob], known).any()
+
+
+def _drifted(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: Match) -> Match:
+    """The labelling to which the pins drift, or ``found`` if that holds as many pins without turning a triangle over."""
+    drift = drifted(reference, px, area_px2)
+    if drift is None:
+        return found
+    blob, places_px = drift
+    known, before = blob >= 0, found.blob >= 0
+    if before.sum() >= known.sum() and not turned_over(reference, px[found.blob], before).any():
+        return found
+    away2 = ((px[blob[known]] - places_px[known]) ** 2).sum(axis=1) / (FINAL_GATE * reference.spacing_px[known]) ** 2
+    score, left = known.sum(), min(len(px), len(blob)) - known.sum()
+    return Match(blob, places_px, float(score - away2.sum()), float(np.sqrt(len(blob)) - (len(blob) - score) - left), drifted=True)
+
+
+def _grown(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
+    """The best labelling that is grown from pairs."""
     n = len(reference.pins_px)
     nothing = Match(np.full(n, -1), np.full((n, 2), np.nan), -1.0)
     if len(px) < 3:
@@ -203,8 +235,10 @@ def _displaced(reference: Reference, px: np.ndarray, blob: np.ndarray) -> float:
     return float(np.hypot(*away) / np.median(reference.spacing_px))
 
 
-def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray) -> Match:
-    """Refine a labelling ``blob`` (N,) of nearly all pins for a slightly different set of blobs, in the way that ``match`` does."""
+def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray, found: Match | None = None) -> Match:
+    """Refine a labelling ``blob`` (N,) of nearly all pins for a slightly different set of blobs, in the way that ``match`` found it."""
+    if found is not None and found.drifted:
+        return _drifted(reference, px, area_px2, replace(found, blob=np.full(len(blob), -1)))
     px = np.ascontiguousarray(px)
     cell = float(np.median(reference.spacing_px))
     layout = _layout(reference)
@@ -218,6 +252,8 @@ def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: M
     its nearest pins are where the motion of the largest part predicts them; else it loses them. If the two labellings give a blob two
     names, and the new one is not better, the result has no lead.
     """
+    if found.drifted:
+        return found
     part, blob = _parts(reference, px, found.blob), found.blob
     main = part == np.bincount(part[part >= 0]).argmax()
     if main[blob >= 0].all():

@@ -252,10 +252,10 @@ class Pipeline:
                 break
             kept = {tuple(px): k for k, px in enumerate(parts.px)}
             before = np.array([kept.get(tuple(blobs.px[k]), -1) if k >= 0 else -1 for k in found.blob])
-            again = rematch(self.reference, parts.px, parts.area_px2, before)
+            again = rematch(self.reference, parts.px, parts.area_px2, before, found)
             if again.score <= found.score:
                 break
-            blobs, found = parts, replace(again, lead=found.lead)
+            blobs, found = parts, again if found.drifted else replace(again, lead=found.lead)
         return blobs, found
 
     def _inside_px(self, px: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The reference: places of the pins of a sensor in a frame without contact, and their neighbours."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
@@ -20,6 +20,8 @@ NEIGHBOURS = 18
 LEAST_SPREAD_PX = 1.0
 # Least distance between two pins at rest, in median spacings. If two pins are nearer to each other, no frame shows them apart.
 FOLDED = 0.02
+# Largest number of coherent motions of the pins, and least eigenvalue of one relative to the largest.
+MOST_MOTIONS, LEAST_MOTION = 60, 1e-6
 # Largest distance of a pin from the frame's origin, px. It is larger than any camera's frame.
 FARTHEST_PX = 1e6
 
@@ -53,6 +55,17 @@ class Reference:
     area_px2: np.ndarray
     slots: np.ndarray
     ring_ends: np.ndarray
+    _motions: dict[float, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
+
+    def motions(self, width: float) -> np.ndarray:
+        """Coherent motions (N, m) of the pins: the eigenvectors of a Gaussian kernel of this width in spacings, times the roots of their
+        eigenvalues, so that all have the same weight."""
+        if width not in self._motions:
+            place = self.pins_px / np.median(self.spacing_px)
+            size, modes = np.linalg.eigh(np.exp(-((place[:, None] - place) ** 2).sum(axis=2) / (2 * width**2)))
+            kept = np.flatnonzero(size > LEAST_MOTION * size[-1])[-MOST_MOTIONS:]
+            self._motions[width] = np.ascontiguousarray(modes[:, kept] * np.sqrt(size[kept]))
+        return self._motions[width]
 
 
 def spread_out(pins_px: np.ndarray) -> bool:
@@ -126,6 +139,15 @@ def _double_areas(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
 
 
+def turned_over(reference: Reference, nodes_px: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
+    """Triangles (t,) bool of the reference whose orientation is reversed when the pins move to ``nodes_px`` (N, 2).
+
+    Only those count whose three pins are ``known`` (N,) bool.
+    """
+    over: np.ndarray = _double_areas(nodes_px, reference.triangles) <= 0
+    return over if known is None else over & known[reference.triangles].all(axis=1)
+
+
 def folded_fraction(reference: Reference, nodes_px: np.ndarray) -> float:
     """Share of the reference's triangles whose orientation is reversed when the pins move to ``nodes_px`` (N, 2)."""
-    return float(np.mean(_double_areas(nodes_px, reference.triangles) <= 0))
+    return float(np.mean(turned_over(reference, nodes_px)))

@@ -74,6 +74,9 @@ REFINED = 8
 NEAR_REST = 0.35
 """Displacement of the rim, in spacings, below which the first settled labelling ends the search, also if pins are missing: one that is a
 row apart is displaced by more than half a spacing."""
+HARDLY_MOVED = 0.75
+"""Displacement of the rim, in spacings, below which the first labelling that holds all pins and turns no triangle over ends the search,
+also if its pins hardly move alike. One that is a row apart lacks a row."""
 DISPLACED_COST = 0.25
 """Cost of a displacement of the rim by one spacing, in rows of pins (the square root of their number), when labellings are compared."""
 SAME_LABELLING = 0.5
@@ -133,7 +136,7 @@ class Match:
     drifted: bool = False
 
 
-def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
+def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray, *, drift: bool = True) -> Match:
     """Label blobs by the pins of a reference.
 
     Parameters
@@ -143,17 +146,19 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         Blob centroids, px, in any order.
     area_px2 : (K,) float
         Blob areas.
+    drift : bool
+        Whether the pins drift (`look_again`) if the grown labelling does not prove itself.
 
     Returns
     -------
     Match
-        The best labelling that was found. Its score states how good it is. If the grown one does not prove itself, the pins drift.
+        The best labelling that was found. Its score states how good it is.
     """
     found = _grown(reference, px, area_px2)
-    return found if _proven(reference, px, found.blob) else _drifted(reference, px, area_px2, found)
+    return found if not drift or proven(reference, px, found.blob) else look_again(reference, px, area_px2, found)
 
 
-def _proven(reference: Reference, px: np.ndarray, blob: np.ndarray) -> bool:
+def proven(reference: Reference, px: np.ndarray, blob: np.ndarray) -> bool:
     """Whether a labelling (N,) turns no triangle over and leaves no pin lost, or no blob."""
     known = blob >= 0
     if known.sum() < min(len(blob), len(px)):
@@ -161,7 +166,7 @@ def _proven(reference: Reference, px: np.ndarray, blob: np.ndarray) -> bool:
     return not known.any() or not turned_over(reference, px[blob], known).any()
 
 
-def _drifted(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: Match) -> Match:
+def look_again(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: Match) -> Match:
     """The labelling to which the pins drift, or ``found`` if that holds as many pins without turning a triangle over."""
     drift = drifted(reference, px, area_px2)
     if drift is None:
@@ -197,7 +202,9 @@ def _grown(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         count = int((labels >= 0).sum())
         if count >= NEARLY_ALL * n or (count >= NEARLY_ALL**2 * len(px) and count > MIN_SETTLED * n):
             found = _refine(layout, px, area_px2, labels, buckets, cell)
-            if found.score >= SETTLED * count and (count >= NEARLY_ALL * n or _displaced(reference, px, found.blob) < NEAR_REST):
+            away = _displaced(reference, px, found.blob)
+            settled = found.score >= SETTLED * count and (count >= NEARLY_ALL * n or away < NEAR_REST)
+            if settled or (away < HARDLY_MOVED and (found.blob >= 0).all() and proven(reference, px, found.blob)):
                 best = found
                 break
         grown[labels.tobytes()] = labels
@@ -238,7 +245,7 @@ def _displaced(reference: Reference, px: np.ndarray, blob: np.ndarray) -> float:
 def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray, found: Match | None = None) -> Match:
     """Refine a labelling ``blob`` (N,) of nearly all pins for a slightly different set of blobs, in the way that ``match`` found it."""
     if found is not None and found.drifted:
-        return _drifted(reference, px, area_px2, replace(found, blob=np.full(len(blob), -1)))
+        return look_again(reference, px, area_px2, replace(found, blob=np.full(len(blob), -1)))
     px = np.ascontiguousarray(px)
     cell = float(np.median(reference.spacing_px))
     layout = _layout(reference)

@@ -38,8 +38,8 @@ MOST_LEFT = 0.03
 """Largest number of blobs among the pins that are none of them, as a share of the pins: every blob should be explained."""
 
 MOST_MISFIT = 0.15
-"""Largest rms distance, in spacings, from the places of the coherent motion to the blobs. Deep contacts of two recordings have at most 0.13,
-a torn picture 0.18."""
+"""Largest rms distance, in spacings, from the places of the coherent motion to the blobs. Deep contacts of two recordings have
+at most 0.13, a torn picture 0.18."""
 
 
 def drifted(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

@@ -75,8 +75,8 @@ NEAR_REST = 0.35
 """Displacement of the rim, in spacings, below which the first settled labelling ends the search, also if pins are missing: one that is a
 row apart is displaced by more than half a spacing."""
 HARDLY_MOVED = 0.75
-"""Displacement of the rim, in spacings, below which the first labelling that holds all pins and turns no triangle over ends the search,
-also if its pins hardly move alike. One that is a row apart lacks a row."""
+"""Displacement of the rim, in spacings, below which the first labelling that holds all pins and blobs and turns no triangle over ends the
+search, also if its pins hardly move alike. One that is a row apart lacks a row, and leaves one over."""
 DISPLACED_COST = 0.25
 """Cost of a displacement of the rim by one spacing, in rows of pins (the square root of their number), when labellings are compared."""
 SAME_LABELLING = 0.5
@@ -204,7 +204,7 @@ def _grown(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
             found = _refine(layout, px, area_px2, labels, buckets, cell)
             away = _displaced(reference, px, found.blob)
             settled = found.score >= SETTLED * count and (count >= NEARLY_ALL * n or away < NEAR_REST)
-            if settled or (away < HARDLY_MOVED and (found.blob >= 0).all() and proven(reference, px, found.blob)):
+            if settled or (away < HARDLY_MOVED and (found.blob >= 0).sum() == len(px) == n and proven(reference, px, found.blob)):
                 best = found
                 break
         grown[labels.tobytes()] = labels

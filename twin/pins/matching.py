@@ -9,6 +9,9 @@ One wrong labelling is nearly as smooth as the true one: each ring of pins is sh
 is turned by 60 / i degrees, and only the innermost rings, which turn most, are inconsistent. Therefore each labelling is unwound before
 it is judged: its rings are shifted back by the number of pins with which the turns of all rings are most similar.
 
+Where contacts squeeze and stretch the layout so far that the grown labelling does not prove itself, all pins drift to the blobs at once
+(`twin.geometry.drift`). A labelling proves itself if no triangle of the layout is turned over, and no pin or no blob is left over.
+
 Distances are in local spacings: the distance of a pin at rest to its nearest neighbour. All limits were chosen, not derived.
 """
 
@@ -23,7 +26,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from twin.compiled import compiled
-from twin.pins.drift import drifted
+from twin.geometry.drift import drift
 from twin.pins.reference import Reference, turned_over
 
 RIDGE = 0.25
@@ -92,6 +95,21 @@ SEAM = 0.7
 shifted by a pin; in contacts with true names at most some 0.6, and 0.9 where the skin slips."""
 PREDICTED_WEIGHT = 0.1
 """Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
+STIFFNESS = ((2.0, 2.0), (1.5, 1.0), (3.0, 3.0), (1.0, 0.5))
+"""Widths beta, in spacings, and weights lambda of coherence that are tried in turn until a labelling proves itself."""
+DRIFT_REACH = 0.6
+"""Largest distance from a pin to its blob after the drift, in spacings."""
+DRIFT_SPECK = 0.2
+"""Least area of a blob that may be a pin, relative to the median."""
+MOST_BLOBS = 1.5
+"""Most blobs for each pin. With more, a frame shows something else."""
+MOST_LOST = 0.1
+"""Largest share of lost pins. What a larger hole hides, a coherent motion may pull apart or push together."""
+MOST_LEFT = 0.03
+"""Largest number of blobs among the pins that are none of them, as a share of the pins: every blob should be explained."""
+MOST_MISFIT = 0.15
+"""Largest rms distance, in spacings, from the places of the coherent motion to the blobs. Deep contacts of two recordings have
+at most 0.13, a torn picture 0.18."""
 Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
 """Blobs by square cell: first blob of each cell, next blob in the same cell, x0, y0, columns, rows (see ``_buckets``)."""
 
@@ -126,7 +144,7 @@ class Match:
         Difference between the scores of this and the best quite different labelling, each less the cost of its displacement from the
         places at rest; infinite if none had to be tried.
     drifted : bool
-        Whether the labelling is one of `twin.pins.drift`. Its predictions are the places to which the pins drifted.
+        Whether the labelling is a drifted one. Its predictions are the places to which the pins drifted.
     """
 
     blob: np.ndarray
@@ -136,7 +154,7 @@ class Match:
     drifted: bool = False
 
 
-def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray, *, drift: bool = True) -> Match:
+def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray, *, second_look: bool = True) -> Match:
     """Label blobs by the pins of a reference.
 
     Parameters
@@ -146,7 +164,7 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray, *, drift: 
         Blob centroids, px, in any order.
     area_px2 : (K,) float
         Blob areas.
-    drift : bool
+    second_look : bool
         Whether the pins drift (`look_again`) if the grown labelling does not prove itself.
 
     Returns
@@ -155,7 +173,7 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray, *, drift: 
         The best labelling that was found. Its score states how good it is.
     """
     found = _grown(reference, px, area_px2)
-    return found if not drift or proven(reference, px, found.blob) else look_again(reference, px, area_px2, found)
+    return found if not second_look or proven(reference, px, found.blob) else look_again(reference, px, area_px2, found)
 
 
 def proven(reference: Reference, px: np.ndarray, blob: np.ndarray) -> bool:
@@ -168,16 +186,59 @@ def proven(reference: Reference, px: np.ndarray, blob: np.ndarray) -> bool:
 
 def look_again(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: Match) -> Match:
     """The labelling to which the pins drift, or ``found`` if that holds as many pins without turning a triangle over."""
-    drift = drifted(reference, px, area_px2)
-    if drift is None:
+    labelled = _drift_labelling(reference, px, area_px2)
+    if labelled is None:
         return found
-    blob, places_px = drift
+    blob, places_px = labelled
     known, before = blob >= 0, found.blob >= 0
     if before.sum() >= known.sum() and not turned_over(reference, px[found.blob], before).any():
         return found
     away2 = ((px[blob[known]] - places_px[known]) ** 2).sum(axis=1) / (FINAL_GATE * reference.spacing_px[known]) ** 2
     score, left = known.sum(), min(len(px), len(blob)) - known.sum()
     return Match(blob, places_px, float(score - away2.sum()), float(np.sqrt(len(blob)) - (len(blob) - score) - left), drifted=True)
+
+
+def _drift_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Blob (N,) of each pin, -1 for none, and places (N, 2) to which the pins drifted; None if no stiffness proves itself.
+
+    The first one is used that leaves no pin lost, or no blob; else the one with most pins.
+
+    Parameters
+    ----------
+    reference : Reference
+    px, area_px2 : (K, 2), (K,) float
+        Places and areas of the blobs.
+    """
+    n, caps = len(reference.pins_px), np.flatnonzero(area_px2 >= DRIFT_SPECK * np.median(area_px2))
+    if not (1 - MOST_LOST) * n <= len(caps) <= MOST_BLOBS * n:
+        return None
+    spacing = float(np.median(reference.spacing_px))
+    rest, blobs = reference.pins_px / spacing, px[caps] / spacing
+    best, most = None, (1 - MOST_LOST) * n
+    for beta, stiffness in STIFFNESS:
+        places = drift(rest, blobs, reference.motions(beta), stiffness)
+        found = _assign_drifted(places, blobs)
+        known = found >= 0
+        if known.sum() < most or np.mean(np.sum((blobs[found] - places)[known] ** 2, axis=1)) > MOST_MISFIT**2:
+            continue
+        left = np.delete(blobs, found[known], axis=0)
+        near = int((((left - places[:, None]) ** 2).sum(axis=2).min(axis=0) < 1).sum()) if len(left) else 0
+        folded = turned_over(reference, np.where(known[:, None], blobs[found], places), known).any()
+        if near <= MOST_LEFT * n and not folded:
+            best, most = (np.where(known, caps[found], -1), places * spacing), known.sum() + 1
+            if known.sum() == min(n, len(caps)):
+                break
+    return best
+
+
+def _assign_drifted(places: np.ndarray, blobs: np.ndarray) -> np.ndarray:
+    """Blob (N,) of each pin, -1 for none: as many pairs within reach as possible, the nearest of all."""
+    share2 = ((blobs - places[:, None]) ** 2).sum(axis=2) / DRIFT_REACH**2
+    pins, chosen = linear_sum_assignment(np.minimum(share2, 1.0))
+    found = np.full(len(places), -1)
+    held = share2[pins, chosen] < 1
+    found[pins[held]] = chosen[held]
+    return found
 
 
 def _grown(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:

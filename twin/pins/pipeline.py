@@ -184,7 +184,7 @@ class Pipeline:
         started = perf_counter()
         blobs = self._detect(frame, self.mask, blob)
         ms["detect"], now = _since(started)
-        found = match(self.reference, blobs.px, blobs.area_px2, drift=False)
+        found = match(self.reference, blobs.px, blobs.area_px2, second_look=False)
         if self._plausible(found):
             blobs, found = self._with_displaced_mask(frame, blob, blobs, found)
         if (found.blob < 0).any() and self._plausible(found):
@@ -245,7 +245,7 @@ class Pipeline:
             return blobs, found
         center = np.asarray(self.blob_spec.mask_center_px) + shift
         displaced = self._detect(frame, circular_mask(self.size_px, tuple(center), self.blob_spec.mask_radius_px), blob)
-        again = match(self.reference, displaced.px, displaced.area_px2, drift=False)
+        again = match(self.reference, displaced.px, displaced.area_px2, second_look=False)
         return (displaced, again) if again.score > found.score else (blobs, found)
 
     def _with_split_caps(self, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:

@@ -10,6 +10,7 @@ from scenes.sensor import SensorSpec
 from twin.camera.projection import project
 from twin.errors import FrameError
 from twin.frames.forms import form_named, from_raw
+from twin.geometry.drift import coherent_motions
 from twin.geometry.pins import pin_lattice, rest_pins
 from twin.pins.voronoi import voronoi
 from twin.types import Form
@@ -20,8 +21,6 @@ NEIGHBOURS = 18
 LEAST_SPREAD_PX = 1.0
 # Least distance between two pins at rest, in median spacings. If two pins are nearer to each other, no frame shows them apart.
 FOLDED = 0.02
-# Largest number of coherent motions of the pins, and least eigenvalue of one relative to the largest.
-MOST_MOTIONS, LEAST_MOTION = 60, 1e-6
 # Largest distance of a pin from the frame's origin, px. It is larger than any camera's frame.
 FARTHEST_PX = 1e6
 
@@ -58,13 +57,9 @@ class Reference:
     _motions: dict[float, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
 
     def motions(self, width: float) -> np.ndarray:
-        """Coherent motions (N, m) of the pins: the eigenvectors of a Gaussian kernel of this width in spacings, times the roots of their
-        eigenvalues, so that all have the same weight."""
+        """Coherent motions (N, m) of the pins (`twin.geometry.drift`), for a kernel of this width in spacings."""
         if width not in self._motions:
-            place = self.pins_px / np.median(self.spacing_px)
-            size, modes = np.linalg.eigh(np.exp(-((place[:, None] - place) ** 2).sum(axis=2) / (2 * width**2)))
-            kept = np.flatnonzero(size > LEAST_MOTION * size[-1])[-MOST_MOTIONS:]
-            self._motions[width] = np.ascontiguousarray(modes[:, kept] * np.sqrt(size[kept]))
+            self._motions[width] = coherent_motions(self.pins_px / np.median(self.spacing_px), width)
         return self._motions[width]
 
 

@@ -85,11 +85,7 @@ DISPLACED_COST = 0.25
 SAME_LABELLING = 0.5
 """Share of equal pairs below which two labellings are quite different."""
 NEAR = 6
-"""Number of neighbours of a lost pin whose labels are removed and grown anew first. After that the same is done with all neighbours."""
-LEAST_KEPT = 0.5
-"""Least share of the pins that must stay labelled for labels to be grown anew."""
-MOST_REGROWN = 0.3
-"""Share of lost pins above which labels are not grown anew."""
+"""Number of nearest neighbours by which parts of a labelling are linked, and of pins beside a gap that decide on names across it."""
 SEAM = 0.7
 """Least difference between the motions of neighbouring pins, in spacings, at which a seam may separate them. It is 1 where names are
 shifted by a pin; in contacts with true names at most some 0.6, and 0.9 where the skin slips."""
@@ -274,9 +270,6 @@ def _grown(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         best = _leading(reference, px, [_refine(layout, px, area_px2, labels, buckets, cell) for labels in likely])
         if best.score < nothing.score:
             return nothing
-    lost = int((best.blob < 0).sum())
-    if 0 < lost < MOST_REGROWN * n and len(px) > n - lost:
-        best = replace(_regrown(layout, px, area_px2, best, buckets, cell), lead=best.lead)
     return best
 
 
@@ -744,24 +737,6 @@ def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
                 if pair not in seen:
                     seen.add(pair)
                     yield pair
-
-
-def _regrown(layout: Layout, px: np.ndarray, area: np.ndarray, found: Match, buckets: Buckets, cell: float) -> Match:
-    """Remove the labels around lost pins, and grow them anew from the others."""
-    rest, neighbours = layout.rest, layout.neighbours
-    for reach in (NEAR, neighbours.shape[1]):
-        doubtful = np.zeros(len(rest), bool)
-        lost = found.blob < 0
-        doubtful[neighbours[lost, :reach].ravel()] = True
-        start = np.where(doubtful, -1, found.blob)
-        if (start >= 0).sum() < LEAST_KEPT * len(rest):
-            break
-        again = _refine(layout, px, area, _grow(*layout[:3], px, start, buckets, cell), buckets, cell)
-        if again.score > found.score:
-            found = again
-        if (found.blob >= 0).all():
-            break
-    return found
 
 
 def _layout(reference: Reference) -> Layout:

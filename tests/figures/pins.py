@@ -5,11 +5,21 @@ from functools import partial
 from pathlib import Path
 
 import bench_pipeline
+import cv2
+import numpy as np
 
 from figures.jobs import Measured, Value, job, real_folder, run_twin
+from scenes import load_sensor
+from scenes.pins import PinsSpec
+from twin.frames import open_recording
+from twin.geometry.pins import namings
+from twin.pins import Pipeline, Reference, nominal_reference
 
 SETS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127", "ur5-331": "ur5-331-raw"}
 FRAMES = 200  # of the bench
+AT_REST = "hex127-flat"  # has frames without contact
+UNKNOWN = (AT_REST, "hex127-deep", "hex127-shapes")  # of another laboratory's sensor
+WHITE, LEAST_PX = 127, 8  # level above which a pixel is white, and least pixels of a component
 VALIDATED, OWN_FRICTION, SEED = 80, 10, 20  # frames drawn at random; of these with a friction of their own
 
 
@@ -18,6 +28,39 @@ def found_on(work: Path, *, sensor: str) -> Measured:
     run_twin(work, "preprocess", real_folder(SETS[sensor]), "--sensor", sensor, "--out", work / "pins")
     summary = json.loads((work / "pins" / "summary.json").read_text())
     return {"frames": Value(summary["frames"]), "all_found": Value(summary["exact_fraction"])}
+
+
+def named_by_a_new_sensor(work: Path, *, recording: str) -> Measured:
+    """Of the frames of an unknown sensor, those in which all pins are named, and the others that are valid with three pins lost at most.
+
+    Connected components show in which frames all pins are separate.
+    """
+    run_twin(work, "new", real_folder(recording), "--out", work / "new.toml")
+    sensor = load_sensor(work / "new.toml")
+    frames = open_recording(real_folder(recording), sensor)
+    pipeline, count = Pipeline(sensor, frames.form), sensor.pins.count
+    separate, named, fair = [], [], []
+    for frame in frames:
+        stats = cv2.connectedComponentsWithStats((frame.image > WHITE).astype(np.uint8), connectivity=8)[2]
+        seen = pipeline(frame)
+        separate.append((stats[1:, cv2.CC_STAT_AREA] >= LEAST_PX).sum() == count)
+        named.append(seen.valid and seen.found == count)
+        fair.append(seen.valid and seen.found >= count - 3)
+    whole = np.array(separate)
+    found = {"frames": Value(int(whole.sum())), "named": Value(float(np.mean(np.array(named)[whole])))}
+    found |= {"others": Value(int((~whole).sum())), "others_named": Value(float(np.mean(np.array(fair)[~whole])))}
+    if recording == AT_REST:
+        return found
+    run_twin(work, "new", real_folder(AT_REST), "--out", work / "rest.toml")
+    rest_px = nominal_reference(load_sensor(work / "rest.toml"), frames.form).pins_px
+    return found | {"rest_off": Value(_apart(pipeline.reference, rest_px, sensor.pins))}
+
+
+def _apart(made: Reference, rest_px: np.ndarray, pins: PinsSpec) -> float:
+    """Median distance, in spacings, of places at rest from those (N, 2) of the same sensor in another window of the same camera."""
+    rim = made.outmost
+    apart = [made.pins_px - px - np.median((made.pins_px - px)[rim], axis=0) for px in (rest_px[order] for order in namings(pins))]
+    return min(float(np.median(np.linalg.norm(one, axis=1) / made.spacing_px)) for one in apart)
 
 
 def speed(work: Path, *, sensor: str) -> Measured:
@@ -59,4 +102,8 @@ for _sensor in ("mg400-331", "mg400-127"):
     _command = f"twin validate --sensor {_sensor} --frames DIR --limit {VALIDATED} --friction-frames {OWN_FRICTION} --seed {SEED} --out OUT"
     job(f"pins.real.{_sensor}", _command, sensors=(_sensor,), code=("training.studies.validation",), recordings=_recording, minutes=8)(
         partial(against_recorded, sensor=_sensor)
+    )
+for _set in UNKNOWN:
+    job(f"pins.new.{_set}", "twin new DIR --out OUT", code=("twin.fit.new_sensor",), recordings=(_set,), minutes=1)(
+        partial(named_by_a_new_sensor, recording=_set)
     )

@@ -323,6 +323,35 @@ def test_a_part_across_a_gap_loses_wrong_names_and_keeps_right_ones(width):
         assert found.lead > 0 and (labels is wrong or named.sum() == len(seen))
 
 
+def deeply_pressed(reference, at, depth):
+    """Places of pins that a contact at ``at`` (2,), in radii of the layout, spreads, and squeezes in a ring around."""
+    middle = reference.pins_px[0]
+    radius = np.linalg.norm(reference.pins_px - middle, axis=1).max()
+    place = (reference.pins_px - middle) / radius
+    away = place - at
+    far = np.linalg.norm(away, axis=1)
+    fade = np.clip(1.1 - np.linalg.norm(place, axis=1) ** 4, 0, 1)
+    return reference.pins_px + radius * away * (depth * np.exp(-((far / 0.45) ** 2)) * fade)[:, None]
+
+
+@pytest.mark.parametrize("damage", ["none", "specks", "lost"])
+@pytest.mark.parametrize("name", ["mg400-331", "mg400-127"])
+def test_a_ring_squeezed_around_a_stretched_field_keeps_every_name(name, damage):
+    rest, rng = Pipeline(load_sensor(name), Form.PROCESSED).reference, np.random.default_rng(3)
+    kept = np.setdiff1d(np.arange(len(rest.pins_px)), [5, 40, 77] if damage == "lost" else [])
+    for at in ((0.0, 0.0), (0.15, -0.1), (-0.2, 0.05)):
+        truth = deeply_pressed(rest, np.array(at), 1.2)
+        px, area = truth[kept], np.full(len(kept), 30.0)
+        if damage == "specks":
+            px = np.vstack([px, truth[rng.permutation(len(truth))[:12]] + 0.5 * rest.spacing_px.mean()])
+            area = np.append(area, np.full(12, 4.0))
+        order = rng.permutation(len(px))
+        blob = match(rest, px[order], area[order]).blob
+        assert folded_fraction(rest, truth) == 0, "the contact itself is possible"
+        np.testing.assert_array_equal(np.flatnonzero(blob >= 0), kept, f"pins found at {at}")
+        np.testing.assert_array_equal(kept[order[blob[kept]]], kept, f"names at {at}")
+
+
 @pytest.mark.parametrize("torn", [-25, -13, 12, 22])
 @pytest.mark.parametrize("name", ["mg400-331", "mg400-127"])
 def test_a_torn_picture_is_named_right_or_not_valid(name, torn):

@@ -20,13 +20,13 @@ from twin.errors import FrameError, OptionError, TwinError
 from twin.fit.camera_pose import CameraReport
 from twin.fit.new_sensor import _camera, _doubtful, _given, _health, new_sensor
 from twin.frames import frames_at, open_recording
-from twin.geometry.pins import rest_pins, usual_spacing
+from twin.geometry.pins import pin_lattice, rest_pins, usual_spacing
 from twin.optics.relief import cap_planes
 from twin.pins import Grade, Pipeline, examine, nominal_reference, tune, with_detector
 from twin.pins.batch import recording_reference
 from twin.pins.detector_spec import shipped_detector
 from twin.pins.identify import Candidate, Seen
-from twin.pins.rest import Rest
+from twin.pins.rest import Rest, rest_from_contacts
 from twin.pins.rest import rest_of as rest_found
 from twin.pins.tune import _at_rest
 from twin.types import Form, Frame
@@ -207,6 +207,26 @@ def test_without_a_no_contact_frame_a_rest_layout_is_made_and_said():
     median = np.sqrt(np.mean(np.sum((layout.rest_px - rest) ** 2, axis=1)))
     assert found.source == "made" and "`no_contact`" in found.line()
     assert error < 0.6 * median
+
+
+@pytest.mark.parametrize("kind", ["rings", "hexagon"])
+def test_deep_contacts_alone_state_the_places_at_rest(kind):
+    """None is light, and all spread the middle: the median of the pins, and a line through their spread, are far off."""
+    pins, rng = PinsSpec(layout=kind, rings=6), np.random.default_rng(1)
+    places = pin_lattice(pins).places
+    radius = np.linalg.norm(places, axis=1)
+    rest = 150 + 130 * places * (0.85 + 0.15 * radius**3)[:, None] @ [[1.0, 0.03], [-0.03, 0.98]]
+    contacts = []
+    for _ in range(30):
+        away = places - rng.uniform(-0.3, 0.3, 2)
+        ridge = np.array([np.cos(angle := rng.uniform(0, np.pi)), np.sin(angle)])
+        pressed = np.exp(-((away @ ridge / 0.5) ** 2)) * np.clip(1 - radius**4, 0, None)
+        contacts.append(rest + 130 * rng.uniform(0.4, 0.7) * (pressed * (away @ ridge))[:, None] * ridge + rng.normal(0, 0.3, rest.shape))
+    nothing = np.zeros((0, 2))
+    seen = tuple(Seen(px, px, 0, nothing) for px in contacts)
+    found = rest_from_contacts(Candidate(pins, 1.0, 1.0, 0, 0, 0.0, np.median(contacts, axis=0), np.ones(127), seen))
+    away_px = np.linalg.norm(found - rest, axis=1)
+    assert np.median(away_px) < 0.08 * usual_spacing(rest) and away_px.max() < 0.2 * usual_spacing(rest)
 
 
 def test_places_at_rest_that_were_made_from_contacts_are_said_to_be(tmp_path):

@@ -9,6 +9,9 @@ One wrong labelling is nearly as smooth as the true one: each ring of pins is sh
 is turned by 60 / i degrees, and only the innermost rings, which turn most, are inconsistent. Therefore each labelling is unwound before
 it is judged: its rings are shifted back by the number of pins with which the turns of all rings are most similar.
 
+Where contacts squeeze and stretch the layout so far that the grown labelling does not prove itself, all pins drift to the blobs at once
+(`twin.geometry.drift`). A labelling proves itself if no triangle of the layout is turned over, and no pin or no blob is left over.
+
 Distances are in local spacings: the distance of a pin at rest to its nearest neighbour. All limits were chosen, not derived.
 """
 
@@ -23,7 +26,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from twin.compiled import compiled
-from twin.pins.reference import Reference
+from twin.geometry.drift import drift
+from twin.pins.reference import Reference, turned_over
 
 RIDGE = 0.25
 """Penalty of the local gradient, which draws it towards zero. It is equivalent to this many neighbours at a distance of one spacing."""
@@ -73,21 +77,35 @@ REFINED = 8
 NEAR_REST = 0.35
 """Displacement of the rim, in spacings, below which the first settled labelling ends the search, also if pins are missing: one that is a
 row apart is displaced by more than half a spacing."""
+HARDLY_MOVED = 0.75
+"""Displacement of the rim, in spacings, below which the first labelling that holds all pins and blobs and turns no triangle over ends the
+search, also if its pins hardly move alike. One that is a row apart lacks a row, and leaves one over."""
 DISPLACED_COST = 0.25
 """Cost of a displacement of the rim by one spacing, in rows of pins (the square root of their number), when labellings are compared."""
 SAME_LABELLING = 0.5
 """Share of equal pairs below which two labellings are quite different."""
 NEAR = 6
-"""Number of neighbours of a lost pin whose labels are removed and grown anew first. After that the same is done with all neighbours."""
-LEAST_KEPT = 0.5
-"""Least share of the pins that must stay labelled for labels to be grown anew."""
-MOST_REGROWN = 0.3
-"""Share of lost pins above which labels are not grown anew."""
+"""Number of nearest neighbours by which parts of a labelling are linked, and of pins beside a gap that decide on names across it."""
 SEAM = 0.7
 """Least difference between the motions of neighbouring pins, in spacings, at which a seam may separate them. It is 1 where names are
 shifted by a pin; in contacts with true names at most some 0.6, and 0.9 where the skin slips."""
 PREDICTED_WEIGHT = 0.1
 """Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
+STIFFNESS = ((2.0, 2.0), (1.5, 1.0), (3.0, 3.0), (1.0, 0.5))
+"""Widths beta, in spacings, and weights lambda of coherence that are tried in turn until a labelling proves itself."""
+DRIFT_REACH = 0.6
+"""Largest distance from a pin to its blob after the drift, in spacings."""
+DRIFT_SPECK = 0.2
+"""Least area of a blob that may be a pin, relative to the median."""
+MOST_BLOBS = 1.5
+"""Most blobs for each pin. With more, a frame shows something else."""
+MOST_LOST = 0.1
+"""Largest share of lost pins. What a larger hole hides, a coherent motion may pull apart or push together."""
+MOST_LEFT = 0.03
+"""Largest number of blobs among the pins that are none of them, as a share of the pins: every blob should be explained."""
+MOST_MISFIT = 0.15
+"""Largest rms distance, in spacings, from the places of the coherent motion to the blobs. Deep contacts of two recordings have
+at most 0.13, a torn picture 0.18."""
 Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
 """Blobs by square cell: first blob of each cell, next blob in the same cell, x0, y0, columns, rows (see ``_buckets``)."""
 
@@ -121,15 +139,18 @@ class Match:
     lead : float
         Difference between the scores of this and the best quite different labelling, each less the cost of its displacement from the
         places at rest; infinite if none had to be tried.
+    drifted : bool
+        Whether the labelling is a drifted one. Its predictions are the places to which the pins drifted.
     """
 
     blob: np.ndarray
     predicted_px: np.ndarray
     score: float
     lead: float = float("inf")
+    drifted: bool = False
 
 
-def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
+def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray, *, second_look: bool = True) -> Match:
     """Label blobs by the pins of a reference.
 
     Parameters
@@ -139,12 +160,85 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         Blob centroids, px, in any order.
     area_px2 : (K,) float
         Blob areas.
+    second_look : bool
+        Whether the pins drift (`look_again`) if the grown labelling does not prove itself.
 
     Returns
     -------
     Match
         The best labelling that was found. Its score states how good it is.
     """
+    found = _grown(reference, px, area_px2)
+    return found if not second_look or proven(reference, px, found.blob) else look_again(reference, px, area_px2, found)
+
+
+def proven(reference: Reference, px: np.ndarray, blob: np.ndarray) -> bool:
+    """Whether a labelling (N,) turns no triangle over and leaves no pin lost, or no blob."""
+    known = blob >= 0
+    if known.sum() < min(len(blob), len(px)):
+        return False
+    return not known.any() or not turned_over(reference, px[blob], known).any()
+
+
+def look_again(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: Match) -> Match:
+    """The labelling to which the pins drift, or ``found`` if that holds as many pins without turning a triangle over."""
+    labelled = _drift_labelling(reference, px, area_px2)
+    if labelled is None:
+        return found
+    blob, places_px = labelled
+    known, before = blob >= 0, found.blob >= 0
+    if before.sum() >= known.sum() and not turned_over(reference, px[found.blob], before).any():
+        return found
+    away2 = ((px[blob[known]] - places_px[known]) ** 2).sum(axis=1) / (FINAL_GATE * reference.spacing_px[known]) ** 2
+    score, left = known.sum(), min(len(px), len(blob)) - known.sum()
+    return Match(blob, places_px, float(score - away2.sum()), float(np.sqrt(len(blob)) - (len(blob) - score) - left), drifted=True)
+
+
+def _drift_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Blob (N,) of each pin, -1 for none, and places (N, 2) to which the pins drifted; None if no stiffness proves itself.
+
+    The first one is used that leaves no pin lost, or no blob; else the one with most pins.
+
+    Parameters
+    ----------
+    reference : Reference
+    px, area_px2 : (K, 2), (K,) float
+        Places and areas of the blobs.
+    """
+    n, caps = len(reference.pins_px), np.flatnonzero(area_px2 >= DRIFT_SPECK * np.median(area_px2))
+    if not (1 - MOST_LOST) * n <= len(caps) <= MOST_BLOBS * n:
+        return None
+    spacing = float(np.median(reference.spacing_px))
+    rest, blobs = reference.pins_px / spacing, px[caps] / spacing
+    best, most = None, (1 - MOST_LOST) * n
+    for beta, stiffness in STIFFNESS:
+        places = drift(rest, blobs, reference.motions(beta), stiffness)
+        found = _assign_drifted(places, blobs)
+        known = found >= 0
+        if known.sum() < most or np.mean(np.sum((blobs[found] - places)[known] ** 2, axis=1)) > MOST_MISFIT**2:
+            continue
+        left = np.delete(blobs, found[known], axis=0)
+        near = int((((left - places[:, None]) ** 2).sum(axis=2).min(axis=0) < 1).sum()) if len(left) else 0
+        folded = turned_over(reference, np.where(known[:, None], blobs[found], places), known).any()
+        if near <= MOST_LEFT * n and not folded:
+            best, most = (np.where(known, caps[found], -1), places * spacing), known.sum() + 1
+            if known.sum() == min(n, len(caps)):
+                break
+    return best
+
+
+def _assign_drifted(places: np.ndarray, blobs: np.ndarray) -> np.ndarray:
+    """Blob (N,) of each pin, -1 for none: as many pairs within reach as possible, the nearest of all."""
+    share2 = ((blobs - places[:, None]) ** 2).sum(axis=2) / DRIFT_REACH**2
+    pins, chosen = linear_sum_assignment(np.minimum(share2, 1.0))
+    found = np.full(len(places), -1)
+    held = share2[pins, chosen] < 1
+    found[pins[held]] = chosen[held]
+    return found
+
+
+def _grown(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
+    """The best labelling that is grown from pairs."""
     n = len(reference.pins_px)
     nothing = Match(np.full(n, -1), np.full((n, 2), np.nan), -1.0)
     if len(px) < 3:
@@ -165,7 +259,9 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         count = int((labels >= 0).sum())
         if count >= NEARLY_ALL * n or (count >= NEARLY_ALL**2 * len(px) and count > MIN_SETTLED * n):
             found = _refine(layout, px, area_px2, labels, buckets, cell)
-            if found.score >= SETTLED * count and (count >= NEARLY_ALL * n or _displaced(reference, px, found.blob) < NEAR_REST):
+            away = _displaced(reference, px, found.blob)
+            settled = found.score >= SETTLED * count and (count >= NEARLY_ALL * n or away < NEAR_REST)
+            if settled or (away < HARDLY_MOVED and (found.blob >= 0).sum() == len(px) == n and proven(reference, px, found.blob)):
                 best = found
                 break
         grown[labels.tobytes()] = labels
@@ -174,9 +270,6 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         best = _leading(reference, px, [_refine(layout, px, area_px2, labels, buckets, cell) for labels in likely])
         if best.score < nothing.score:
             return nothing
-    lost = int((best.blob < 0).sum())
-    if 0 < lost < MOST_REGROWN * n and len(px) > n - lost:
-        best = replace(_regrown(layout, px, area_px2, best, buckets, cell), lead=best.lead)
     return best
 
 
@@ -203,8 +296,10 @@ def _displaced(reference: Reference, px: np.ndarray, blob: np.ndarray) -> float:
     return float(np.hypot(*away) / np.median(reference.spacing_px))
 
 
-def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray) -> Match:
-    """Refine a labelling ``blob`` (N,) of nearly all pins for a slightly different set of blobs, in the way that ``match`` does."""
+def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray, found: Match | None = None) -> Match:
+    """Refine a labelling ``blob`` (N,) of nearly all pins for a slightly different set of blobs, in the way that ``match`` found it."""
+    if found is not None and found.drifted:
+        return look_again(reference, px, area_px2, replace(found, blob=np.full(len(blob), -1)))
     px = np.ascontiguousarray(px)
     cell = float(np.median(reference.spacing_px))
     layout = _layout(reference)
@@ -218,6 +313,8 @@ def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: M
     its nearest pins are where the motion of the largest part predicts them; else it loses them. If the two labellings give a blob two
     names, and the new one is not better, the result has no lead.
     """
+    if found.drifted:
+        return found
     part, blob = _parts(reference, px, found.blob), found.blob
     main = part == np.bincount(part[part >= 0]).argmax()
     if main[blob >= 0].all():
@@ -640,24 +737,6 @@ def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
                 if pair not in seen:
                     seen.add(pair)
                     yield pair
-
-
-def _regrown(layout: Layout, px: np.ndarray, area: np.ndarray, found: Match, buckets: Buckets, cell: float) -> Match:
-    """Remove the labels around lost pins, and grow them anew from the others."""
-    rest, neighbours = layout.rest, layout.neighbours
-    for reach in (NEAR, neighbours.shape[1]):
-        doubtful = np.zeros(len(rest), bool)
-        lost = found.blob < 0
-        doubtful[neighbours[lost, :reach].ravel()] = True
-        start = np.where(doubtful, -1, found.blob)
-        if (start >= 0).sum() < LEAST_KEPT * len(rest):
-            break
-        again = _refine(layout, px, area, _grow(*layout[:3], px, start, buckets, cell), buckets, cell)
-        if again.score > found.score:
-            found = again
-        if (found.blob >= 0).all():
-            break
-    return found
 
 
 def _layout(reference: Reference) -> Layout:

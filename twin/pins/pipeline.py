@@ -17,7 +17,7 @@ from twin.frames.forms import blob_spec, form_named, frame_size, levels_at, pin_
 from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.identify import SHOWN, judge_layout
-from twin.pins.matching import Match, complete, confirm, match, rematch
+from twin.pins.matching import Match, complete, confirm, look_again, match, proven, rematch
 from twin.pins.reference import Reference, folded_fraction, make_reference, nominal_reference
 from twin.pins.rest import require_even
 from twin.pins.split import split_chains, split_merged
@@ -184,13 +184,17 @@ class Pipeline:
         started = perf_counter()
         blobs = self._detect(frame, self.mask, blob)
         ms["detect"], now = _since(started)
-        found = match(self.reference, blobs.px, blobs.area_px2)
+        found = match(self.reference, blobs.px, blobs.area_px2, second_look=False)
         if self._plausible(found):
             blobs, found = self._with_displaced_mask(frame, blob, blobs, found)
         if (found.blob < 0).any() and self._plausible(found):
             blobs, found = self._with_split_caps(blobs, found)
             if (found.blob < 0).any():
                 found = confirm(self.reference, blobs.px, blobs.area_px2, found)
+        if not proven(self.reference, blobs.px, found.blob):
+            again = look_again(self.reference, blobs.px, blobs.area_px2, found)
+            if again is not found:
+                blobs, found = self._with_split_caps(blobs, again)
         ms["match"], _ = _since(now)
         return blobs, found
 
@@ -241,7 +245,7 @@ class Pipeline:
             return blobs, found
         center = np.asarray(self.blob_spec.mask_center_px) + shift
         displaced = self._detect(frame, circular_mask(self.size_px, tuple(center), self.blob_spec.mask_radius_px), blob)
-        again = match(self.reference, displaced.px, displaced.area_px2)
+        again = match(self.reference, displaced.px, displaced.area_px2, second_look=False)
         return (displaced, again) if again.score > found.score else (blobs, found)
 
     def _with_split_caps(self, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
@@ -252,10 +256,10 @@ class Pipeline:
                 break
             kept = {tuple(px): k for k, px in enumerate(parts.px)}
             before = np.array([kept.get(tuple(blobs.px[k]), -1) if k >= 0 else -1 for k in found.blob])
-            again = rematch(self.reference, parts.px, parts.area_px2, before)
+            again = rematch(self.reference, parts.px, parts.area_px2, before, found)
             if again.score <= found.score:
                 break
-            blobs, found = parts, replace(again, lead=found.lead)
+            blobs, found = parts, again if found.drifted else replace(again, lead=found.lead)
         return blobs, found
 
     def _inside_px(self, px: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The reference: places of the pins of a sensor in a frame without contact, and their neighbours."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
@@ -10,6 +10,7 @@ from scenes.sensor import SensorSpec
 from twin.camera.projection import project
 from twin.errors import FrameError
 from twin.frames.forms import form_named, from_raw
+from twin.geometry.drift import coherent_motions
 from twin.geometry.pins import pin_lattice, rest_pins
 from twin.pins.voronoi import voronoi
 from twin.types import Form
@@ -53,6 +54,13 @@ class Reference:
     area_px2: np.ndarray
     slots: np.ndarray
     ring_ends: np.ndarray
+    _motions: dict[float, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
+
+    def motions(self, width: float) -> np.ndarray:
+        """Coherent motions (N, m) of the pins (`twin.geometry.drift`), for a kernel of this width in spacings."""
+        if width not in self._motions:
+            self._motions[width] = coherent_motions(self.pins_px / np.median(self.spacing_px), width)
+        return self._motions[width]
 
     def map_to(self, other: "Reference") -> np.ndarray:
         """Linear map (2, 2) of the same pins about their middle in another view: ``displacements @ map`` are those in that view."""
@@ -132,6 +140,15 @@ def _double_areas(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
 
 
+def turned_over(reference: Reference, nodes_px: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
+    """Triangles (t,) bool of the reference whose orientation is reversed when the pins move to ``nodes_px`` (N, 2).
+
+    Only those count whose three pins are ``known`` (N,) bool.
+    """
+    over: np.ndarray = _double_areas(nodes_px, reference.triangles) <= 0
+    return over if known is None else over & known[reference.triangles].all(axis=1)
+
+
 def folded_fraction(reference: Reference, nodes_px: np.ndarray) -> float:
     """Share of the reference's triangles whose orientation is reversed when the pins move to ``nodes_px`` (N, 2)."""
-    return float(np.mean(_double_areas(nodes_px, reference.triangles) <= 0))
+    return float(np.mean(turned_over(reference, nodes_px)))

@@ -15,7 +15,7 @@ OUTLIERS = 0.02
 """Least share of the other points that are expected to belong to no point."""
 ROUNDS = 120
 """Most rounds of a drift."""
-SETTLED = 1e-3
+SETTLED = 1e-2
 """Relative change of the variance below which a drift ends."""
 LEAST_VARIANCE = 1e-4
 """Least variance of the mixture, in squared spacings."""

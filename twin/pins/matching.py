@@ -91,8 +91,10 @@ SEAM = 0.7
 shifted by a pin; in contacts with true names at most some 0.6, and 0.9 where the skin slips."""
 PREDICTED_WEIGHT = 0.1
 """Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
-STIFFNESS = ((2.0, 2.0), (1.5, 1.0), (3.0, 3.0), (1.0, 0.5))
-"""Widths beta, in spacings, and weights lambda of coherence that are tried in turn until a labelling proves itself."""
+Stiffnesses = tuple[tuple[float, float], ...]
+STIFFNESS: Stiffnesses = ((2.0, 2.0), (1.5, 1.0), (3.0, 3.0), (1.0, 0.5))
+"""Widths beta, in spacings, and weights lambda of coherence that are tried in turn until a labelling proves itself. Where the grown
+labelling turns nothing over, only the first is."""
 DRIFT_REACH = 0.6
 """Largest distance from a pin to its blob after the drift, in spacings."""
 DRIFT_SPECK = 0.2
@@ -182,19 +184,23 @@ def proven(reference: Reference, px: np.ndarray, blob: np.ndarray) -> bool:
 
 def look_again(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: Match) -> Match:
     """The labelling to which the pins drift, or ``found`` if that holds as many pins without turning a triangle over."""
-    labelled = _drift_labelling(reference, px, area_px2)
+    before = found.blob >= 0
+    folded = not before.any() or turned_over(reference, px[found.blob], before).any()
+    labelled = _drift_labelling(reference, px, area_px2, STIFFNESS if folded else STIFFNESS[:1])
     if labelled is None:
         return found
     blob, places_px = labelled
-    known, before = blob >= 0, found.blob >= 0
-    if before.sum() >= known.sum() and not turned_over(reference, px[found.blob], before).any():
+    known = blob >= 0
+    if before.sum() >= known.sum() and not folded:
         return found
     away2 = ((px[blob[known]] - places_px[known]) ** 2).sum(axis=1) / (FINAL_GATE * reference.spacing_px[known]) ** 2
     score, left = known.sum(), min(len(px), len(blob)) - known.sum()
     return Match(blob, places_px, float(score - away2.sum()), float(np.sqrt(len(blob)) - (len(blob) - score) - left), drifted=True)
 
 
-def _drift_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def _drift_labelling(
+    reference: Reference, px: np.ndarray, area_px2: np.ndarray, stiffnesses: Stiffnesses
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Blob (N,) of each pin, -1 for none, and places (N, 2) to which the pins drifted; None if no stiffness proves itself.
 
     The first one is used that leaves no pin lost, or no blob; else the one with most pins.
@@ -204,6 +210,8 @@ def _drift_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray)
     reference : Reference
     px, area_px2 : (K, 2), (K,) float
         Places and areas of the blobs.
+    stiffnesses : ((beta, lambda), ...)
+        Those that are tried in turn.
     """
     n, caps = len(reference.pins_px), np.flatnonzero(area_px2 >= DRIFT_SPECK * np.median(area_px2))
     if not (1 - MOST_LOST) * n <= len(caps) <= MOST_BLOBS * n:
@@ -211,16 +219,16 @@ def _drift_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray)
     spacing = float(np.median(reference.spacing_px))
     rest, blobs = reference.pins_px / spacing, px[caps] / spacing
     best, most = None, (1 - MOST_LOST) * n
-    for beta, stiffness in STIFFNESS:
+    for beta, stiffness in stiffnesses:
         places = drift(rest, blobs, reference.motions(beta), stiffness)
         found = _assign_drifted(places, blobs)
         known = found >= 0
         if known.sum() < most or np.mean(np.sum((blobs[found] - places)[known] ** 2, axis=1)) > MOST_MISFIT**2:
             continue
         left = np.delete(blobs, found[known], axis=0)
-        near = int((((left - places[:, None]) ** 2).sum(axis=2).min(axis=0) < 1).sum()) if len(left) else 0
+        beside = int((((left - places[:, None]) ** 2).sum(axis=2).min(axis=0) < 1).sum()) if len(left) else 0
         folded = turned_over(reference, np.where(known[:, None], blobs[found], places), known).any()
-        if near <= MOST_LEFT * n and not folded:
+        if beside <= MOST_LEFT * n and not folded:
             best, most = (np.where(known, caps[found], -1), places * spacing), known.sum() + 1
             if known.sum() == min(n, len(caps)):
                 break

@@ -12,8 +12,8 @@ import numpy as np
 
 from scenes import load_object, load_sensor
 from training.surrogate.contacts import SurrogateContacts
-from training.surrogate.felt import Contact
 from training.surrogate.model import surrogate_of
+from training.surrogate.reading import EpisodeContact
 from twin.mechanics.law import ContactLaw
 
 WORLD = """
@@ -33,7 +33,7 @@ PUSH_FROM_S, PUSH_N = 1.0, 0.3  # sideways
 
 sensor, plane = load_sensor("mg400-331"), load_object("plane")
 skin = SurrogateContacts(surrogate_of(sensor), sensor, 1)
-skin.begin(0, Contact(sensor, plane, ContactLaw.of_object(plane)))
+skin.begin(0, EpisodeContact(sensor, plane, ContactLaw.of_object(plane)))
 model = mujoco.MjModel.from_xml_string(WORLD)
 data = mujoco.MjData(model)
 body = model.body("plate").id

@@ -88,7 +88,7 @@ def experiments() -> Catalog:
 
 
 def randomisations() -> Catalog:
-    """All randomisations (distributions of quantities that are drawn for each simulated contact)."""
+    """All randomisations (distributions of quantities that are sampled for each simulated contact)."""
     return _catalog("randomisations", list_randomisations(), load_randomisation, lambda spec: f"{len(spec.sensor)} numbers of the sensor")
 
 

@@ -1,7 +1,7 @@
 """Specification of an experiment: the contacts that the robot makes, in the robot's coordinates.
 
 The labels are those of the recordings: ``pose_1..6`` and ``move_1..6`` are x, y, z (mm) and Rx, Ry, Rz (deg) of the tool in the work frame.
-For each contact a pose and a move are drawn uniformly from their ranges. The arm goes to ``pose - move + clear``, taps by ``tap``, and
+For each contact a pose and a move are sampled uniformly from their ranges. The arm goes to ``pose - move + clear``, taps by ``tap``, and
 moves by ``move`` (the shear). The frame is taken at ``pose + clear + tap``.
 """
 

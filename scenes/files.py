@@ -16,7 +16,7 @@ LONGEST_SHOWN = 60  # largest number of characters of a wrong key or value in a 
 LONGEST_PATH = 400  # largest number of characters of a path in a message
 
 
-def shown(part: object, most: int = LONGEST_SHOWN) -> str:
+def quote(part: object, most: int = LONGEST_SHOWN) -> str:
     """A key or value of a file for a one-line message: its first ``most`` characters, with ``?`` for characters that can't be printed."""
     text = str(part)
     text = text if len(text) <= most else f"{text[:most]}..."
@@ -78,7 +78,7 @@ def read_toml(path: Path) -> dict[str, object]:
     except ValueError as error:  # Python refuses to read thousands of decimal digits
         raise SpecError(f"{path}: {_TOO_LONG}") from error
     for key, problem in _beyond_bounds(data):
-        raise SpecError(f"{path}: {shown(key)}: {problem}")
+        raise SpecError(f"{path}: {quote(key)}: {problem}")
     return data
 
 

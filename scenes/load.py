@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 from scenes.base import Section, SpecError
 from scenes.experiment import ExperimentSpec
-from scenes.files import LONGEST_PATH, LONGEST_SHOWN, read_toml, shown
+from scenes.files import LONGEST_PATH, LONGEST_SHOWN, quote, read_toml
 from scenes.object import MeshShape, ObjectSpec
 from scenes.plugins import other_files
 from scenes.randomisation import RandomisationSpec
@@ -84,16 +84,16 @@ def load_object(name_or_path: str | Path | ObjectSpec) -> ObjectSpec:
     path = Path(name_or_path) if isinstance(name_or_path, str | os.PathLike) else Path()
     if path.suffix.lower() in MESH_SUFFIXES:
         if not os.path.isfile(path):  # unlike ``Path.is_file`` it is also False for a text that can't be a path
-            raise SpecError(f"{shown(path, LONGEST_PATH)}: no such mesh file; give the path of an existing STL, OBJ or PLY")
+            raise SpecError(f"{quote(path, LONGEST_PATH)}: no such mesh file; give the path of an existing STL, OBJ or PLY")
         mesh = MeshShape(kind="mesh", file=str(path.resolve()), sha256=_digest(path))
-        return _checked({"name": path.stem, "description": f"mesh {path.name}", "shape": mesh}, path, ObjectSpec)
+        return _validate({"name": path.stem, "description": f"mesh {path.name}", "shape": mesh}, path, ObjectSpec)
     spec_path = _find(name_or_path, "objects")
     spec = read_section(spec_path, ObjectSpec)
     if isinstance(spec.shape, MeshShape):
         file = spec_path.parent / spec.shape.file
         if not os.path.isfile(file):
             raise SpecError(
-                f"{spec_path}: shape.file: no such mesh file '{shown(spec.shape.file)}'; the path is relative to the specification"
+                f"{spec_path}: shape.file: no such mesh file '{quote(spec.shape.file)}'; the path is relative to the specification"
             )
         digest = _digest(file)
         if spec.shape.sha256 not in ("", digest):
@@ -175,14 +175,14 @@ def _find(name_or_path: object, kind: str) -> Path:
     if path.suffix == ".toml":
         if not os.path.isfile(path):
             raise SpecError(
-                f"{shown(path, LONGEST_PATH)}: no such file; give the path of an existing TOML specification, or a name ({listed})"
+                f"{quote(path, LONGEST_PATH)}: no such file; give the path of an existing TOML specification, or a name ({listed})"
             )
         return path
     if str(name_or_path) in known:
         return known[str(name_or_path)]
     near = difflib.get_close_matches(str(name_or_path), known, n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
-    raise SpecError(f"no {kind[:-1]} named '{shown(name_or_path)}': {hint} ({listed}; own files go to {user_spec_dir() / kind})")
+    raise SpecError(f"no {kind[:-1]} named '{quote(name_or_path)}': {hint} ({listed}; own files go to {user_spec_dir() / kind})")
 
 
 def read_section(path: Path, model: type[Spec]) -> Spec:
@@ -194,10 +194,10 @@ def read_section(path: Path, model: type[Spec]) -> Spec:
         If the file can't be read or is not valid. The message names the file, the key and the remedy, on one line.
     """
     name = {"name": path.stem} if "name" in model.model_fields else {}
-    return _checked(name | read_toml(path), path, model)
+    return _validate(name | read_toml(path), path, model)
 
 
-def _checked(data: dict[str, object], path: Path, model: type[Spec]) -> Spec:
+def _validate(data: dict[str, object], path: Path, model: type[Spec]) -> Spec:
     try:
         data = fill_in_tables(data, path.parent)
     except ValueError as error:
@@ -205,24 +205,24 @@ def _checked(data: dict[str, object], path: Path, model: type[Spec]) -> Spec:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise SpecError(f"{path}: {explained(error, model)}") from error
+        raise SpecError(f"{path}: {explain_problems(error, model)}") from error
 
 
-def explained(error: ValidationError, model: type[BaseModel]) -> str:
+def explain_problems(error: ValidationError, model: type[BaseModel]) -> str:
     """The problems of a validation, key by key, in one line."""
     problems = []
     found = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")  # a misspelt key is missing, too
     for item in found[:MOST_PROBLEMS]:
-        key = ".".join(shown(part) for part in item["loc"])
+        key = ".".join(quote(part) for part in item["loc"])
         if item["type"] == "extra_forbidden":
             known = _keys_at(model, item["loc"][:-1])
-            near = difflib.get_close_matches(shown(item["loc"][-1]), known, n=1)
+            near = difflib.get_close_matches(quote(item["loc"][-1]), known, n=1)
             problems.append(f"unknown key '{key}'; " + (f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(known)}"))
         elif item["type"] == "missing":
             problems.append(f"key '{key}' is missing; add it (see the shipped specifications for examples)")
         else:
-            came = "" if isinstance(item["input"], dict) else f", got {shown(repr(item['input']))}"
-            said = shown(item["msg"].removeprefix("Value error, ").replace("Input should be", "must be"), 4 * LONGEST_SHOWN)
+            came = "" if isinstance(item["input"], dict) else f", got {quote(repr(item['input']))}"
+            said = quote(item["msg"].removeprefix("Value error, ").replace("Input should be", "must be"), 4 * LONGEST_SHOWN)
             between = "" if not key else " " if said.startswith("must be") else ": "
             problems.append(f"{key}{between}{said}{came}")
     if len(found) > MOST_PROBLEMS:

@@ -42,7 +42,7 @@ def others(kind: str, own: Container[str] = (), *, is_one: Callable[[Any], bool]
         begun = getattr(getattr(sys.modules.get(entry.module), "__spec__", None), "_initializing", False)
         if entry in _judged or begun:  # a package that is being imported asks for a part of ours; the next call finds its own
             continue
-        part, why = _loaded(entry)
+        part, why = _load_part(entry)
         if entry.name in own or entry.name in found:
             why = f"there is another '{entry.name}'"
         elif not why and not is_one(part):
@@ -79,7 +79,7 @@ def _own_classes(kind: str, base: type) -> dict[str, type]:
     return found
 
 
-def _loaded(entry: EntryPoint) -> tuple[Any, str]:
+def _load_part(entry: EntryPoint) -> tuple[Any, str]:
     """A part, and why it can't be loaded."""
     try:
         return entry.load(), ""
@@ -98,7 +98,7 @@ def plugin_lines() -> list[str]:
     lines = []
     for kind in KINDS:
         for entry in _entries(kind):
-            why = _judged[entry] if entry in _judged else _loaded(entry)[1]
+            why = _judged[entry] if entry in _judged else _load_part(entry)[1]
             lines.append(f"{kind}: {entry.name} of {_package(entry)}{f'; LEFT OUT: {why}' if why else ''}")
     return lines
 

@@ -1,4 +1,4 @@
-"""Specification of the quantities that are drawn at random for each simulated contact."""
+"""Specification of the quantities that are sampled at random for each simulated contact."""
 
 from typing import Annotated, Self
 
@@ -10,7 +10,7 @@ from scenes.sensor import SensorSpec
 Ends = tuple[float, float]
 
 
-class Spread(Section):
+class SpreadSpec(Section):
     """Distribution of a number of a specification. Exactly one of the three keys is given.
 
     Attributes
@@ -44,7 +44,7 @@ class Spread(Section):
 
 
 class FrictionSpread(Section):
-    """Friction of a contact, drawn for each contact.
+    """Friction of a contact, sampled for each contact.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class FrictionSpread(Section):
 
 
 class RandomisationSpec(Section):
-    """Quantities that are drawn at random for each contact.
+    """Quantities that are sampled at random for each contact.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class RandomisationSpec(Section):
     executed_share: Fraction = 1.0
     pin_noise_px: NonNegative = 0.0
     friction: FrictionSpread | None = None
-    sensor: Annotated[dict[str, Spread], Field(default_factory=dict)]
+    sensor: Annotated[dict[str, SpreadSpec], Field(default_factory=dict)]
 
     @model_validator(mode="after")
     def _check(self) -> Self:

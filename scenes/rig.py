@@ -111,7 +111,7 @@ class RigSpec(Section):
     force_sensor : ForceSensorSpec, optional
         Force sensor of the recordings, if their tables contain measured forces.
     placed : list of PlacedSpec
-        Objects at other positions than the plate. ``before`` returns the rig in front of one of them.
+        Objects at other positions than the plate. ``for_object`` returns the rig in front of one of them.
     """
 
     contact_offset_mm: float = 0.0
@@ -131,7 +131,7 @@ class RigSpec(Section):
     force_sensor: ForceSensorSpec | None = None
     placed: tuple[PlacedSpec, ...] = ()
 
-    def before(self, name: str) -> "RigSpec":
+    def for_object(self, name: str) -> "RigSpec":
         """The rig in front of the object with this name, without ``placed``."""
         own = next((each for each in self.placed if each.object == name), None)
         known = {} if own is None else own.model_dump(exclude_none=True, exclude={"object"})

@@ -313,7 +313,7 @@ class ReliefSpec(Section):
     caps, skin : bool
         Whether the tiles are used on the caps with their edges (up to ``SKIN_FROM`` cap radii), and on the skin around.
     pattern : int
-        With 0 each pin has its own tile. Another number stands for another print of the sensor: each pin's tile is drawn at random, with
+        With 0 each pin has its own tile. Another number stands for another print of the sensor: each pin's tile is sampled at random, with
         the mean and the covariance of all measured tiles.
     """
 
@@ -432,7 +432,7 @@ class ResponseSpec(Section):
     exposure, white_balance : float, three numbers
         Gain of all colours, and gain of each colour.
     brightness_drift : float
-        Relative standard deviation of a gain that is drawn for each frame.
+        Relative standard deviation of a gain that is sampled for each frame.
     read_noise, shot_noise : float
         The noise has the variance ``read_noise^2 + shot_noise * light``; light 1 is saturation.
     noise_sigma_px : float

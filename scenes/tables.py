@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from scenes.base import PICTURE
-from scenes.files import INT64, LARGEST_BYTES, read_regular, shown
+from scenes.files import INT64, LARGEST_BYTES, quote, read_regular
 
 Nested: TypeAlias = "int | float | list[Nested] | tuple[Nested, ...]"
 """A number, or nested lists of numbers, with the same length at each level."""
@@ -129,8 +129,8 @@ def _read_table(reference: Mapping[str, object], folder: Path, key: str) -> list
         try:
             values = [_number(word) for word in words]
         except ValueError as error:
-            raise ValueError(f"{key}: {file}, line {number}: {shown(error)}; give numbers with commas between them") from None
-        table.append(_folded(values, shape[1:]))
+            raise ValueError(f"{key}: {file}, line {number}: {quote(error)}; give numbers with commas between them") from None
+        table.append(_fold(values, shape[1:]))
     return table
 
 
@@ -156,7 +156,7 @@ def _content(file: str, folder: Path, key: str, word: str, suffixes: tuple[str, 
     except FileNotFoundError:
         raise ValueError(f"{key}: the {what} {folder / file} is missing; copy it together with the specification") from None
     except OSError as error:
-        raise ValueError(f"{key}: the {what} {folder / file} can't be read ({error.strerror}); copy it anew") from error
+        raise ValueError(f"{key}: the {what} {folder / file} can't be read ({error.strerror}); copy it again") from error
 
 
 def _number(word: str) -> int | float:
@@ -172,12 +172,12 @@ def _number(word: str) -> int | float:
     return number
 
 
-def _folded(values: Sequence[int | float], shape: Sequence[int]) -> Nested:
+def _fold(values: Sequence[int | float], shape: Sequence[int]) -> Nested:
     """Numbers in C order as nested lists of a shape; for an empty shape the only number itself."""
     if not shape:
         return values[0]
     each = prod(shape[1:])
-    return [_folded(values[each * k : each * (k + 1)], shape[1:]) for k in range(shape[0])]
+    return [_fold(values[each * k : each * (k + 1)], shape[1:]) for k in range(shape[0])]
 
 
 def _flat(value: Nested) -> list[int | float]:

@@ -20,7 +20,7 @@ from hypothesis import settings  # noqa: E402
 
 from scenes import load_sensor  # noqa: E402
 
-# The same code gives the same answer: what Hypothesis draws follows from the test, not from the clock. `make validate` draws anew.
+# The same code gives the same answer: what Hypothesis draws follows from the test, not from the clock. `make validate` draws again.
 settings.register_profile("same", derandomize=True)
 settings.register_profile("anew", derandomize=False)
 settings.load_profile("same")

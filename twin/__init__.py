@@ -29,7 +29,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from twin.lazy import WhenImported, named
+from twin.lazy import WhenImported, offered_name
 
 _PLACES = {
     "BaselinesVecEnv": "training.environments.baselines",
@@ -49,7 +49,7 @@ _PLACES = {
     "learn": "twin.cli.learning",
     "load_experiment": "scenes",
     "load_limits": "hardware.safety.decide",
-    "load_model": "training.estimate.loading:load_remembering",
+    "load_model": "training.estimate.loading:load_with_history",
     "load_object": "scenes",
     "load_sensor": "scenes",
     "make_dataset": "twin.cli.learning",
@@ -90,7 +90,7 @@ def __getattr__(name: str) -> Any:
     if name in _MODULES:
         return import_module(f"twin.{name}")
     require_own("training", "hardware")
-    return named(_PLACES, "twin", name)
+    return offered_name(_PLACES, "twin", name)
 
 
 __all__ = ["__version__", *sorted([*_PLACES, *_MODULES])]

@@ -21,18 +21,18 @@ from scenes import load_sensor as load_sensor
 from training.environments import register_all as register_all
 from training.environments.baselines import BaselinesVecEnv as BaselinesVecEnv
 from training.environments.learn import Learnt as Learnt
-from training.estimate.loading import load_remembering as load_remembering
+from training.estimate.loading import load_with_history as load_with_history
 from training.generation.run import Simulated as Simulated
-from training.studies.degradation import Result as Result
+from training.studies.degradation import DegradationResult as DegradationResult
 from training.studies.evaluation import Evaluation as Evaluation
 from training.studies.label_audit import LabelAudit as LabelAudit
 from training.studies.prediction import Predictions as Predictions
 from training.studies.realism import Realism as Realism
-from training.studies.train import Trained as Trained
+from training.studies.train import TrainedRun as TrainedRun
 from training.studies.validation import Validation as Validation
-from twin.fit.contact.calibrate import ContactCalibration as ContactCalibration
-from twin.fit.go_on import WholeSensor as WholeSensor
-from twin.fit.optics import OpticsCalibration as OpticsCalibration
+from twin.calibration.contact.calibrate import ContactCalibration as ContactCalibration
+from twin.calibration.go_on import WholeSensor as WholeSensor
+from twin.calibration.optics import OpticsCalibration as OpticsCalibration
 from twin.mechanics.path import ContactPose as ContactPose
 from twin.pins.batch import Preprocessed as Preprocessed
 from twin.pins.graph import node_features as node_features
@@ -46,7 +46,7 @@ from twin.types import Observation as Observation
 from twin import errors as errors
 from twin import extend as extend
 
-load_model = load_remembering
+load_model = load_with_history
 register_environments = register_all
 
 __version__: str
@@ -71,13 +71,13 @@ def calibrate_contact(
     sensor: str | Path | SensorSpec,
     frames: Path | str,
     out: Path | str,
-    labels: int = ...,
+    num_labelled: int = ...,
     seed: int = ...,
     experiment: str | Path | ExperimentSpec = ...,
     obj: str | Path | ObjectSpec | None = ...,
     hold: str | Sequence[str] | None = ...,
     workers: int = ...,
-    across: int = ...,
+    elements: int = ...,
     form: Form | str | None = ...,
     table: Path | str | None = ...,
     no_contact: Path | str | None = ...,
@@ -92,7 +92,7 @@ def calibrate_optics(
     frames: Path | str,
     out: Path | str,
     no_contact: Path | str | None = ...,
-    limit: int = ...,
+    max_frames: int = ...,
     pipeline: Path | str | None = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
@@ -104,7 +104,7 @@ def check(
     sensor: str | Path | SensorSpec,
     form: Form | str | None = ...,
     pipeline: Path | str | None = ...,
-    limit: int = ...,
+    max_frames: int = ...,
     no_contact: Path | str | None = ...,
     push: str | Sequence[str] | None = ...,
     twist: Path | str | None = ...,
@@ -125,7 +125,7 @@ def collect(
     obj: str | Path | ObjectSpec | None = ...,
     servo: str | Path | ServoSpec = ...,
     form: Form | str | None = ...,
-    limits: str | None = ...,
+    safety: str | None = ...,
     seed: int | None = ...,
     design: str = ...,
     plain_light: bool = ...,
@@ -141,7 +141,7 @@ def evaluate(
     data: Path | str | Sequence[Path | str],
     out: Path | str,
     rows: str = ...,
-    labels: str = ...,
+    label_kind: str = ...,
     robustness: bool = ...,
     table: Path | str | None = ...,
     no_contact: Path | str | None = ...,
@@ -158,8 +158,8 @@ def learn(
     randomise: str | None = ...,
     surrogate: Path | str | None = ...,
     objects: str | Sequence[str] | None = ...,
-    memory: bool = ...,
-    sight: bool = ...,
+    friction_history: bool = ...,
+    state_estimator: bool = ...,
     minutes: float = ...,
     environments: int = ...,
     fem: int = ...,
@@ -184,7 +184,7 @@ def make_dataset(
     scheduler: str = ...,
     quality: Literal['drawn', 'preview', 'standard', 'high'] | None = ...,
     residual: bool = ...,
-    across: int = ...,
+    elements: int = ...,
     also: str | Sequence[str] | None = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
@@ -195,18 +195,18 @@ def new_sensor(
     *,
     out: Path | str,
     camera: str | Path = ...,
-    labels: Path | str | None = ...,
+    label_table: Path | str | None = ...,
     experiment: str | Path | ExperimentSpec | None = ...,
     contacts: int = ...,
     optics: bool = ...,
     workers: int = ...,
-    across: int = ...,
+    elements: int = ...,
     layout: str | None = ...,
     radius_mm: float | None = ...,
     no_contact: Path | str | None = ...,
     table: Path | str | None = ...,
     form: Form | str | None = ...,
-    limit: int = ...,
+    max_frames: int = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
 ) -> WholeSensor: ...
@@ -242,7 +242,7 @@ def realism(
     sensor: str | Path | SensorSpec,
     out: Path | str,
     pose_aligned: bool = ...,
-    limit: int | None = ...,
+    max_frames: int | None = ...,
     fitted: int = ...,
     without: str | Sequence[str] | None = ...,
     residual: bool = ...,
@@ -263,12 +263,12 @@ def robustness(
     model: Path | str | Sequence[Path | str] | None = ...,
     conditions: Path | str | None = ...,
     frames: Path | str | None = ...,
-    limit: int = ...,
+    max_frames: int = ...,
     rendered: bool = ...,
     jobs: int = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
-) -> Result: ...
+) -> DegradationResult: ...
 
 def run_policy(
     policy: Path | str,
@@ -279,7 +279,7 @@ def run_policy(
     arm: str = ...,
     servo: str | Path | ServoSpec = ...,
     steps: int | None = ...,
-    limits: str | None = ...,
+    safety: str | None = ...,
     record: bool = ...,
     seed: int = ...,
     known_place: bool = ...,
@@ -301,7 +301,7 @@ def servo(
     steps: int | None = ...,
     stream: bool = ...,
     rate: float = ...,
-    limits: str | None = ...,
+    safety: str | None = ...,
     record: bool = ...,
     seed: int = ...,
     known_place: bool = ...,
@@ -320,7 +320,7 @@ def train(
     data: Path | str | Sequence[Path | str],
     out: Path | str,
     target: str | Sequence[str] = ...,
-    labels: str = ...,
+    label_kind: str = ...,
     seed: int = ...,
     split: int = ...,
     epochs: int | None = ...,
@@ -336,7 +336,7 @@ def train(
     pipeline: Path | str | None = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
-) -> Trained: ...
+) -> TrainedRun: ...
 
 def tune(
     *,
@@ -345,7 +345,7 @@ def tune(
     out: Path | str | None = ...,
     method: Literal['twin', 'legacy', 'adaptive', 'fixed', 'simple', 'log', 'dog', 'doh'] = ...,
     form: Form | str | None = ...,
-    limit: int = ...,
+    max_frames: int = ...,
     table: Path | str | None = ...,
     no_contact: Path | str | None = ...,
     force: bool = ...,
@@ -359,10 +359,10 @@ def validate(
     out: Path | str,
     experiment: str | Path | ExperimentSpec = ...,
     obj: str | Path | ObjectSpec | None = ...,
-    limit: int | None = ...,
+    max_frames: int | None = ...,
     friction_frames: int = ...,
     seed: int = ...,
-    across: int = ...,
+    elements: int = ...,
     form: Form | str | None = ...,
     table: Path | str | None = ...,
     no_contact: Path | str | None = ...,

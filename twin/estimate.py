@@ -66,6 +66,6 @@ class SensorModel(Protocol):
         """Raise an error if the model was not trained on frames of this sensor and form."""
 
 
-def seen_in(frame: Frame, estimate: Estimate | None, pipeline: Pipeline) -> Observation:
+def pins_in(frame: Frame, estimate: Estimate | None, pipeline: Pipeline) -> Observation:
     """The pins behind the estimate of a frame. The pipeline searches for them only if the estimate does not contain them."""
     return pipeline(frame) if estimate is None or estimate.seen is None else estimate.seen

@@ -1,11 +1,11 @@
 """What authors of new parts need: protocols and base classes of layouts, materials, arms, cameras, models, tasks, degradations, detectors.
 
 arms          Arm ArmState BaseArm FEEDBACK_AGE_S MG400 Mg400Ports Mg400Emulator
-cameras       FrameSource LiveSource Picture ReadFailed capture
+cameras       FrameSource LiveSource DevicePicture ReadFailed capture
 devices       DeviceError Connection
 models        Estimate SensorModel Model PinModel Recipe register_model refuse_sizes
 tasks         Task
-degradations  Condition View over_channels
+degradations  Condition PictureView over_channels
 detectors     Detector DetectorSpec
 sensors       PinsSpec Layout LatticeLayout MaterialLaw
 mechanics     SkinSolver
@@ -16,17 +16,18 @@ The pages below `docs/how-to` show how to add each of them. Each name is importe
 
 from typing import Any
 
-from twin.lazy import named
+from twin.lazy import offered_name
 
 _PLACES = {
     "Arm": "hardware.arms.arm",
     "ArmState": "hardware.arms.arm",
     "BaseArm": "hardware.arms.arm",
-    "Condition": "twin.judge.degradation.condition",
+    "Condition": "twin.evaluation.degradation.condition",
     "Connection": "hardware.errors",
     "Detector": "twin.pins.detector",
     "DetectorSpec": "twin.pins.detector_spec",
     "DeviceError": "hardware.errors",
+    "DevicePicture": "hardware.cameras.reader",
     "Estimate": "twin.estimate",
     "FEEDBACK_AGE_S": "hardware.arms.arm",
     "FrameSource": "hardware.cameras.source",
@@ -38,7 +39,7 @@ _PLACES = {
     "Mg400Emulator": "hardware.emulators.mg400",
     "Mg400Ports": "hardware.arms.mg400",
     "Model": "training.models.part",
-    "Picture": "hardware.cameras.reader",
+    "PictureView": "twin.evaluation.degradation.condition",
     "PinModel": "training.models.part",
     "PinsSpec": "scenes.pins",
     "Preview": "twin.optics.preview",
@@ -47,9 +48,8 @@ _PLACES = {
     "SensorModel": "twin.estimate",
     "SkinSolver": "twin.mechanics",
     "Task": "training.environments.tasks",
-    "View": "twin.judge.degradation.condition",
     "capture": "hardware.cameras.reader",
-    "over_channels": "twin.judge.degradation.condition",
+    "over_channels": "twin.evaluation.degradation.condition",
     "project": "twin.camera.projection",
     "refuse_sizes": "training.models.part",
     "register_model": "training.models:register",
@@ -60,4 +60,4 @@ __all__ = sorted(_PLACES)
 
 
 def __getattr__(name: str) -> Any:
-    return named(_PLACES, "twin.extend", name)
+    return offered_name(_PLACES, "twin.extend", name)

@@ -6,8 +6,8 @@ from hardware.arms.arm import BaseArm as BaseArm
 from hardware.arms.arm import FEEDBACK_AGE_S as FEEDBACK_AGE_S
 from hardware.arms.mg400 import MG400 as MG400
 from hardware.arms.mg400 import Mg400Ports as Mg400Ports
+from hardware.cameras.reader import DevicePicture as DevicePicture
 from hardware.cameras.reader import LiveSource as LiveSource
-from hardware.cameras.reader import Picture as Picture
 from hardware.cameras.reader import ReadFailed as ReadFailed
 from hardware.cameras.reader import capture as capture
 from hardware.cameras.source import FrameSource as FrameSource
@@ -27,10 +27,10 @@ from training.models.recipes import Recipe as Recipe
 from twin.camera.projection import project as project
 from twin.estimate import Estimate as Estimate
 from twin.estimate import SensorModel as SensorModel
+from twin.evaluation.degradation.condition import Condition as Condition
+from twin.evaluation.degradation.condition import PictureView as PictureView
+from twin.evaluation.degradation.condition import over_channels as over_channels
 from twin.geometry.pins import rest_pins as rest_pins
-from twin.judge.degradation.condition import Condition as Condition
-from twin.judge.degradation.condition import View as View
-from twin.judge.degradation.condition import over_channels as over_channels
 from twin.mechanics import SkinSolver as SkinSolver
 from twin.optics.preview import Preview as Preview
 from twin.pins.detector import Detector as Detector

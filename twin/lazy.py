@@ -12,7 +12,7 @@ from typing import Any
 from twin.errors import extras_named
 
 
-def named(places: Mapping[str, str], module: str, name: str) -> Any:
+def offered_name(places: Mapping[str, str], module: str, name: str) -> Any:
     """What a module offers under a name: the work of its ``__getattr__``.
 
     Parameters

@@ -14,11 +14,11 @@ from twin.pins.graph import make_graph
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.report.charts import save_figure
-from twin.report.plots import Look, contact_panel
+from twin.report.plots import ObservedFrame, contact_panel
 from twin.report.skin3d import displaced_skin, draw_contact_skin, write_surface
 from twin.simulator import RenderedFrame, Simulator
 from twin.store import made_by, write_json, write_npz, writes
-from twin.types import ContactState, FloatArray, Form, Quality, Readable
+from twin.types import ContactState, FloatArray, Form, Quality, ReadableResult
 
 FILES = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
 """Files of a contact, in the order in which they are written."""
@@ -35,12 +35,12 @@ class Pose(Protocol):
 
 
 @dataclass(frozen=True, repr=False)
-class RenderedContact(Readable):
+class RenderedContact(ReadableResult):
     """A simulated and rendered contact, and its files."""
 
     state: ContactState
     rendered: RenderedFrame
-    look: Look
+    look: ObservedFrame
     written: list[Path]
 
     def lines(self) -> list[str]:
@@ -49,10 +49,10 @@ class RenderedContact(Readable):
         visible = self.rendered.truth.visible
         seen = self.look.observation
         found = f"the pipeline finds {seen.found} of {len(seen.pins_px)} pins in the picture"
-        useless = f"note: the pipeline can't use the picture: {seen.reason}; 'twin check' tells where the specification is wrong"
+        useless = f"note: the pipeline can't use the picture: {seen.reason}; 'twin check' shows where the specification is wrong"
         return [
             f"force {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f} N, contact area {self.state.area_mm2:.1f} mm2, "
-            f"{int(visible.sum())} of {len(visible)} caps in sight",
+            f"{int(visible.sum())} of {len(visible)} caps visible",
             found if seen.valid else useless,
         ]
 
@@ -60,7 +60,7 @@ class RenderedContact(Readable):
 @writes(*FILES)
 def render_contact(
     sensor: SensorSpec,
-    touched: ObjectSpec,
+    obj: ObjectSpec,
     pose: ContactPose,
     out: Path,
     *,
@@ -93,31 +93,31 @@ def render_contact(
     """
     simulator = Simulator(sensor, quality=quality)
     simulator.check_form(form)
-    with stage(progress, f"press {touched.name}") as step:
-        state = simulator.press(touched, pose, progress=step)
+    with stage(progress, f"press {obj.name}") as step:
+        state = simulator.press(obj, pose, progress=step)
     with stage(progress, "render"):
         rendered = simulator.render(state, form=form, seed=seed)
     with stage(progress, "pictures"):
-        written, look = write_contact(out, simulator, touched, pose, state, rendered)
+        written, look = write_contact(out, simulator, obj, pose, state, rendered)
     return RenderedContact(state, rendered, look, written)
 
 
 def write_contact(
-    out: Path, simulator: Simulator, touched: ObjectSpec, pose: Pose, state: ContactState, rendered: RenderedFrame
-) -> tuple[list[Path], Look]:
+    out: Path, simulator: Simulator, obj: ObjectSpec, pose: Pose, state: ContactState, rendered: RenderedFrame
+) -> tuple[list[Path], ObservedFrame]:
     """Write all files of one contact into a folder. Returns the files, and what the pipeline sees in the picture."""
     spec = simulator.spec
     write_image(out / "frame.png", rendered.frame.image)
     write_exr(out / "frame.exr", rendered.linear, simulator.renderer.choice)
     write_npz(out / "truth.npz", asdict(rendered.truth) | contact_arrays(state), compressed=True)
-    record = contact_record(simulator, touched, pose, state, rendered)
-    write_json(out / "truth.json", record | {"made_by": made_by(Simulator, inputs=[spec, touched, pose])})
+    record = contact_record(simulator, obj, pose, state, rendered)
+    write_json(out / "truth.json", record | {"made_by": made_by(Simulator, inputs=[spec, obj, pose])})
 
     mesh = simulator.solver.mesh
     write_surface(out / "skin.vtp", displaced_skin(mesh, state))
-    draw_contact_skin(mesh, spec.pins, state, build_field(touched), out / "skin.png")
+    draw_contact_skin(mesh, spec.pins, state, build_field(obj), out / "skin.png")
     look = look_at(simulator, rendered)
-    title = f"{spec.name} against {touched.name}, {pose.indent_mm:g} mm deep, {state.force_n[2]:.2f} N"
+    title = f"{spec.name} against {obj.name}, {pose.indent_mm:g} mm deep, {state.force_n[2]:.2f} N"
     save_figure(out / "panel.png", contact_panel(out / "skin.png", look, title), dpi=110)
     return [out / name for name in FILES], look
 
@@ -128,17 +128,15 @@ def contact_arrays(state: ContactState) -> dict[str, FloatArray]:
     return {f"contact_{name.removeprefix('contact_')}": getattr(state, name) for name in names}
 
 
-def look_at(simulator: Simulator, rendered: RenderedFrame) -> Look:
+def look_at(simulator: Simulator, rendered: RenderedFrame) -> ObservedFrame:
     """Run the pipeline on a rendered frame. The graph without contact is that of the pins' true places at rest."""
     pipeline = Pipeline(simulator.spec, rendered.frame.form)
     pipeline(rendered.frame)  # first: it loads compiled code, which must not count in its times
     rest = make_graph(pipeline.graph, rendered.truth.rest_px, outmost=pipeline.reference.outmost)
-    return Look(rendered.frame, pipeline(rendered.frame), rest)
+    return ObservedFrame(rendered.frame, pipeline(rendered.frame), rest)
 
 
-def contact_record(
-    simulator: Simulator, touched: ObjectSpec, pose: Pose, state: ContactState, rendered: RenderedFrame
-) -> dict[str, object]:
+def contact_record(simulator: Simulator, obj: ObjectSpec, pose: Pose, state: ContactState, rendered: RenderedFrame) -> dict[str, object]:
     """The content of ``truth.json``: forces on the object in the sensor frame, the pose, and all resolved specifications."""
     return {
         "force_n": state.force_n.tolist(),
@@ -152,5 +150,5 @@ def contact_record(
         "seconds": {"render": rendered.seconds},
         **simulator.describe(),
         "sensor": simulator.spec.model_dump(mode="json"),
-        "object": touched.model_dump(mode="json"),
+        "object": obj.model_dump(mode="json"),
     }

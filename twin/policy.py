@@ -73,15 +73,15 @@ class Policy:
     sight: Layers = ()
     domain: Mapping[str, np.ndarray] = field(default_factory=dict)
 
-    def reduced(self, tactile: FloatArray, goal: FloatArray) -> FloatArray:
+    def reduce_inputs(self, tactile: FloatArray, goal: FloatArray) -> FloatArray:
         """Inputs (B, K + G + S) of the network of the actions, from observations (B, ...) and goals (B, G)."""
-        seen = (flattened(tactile) - self.mean) @ self.basis.T
+        seen = (flatten(tactile) - self.mean) @ self.basis.T
         x = np.concatenate([seen, goal], axis=1).astype(np.float32)
         return np.concatenate([x, _through(self.sight, x)], axis=1) if self.sight else x
 
     def act(self, tactile: FloatArray, goal: FloatArray) -> FloatArray:
         """Actions (B, A) in [-1, 1]."""
-        return np.clip(_through(self.layers, self.reduced(tactile, goal)), -1.0, 1.0)
+        return np.clip(_through(self.layers, self.reduce_inputs(tactile, goal)), -1.0, 1.0)
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -110,13 +110,13 @@ def load_policy(path: Path) -> Policy:
     PolicyError
         If there is no such file, or if it contains no policy of this version.
     """
-    with FILE.opened(path) as (about, arrays):
+    with FILE.open_arrays(path) as (about, arrays):
         SensorSpec.model_validate(about["sensor"])
         domain = {key.removeprefix(DOMAIN): arrays.pop(key) for key in list(arrays) if key.startswith(DOMAIN)}
         return Policy(about, arrays["mean"], arrays["basis"], layers_from(arrays), layers_from(arrays, "sight"), domain)
 
 
-def flattened(tactile: FloatArray | ImageArray) -> FloatArray:
+def flatten(tactile: FloatArray | ImageArray) -> FloatArray:
     """Observations (B, ...) as vectors (B, D). Pictures (B, H, W, k) uint8 become means over squares of ``PICTURE_CELL_PX``, 0 to 1."""
     if tactile.dtype != np.uint8:
         return np.asarray(tactile, float).reshape(len(tactile), -1)
@@ -136,7 +136,7 @@ def _through(layers: Layers, x: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Action:
+class PolicyAction:
     """Result of a policy for a frame, for a control loop: an ``Estimate`` whose labels are the axes and whose values are the action."""
 
     names: tuple[str, ...]
@@ -215,18 +215,18 @@ class PolicyModel:
                 f"the policy was trained for {self.form} frames of '{self.sensor.name}'; these are {form} frames of '{sensor.name}'"
             )
 
-    def __call__(self, frame: Frame) -> Action:
+    def __call__(self, frame: Frame) -> PolicyAction:
         """The action for a frame. It is not valid if too few pins are found, or if they show a contact that the policy does not know."""
         seen, moved = self.pipeline(frame), None
         reason = seen.reason
         if seen.graph is not None:
             moved, reason = self._displacements(seen.graph.nodes_px, np.isnan(seen.pins_px[:, 0]))
         if moved is None or reason:
-            return Action(self.policy.axes, np.full(len(self.policy.axes), np.nan), False, reason, seen)
+            return PolicyAction(self.policy.axes, np.full(len(self.policy.axes), np.nan), False, reason, seen)
         count = int(self.policy.about["stack"])
         self._stack = [*(self._stack or [moved] * count), moved][-count:]
         action = self.policy.act(np.array(self._stack)[None], self._goal[None])[0]
-        return Action(self.policy.axes, action, True, "", seen)
+        return PolicyAction(self.policy.axes, action, True, "", seen)
 
 
 def with_goal(policy: Policy, goal: FloatArray) -> Policy:

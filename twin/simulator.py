@@ -53,7 +53,7 @@ class RenderedFrame:
 
     def __repr__(self) -> str:
         visible = self.truth.visible
-        return f"<RenderedFrame: {self.frame!r}, {visible.sum()} of {len(visible)} caps in sight, {self.seconds:.2f} s>"
+        return f"<RenderedFrame: {self.frame!r}, {visible.sum()} of {len(visible)} caps visible, {self.seconds:.2f} s>"
 
     def to_table(self) -> dict[str, np.ndarray]:
         """Columns with a row for each pin, in the specification's order: ``pandas.DataFrame(rendered.to_table())``."""
@@ -81,7 +81,7 @@ class Simulator:
     solver : SkinSolver, optional
         A solver of the same sensor. Default: a new one with the usual resolution.
     shading : Shading, optional
-        Shading of drawn pictures (see `Renderer`).
+        Shading of rasterised pictures (see `Renderer`).
 
     Raises
     ------
@@ -165,7 +165,7 @@ class Simulator:
         """
         jobs = [ContactJob(obj, pose, friction) for obj, pose in contacts]
         for job in jobs:
-            _require_contact(job.touched, job.pose)
+            _require_contact(job.obj, job.pose)
         found: dict[int, ContactState] = {}
         with stage(progress, "contacts") as step:
             for outcome in press_many(self.spec, jobs, processes=workers, resolution=self.solver.resolution):
@@ -228,7 +228,8 @@ class Simulator:
             raise ContactError(f"the state is not one of {self.spec.name}, but of another sensor; press the object against this one")
 
     def describe(self) -> dict[str, dict[str, object]]:
-        """All other parameters of a result besides sensor and object: variant, samples (0 for a drawn picture), mesh and tolerances."""
+        """All other parameters of a result besides sensor and object: variant, samples (0 for a rasterised picture), mesh and
+        tolerances."""
         return {
             "renderer": {"variant": self.renderer.choice.variant, "samples_per_pixel": self.renderer.spp},
             "solver": {

@@ -28,7 +28,7 @@ FINE = 20
 FIRST, NONE = "first", "none"
 
 
-class Readable:
+class ReadableResult:
     """A result in words. Its ``repr`` is the first line, its text all lines."""
 
     def lines(self) -> Iterable[str]:
@@ -198,7 +198,7 @@ class ContactState:
         return float(self.point_area_mm2[self.slipping].sum() / max(self.point_area_mm2.sum(), 1e-9))
 
     @classmethod
-    def untouched(
+    def undeformed(
         cls, nodes_mm: FloatArray, base_mm: FloatArray, axis: FloatArray, caps_mm: FloatArray, *, T_sensor_object: FloatArray | None = None
     ) -> "ContactState":
         """The state of the undeformed sensor without contact."""

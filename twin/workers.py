@@ -31,7 +31,7 @@ TRIES = 4
 LOOK_S = 1.0
 # Longest wait for the first worker of a scheduler, in s.
 JOIN_S = 60.0
-AGAIN = "what is done is kept, and the same command goes on from there"
+AGAIN = "what is done is kept, and the same command resumes from there"
 
 Task = TypeVar("Task")
 Made = TypeVar("Made")
@@ -249,7 +249,7 @@ def _client(scheduler: str) -> Iterator["Client"]:
     import dask
     from distributed import Client
 
-    with dask.config.set({"distributed.comm.timeouts.connect": "10s"}), _silenced():
+    with dask.config.set({"distributed.comm.timeouts.connect": "10s"}), _silence_dask():
         try:
             client = Client(scheduler, timeout="10s")
         except (OSError, ValueError) as error:
@@ -261,7 +261,7 @@ def _client(scheduler: str) -> Iterator["Client"]:
 
 
 @contextmanager
-def _silenced() -> Iterator[None]:
+def _silence_dask() -> Iterator[None]:
     """Context without Dask's own log. It reports each lost connection in twenty lines; this program reports it in one."""
     loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]
     levels = [logger.level for logger in loggers]
@@ -291,7 +291,7 @@ def _by_cluster(client: "Client", make: Callable[[str, int], Made], text: str, t
             room = AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"])) - len(flying)
             for _ in range(min(room, len(waiting))):
                 index = waiting.pop()
-                flying[client.submit(_checked, make, text, index, own, pure=False)] = index
+                flying[client.submit(_make_with_same_code, make, text, index, own, pure=False)] = index
             done = set(wait_for(list(flying), timeout=LOOK_S, return_when="FIRST_COMPLETED").done)
         except TimeoutError:
             done = set()
@@ -320,7 +320,7 @@ def _result(future: "Future[Made]", index: int, where: str) -> Made:
     raise DatasetError(f"{where}: contact {index}: {type(error).__name__}: {error}; {AGAIN}") from error
 
 
-def _checked(make: Callable[[str, int], Made], text: str, index: int, expected: str) -> Made:
+def _make_with_same_code(make: Callable[[str, int], Made], text: str, index: int, expected: str) -> Made:
     """``make(text, index)`` on a worker; ``DatasetError`` if the worker's code differs from that of the client."""
     if fingerprint(make) != expected:
         raise DatasetError("a worker runs another version of this program, so its frames would differ; install the same version there")

@@ -55,7 +55,7 @@ def text_of(page: str, members: list[Module]) -> str:
     for module in members:
         tree = module.tree
         lines += [f"## {module.name}", "", markdown(ast.get_docstring(tree)), ""]
-        exported = _exported(tree) if module.path.name in ("__init__.py", "extend.py") else {}
+        exported = _list_exports(tree) if module.path.name in ("__init__.py", "extend.py") else {}
         if exported:
             first = min(exported)
             lines += [
@@ -65,11 +65,11 @@ def text_of(page: str, members: list[Module]) -> str:
                 "",
             ]
         for node in _public(tree.body):
-            lines += _described(node, "###")
+            lines += _describe(node, "###")
     return "\n".join(lines) + "\n"
 
 
-def _described(node: ast.FunctionDef | ast.ClassDef, level: str, owner: str = "") -> Iterator[str]:
+def _describe(node: ast.FunctionDef | ast.ClassDef, level: str, owner: str = "") -> Iterator[str]:
     """A function or class with its signature and its docstring; a class with its methods."""
     kind = _kind(node)
     yield from (f"{level} {owner}{node.name}", "", f"```python\n{signature(node, kind)}\n```", "", markdown(ast.get_docstring(node)), "")
@@ -78,7 +78,7 @@ def _described(node: ast.FunctionDef | ast.ClassDef, level: str, owner: str = ""
         for each in _public(node.body):
             if each.name not in seen:  # a setter stands with its property
                 seen.add(each.name)
-                yield from _described(each, f"{level}#", f"{node.name}.")
+                yield from _describe(each, f"{level}#", f"{node.name}.")
 
 
 def _kind(node: ast.FunctionDef | ast.ClassDef) -> str:
@@ -159,7 +159,7 @@ def plain(text: str) -> str:
     return "\n".join(lines)
 
 
-def _exported(tree: ast.Module) -> dict[str, str]:
+def _list_exports(tree: ast.Module) -> dict[str, str]:
     """Names in ``__all__`` and where they are defined."""
     places = {
         alias.asname or alias.name: f"{node.module}.{alias.name}"
@@ -174,7 +174,7 @@ def _exported(tree: ast.Module) -> dict[str, str]:
     return {name: places[name] for name in names if name in places}
 
 
-def undocumented() -> list[str]:
+def list_undocumented() -> list[str]:
     """Public functions, classes and methods that neither have a docstring nor stand for one that has.
 
     A method needs none where another class of the packages explains the method of that name: a protocol or base class that it fills.
@@ -197,11 +197,11 @@ def undocumented() -> list[str]:
 
 def _public(body: list[ast.stmt]) -> Iterator[ast.FunctionDef | ast.ClassDef]:
     for node in body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_") and not _registered(node):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_") and not _registers(node):
             yield node
 
 
-def _registered(node: ast.FunctionDef | ast.ClassDef) -> bool:
+def _registers(node: ast.FunctionDef | ast.ClassDef) -> bool:
     """Whether a decorator that takes a description registers the function: ``@condition("darker", ...)``."""
     return any(isinstance(mark, ast.Call) and len(mark.args) > 1 for mark in node.decorator_list)
 

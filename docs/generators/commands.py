@@ -66,7 +66,7 @@ def groups() -> list[Group]:
     context = program.make_context("twin", ["--help"], resilient_parsing=True)
     return [
         Group(title, tuple(found for name in names for found in _commands(program.get_command(context, name), name)))
-        for title, names in program.titled(context).items()
+        for title, names in program.commands_by_title(context).items()
     ]
 
 

@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from hardware.safety.decide import SafetyLimits
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, ServoSpec
 from scenes.base import OpenSection, Section
-from twin.judge.degradation.plan import SweepPlan
+from twin.evaluation.degradation.plan import SweepPlan
 from twin.pins import DetectorSpec
 
 
@@ -45,7 +45,7 @@ FILES = (
         "randomisation", "Randomisation", RandomisationSpec, "Given to `--randomise`; shipped ones lie in `scenes/randomisations`."
     ),
     SpecificationFile("servo", "Servo", ServoSpec, "Given to `--servo`; the shipped one lies in `scenes/servos`."),
-    SpecificationFile("limits", "Safety limits", SafetyLimits, "Given to `--limits`; shipped ones lie in `hardware/limits`."),
+    SpecificationFile("limits", "Safety limits", SafetyLimits, "Given to `--safety`; shipped ones lie in `hardware/limits`."),
     SpecificationFile("detector", "Pin detection", DetectorSpec, "Written by `twin tune`, given to `--pipeline`."),
     SpecificationFile("sweep", "Robustness sweep", SweepPlan, "Given to `--conditions` of `twin robustness`."),
 )
@@ -82,7 +82,7 @@ def unit_of(key: str) -> str:
     return next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
 
 
-def explained(section: type[Section]) -> dict[str, Explained]:
+def explain_attributes(section: type[Section]) -> dict[str, Explained]:
     """What the ``Attributes`` of a class and its parents say, by key."""
     found: dict[str, Explained] = {}
     for base in reversed(section.__mro__):
@@ -95,9 +95,9 @@ def explained(section: type[Section]) -> dict[str, Explained]:
     return found
 
 
-def unexplained(section: type[Section]) -> list[str]:
+def list_unexplained(section: type[Section]) -> list[str]:
     """Keys of a class that it says nothing about."""
-    known = explained(section)
+    known = explain_attributes(section)
     return [key for key in section.model_fields if key not in known or not known[key].text]
 
 
@@ -198,7 +198,7 @@ def text_of(made: SpecificationFile) -> str:
     lines = [f"# {made.title}", "", made.where, ""]
     for place, section in sections_of(made.root).items():
         lines += [f"## `[{place}]`" if place else "## The file", "", _markdown(summary_of(section)), ""]
-        known = explained(section)
+        known = explain_attributes(section)
         lines += ["| key | unit | default | values | meaning |", "| --- | --- | --- | --- | --- |"]
         for key, field in section.model_fields.items():
             values = values_of(field.annotation, tuple(field.metadata)).replace("|", "\\|")

@@ -22,7 +22,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     return {"parallel_read_safe": True}
 
 
-def generated() -> dict[str, str]:
+def generate_pages() -> dict[str, str]:
     """Text of every generated page by its path below the documentation, without the ending."""
     pages = {f"{REFERENCE}/commands/{_stem(group.title)}": commands.text_of(group) for group in commands.groups()}
     pages |= {f"{REFERENCE}/specifications/{made.stem}": specifications.text_of(made) for made in specifications.FILES}
@@ -35,7 +35,7 @@ def _stem(title: str) -> str:
 
 def _write_references(app: Sphinx) -> None:
     """Write what has changed and remove what is gone, so that a second build reads only changed pages."""
-    pages = {Path(app.srcdir) / f"{name}.md": text for name, text in generated().items()}
+    pages = {Path(app.srcdir) / f"{name}.md": text for name, text in generate_pages().items()}
     for path in (Path(app.srcdir) / REFERENCE).rglob("*.md"):
         if path not in pages:
             path.unlink()

@@ -172,10 +172,10 @@ class BaseArm(Connection):
 
     def wait_settled(self, pose: np.ndarray, **options: Any) -> ArmState:
         """Wait for feedback of the arm at rest at ``pose``; see ``Arm``."""
-        with self._watched():
-            return self._settled(pose, **options)
+        with self._watch_move():
+            return self._wait_until_settled(pose, **options)
 
-    def _settled(
+    def _wait_until_settled(
         self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0, at_rest: bool = True
     ) -> ArmState:
         """As ``wait_settled``, for callers that stop the arm after an error themselves."""
@@ -204,7 +204,7 @@ class BaseArm(Connection):
             time.sleep(POLL_S)
 
     @contextmanager
-    def _watched(self) -> Iterator[None]:
+    def _watch_move(self) -> Iterator[None]:
         """Context in which a move is sent and waited for. After any error, Ctrl-C included, the arm is stopped, earlier moves too."""
         try:
             yield

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from hardware.errors import DeviceError
-from scenes.files import shown
+from scenes.files import quote
 
 # Numbers of the Dobots' alarms that planning raises (see ``hardware.arms.dobot_alarms``).
 NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23
@@ -115,7 +115,7 @@ class LinkageKinematics:
         j1 = np.degrees(np.arctan2(y, x))
         return np.array([x, y, z, 0.0, 0.0, turn - 360.0 * np.round((turn - j1) / 360.0)])
 
-    def fitted(self, joints_deg: np.ndarray, poses: np.ndarray) -> "LinkageKinematics":
+    def fit_lengths(self, joints_deg: np.ndarray, poses: np.ndarray) -> "LinkageKinematics":
         """The same arm with the four lengths that fit measured pairs best (they enter linearly).
 
         Parameters
@@ -175,9 +175,9 @@ def finite_numbers(what: str, given: np.ndarray, count: int) -> np.ndarray:
         numbers = np.array("")
     numbers = np.ma.filled(numbers.astype(float), np.nan) if numbers.dtype.kind in "iuf" else np.array(np.nan)
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise DeviceError(f"{what} must be {count} finite numbers (mm, deg), not {shown(repr(given))}")
+        raise DeviceError(f"{what} must be {count} finite numbers (mm, deg), not {quote(repr(given))}")
     if not (np.abs(numbers) < FARTHEST).all():
-        raise DeviceError(f"{what} {shown(repr(given))} is farther than any arm reaches; give mm and deg")
+        raise DeviceError(f"{what} {quote(repr(given))} is farther than any arm reaches; give mm and deg")
     return numbers
 
 

@@ -132,7 +132,7 @@ class Magician(BaseArm):
     def home(self, *, timeout_s: float = HOME_TIMEOUT_S) -> None:
         """Find the joints' zeros. The arm moves through its whole range: keep clear of it."""
         self._require_enabled()
-        with self._watched():
+        with self._watch_move():
             self._last_index = self._index_of(self._request(Id.HOME, struct.pack("<I", 0), ctrl=WRITE | QUEUED))
             self._await_queue(timeout_s)
 
@@ -150,7 +150,7 @@ class Magician(BaseArm):
         except DeviceError as error:
             raise StaleDataError(f"{error}. Don't trust the last pose") from error
         if (took_s := awake_s() - awake_from_s) > max_age_s:
-            raise StaleDataError(f"{self.name}: the arm took {took_s:.2f} s to tell its state (allowed {max_age_s:g} s)")
+            raise StaleDataError(f"{self.name}: the arm took {took_s:.2f} s to report its state (allowed {max_age_s:g} s)")
         pose = np.array([*values[:3], 0.0, 0.0, values[3]])
         self._require_possible(pose)
         return ArmState(pose, values[4:], begun_s, self._enabled, moving, explain(alarms) if alarms else "")
@@ -163,13 +163,13 @@ class Magician(BaseArm):
         self._request(Id.PTP_JOINT_PARAMS, struct.pack("<8f", *joints), ctrl=WRITE)
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watched():
+        with self._watch_move():
             sent, joints = linear_target(self.name, self.kinematics, pose)
             self._move(Ptp.MOVL_XYZ, sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
         return sent
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watched():
+        with self._watch_move():
             sent = joint_target(self.name, joints_deg)
             self._move(Ptp.MOVJ_ANGLE, sent, sent, self.kinematics.forward(sent), wait=wait, timeout_s=timeout_s)
         return sent
@@ -184,7 +184,7 @@ class Magician(BaseArm):
         if not wait:
             return
         self._await_queue(timeout_s)
-        self._settled(pose, timeout_s=max(begun_s + timeout_s - time.monotonic(), 0.2))
+        self._wait_until_settled(pose, timeout_s=max(begun_s + timeout_s - time.monotonic(), 0.2))
 
     def _await_queue(self, timeout_s: float) -> None:
         deadline = time.monotonic() + timeout_s

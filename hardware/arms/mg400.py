@@ -67,7 +67,7 @@ class Mg400Ports:
     motion: int = MOTION_PORT
     feedback: tuple[int, ...] = tuple(FEEDBACK_PERIOD_S)[:2]
 
-    def shifted(self, offset: int) -> "Mg400Ports":
+    def shift_ports(self, offset: int) -> "Mg400Ports":
         """The same ports, shifted by an offset."""
         require_ports(offset)
         return Mg400Ports(self.dashboard + offset, self.motion + offset, tuple(port + offset for port in self.feedback))
@@ -159,7 +159,7 @@ class MG400(BaseArm):
         self._enabled = True
 
     def disable(self) -> None:
-        self._tell_in_any_case("DisableRobot()", "disabled")
+        self._send_over_dashboard("DisableRobot()", "disabled")
         self._under_way = self._enabled = False
         self._dashboard.supervise()
         self._shows(lambda packet: int(packet["mode"]) not in ENABLED_MODES)  # so that the next state shows it
@@ -179,7 +179,7 @@ class MG400(BaseArm):
         self._require_in_use()
         self._sent, self._unstopped = None, True
         try:
-            self._tell_in_any_case("ResetRobot()", "stopped")
+            self._send_over_dashboard("ResetRobot()", "stopped")
         except DeviceNotConnectedError:
             raise
         except DeviceError as error:
@@ -207,7 +207,7 @@ class MG400(BaseArm):
 
     def emergency_stop(self) -> None:
         self._sent = None
-        self._tell_in_any_case("EmergencyStop()", "switched off")
+        self._send_over_dashboard("EmergencyStop()", "switched off")
         self._unstopped = self._under_way = self._enabled = False
 
     def state(self, *, max_age_s: float = SILENCE_S) -> ArmState:
@@ -259,7 +259,7 @@ class MG400(BaseArm):
         return float(self._feedback.newest(SILENCE_S)[0]["speed_scaling"])
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watched():
+        with self._watch_move():
             sent, joints = linear_target(self.name, self.kinematics, pose)
             self._move("MovL", sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
         return sent
@@ -281,7 +281,7 @@ class MG400(BaseArm):
         return f",SpeedL={int(np.clip(np.floor(100 * turn_deg / MAX_JOINT_DEG_S / wanted_s + 1e-9), 1, 100))}"
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watched():
+        with self._watch_move():
             sent = joint_target(self.name, joints_deg)
             self._move("JointMovJ", sent, sent, None, wait=wait, timeout_s=timeout_s)
         return sent
@@ -304,7 +304,7 @@ class MG400(BaseArm):
         self._await_queue(begun_s + timeout_s, timeout_s)
         left_s = max(begun_s + timeout_s - time.monotonic(), SETTLE_S)
         if pose is not None:
-            self._settled(pose, timeout_s=left_s)
+            self._wait_until_settled(pose, timeout_s=left_s)
         else:
             self._await_joints(joints, left_s)
         self._under_way = False
@@ -347,7 +347,9 @@ class MG400(BaseArm):
                 time.sleep(POLL_S)
 
     def _await_joints(self, joints: np.ndarray, timeout_s: float) -> None:
-        self._settled(self.kinematics.forward(joints), tolerance_mm=1.0, timeout_s=timeout_s)  # our link lengths are not exactly this arm's
+        self._wait_until_settled(
+            self.kinematics.forward(joints), tolerance_mm=1.0, timeout_s=timeout_s
+        )  # our link lengths are not exactly this arm's
 
     def _may_move(self) -> bool:
         return self._in_use and self._under_way
@@ -380,7 +382,7 @@ class MG400(BaseArm):
             self._alarm_text = explain(ids)
         return self._alarm_text
 
-    def _tell_in_any_case(self, request: str, what: str) -> None:
+    def _send_over_dashboard(self, request: str, what: str) -> None:
         """Send a request over the dashboard connection alone. A lost connection is opened once more, because the arm may still move."""
         self._require_in_use()
         expected = time.monotonic() - self._mute_s > MUTE_S and self._feedback.age_s() <= SILENCE_S

@@ -10,7 +10,7 @@ import numpy as np
 
 from hardware.arms.arm import FEEDBACK_AGE_S
 from hardware.arms.awake import awake_s
-from hardware.arms.mg400_wire import PACKET_BYTES, Reply, newest_packet, take_reply, told_apart, why_no_packet
+from hardware.arms.mg400_wire import PACKET_BYTES, Reply, describe_bytes, newest_packet, take_reply, why_no_packet
 from hardware.arms.supervisor import Supervisor
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
@@ -102,7 +102,7 @@ class CommandPort:
                 look()
             came = self._buffer
         host, port = self._address
-        instead = f", {told_apart(came.encode('ascii', errors='replace'))} came instead: is this an MG400?" if came else ""
+        instead = f", {describe_bytes(came.encode('ascii', errors='replace'))} came instead: is this an MG400?" if came else ""
         raise DeviceError(
             f"{self._name}: no reply to {text} from {host}:{port} within {timeout_s:g} s{instead}; check the arm, then connect again"
         )
@@ -116,7 +116,7 @@ class CommandPort:
                 self._socket.settimeout(REPLY_TIMEOUT_S)
                 self._socket.sendall(text.encode("ascii"))
             except OSError as error:
-                self._lost(error)
+                self._lost_error(error)
 
     def poll(self, request: str, *, wait_s: float) -> Reply | None:
         """The reply to a request, if it comes within ``wait_s``."""
@@ -139,19 +139,19 @@ class CommandPort:
         except TimeoutError:
             return False
         except OSError as error:
-            self._lost(error)
+            self._lost_error(error)
         if not data:
-            self._lost(None)
+            self._lost_error(None)
         self._heard = True
         self._buffer += data.decode("ascii", errors="replace")
         return True
 
-    def _lost(self, error: OSError | None) -> None:
+    def _lost_error(self, error: OSError | None) -> None:
         came = self._buffer
         self.close()
         reason = f" ({error.strerror or error})" if error else ""
-        if came and not self._numbered(came):
-            said, (host, port) = told_apart(came.encode("ascii", errors="replace")), self._address
+        if came and not self._begins_reply(came):
+            said, (host, port) = describe_bytes(came.encode("ascii", errors="replace")), self._address
             raise DeviceNotConnectedError(
                 f"{self._name}: {said} came from {host}:{port}: this is no MG400. Check address and port"
             ) from error
@@ -161,7 +161,7 @@ class CommandPort:
         ) from error
 
     @staticmethod
-    def _numbered(text: str) -> bool:
+    def _begins_reply(text: str) -> bool:
         """Whether a text can be the beginning of a reply."""
         return text.lstrip()[:1] in "-0123456789"
 
@@ -205,7 +205,7 @@ class Feedback:
         """
         connection = self._connect()
         self._ended = Event()  # a new event: an earlier reader that still runs must keep its own and end
-        self._thread = Thread(target=self._read, args=(connection, self._ended), daemon=True, name="mg400-feedback")
+        self._thread = Thread(target=self._read_loop, args=(connection, self._ended), daemon=True, name="mg400-feedback")
         self._thread.start()
         with self._arrived:
             if not self._arrived.wait_for(lambda: self._newest is not None, CONNECT_TIMEOUT_S):
@@ -256,7 +256,7 @@ class Feedback:
             "an arm: 'twin emulate mg400'), and close other programs that use the arm"
         )
 
-    def _read(self, connection: socket.socket, ended: Event) -> None:
+    def _read_loop(self, connection: socket.socket, ended: Event) -> None:
         while not ended.is_set():
             with contextlib.suppress(OSError):
                 self._read_until_silent(connection, ended)

@@ -219,7 +219,7 @@ def newest_packet(buffer: bytes, *, lenient: bool = False) -> tuple[np.void | No
     return newest, buffer[begin + PACKET_BYTES :], begin + PACKET_BYTES - used
 
 
-def told_apart(came: bytes) -> str:
+def describe_bytes(came: bytes) -> str:
     """Description of unexpected bytes, in words: text is quoted, other bytes are counted."""
     text = came[:60].split(b"\r\n")[0]
     if not came:
@@ -244,8 +244,9 @@ def why_no_packet(came: bytes, *, closed: bool) -> str:
             f"packets came whose test value is {int(packet['test_value']):#x} instead of {TEST_VALUE:#x}: an emulator, or a controller of "
             "another kind. If their poses can be trusted, use it as 'mg400-lenient:ADDRESS'"
         )
-    if told_apart(came).startswith("the text"):
-        return f"{told_apart(came)} came instead of feedback: this is no MG400. Check address and port"
+    if describe_bytes(came).startswith("the text"):
+        return f"{describe_bytes(came)} came instead of feedback: this is no MG400. Check address and port"
     return (
-        f"{told_apart(came)} came, and no packet of {PACKET_BYTES} bytes: its firmware or the arm may be of another kind. Check the address"
+        f"{describe_bytes(came)} came, and no packet of {PACKET_BYTES} bytes: its firmware or the arm may be of "
+        f"another kind. Check the address"
     )

@@ -27,7 +27,7 @@ class Speeds:
     linear_mm_s2: float = np.inf
     angular_deg_s2: float = np.inf
 
-    def scaled(self, factor: float) -> "Speeds":
+    def scale_time(self, factor: float) -> "Speeds":
         """The same motion in ``1 / factor`` of the time."""
         return Speeds(
             self.linear_mm_s * factor, self.angular_deg_s * factor, self.linear_mm_s2 * factor**2, self.angular_deg_s2 * factor**2
@@ -43,7 +43,7 @@ def travel_time_s(length: float, speed: float, acceleration: float) -> float:
     return length / speed + speed / acceleration
 
 
-def travelled(fraction: float, ramp: float) -> float:
+def travelled_share(fraction: float, ramp: float) -> float:
     """Share of the path after a share of the time. Acceleration and braking each take the share ``ramp`` of the time."""
     t = min(max(fraction, 0.0), 1.0)
     if ramp > 0:
@@ -85,7 +85,7 @@ class Piece:
 
     def _value(self, time_s: float) -> np.ndarray:
         elapsed = min(time_s, self.cut_s) - self.start_s
-        share = travelled(elapsed / self.duration_s if self.duration_s > 0 else 1.0, self.ramp)
+        share = travelled_share(elapsed / self.duration_s if self.duration_s > 0 else 1.0, self.ramp)
         return between(self.kinematics, self.start, self.end, share, self.linear)
 
 

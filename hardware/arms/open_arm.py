@@ -7,7 +7,7 @@ from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, address_of
 from hardware.arms.simulated import SimulatedArm
 from hardware.errors import DeviceError
-from scenes.files import shown
+from scenes.files import quote
 from scenes.plugins import others
 
 KINDS = ("simulated", "mg400", "mg400-lenient", "magician")
@@ -37,14 +37,14 @@ def open_arm(spec: str) -> Arm:
         return SimulatedArm(axes=int(rest or 6), name=f"simulated arm of {rest or 6} axes")
     if kind in ("mg400", "mg400-lenient"):
         host, offset = address_of(rest)
-        return MG400(host or DEFAULT_HOSTS["LAN1"], ports=Mg400Ports().shifted(offset), lenient=kind == "mg400-lenient")
+        return MG400(host or DEFAULT_HOSTS["LAN1"], ports=Mg400Ports().shift_ports(offset), lenient=kind == "mg400-lenient")
     if kind == "magician":
         return Magician(rest or _attached_magician())
     there = others("arms", KINDS)
     if kind in there:
         arm: Arm = there[kind](rest)
         return arm
-    raise DeviceError(f"no arm '{shown(spec)}'; there are: {', '.join((ARM_SPECS, *there))}")
+    raise DeviceError(f"no arm '{quote(spec)}'; there are: {', '.join((ARM_SPECS, *there))}")
 
 
 def kind_of(spec: str) -> str:

@@ -99,7 +99,7 @@ class SimulatedArm(BaseArm):
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         self._require_connected()
         now_s = time.monotonic()
-        told_s = self._told_s(now_s)
+        told_s = self._newest_feedback_s(now_s)
         if now_s - told_s > max_age_s:
             raise StaleDataError(
                 f"{self.name}: newest feedback is {now_s - told_s:.2f} s old (allowed {max_age_s:g} s); stop, then reconnect the arm"
@@ -118,13 +118,13 @@ class SimulatedArm(BaseArm):
         self._speeds = Speeds(linear_mm_s, angular_deg_s, self._speeds.linear_mm_s2, self._speeds.angular_deg_s2)
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watched():
+        with self._watch_move():
             sent = self.kinematics.nearest_pose(finite_numbers(f"{self.name}: the pose", pose, 6))
             self._move(sent, linear=True, wait=wait, settled=sent, timeout_s=timeout_s)
         return sent
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watched():
+        with self._watch_move():
             sent = joint_target(self.name, joints_deg, self.axes)
             self._move(sent, linear=False, wait=wait, settled=self.kinematics.forward(sent), timeout_s=timeout_s)
         return sent
@@ -139,11 +139,11 @@ class SimulatedArm(BaseArm):
         if SimulatedFault.IGNORE not in self.faults:
             self._begin(end, linear, now_s)
         if wait:
-            self._settled(settled, timeout_s=timeout_s)
+            self._wait_until_settled(settled, timeout_s=timeout_s)
 
     def _begin(self, end: np.ndarray, linear: bool, now_s: float) -> None:
         factor = self._scale * (SLOW_FACTOR if SimulatedFault.SLOW in self.faults else 1.0)
-        piece = self.track.move(end, self._speeds.scaled(factor), linear=linear, now_s=now_s)
+        piece = self.track.move(end, self._speeds.scale_time(factor), linear=linear, now_s=now_s)
         if isinstance(piece, Violation):
             raise DeviceError(f"{self.name}: refused (alarm {piece.code}): {piece.text}; choose a target within reach and limits")
         halfway_s = piece.start_s + STALL_AFTER * piece.duration_s
@@ -155,7 +155,7 @@ class SimulatedArm(BaseArm):
     def _error(self, time_s: float) -> str:
         return next((text for since, text in self._errors if since <= time_s), "")
 
-    def _told_s(self, now_s: float) -> float:
+    def _newest_feedback_s(self, now_s: float) -> float:
         """Time of the newest feedback: now, unless the fault SILENT is on."""
         if SimulatedFault.SILENT not in self.faults:
             self._silent_since = None

@@ -8,7 +8,7 @@ from hardware.cameras.session import SessionSource
 from hardware.cameras.source import FrameSource
 from hardware.cameras.uvc import UvcCamera, UvcSettings
 from hardware.errors import DeviceError
-from scenes.files import LONGEST_PATH, shown
+from scenes.files import LONGEST_PATH, quote
 from scenes.plugins import others
 from scenes.sensor import SensorSpec
 from twin.frames.forms import frame_size
@@ -61,5 +61,5 @@ def open_camera(
         return MjpegCamera(text, spec, live_form)
     if not os.path.exists(text):
         expected = "a number, /dev/videoN, http://..., twin, a folder or a video"
-        raise DeviceError(f"{shown(text, LONGEST_PATH)}: no such camera, file or folder; expected {expected}")
+        raise DeviceError(f"{quote(text, LONGEST_PATH)}: no such camera, file or folder; expected {expected}")
     return SessionSource(text) if is_session(text) else RecordedSource(text, spec, form)

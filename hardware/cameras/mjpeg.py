@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 
-from hardware.cameras.reader import LiveSource, Picture, ReadFailed, TornPicture
+from hardware.cameras.reader import DevicePicture, LiveSource, ReadFailed, TornPicture
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
@@ -133,7 +133,7 @@ class MjpegCamera(LiveSource):
             with contextlib.suppress(OSError):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
-    def _grab(self) -> Picture:
+    def _grab(self) -> DevicePicture:
         if self._stream is None:
             self._again(self._request)
         stream = self._stream
@@ -150,7 +150,7 @@ class MjpegCamera(LiveSource):
         again = number is not None and number == self._last
         if number is not None:
             self._last = number
-        return Picture(image, stamped_s(headers), lost, note, again)
+        return DevicePicture(image, stamped_s(headers), lost, note, again)
 
 
 def next_part(stream: Readable) -> tuple[dict[str, str], bytes]:

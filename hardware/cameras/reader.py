@@ -49,7 +49,7 @@ KEPT_PERIODS = 30
 
 
 @dataclass(frozen=True)
-class Picture:
+class DevicePicture:
     """A picture from a device.
 
     Attributes
@@ -127,7 +127,7 @@ class LiveSource(Connection):
         """End a waiting read, if the device can. It is called from another thread than ``_grab``."""
 
     @abstractmethod
-    def _grab(self) -> Picture:
+    def _grab(self) -> DevicePicture:
         """The next picture; raises ``ReadFailed`` if there is none."""
 
     def _finish(self, image: np.ndarray) -> np.ndarray:
@@ -311,15 +311,15 @@ class LiveSource(Connection):
         camera = None if self._spec is None or self.form is not Form.PROCESSED else self._spec.camera
         return not self.notices_still or (camera is not None and image.shape[1::-1] != (camera.width_px, camera.height_px))
 
-    def _is_new(self, picture: Picture) -> bool:
+    def _is_new(self, picture: DevicePicture) -> bool:
         """Whether a picture has a new number, a new stamp, and a new content if it can't repeat."""
         repeats = self._still is not None and self._still[2] > 1 and not self._may_repeat(picture.image)
         before_s, self._stamp_s = self._stamp_s, picture.time_s
         return not (repeats or picture.again or picture.time_s - before_s < STAMP_S)
 
-    def _look_back(self, picture: Picture) -> None:
+    def _look_back(self, picture: DevicePicture) -> None:
         """Count an outage before this picture, and note what is irregular in it."""
-        # a server may send its last picture again when it is asked anew
+        # a server may send its last picture again when it is asked again
         if self._still is None or self._still[2] == 1 or self._may_repeat(picture.image):
             period_s, self._came_s = time.monotonic() - self._came_s, time.monotonic()
             outage = period_s > max(OUTAGE_S, OUTAGE_PERIODS * self._usual_s())
@@ -327,7 +327,7 @@ class LiveSource(Connection):
                 (self._outages_s if outage else self._periods_s).append(period_s)
         self._notes |= {picture.note} - {""}
 
-    def _look_at(self, picture: Picture) -> str:
+    def _look_at(self, picture: DevicePicture) -> str:
         if picture.image.max(initial=0) < BLACK_LEVEL:
             return "the picture is black; check the sensor's lamps and the camera's exposure"
         if self.notices_late and (age_s := time.monotonic() - picture.time_s) > LATE_S:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hardware.arms.arm import ArmState
-from hardware.cameras.reader import LiveSource, Picture, ReadFailed
+from hardware.cameras.reader import DevicePicture, LiveSource, ReadFailed
 from hardware.errors import DeviceError, DeviceNotConnectedError
 from hardware.rig.geometry import PlacedObject
 from scenes.sensor import ResponseSpec, SensorSpec
@@ -103,15 +103,15 @@ class TwinCamera(LiveSource):
         self._asked.set()
         return super()._take(wanted, timeout_s, missing)
 
-    def _grab(self) -> Picture:
-        follower, preview = self._opened()
+    def _grab(self) -> DevicePicture:
+        follower, preview = self._require_open()
         if self._on_demand:
             self._await_reader()
         self._end.wait(max(0.0, self._due_s - time.monotonic()))
         self._due_s = time.monotonic() + self._period_s
         try:
             told = self._pose()
-            self.state = follower.move(self._placed.seen_from(told.pose), told.time_s)
+            self.state = follower.move(self._placed.object_from(told.pose), told.time_s)
         except (ContactError, DeviceError) as error:
             self._end.wait(RETRY_S)
             self._asked.set()
@@ -120,7 +120,7 @@ class TwinCamera(LiveSource):
         self._drawn += 1
         rng = np.random.default_rng((self._seed, self._drawn))
         image = expose(light, self._spec.capture, rng, origin_px=preview.window_px[:2])
-        return Picture(steady(image, self._spec.response, rng), told.time_s)
+        return DevicePicture(steady(image, self._spec.response, rng), told.time_s)
 
     def _pose(self) -> ArmState:
         """The arm's newest state. A camera that waits for its arm reports when the arm is lost and when it is back."""
@@ -140,7 +140,7 @@ class TwinCamera(LiveSource):
                     LOG.warning("%s: its arm is back", self.name)
                 return told
 
-    def _opened(self) -> tuple[Follower, Preview]:
+    def _require_open(self) -> tuple[Follower, Preview]:
         """The objects that ``_open`` made; raises ``DeviceNotConnectedError`` before it."""
         if self._follower is None or self._preview is None:
             raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
@@ -155,7 +155,7 @@ class TwinCamera(LiveSource):
     def _finish(self, image: np.ndarray) -> np.ndarray:
         if self._recording is None:
             return image
-        return record(image, self._recording, origin_px=self._opened()[1].window_px[:2])
+        return record(image, self._recording, origin_px=self._require_open()[1].window_px[:2])
 
 
 def preview_of(spec: SensorSpec, form: Form) -> Preview:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 
-from hardware.cameras.reader import LiveSource, Picture, ReadFailed
+from hardware.cameras.reader import DevicePicture, LiveSource, ReadFailed
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
 from twin.frames.images import quiet
@@ -77,7 +77,7 @@ class UvcCamera(LiveSource):
             self._device.release()
             self._device = None
 
-    def _grab(self) -> Picture:
+    def _grab(self) -> DevicePicture:
         if self._device is None:
             self._again(self._open)
         device = self._device
@@ -87,7 +87,7 @@ class UvcCamera(LiveSource):
         if not good or image is None or not image.size:
             self._close()  # the camera may be unplugged: it must be opened again
             raise ReadFailed("no picture")
-        return Picture(image if image.ndim == 2 else image[..., ::-1].copy(), exposed_s(device.get(cv2.CAP_PROP_POS_MSEC)))
+        return DevicePicture(image if image.ndim == 2 else image[..., ::-1].copy(), exposed_s(device.get(cv2.CAP_PROP_POS_MSEC)))
 
 
 def exposed_s(position_ms: float) -> float:

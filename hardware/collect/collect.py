@@ -28,7 +28,7 @@ from hardware.workcell.mover import Mover
 from hardware.workcell.plan import check_plan
 from scenes import ObjectSpec, SensorSpec, ServoSpec
 from scenes.experiment import LABELS, ExperimentSpec
-from scenes.files import shown
+from scenes.files import quote
 from twin.errors import FrameError
 from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
@@ -55,7 +55,7 @@ COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
 
 
 @dataclass(frozen=True)
-class Contact:
+class PlannedContact:
     """One contact to make: the label of the pose after the move (6,), and the move (6,), in mm and deg."""
 
     pose: np.ndarray
@@ -98,7 +98,7 @@ class Collection:
                 if not isinstance(before, dict):
                     raise ValueError("expected keys and values")
             except (ValueError, RecursionError) as error:
-                raise DeviceError(f"{meta}: is damaged ({shown(error)}); remove it if the folder holds no contacts yet") from error
+                raise DeviceError(f"{meta}: is damaged ({quote(error)}); remove it if the folder holds no contacts yet") from error
             other = [key for key in about if before.get(key) != about[key]]
             if other and not (self.has_rest or self._has_contacts()):  # a start that failed; nothing is lost
                 write_json(meta, about | {"made_by": made_by(collect, inputs=about)})
@@ -137,7 +137,7 @@ class Collection:
             with table.open(newline="", encoding="utf-8") as file:
                 rows = list(csv.reader(file))
         except (ValueError, csv.Error) as error:
-            raise DeviceError(f"{table}: is damaged ({shown(error)}); give another `out`") from error
+            raise DeviceError(f"{table}: is damaged ({quote(error)}); give another `out`") from error
         if rows[:1] != [list(COLUMNS)] or any(len(row) != len(COLUMNS) for row in rows):
             raise DeviceError(f"{table}: is not the table of a collection; give another `out`")
         return len(rows) - 1
@@ -173,12 +173,12 @@ class Collection:
         try:
             text = lines.read_text(encoding="utf-8")
         except ValueError as error:
-            raise DeviceError(f"{lines}: is damaged ({shown(error)}); give another `out`") from error
+            raise DeviceError(f"{lines}: is damaged ({quote(error)}); give another `out`") from error
         if not text.endswith("\n"):
             write_text(lines, text[: text.rfind("\n") + 1])
 
 
-def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str = "random") -> Contact:
+def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str = "random") -> PlannedContact:
     """Pose and move of contact ``index`` within the experiment's ranges. They depend only on these arguments.
 
     With the design "even", the first contacts fill the ranges evenly, whatever their number is: they are a scrambled Sobol sequence (Sobol
@@ -188,13 +188,13 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
     low, high = np.array(list(experiment.ranges().values())).T
     if design == "random":
         numbers = np.random.default_rng([seed, index]).uniform(low, high)
-        return Contact(numbers[:6], numbers[6:])
+        return PlannedContact(numbers[:6], numbers[6:])
     varied = high > low
     sequence = Sobol(int(varied.sum()), scramble=True, rng=np.random.default_rng(seed))
     shares = sequence.fast_forward(index).random(1)[0] if index else sequence.random(1)[0]
     numbers = low.copy()
     numbers[varied] += shares * (high - low)[varied]
-    return Contact(numbers[:6], numbers[6:])
+    return PlannedContact(numbers[:6], numbers[6:])
 
 
 class WorkFrame:
@@ -254,7 +254,7 @@ def collect(
     count : int
         Number of contacts in the collection at the end.
     seed : int
-        Seed of the drawn contacts.
+        Seed of the sampled contacts.
     design : {"random", "even"}
         See ``draw_contact``.
     speed : (float, float)
@@ -307,7 +307,7 @@ def collect(
     return collection.count
 
 
-def _collect_one(stops: "_Stops", experiment: ExperimentSpec, collection: Collection, index: int, asked: Contact) -> None:
+def _collect_one(stops: "_Stops", experiment: ExperimentSpec, collection: Collection, index: int, asked: PlannedContact) -> None:
     """Make one contact and keep its frame: go above the place, tap, move along the surface, take the frame, lift off.
 
     A frame is awaited at every stop, because the skin's state depends on where the arm has been.
@@ -368,7 +368,7 @@ class CollectPlan:
     Attributes
     ----------
     sensor : SensorSpec
-    stimulus : ObjectSpec
+    obj : ObjectSpec
         The object that is touched.
     experiment : ExperimentSpec
         Experiment that defines the contacts.
@@ -379,7 +379,7 @@ class CollectPlan:
     count : int
         Number of contacts in the folder at the end.
     seed : int or None
-        Seed of the drawn contacts. None: the experiment's own seed.
+        Seed of the sampled contacts. None: the experiment's own seed.
     design : {"random", "even"}
         Distribution of the contacts over the experiment's ranges.
     form : Form or None
@@ -395,7 +395,7 @@ class CollectPlan:
     """
 
     sensor: SensorSpec
-    stimulus: ObjectSpec
+    obj: ObjectSpec
     experiment: ExperimentSpec
     servo: ServoSpec
     camera: str
@@ -416,8 +416,8 @@ class CollectPlan:
             raise DeviceError(f"`design` {self.design}: must be {' or '.join(DESIGNS)}")
 
     @property
-    def drawn_with(self) -> int:
-        """The seed of the drawn contacts: the plan's, else the experiment's."""
+    def sampling_seed(self) -> int:
+        """The seed of the sampled contacts: the plan's, else the experiment's."""
         return self.experiment.seed if self.seed is None else self.seed
 
 
@@ -448,14 +448,14 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
     kept = KeptAlso(out, plan.also, plan.sensor)
     rig = build_rig(
         plan.sensor,
-        plan.stimulus,
+        plan.obj,
         plan.servo.placement,
         plan.experiment,
         camera=plan.camera,
         arm=plan.arm,
         form=plan.form,
         limits=plan.limits,
-        seed=plan.drawn_with,
+        seed=plan.sampling_seed,
         plain_light=plan.plain_light,
         at_once=True,
     )
@@ -466,7 +466,7 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
         try:
             measure_reference(plan.sensor, rig.source.form, frame)
         except FrameError as error:
-            raise FrameError(f"{error}; remove {collection.rest} and give the same command again, which takes it anew") from error
+            raise FrameError(f"{error}; remove {collection.rest} and give the same command again, which takes it again") from error
 
     with kept:
         if before < plan.count:
@@ -481,7 +481,7 @@ def _collect_on_rig(
     """Make the missing contacts. Each is kept in the further formats before the next one is made."""
     with rig, stage(progress, "contacts") as step:
 
-        def made(done: float, total: float = 1.0, note: str = "") -> None:
+        def report_contact(done: float, total: float = 1.0, note: str = "") -> None:
             kept.catch_up()
             step(done, total, note)
 
@@ -493,11 +493,11 @@ def _collect_on_rig(
             plan.experiment,
             collection,
             plan.count,
-            seed=plan.drawn_with,
+            seed=plan.sampling_seed,
             design=plan.design,
             speed=(plan.servo.linear_mm_s, plan.servo.angular_deg_s),
             on_rest=require_rest,
-            progress=made,
+            progress=report_contact,
         )
 
 
@@ -505,7 +505,9 @@ def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
     """Check the plan and report it. Of the contacts the next ``CHECKED_CONTACTS`` are checked."""
     work, near = WorkFrame(plan.experiment, rig.placed), rig.arm.state().pose
     pressed = np.array(plan.experiment.clear) + np.array(plan.experiment.tap)
-    asked = [draw_contact(plan.experiment, plan.drawn_with, n, plan.design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))]
+    asked = [
+        draw_contact(plan.experiment, plan.sampling_seed, n, plan.design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))
+    ]
     planned = [work.base_pose(one.pose + pressed, near) for one in asked]
     clear = work.base_pose(np.zeros(6), near, away_mm=CLEAR_MM)
     spent_s = (plan.count - made) * CONTACT_S
@@ -522,12 +524,12 @@ def _about(plan: CollectPlan, rig: Rig) -> dict[str, Any]:
     """Everything that the frames depend on. A collection is continued only if all of this is the same."""
     low, high = zip(*plan.experiment.ranges().values(), strict=True)
     return {
-        "comments": f"collected: {plan.experiment.name}, {plan.sensor.name}, {plan.stimulus.name}",
+        "comments": f"collected: {plan.experiment.name}, {plan.sensor.name}, {plan.obj.name}",
         "camera": plan.camera,
         "arm": plan.arm,
         "sensor": plan.sensor.name,
         "form": str(rig.source.form),
-        "seed": plan.drawn_with,
+        "seed": plan.sampling_seed,
         "experiment": plan.experiment.model_dump(mode="json"),
         "placement": plan.servo.placement.model_dump(mode="json"),
         "tap_move": plan.experiment.tap,

@@ -42,7 +42,7 @@ def gather_frames(
     every_s : float
         Time between two frames.
     say : callable
-        Called with each line that tells the person what to do.
+        Called with each line that asks the person what to do.
     sleep : callable
         Function that waits for a time in s.
 

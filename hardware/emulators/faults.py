@@ -7,7 +7,7 @@ from difflib import get_close_matches
 from threading import Timer
 from typing import Self
 
-from scenes.files import shown
+from scenes.files import quote
 from twin.errors import TwinError
 
 
@@ -70,21 +70,21 @@ class Faults:
         if name not in self.known:
             close = get_close_matches(name, self.known, n=1)
             raise TwinError(
-                f"no fault '{shown(name)}'{f' (did you mean {close[0]}?)' if close else ''}; there are: {', '.join(self.known)}"
+                f"no fault '{quote(name)}'{f' (did you mean {close[0]}?)' if close else ''}; there are: {', '.join(self.known)}"
             )
         default = self.known[name][0]
         if default is None:
             if value:
-                raise TwinError(f"fault '{shown(text)}': {name} is a switch and takes no value; give {name} alone")
+                raise TwinError(f"fault '{quote(text)}': {name} is a switch and takes no value; give {name} alone")
             self._on[name] = 1.0
             return
         example = f"for example {name}={default:g}"
         try:
             number = float(value) if value else default
         except ValueError as error:
-            raise TwinError(f"fault '{shown(text)}': '{shown(value)}' is not a number; {example}") from error
+            raise TwinError(f"fault '{quote(text)}': '{quote(value)}' is not a number; {example}") from error
         if number not in self._ranges[name]:
-            raise TwinError(f"fault '{shown(text)}': {name} must be {self._ranges[name]}, not {shown(value)}; {example}")
+            raise TwinError(f"fault '{quote(text)}': {name} must be {self._ranges[name]}, not {quote(value)}; {example}")
         self._on[name] = number
 
     def clear(self) -> None:

@@ -48,7 +48,7 @@ NOT_ATTACHED: dict[int, tuple[int, bytes]] = {
     Id.COLOR: (3, bytes(3)),
     Id.INFRARED: (2, bytes(1)),
 }
-# Commands that tell what the device is, with their replies to a read. The values are chosen for the emulator.
+# Commands that report what the device is, with their replies to a read. The values are chosen for the emulator.
 DEVICE_SERIAL, DEVICE_NAME, DEVICE_VERSION, POSE_L = 0, 1, 2, 13
 TOLD: dict[int, bytes] = {
     DEVICE_SERIAL: b"EMULATED",
@@ -119,7 +119,7 @@ class MagicianController:
         """Execute a command or queue it. The reply has the same id and ctrl."""
         with self.lock:
             now_s = self.advance()
-            if not self._understood(message):
+            if not self._understands(message):
                 return self.refuse(message)
             if message.is_queued:  # with the write bit or, from some clients, without
                 if len(self._queue) >= QUEUE_N:
@@ -128,7 +128,7 @@ class MagicianController:
                 self._queue.append(Queued(self._issued, message, now_s))
                 self.advance()
                 return Message(message.id, message.ctrl, struct.pack("<Q", self._issued))
-            return Message(message.id, message.ctrl, self._write(message, now_s) if message.is_write else self._read(message, now_s))
+            return Message(message.id, message.ctrl, self._write(message, now_s) if message.is_write else self._answer_read(message, now_s))
 
     def refuse(self, message: Message) -> Message:
         """Raise the alarm of a command that is not understood. The reply is empty."""
@@ -169,7 +169,7 @@ class MagicianController:
                 self._queue.pop(0)
             return now_s
 
-    def _understood(self, message: Message) -> bool:
+    def _understands(self, message: Message) -> bool:
         """Whether a command is known and its parameters are allowed. A read of anything unknown is allowed: clients ask what there is."""
         writes = message.is_write or message.is_queued
         return self._has_its_form(message, writes=writes) and (not writes or self._has_allowed_numbers(message))
@@ -194,7 +194,7 @@ class MagicianController:
             return False
         return min(numbers) > 0 if message.id in SPEEDS else min(numbers) >= 0 or message.id not in JOG_SPEEDS
 
-    def _read(self, message: Message, now_s: float) -> bytes:
+    def _answer_read(self, message: Message, now_s: float) -> bytes:
         if message.id == Id.GET_POSE:
             pose = self.track.pose(now_s)
             return struct.pack("<8f", *pose[[0, 1, 2, 5]], *self.track.joints_deg(now_s))
@@ -317,7 +317,7 @@ class MagicianController:
     def _go(self, end: np.ndarray, speeds: Speeds, begins_s: float, *, linear: bool) -> float:
         if self.alarms or "ignore-moves" in self.faults:
             return begins_s
-        speeds = speeds.scaled(self._time_scale * self.faults.factor("slow"))
+        speeds = speeds.scale_time(self._time_scale * self.faults.factor("slow"))
         # The end comes first: the places along a line to a far one are too many to count.
         broken = check_line(self.kinematics, end, end) if linear else None
         piece = broken or self.track.move(end, speeds, linear=linear, now_s=begins_s)

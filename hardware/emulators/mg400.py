@@ -158,7 +158,7 @@ class Mg400Emulator(Emulator):
                 listener.listen()
                 self._listeners[listener] = port
         self._started_s = time.monotonic()
-        self._run(self._accept)
+        self._start_thread(self._accept)
         self.faults.after("emergency-stop", self.arm.press_emergency_stop)
         self.faults.after("die", self.kill)
 
@@ -188,7 +188,7 @@ class Mg400Emulator(Emulator):
                 bound.close()
             self._clients.clear()
 
-    def _run(self, target: Callable[..., None], *arguments: object) -> None:
+    def _start_thread(self, target: Callable[..., None], *arguments: object) -> None:
         thread = Thread(target=target, args=arguments, daemon=True, name="mg400-emulator")
         self._threads = [*(one for one in self._threads if one.is_alive()), thread]
         thread.start()
@@ -209,7 +209,7 @@ class Mg400Emulator(Emulator):
                     client.close()
                 else:
                     client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    self._run(self._serve, client, port)
+                    self._start_thread(self._serve, client, port)
 
     def _serve(self, client: socket.socket, port: int) -> None:
         """Serve a client until it has gone. It is hung up on even if serving fails, so that it does not wait for ever."""
@@ -313,8 +313,8 @@ def feedback_packet(arm: Mg400Controller) -> np.ndarray:
     mode, now_s = arm.mode(), arm.update()
     user, tool = arm.users[arm.user], arm.tools[arm.tool]
     joints, before = arm.track.joints_deg(now_s), arm.track.joints_deg(now_s - DIFFERENCE_S)
-    seen = _seen(arm, joints, user, tool)
-    speed = (seen - _seen(arm, before, user, tool)) / DIFFERENCE_S
+    seen = _tool_in_user_frame(arm, joints, user, tool)
+    speed = (seen - _tool_in_user_frame(arm, before, user, tool)) / DIFFERENCE_S
     half_turn = np.radians(seen[3]) / 2
     packet = np.zeros((), PACKET)
     for names, value in (
@@ -348,7 +348,7 @@ def feedback_packet(arm: Mg400Controller) -> np.ndarray:
     return packet
 
 
-def _seen(arm: Mg400Controller, joints: np.ndarray, user: PlanarFrame, tool: PlanarFrame) -> np.ndarray:
+def _tool_in_user_frame(arm: Mg400Controller, joints: np.ndarray, user: PlanarFrame, tool: PlanarFrame) -> np.ndarray:
     """X, Y, Z, R of the tool in the user frame."""
     flange = PlanarFrame.of_pose(arm.kinematics.forward(joints))
     return (user.inverse() @ flange @ tool).pose[[0, 1, 2, 5]]

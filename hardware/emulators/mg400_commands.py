@@ -223,7 +223,7 @@ class Mg400Commands:
         read_numbers(request, (), (0,))
         if request.keywords and self.firmware >= (1, 7):
             raise RefusedError(ErrorId.PARAMETER_TYPE - 1)
-        pose = self._seen(PlanarFrame.of_pose(self.arm.track.pose(self.arm.update())), *self._frames(request))
+        pose = self._tool_in_user_frame(PlanarFrame.of_pose(self.arm.track.pose(self.arm.update())), *self._frames(request))
         return _text([*pose, 0.0, 0.0] if "six-value-pose" in self.arm.faults else pose)
 
     def _forward(self, request: Request) -> str:
@@ -231,7 +231,7 @@ class Mg400Commands:
         if self.arm.kinematics.violation(np.array(joints)):
             raise RefusedError(ErrorId.FAILED)
         flange = PlanarFrame.of_pose(self.arm.kinematics.forward(np.array(joints)))
-        return _text(self._seen(flange, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
+        return _text(self._tool_in_user_frame(flange, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
 
     def _inverse(self, request: Request) -> str:
         if len(request.values) not in (6, 7, 8):  # two optional parameters select the solution near given joints; here there is only one
@@ -243,7 +243,7 @@ class Mg400Commands:
         return _text(joints)
 
     def _to_pose(self, request: Request, *, linear: bool) -> str:
-        place, groups = self._split(request)
+        place, groups = self._split_outputs(request)
         pose = read_numbers(place, (NUMBER,) * 4, (4,))
         flange = self._flange(pose, *self._frames(request))
         length_mm = float(np.linalg.norm(flange.pose[:3] - self.arm.last_target().pose[:3]))
@@ -252,7 +252,7 @@ class Mg400Commands:
         return ""
 
     @staticmethod
-    def _split(request: Request) -> tuple[Request, tuple[str, ...]]:
+    def _split_outputs(request: Request) -> tuple[Request, tuple[str, ...]]:
         """A move and the outputs ``{Mode,Distance,Index,Status}`` that it sets on its path. Only moves with IO have outputs."""
         if not request.name.endswith("io"):
             return request, ()
@@ -363,7 +363,7 @@ class Mg400Commands:
         return user @ PlanarFrame(*pose) @ tool.inverse()
 
     @staticmethod
-    def _seen(flange: PlanarFrame, user: PlanarFrame, tool: PlanarFrame) -> list[float]:
+    def _tool_in_user_frame(flange: PlanarFrame, user: PlanarFrame, tool: PlanarFrame) -> list[float]:
         return list((user.inverse() @ flange @ tool).pose[[0, 1, 2, 5]])
 
 

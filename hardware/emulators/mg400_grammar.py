@@ -46,10 +46,10 @@ def take_request(buffer: str) -> tuple[Request | None, str]:
             return _parse(_bare(buffer[begin : n + 1])), buffer[n + 1 :]
         if letter == "\n":
             if text := _bare(buffer[begin:n]):
-                return _malformed(text), buffer[n + 1 :]
+                return _malformed_request(text), buffer[n + 1 :]
             begin = n + 1
     rest = buffer[begin:]
-    return (_malformed(_bare(rest)), "") if len(rest) > LONGEST_REQUEST else (None, rest)
+    return (_malformed_request(_bare(rest)), "") if len(rest) > LONGEST_REQUEST else (None, rest)
 
 
 def _bare(text: str) -> str:
@@ -57,7 +57,7 @@ def _bare(text: str) -> str:
     return text.strip(" \r\n\t;")
 
 
-def _malformed(text: str) -> Request:
+def _malformed_request(text: str) -> Request:
     return Request("", (), {}, text)
 
 

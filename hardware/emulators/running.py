@@ -19,7 +19,7 @@ def say(line: str) -> None:
     print(line, flush=True)
 
 
-def run_until_told(
+def run_until_signal(
     device: AbstractContextManager[Any],
     ready: Callable[[], str],
     failure: Callable[[], Exception | None] = lambda: None,
@@ -84,7 +84,7 @@ def emulate_mg400(
     _require_time_scale(time_scale)
     version = OLD_FIRMWARE if lenient else firmware
     arm = Mg400Emulator(host=host, port_offset=port_offset, faults=faults, firmware=version, time_scale=time_scale)
-    run_until_told(arm, lambda: f"mg400 {host} {' '.join(str(port) for port in arm.ports.values())}", on_ready=on_ready)
+    run_until_signal(arm, lambda: f"mg400 {host} {' '.join(str(port) for port in arm.ports.values())}", on_ready=on_ready)
 
 
 def emulate_magician(
@@ -93,7 +93,7 @@ def emulate_magician(
     """Emulate a Dobot Magician on a pseudo-terminal until it is ended; see ``MagicianEmulator``."""
     _require_time_scale(time_scale)
     arm = MagicianEmulator(link=link, faults=faults, time_scale=time_scale)
-    run_until_told(arm, lambda: f"magician {link or arm.device}", on_ready=on_ready)
+    run_until_signal(arm, lambda: f"magician {link or arm.device}", on_ready=on_ready)
 
 
 def _require_time_scale(time_scale: float) -> None:

@@ -9,7 +9,7 @@ from hardware.arms.arm import ArmState
 from hardware.arms.mg400_link import Feedback
 from hardware.arms.mg400_wire import FEEDBACK_PERIOD_S, address_of, pose_in
 from hardware.emulators.camera import CameraEmulator
-from hardware.emulators.running import run_until_told, say
+from hardware.emulators.running import run_until_signal, say
 from hardware.rig.geometry import PlacedObject
 from hardware.workcell.build import twin_camera
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
@@ -61,7 +61,7 @@ class FeedbackPose:
 def emulate_camera(
     arm: str,
     sensor: SensorSpec,
-    stimulus: ObjectSpec,
+    obj: ObjectSpec,
     servo: ServoSpec,
     *,
     host: str = "127.0.0.1",
@@ -88,9 +88,9 @@ def emulate_camera(
     plain_light : bool
         Without path tracing at the start; see ``hardware.workcell.build.drawn``.
     """
-    placed = PlacedObject(stimulus, servo.placement, Mounting.of(sensor, load_experiment(servo.experiment)))
+    placed = PlacedObject(obj, servo.placement, Mounting.of(sensor, load_experiment(servo.experiment)))
     pose = FeedbackPose.of(arm)
     source = twin_camera(sensor, placed, pose, Form.RAW, fps=fps, plain_light=plain_light)
     device = CameraEmulator(source, host=host, port=port, faults=faults)
     with pose:
-        run_until_told(device, lambda: f"camera {device.url}", lambda: device.error, on_ready=on_ready)
+        run_until_signal(device, lambda: f"camera {device.url}", lambda: device.error, on_ready=on_ready)

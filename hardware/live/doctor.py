@@ -15,7 +15,7 @@ from twin.errors import EXTRAS, RenderError
 from twin.optics.variants.variant import report
 from twin.report.skin3d import probe_offscreen
 from twin.store import cache_folder
-from twin.types import Readable
+from twin.types import ReadableResult
 
 # Folder in which the Linux kernel lists its cameras.
 SYSFS_CAMERAS = Path("/sys/class/video4linux")
@@ -53,7 +53,7 @@ def serial_ports() -> list[Device]:
 
 
 @dataclass(frozen=True, repr=False)
-class Machine(Readable):
+class Machine(ReadableResult):
     """What this machine has.
 
     Attributes

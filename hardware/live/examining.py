@@ -7,20 +7,20 @@ from pathlib import Path
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import await_frame
 from scenes import SensorSpec
+from twin.calibration.camera_view import register_files
 from twin.errors import FrameError, OptionError
-from twin.fit.camera_view import register_files
 from twin.frames import evenly_read, open_recording
 from twin.pins import DetectorSpec, Finding, Grade, examine, with_detector
 from twin.progress import Progress, silent, stage
 from twin.store import writes_file
-from twin.types import Form, Frame, Readable
+from twin.types import Form, Frame, ReadableResult
 
 LIMIT = 20  # most frames that are used
 MOST_LIVE = 1000  # most frames of a camera that are kept: 6 GB at 1920 x 1080 in colour
 
 
 @dataclass(frozen=True, repr=False)
-class Examination(Readable):
+class Examination(ReadableResult):
     """The findings, and the irregularities of the recording."""
 
     findings: list[Finding]
@@ -67,15 +67,15 @@ def examine_sensor(
     detector : DetectorSpec, optional
         Result of 'twin tune'; by default the specification's own detector.
     no_contact, pushes, twist, out : optional
-        As ``rest``, ``pushes``, ``twist`` and ``out`` of ``twin.fit.camera_view.register_files``: the camera's turn and mirror are found,
-        and the frames are compared with the corrected copy of the specification.
+        As ``rest``, ``pushes``, ``twist`` and ``out`` of ``twin.calibration.camera_view.register_files``: the camera's turn and mirror are
+        found, and the frames are compared with the corrected copy of the specification.
     contacts : callable, optional
         Finding whether a model of the sensor knows the contacts in the frames; for the specification's own detector.
 
     Raises
     ------
     FrameError
-        The detector is not of method ``twin``, there are no frames, or the pushes do not tell the camera's view.
+        The detector is not of method ``twin``, there are no frames, or the pushes do not determine the camera's view.
     OptionError
         Pushes without a frame without contact, or the other way round.
     DeviceError
@@ -114,6 +114,6 @@ def frames_of(source: str, sensor: SensorSpec | None, form: Form | None, limit: 
         recording = open_recording(Path(source), sensor, form)
         return evenly_read(recording, limit), recording.notes()
     if limit > MOST_LIVE:
-        raise FrameError(f"`limit` {limit}: at most {MOST_LIVE} frames of a camera, as they are kept until the end")
+        raise FrameError(f"`max_frames` {limit}: at most {MOST_LIVE} frames of a camera, as they are kept until the end")
     with camera:
         return [await_frame(camera) for _ in range(limit)], []

@@ -16,7 +16,7 @@ from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError
 from hardware.live.live import LiveSession, estimate_line
 from hardware.safety.decide import load_limits
-from hardware.safety.eyes import Eyes
+from hardware.safety.eyes import FreshFrames
 from hardware.safety.safe_arm import SafeArm, try_each
 from hardware.workcell.plan import check_standing
 from scenes.sensor import SensorSpec
@@ -24,7 +24,7 @@ from twin.errors import FrameError, TwinError
 from twin.estimate import Estimate, SensorModel
 from twin.pins import Pipeline
 from twin.records.session import SessionWriter
-from twin.studio.live_page import LiveShot
+from twin.studio.live_page import LiveFrame
 from twin.types import Frame
 
 # Speed, mm/s and deg/s, of an arm that the page moves. It is slow, so that a person can watch it.
@@ -60,7 +60,7 @@ class WatchedArm:
         self._armed = False
         self._moves = threading.Lock()
         self._source, self._pipeline = source, pipeline
-        self._eyes = Eyes(self._arm, source) if source is not None else None
+        self._eyes = FreshFrames(self._arm, source) if source is not None else None
         self._steps: list[tuple[int, float]] = []  # axis and length of the steps from the pose at which it was armed
 
     @property
@@ -132,7 +132,7 @@ class WatchedArm:
                 move()
                 self._steps.pop()
             else:
-                with self._eyes.watched():
+                with self._eyes.watching():
                     self._eyes.stand()
                     self._eyes.move(move)
                 self._steps.append((axis, by_mm))
@@ -197,7 +197,7 @@ class CameraFeed:
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def start(self, on_shot: Callable[[LiveShot], None], on_end: Callable[[str], None]) -> None:
+    def start(self, on_frame: Callable[[LiveFrame], None], on_end: Callable[[str], None]) -> None:
         """Connect camera and arm, and deliver frames from a thread.
 
         Raises
@@ -217,7 +217,7 @@ class CameraFeed:
             with self._writing:
                 if self._writer is not None:
                     self._writer.append(frame, estimate_line(estimate) | {"time_s": time.monotonic()})
-            on_shot(LiveShot(frame, estimate, tuple(self._session.lines(estimate)[1:])))
+            on_frame(LiveFrame(frame, estimate, tuple(self._session.lines(estimate)[1:])))
 
         def run() -> None:
             try:

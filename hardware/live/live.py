@@ -18,15 +18,15 @@ from hardware.cameras.session import SessionSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.live.rerun_view import RerunView
-from hardware.servo.timing import Spread, Timing
-from hardware.workcell.build import given_frame
+from hardware.servo.timing import TimeSpread, Timing
+from hardware.workcell.build import load_rest_frame
 from twin.errors import FrameError, OptionError, TwinError
-from twin.estimate import Estimate, Estimator, SensorModel, seen_in
+from twin.estimate import Estimate, Estimator, SensorModel, pins_in
 from twin.pins import Pipeline
 from twin.records import KeptAlso
 from twin.records.session import SESSION_FILES, SessionWriter
 from twin.store import output
-from twin.studio.live_page import LivePage, LiveShot
+from twin.studio.live_page import LiveFrame, LivePage
 from twin.types import FIRST, NONE, Frame
 
 # Number of newest times of each kind from which the figures are computed.
@@ -115,7 +115,7 @@ class LiveSession:
     def timing(self) -> Timing:
         """The figures so far."""
         rate_hz = self.count / max(time.monotonic() - self._begun_s, 1e-9)
-        late, ages, spent = (Spread.of(list(times)) for times in (self._late, self._ages, self._spent))
+        late, ages, spent = (TimeSpread.of(list(times)) for times in (self._late, self._ages, self._spent))
         return Timing(self.count, rate_hz, rate_hz, late, ages, spent, self.source.dropped)
 
     def lines(self, estimate: Estimate) -> list[str]:
@@ -182,16 +182,16 @@ class Shower:
     def __enter__(self) -> "Shower":
         self._thread.start()
         self._opened.wait()
-        self._tell()
+        self._raise_error()
         return self
 
     def __exit__(self, kind: type | None, *_: object) -> None:
         self._end.set()
         self._thread.join(timeout=CLOSE_S)
         if kind is None:
-            self._tell()
+            self._raise_error()
 
-    def _tell(self) -> None:
+    def _raise_error(self) -> None:
         """Raise the error with which the view ended, if there is one."""
         if isinstance(self._error, TwinError):
             raise self._error
@@ -220,7 +220,7 @@ class Shower:
                 except RuntimeError:  # the session added a time while the times were read
                     continue
                 shown = newest
-                view.show(LiveShot(*newest, tuple(lines[1:])), seen_in(*newest, self._pipeline))
+                view.show(LiveFrame(*newest, tuple(lines[1:])), pins_in(*newest, self._pipeline))
 
 
 @dataclass(frozen=True)
@@ -273,7 +273,7 @@ class WatchPlan:
 
 
 @dataclass(frozen=True)
-class Watched:
+class WatchResult:
     """The result of ``watch``.
 
     Attributes
@@ -326,7 +326,7 @@ def watch(
     name: str = "",
     on_shown: Callable[[str], None] | None = None,
     on_estimate: Callable[[Frame, Estimate], None] | None = None,
-) -> Watched:
+) -> WatchResult:
     """Estimate the pose in every frame that the camera or the session delivers, until the plan's end or Ctrl-C.
 
     Parameters
@@ -348,7 +348,7 @@ def watch(
     kept = KeptAlso(plan.record or Path(), plan.also, model.sensor)
     source = SessionSource(plan.replay) if plan.replay is not None else open_camera(plan.camera, model.sensor, model.form)
     model.check(model.sensor, source.form)
-    rest = source.rest if isinstance(source, SessionSource) else given_frame(plan.at_rest, model)
+    rest = source.rest if isinstance(source, SessionSource) else load_rest_frame(plan.at_rest, model)
     found: list[np.ndarray] = []
 
     def keep(frame: Frame, estimate: Estimate) -> None:
@@ -381,7 +381,7 @@ def watch(
         except KeyboardInterrupt:
             interrupted = True
         same = (same_estimates(source.steps, found), len(found)) if isinstance(source, SessionSource) else None
-        return Watched(session.timing(), interrupted, same, plan.record, session.count, source.notes(), session.valid, session.invalid)
+        return WatchResult(session.timing(), interrupted, same, plan.record, session.count, source.notes(), session.valid, session.invalid)
 
 
 def _catch_up(session: LiveSession, kept: KeptAlso) -> None:

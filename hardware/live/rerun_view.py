@@ -12,7 +12,7 @@ import numpy as np
 
 from hardware.errors import DeviceError
 from twin.errors import OptionError
-from twin.studio.live_page import LiveShot
+from twin.studio.live_page import LiveFrame
 from twin.types import Observation
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class RerunView:
         return self
 
     def __exit__(self, *_: object) -> None:
-        stream = self._opened()
+        stream = self._require_open()
         try:
             stream.flush(timeout_sec=ANSWER_S)
         except RuntimeError as error:
@@ -84,14 +84,14 @@ class RerunView:
         finally:
             stream.disconnect()
 
-    def _opened(self) -> rerun.RecordingStream:
+    def _require_open(self) -> rerun.RecordingStream:
         if self._stream is None:
             raise DeviceError(f"`rerun` {self._target}: not open; use the view as a context manager")
         return self._stream
 
-    def show(self, shot: LiveShot, seen: Observation) -> None:
+    def show(self, live: LiveFrame, seen: Observation) -> None:
         """Log a frame with its pins and graph, the estimate's values with their intervals, and the lines, on ``frame`` and ``time``."""
-        rerun, stream, frame, estimate = self._rerun, self._opened(), shot.frame, shot.estimate
+        rerun, stream, frame, estimate = self._rerun, self._require_open(), live.frame, live.estimate
         stream.set_time("frame", sequence=frame.sequence)
         stream.set_time("time", duration=frame.time_s)
         stream.log("camera", rerun.Image(frame.image))
@@ -101,7 +101,7 @@ class RerunView:
             stream.log("camera/pins", rerun.Points2D(nodes))
         for name, value, low, high in zip(estimate.names, estimate.value, estimate.low, estimate.high, strict=True):
             stream.log(f"pose/{name}", rerun.Scalars([value, low, high]))
-        stream.log("figures", rerun.TextDocument("\n".join(shot.lines)))
+        stream.log("figures", rerun.TextDocument("\n".join(live.lines)))
 
 
 def _address(target: str) -> tuple[str, int]:

@@ -13,7 +13,7 @@ STEP_DEG = 30.0
 SAMPLE_MM = 1.0
 
 
-def way_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> list[np.ndarray]:
+def path_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> list[np.ndarray]:
     """Poses (6,) of the path from ``start``; the last one is ``clear``.
 
     The path is straight if the dome stays outside a circle around the object's section. Otherwise the arm first leaves the circle if it is

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scenes.object import ObjectSpec
 from scenes.servo import PlacementSpec
 from twin.rig.mounting import Mounting
-from twin.rig.touch import Surface, Touch
+from twin.rig.touch import SmoothSurface, TrueTouch
 
 
 def matrix_of(pose: np.ndarray) -> np.ndarray:
@@ -26,7 +26,7 @@ def pose_of(T: np.ndarray, near: np.ndarray) -> np.ndarray:
     return np.concatenate([T[:3, 3], angles])
 
 
-def moved(pose: np.ndarray, step_mm: np.ndarray) -> np.ndarray:
+def shift_in_tool(pose: np.ndarray, step_mm: np.ndarray) -> np.ndarray:
     """The pose (6,) shifted by a step (3,) that is given in the tool's frame."""
     out = np.array(pose, float)
     out[:3] += matrix_of(pose)[:3, :3] @ np.asarray(step_mm, float)
@@ -64,9 +64,9 @@ class PlacedObject:
         self.spec, self.mounting = spec, mounting
         self.T_base_object = object_in_base(placement)
         self._T_tool_sensor = mounting.T_tool_sensor
-        self._surface = Surface(spec)
+        self._surface = SmoothSurface(spec)
 
-    def seen_from(self, pose: np.ndarray) -> np.ndarray:
+    def object_from(self, pose: np.ndarray) -> np.ndarray:
         """``T_sensor_object`` (4, 4) if the arm is at a pose (6,)."""
         return np.linalg.inv(matrix_of(pose) @ self._T_tool_sensor) @ self.T_base_object
 
@@ -80,10 +80,10 @@ class PlacedObject:
         T[:3, 3] = centre - T[:3, :3] @ self.mounting.centre_mm
         return pose_of(T, np.zeros(6))
 
-    def touch(self, pose: np.ndarray) -> Touch:
-        """The true contact of the sensor if the arm is at a pose (6,), as a ``Touch`` whose arrays have no axis of poses."""
-        found = self._surface.touched(self.mounting, self.seen_from(pose)[None])
-        return Touch(*(getattr(found, field.name)[0] for field in fields(Touch)))
+    def touch(self, pose: np.ndarray) -> TrueTouch:
+        """The true contact of the sensor if the arm is at a pose (6,), as a ``TrueTouch`` whose arrays have no axis of poses."""
+        found = self._surface.depth_and_angle(self.mounting, self.object_from(pose)[None])
+        return TrueTouch(*(getattr(found, field.name)[0] for field in fields(TrueTouch)))
 
     def distance_mm(self, place_mm: np.ndarray) -> float:
         """Distance of a point (3,) of the base frame from the surface, in the section through the object's origin; negative inside."""

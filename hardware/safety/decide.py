@@ -16,7 +16,7 @@ from hardware.arms.motion import check_line, turn_between_deg
 from hardware.errors import DeviceError
 from hardware.rig.geometry import distance_to_axis
 from scenes.base import Fraction, NonNegative, Positive, Section, SpecError
-from scenes.files import LONGEST_PATH, shown
+from scenes.files import LONGEST_PATH, quote
 from scenes.load import read_section
 from scenes.plugins import other_files
 
@@ -110,7 +110,7 @@ def load_limits(name_or_path: str | Path) -> SafetyLimits:
     shipped |= other_files("limits", shipped)
     path, example = shipped.get(str(name_or_path), Path(name_or_path)), SHIPPED_LIMITS / "mg400.toml"
     if not str(name_or_path) or not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
-        told = f"{shown(path, LONGEST_PATH)}: no such file" if path.suffix else f"no limits are called '{shown(name_or_path)}'"
+        told = f"{quote(path, LONGEST_PATH)}: no such file" if path.suffix else f"no limits are called '{quote(name_or_path)}'"
         raise DeviceError(f"{told}; give one of {', '.join(shipped)}, or the path of a TOML file like {example}")
     try:
         return read_section(path, SafetyLimits)
@@ -118,7 +118,7 @@ def load_limits(name_or_path: str | Path) -> SafetyLimits:
         raise DeviceError(f"{error}; a file like {example} is expected") from error
 
 
-class Code(StrEnum):
+class DecisionCode(StrEnum):
     """Reason of a decision."""
 
     OK = "ok"
@@ -159,7 +159,7 @@ class Decision:
     """The decision about a move. ``pose`` (6,) is the pose that may be sent; None if none may be sent."""
 
     action: Action
-    code: Code
+    code: DecisionCode
     reason: str
     pose: np.ndarray | None = None
 
@@ -218,16 +218,16 @@ class Sensed:
 
 
 @dataclass(frozen=True)
-class _FeltRule:
+class _ReadingRule:
     """The reaction of the arm if a value of the contact exceeds a limit. Both are named by their attributes. NaN never exceeds a limit."""
 
     felt: str
     limit: str
     action: Action
-    code: Code
+    code: DecisionCode
     said: str
 
-    def broken(self, sensed: Sensed, limits: SafetyLimits) -> Decision | None:
+    def limit_decision(self, sensed: Sensed, limits: SafetyLimits) -> Decision | None:
         """The decision if the limit is exceeded."""
         felt, limit = getattr(sensed, self.felt), getattr(limits, self.limit)
         return None if limit is None or not felt > limit else Decision(self.action, self.code, self.said.format(felt=felt, limit=limit))
@@ -237,14 +237,18 @@ _TURNED, _STILL = "the sensor feels {felt:.0f} N mm about its axis", "the arm ho
 _SLIDES = "the contact begins to slide (probability {felt:.0%}, allowed {limit:.0%}); press harder"
 # The rules, in the order of their priority.
 _FELT = (
-    _FeltRule("depth_mm", "contact_mm", Action.RETRACT, Code.TOO_DEEP, "{felt:.1f} mm deep in contact (allowed {limit:g} mm)"),
-    _FeltRule("force_n", "force_n", Action.RETRACT, Code.TOO_STRONG, "the sensor feels {felt:.1f} N (allowed {limit:g} N)"),
-    _FeltRule("turning_nmm", "torque_nmm", Action.RETRACT, Code.TOO_TWISTED, f"{_TURNED} (allowed {{limit:g}} N mm)"),
-    _FeltRule("force_n", "hold_force_n", Action.HOLD, Code.HELD_FORCE, f"the sensor feels {{felt:.1f}} N ({_STILL} N)"),
-    _FeltRule("turning_nmm", "hold_torque_nmm", Action.HOLD, Code.HELD_FORCE, f"{_TURNED} ({_STILL} N mm)"),
-    _FeltRule("slip_begins", "slip_begins", Action.HOLD, Code.SLIPPING, _SLIDES),
-    _FeltRule(
-        "slip_share", "slip_share", Action.HOLD, Code.SLIPPING, "{felt:.0%} of the contact slides (allowed {limit:.0%}); press harder"
+    _ReadingRule("depth_mm", "contact_mm", Action.RETRACT, DecisionCode.TOO_DEEP, "{felt:.1f} mm deep in contact (allowed {limit:g} mm)"),
+    _ReadingRule("force_n", "force_n", Action.RETRACT, DecisionCode.TOO_STRONG, "the sensor feels {felt:.1f} N (allowed {limit:g} N)"),
+    _ReadingRule("turning_nmm", "torque_nmm", Action.RETRACT, DecisionCode.TOO_TWISTED, f"{_TURNED} (allowed {{limit:g}} N mm)"),
+    _ReadingRule("force_n", "hold_force_n", Action.HOLD, DecisionCode.HELD_FORCE, f"the sensor feels {{felt:.1f}} N ({_STILL} N)"),
+    _ReadingRule("turning_nmm", "hold_torque_nmm", Action.HOLD, DecisionCode.HELD_FORCE, f"{_TURNED} ({_STILL} N mm)"),
+    _ReadingRule("slip_begins", "slip_begins", Action.HOLD, DecisionCode.SLIPPING, _SLIDES),
+    _ReadingRule(
+        "slip_share",
+        "slip_share",
+        Action.HOLD,
+        DecisionCode.SLIPPING,
+        "{felt:.0%} of the contact slides (allowed {limit:.0%}); press harder",
     ),
 )
 
@@ -278,7 +282,7 @@ def decide(
     try:
         target = finite_numbers("the target", target, 6)
     except DeviceError as error:
-        return Decision(Action.REFUSE, Code.NOT_A_NUMBER, str(error))
+        return Decision(Action.REFUSE, DecisionCode.NOT_A_NUMBER, str(error))
     unwrapped = kinematics is not None and kinematics.axes == 4
     if kinematics is not None and unwrapped:
         target = kinematics.nearest_pose(target)
@@ -288,8 +292,10 @@ def decide(
     if kinematics is not None and (refused := _joints(pose, state.pose, limits, kinematics)):
         return refused
     if shortened:
-        return Decision(Action.MOVE, Code.STEP_SHORTENED, f"shortened to a step of {limits.step_mm} mm, {limits.step_deg} deg", pose)
-    return Decision(Action.MOVE, Code.OK, "", pose)
+        return Decision(
+            Action.MOVE, DecisionCode.STEP_SHORTENED, f"shortened to a step of {limits.step_mm} mm, {limits.step_deg} deg", pose
+        )
+    return Decision(Action.MOVE, DecisionCode.OK, "", pose)
 
 
 def clip(target: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics: Kinematics | None = None) -> np.ndarray:
@@ -328,7 +334,7 @@ def decide_joints(
     try:
         end = finite_numbers("the joints", joints_deg, len(state.joints_deg))
     except DeviceError as error:
-        return Decision(Action.REFUSE, Code.NOT_A_NUMBER, str(error))
+        return Decision(Action.REFUSE, DecisionCode.NOT_A_NUMBER, str(error))
     steps = max(1, int(np.ceil(np.abs(end - state.joints_deg).max())))
     for n in range(1, steps + 1):
         joints = state.joints_deg + n / steps * (end - state.joints_deg)
@@ -337,9 +343,9 @@ def decide_joints(
             return refused
     if shorten(state.pose, pose, limits)[1]:
         return Decision(
-            Action.REFUSE, Code.STEP_TOO_LONG, f"it would carry the tool farther than a step of {limits.step_mm} mm; go in steps"
+            Action.REFUSE, DecisionCode.STEP_TOO_LONG, f"it would carry the tool farther than a step of {limits.step_mm} mm; go in steps"
         )
-    return Decision(Action.MOVE, Code.OK, "", pose)
+    return Decision(Action.MOVE, DecisionCode.OK, "", pose)
 
 
 def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwrapped: bool = False) -> tuple[np.ndarray, bool]:
@@ -357,31 +363,35 @@ def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwr
 
 def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed | None) -> Decision | None:
     if (age_s := now_s - state.time_s) > limits.feedback_age_s:
-        return Decision(Action.HOLD, Code.STALE_FEEDBACK, f"feedback is {age_s:.2f} s old (allowed {limits.feedback_age_s:g} s)")
+        return Decision(Action.HOLD, DecisionCode.STALE_FEEDBACK, f"feedback is {age_s:.2f} s old (allowed {limits.feedback_age_s:g} s)")
     if not (np.isfinite(state.pose).all() and np.isfinite(state.joints_deg).all()):
-        return Decision(Action.HOLD, Code.NOT_A_NUMBER, f"the arm says that it is at {state.pose}; restart it")
+        return Decision(Action.HOLD, DecisionCode.NOT_A_NUMBER, f"the arm says that it is at {state.pose}; restart it")
     if state.error:
-        return Decision(Action.HOLD, Code.ARM_ERROR, state.error)
+        return Decision(Action.HOLD, DecisionCode.ARM_ERROR, state.error)
     if not state.enabled:
-        return Decision(Action.REFUSE, Code.NOT_ENABLED, "the arm is not enabled; call enable() first")
+        return Decision(Action.REFUSE, DecisionCode.NOT_ENABLED, "the arm is not enabled; call enable() first")
     if sensed is None:
         return None
     if not (age_s := now_s - sensed.frame_time_s) <= limits.frame_age_s:
-        return Decision(Action.HOLD, Code.STALE_FRAME, f"the sensor's frame is {age_s:.2f} s old (allowed {limits.frame_age_s:g} s)")
-    return next(filter(None, (rule.broken(sensed, limits) for rule in _FELT)), None)
+        return Decision(
+            Action.HOLD, DecisionCode.STALE_FRAME, f"the sensor's frame is {age_s:.2f} s old (allowed {limits.frame_age_s:g} s)"
+        )
+    return next(filter(None, (rule.limit_decision(sensed, limits) for rule in _FELT)), None)
 
 
 def _place(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits) -> Decision | None:
     for axis, value, (low, high) in zip("xyz", pose[:3], limits.box_mm, strict=True):
         if not low <= value <= high:
-            return Decision(Action.REFUSE, Code.OUTSIDE_BOX, f"{axis} {value:.1f} mm is outside the box's [{low:g}, {high:g}] mm")
+            return Decision(Action.REFUSE, DecisionCode.OUTSIDE_BOX, f"{axis} {value:.1f} mm is outside the box's [{low:g}, {high:g}] mm")
     if limits.annulus_mm is None:
         return None
     inner, outer = limits.annulus_mm
     nearest = min(distance_to_axis(start[:2], pose[:2]), float(np.hypot(*pose[:2])))
     if np.hypot(*pose[:2]) > outer or (nearest < inner and nearest < np.hypot(*start[:2])):
         return Decision(
-            Action.REFUSE, Code.OUTSIDE_ANNULUS, f"comes within {nearest:.1f} mm of the base's axis or beyond [{inner:g}, {outer:g}] mm"
+            Action.REFUSE,
+            DecisionCode.OUTSIDE_ANNULUS,
+            f"comes within {nearest:.1f} mm of the base's axis or beyond [{inner:g}, {outer:g}] mm",
         )
     return None
 
@@ -391,20 +401,22 @@ def _joints(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematic
     try:
         joints = kinematics.inverse(pose)
     except OutOfReachError as error:
-        return Decision(Action.REFUSE, Code.OUT_OF_REACH, str(error))
+        return Decision(Action.REFUSE, DecisionCode.OUT_OF_REACH, str(error))
     if broken := _broken_joints(joints, limits, kinematics):
         return broken
     blocked = check_line(kinematics, kinematics.nearest_pose(start), pose)
-    return Decision(Action.REFUSE, Code.LINE_BLOCKED, blocked.text) if blocked else None
+    return Decision(Action.REFUSE, DecisionCode.LINE_BLOCKED, blocked.text) if blocked else None
 
 
 def _broken_joints(joints: np.ndarray, limits: SafetyLimits, kinematics: Kinematics) -> Decision | None:
     if own := kinematics.violation(joints):
-        code = Code.LINKAGE_LIMIT if own.code in (LINKAGE_ABOVE, LINKAGE_BELOW) else Code.JOINT_LIMIT
+        code = DecisionCode.LINKAGE_LIMIT if own.code in (LINKAGE_ABOVE, LINKAGE_BELOW) else DecisionCode.JOINT_LIMIT
         return Decision(Action.REFUSE, code, own.text)
     for n, (angle, (low, high)) in enumerate(zip(joints, limits.joints_deg or (), strict=False), start=1):
         if not low <= angle <= high:
-            return Decision(Action.REFUSE, Code.JOINT_LIMIT, f"J{n} at {angle:.1f} deg is outside [{low:g}, {high:g}] deg")
+            return Decision(Action.REFUSE, DecisionCode.JOINT_LIMIT, f"J{n} at {angle:.1f} deg is outside [{low:g}, {high:g}] deg")
     if limits.linkage_deg is not None and joints[2] - joints[1] > limits.linkage_deg:
-        return Decision(Action.REFUSE, Code.LINKAGE_LIMIT, f"J3 - J2 = {joints[2] - joints[1]:.1f} deg is more than {limits.linkage_deg:g}")
+        return Decision(
+            Action.REFUSE, DecisionCode.LINKAGE_LIMIT, f"J3 - J2 = {joints[2] - joints[1]:.1f} deg is more than {limits.linkage_deg:g}"
+        )
     return None

@@ -16,7 +16,7 @@ import numpy as np
 from hardware.arms.arm import Arm
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError
-from hardware.safety.watch import beside
+from hardware.safety.watch import work_in_thread
 
 Result = TypeVar("Result")
 # Interval, s, at which the thread looks at the frames while the arm moves, and at which a wait for a fresh frame looks.
@@ -31,7 +31,7 @@ class BlindError(StaleDataError):
     """The camera gives no fresh frame, so the arm may not move towards an object."""
 
 
-class Eyes:
+class FreshFrames:
     """Lets an arm move only while a camera gives fresh frames.
 
     Parameters
@@ -66,7 +66,7 @@ class Eyes:
             return ""
         return f"the picture stayed the same while the arm moved {travel_mm:.1f} mm in contact"
 
-    def await_sight(self, *, timeout_s: float) -> None:
+    def await_frame(self, *, timeout_s: float) -> None:
         """Wait for a fresh frame while the arm stands; ``BlindError`` if none comes in time."""
         deadline = time.monotonic() + timeout_s
         self.stand()
@@ -111,9 +111,9 @@ class Eyes:
         """Note that the arm stands: it was stopped, or came to its end."""
         self._going, self._stopped = False, ""
 
-    def watched(self) -> AbstractContextManager[None]:
+    def watching(self) -> AbstractContextManager[None]:
         """Context in which the thread looks at the frames."""
-        return beside(self._watch, "eyes")
+        return work_in_thread(self._watch, "eyes")
 
     def _watch(self, end: threading.Event) -> None:
         while not end.wait(LOOK_S):

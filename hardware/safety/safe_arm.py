@@ -17,7 +17,7 @@ from hardware.arms.arm import FEEDBACK_AGE_S, Arm, ArmState
 from hardware.arms.kinematics import Kinematics
 from hardware.errors import DeviceError, StaleDataError, also, leave
 from hardware.rig.last_axis import LastAxis
-from hardware.safety.decide import Action, Code, Decision, SafetyLimits, Sensed, clip, decide, decide_joints
+from hardware.safety.decide import Action, Decision, DecisionCode, SafetyLimits, Sensed, clip, decide, decide_joints
 
 # Number of newest decisions that are kept in memory.
 KEPT_DECISIONS = 10_000
@@ -134,7 +134,7 @@ class SafeArm:
 
     def _ungated(self, call: str) -> None:
         """Pass on a call that is never refused."""
-        self._note(call, Decision(Action.MOVE, Code.UNGATED, ""))
+        self._note(call, Decision(Action.MOVE, DecisionCode.UNGATED, ""))
         getattr(self.arm, call)()
 
     def disconnect(self) -> None:
@@ -178,7 +178,7 @@ class SafeArm:
         """Set the speed; a speed above the limits is reduced to them."""
         linear, angular = min(linear_mm_s, self.limits.linear_mm_s), min(angular_deg_s, self.limits.angular_deg_s)
         if (linear, angular) != (linear_mm_s, angular_deg_s):
-            self._note("set_speed", Decision(Action.MOVE, Code.SPEED_CAPPED, f"to {linear:g} mm/s and {angular:g} deg/s"))
+            self._note("set_speed", Decision(Action.MOVE, DecisionCode.SPEED_CAPPED, f"to {linear:g} mm/s and {angular:g} deg/s"))
         self.arm.set_speed(linear, angular)
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
@@ -195,7 +195,7 @@ class SafeArm:
         self._obey("move_linear", decision)
         return self.arm.move_linear(decision.allowed, wait=wait, timeout_s=timeout_s)
 
-    def clipped(self, pose: np.ndarray) -> np.ndarray:
+    def clip_pose(self, pose: np.ndarray) -> np.ndarray:
         """The pose (6,), as near to the given one as the limits permit, that ``move_linear`` would allow from the arm's present pose."""
         return clip(pose, self._newest_state("clipped").pose, self.limits, self.kinematics)
 
@@ -233,9 +233,9 @@ class SafeArm:
 
     def shutdown(self, why: str) -> None:
         """Stop, retreat along the normal, disable."""
-        self._note("shutdown", Decision(Action.RETRACT, Code.SHUTDOWN, why))
+        self._note("shutdown", Decision(Action.RETRACT, DecisionCode.SHUTDOWN, why))
         for failed in try_each(stop=self.arm.stop, retreat=self.retreat, disable=self.arm.disable):
-            self._note("shutdown", Decision(Action.HOLD, Code.SHUTDOWN, failed))
+            self._note("shutdown", Decision(Action.HOLD, DecisionCode.SHUTDOWN, failed))
 
     def _newest_state(self, call: str) -> ArmState:
         try:
@@ -244,7 +244,7 @@ class SafeArm:
                 state = self.arm.state(max_age_s=self.limits.feedback_age_s)
             return state
         except StaleDataError as error:
-            self._obey(call, Decision(Action.HOLD, Code.STALE_FEEDBACK, str(error)))
+            self._obey(call, Decision(Action.HOLD, DecisionCode.STALE_FEEDBACK, str(error)))
             raise
 
     def _obey(self, call: str, decision: Decision) -> None:
@@ -252,7 +252,7 @@ class SafeArm:
         if decision.action is Action.MOVE:
             return
         try:
-            if decision.code is not Code.NOT_ENABLED:  # an arm that is not enabled stands still
+            if decision.code is not DecisionCode.NOT_ENABLED:  # an arm that is not enabled stands still
                 self.arm.stop()
             if decision.action is Action.RETRACT:
                 self.retreat()

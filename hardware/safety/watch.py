@@ -33,7 +33,7 @@ WORD_S = 1.5
 
 
 @contextmanager
-def beside(work: Callable[[threading.Event], None], name: str) -> Iterator[None]:
+def work_in_thread(work: Callable[[threading.Event], None], name: str) -> Iterator[None]:
     """Context in which a thread does ``work``, which ends when the event that it is given is set."""
     end = threading.Event()
     thread = threading.Thread(target=work, args=(end,), name=name, daemon=True)
@@ -78,9 +78,9 @@ class ArmWatch:
         if self._lost:
             raise DeviceError(self._lost)
 
-    def watched(self) -> AbstractContextManager[None]:
+    def watching(self) -> AbstractContextManager[None]:
         """Context in which the thread runs."""
-        return beside(self._watch, "arm watch")
+        return work_in_thread(self._watch, "arm watch")
 
     @contextmanager
     def alert(self) -> Iterator[None]:

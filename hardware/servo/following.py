@@ -11,17 +11,17 @@ import numpy as np
 
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.errors import DeviceError, in_short
-from hardware.rig.geometry import PlacedObject, moved
+from hardware.rig.geometry import PlacedObject, shift_in_tool
 from hardware.rig.last_axis import LastAxis, poses_along, turns_back_mm
 from hardware.servo.loop import ServoLoop, require_labels
 from hardware.servo.policy_law import policy_law
 from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
 from hardware.servo.timing import Timing
 from hardware.servo.trajectory import Measures, Trajectory, measure, trajectory_figure, trajectory_of, write_csv
-from hardware.workcell.build import TWIN, Rig, build_rig, given_frame
+from hardware.workcell.build import TWIN, Rig, build_rig, load_rest_frame
 from hardware.workcell.plan import check_plan
 from scenes import ObjectSpec, ServoSpec, load_experiment
-from scenes.files import shown
+from scenes.files import quote
 from twin.errors import OptionError, TwinError
 from twin.estimate import Estimate, SensorModel
 from twin.policy import PolicyModel
@@ -54,7 +54,7 @@ class FollowPlan:
 
     Attributes
     ----------
-    stimulus : ObjectSpec
+    obj : ObjectSpec
         The object.
     servo : ServoSpec
         Gains, speeds and the object's place.
@@ -85,7 +85,7 @@ class FollowPlan:
         End after the check of the plan, before anything moves.
     """
 
-    stimulus: ObjectSpec
+    obj: ObjectSpec
     servo: ServoSpec
     camera: str = ""
     arm: str = "simulated"
@@ -111,7 +111,7 @@ class FollowPlan:
             if kind_of(self.arm) != "simulated":
                 open_arm(self.arm)  # an arm that does not exist is said first; nothing is opened
                 raise OptionError(
-                    f"`arm` {shown(self.arm)} moves by what a camera sees: give the sensor's with `camera`; `camera=twin` draws the "
+                    f"`arm` {quote(self.arm)} moves by what a camera sees: give the sensor's with `camera`; `camera=twin` draws the "
                     "frames for the pose that the arm reports, and such a loop does not feel what it touches"
                 )
             object.__setattr__(self, "camera", TWIN)
@@ -184,7 +184,7 @@ def follow(
         The run could not begin, or it ended before its first step.
     """
     kept = KeptAlso(out / SESSION, plan.also, model.sensor)
-    rest = given_frame(plan.at_rest, model)
+    rest = load_rest_frame(plan.at_rest, model)
     if rest is not None:
         model = model.at_rest(rest)
     elif plan.at_rest != FIRST:
@@ -194,9 +194,9 @@ def follow(
     steps = plan.steps or round_steps
     if plan.steps:
         wanted_mm = min(wanted_mm, plan.steps * plan.servo.feed_mm)
-    told = _told(plan, model) | (about or {})
+    told = _result_entries(plan, model) | (about or {})
     failure, followed = "", None
-    with rig, stage(progress, f"following the {plan.stimulus.name}") as step, ExitStack() as stack:
+    with rig, stage(progress, f"following the {plan.obj.name}") as step, ExitStack() as stack:
         takes_rest = plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live
         _say_plan(plan, rig, model, wanted_mm, steps, takes_rest)
         first = rig.await_frame()
@@ -246,7 +246,7 @@ def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[
 def _rig_of(plan: FollowPlan, model: SensorModel) -> Rig:
     return build_rig(
         model.sensor,
-        plan.stimulus,
+        plan.obj,
         plan.servo.placement,
         load_experiment(plan.servo.experiment),
         camera=plan.camera,
@@ -269,9 +269,9 @@ def _settings(plan: FollowPlan, rig: Rig, steps: int) -> LoopSettings:
     )
 
 
-def _told(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
+def _result_entries(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
     """The entries that are stored with the results."""
-    names = {"sensor": model.sensor.name, "object": plan.stimulus.name, "camera": plan.camera, "arm": plan.arm}
+    names = {"sensor": model.sensor.name, "object": plan.obj.name, "camera": plan.camera, "arm": plan.arm}
     return names | {"servo": plan.servo.model_dump()}
 
 
@@ -283,7 +283,7 @@ def _say_plan(plan: FollowPlan, rig: Rig, model: SensorModel, wanted_mm: float, 
         if np.linalg.norm(pose[:3] - near[:3]) >= CHECK_MM:
             near = axis.on_turn(pose, near[5])[0]
             along.append(near)
-    clear = moved(planned[0], -plan.servo.clear_mm * rig.mounting.axis)
+    clear = shift_in_tool(planned[0], -plan.servo.clear_mm * rig.mounting.axis)
     spent_s = steps / plan.stream_hz if plan.stream_hz else steps * plan.servo.feed_mm / plan.servo.linear_mm_s
     at_rest = model.at_rest if takes_rest else None
     for line in check_plan(rig, model.pipeline, clear, along, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s, at_rest=at_rest):
@@ -319,9 +319,7 @@ def _results(plan: FollowPlan, rig: Rig, loop: ServoLoop, wanted_mm: float, fail
 
 
 def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, told: dict[str, Any]) -> list[Path]:
-    figure = trajectory_figure(
-        followed.path, followed.measures, f"{plan.stimulus.name}, {model.sensor.name}", outline_mm=followed.outline_mm
-    )
+    figure = trajectory_figure(followed.path, followed.measures, f"{plan.obj.name}, {model.sensor.name}", outline_mm=followed.outline_mm)
     content = {
         **told,
         "measures": asdict(followed.measures),

@@ -36,7 +36,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Step:
+class LawStep:
     """The result of one step of the law.
 
     Attributes
@@ -81,7 +81,7 @@ def reading_at(mounting: Mounting, T_base_surface: np.ndarray, pose: np.ndarray)
 
 def servo_step(
     spec: ServoSpec, mounting: Mounting, T_base_surface: np.ndarray, pose: np.ndarray, memory: Memory, *, fresh: bool = True
-) -> Step:
+) -> LawStep:
     """The arm's next pose.
 
     Parameters
@@ -112,4 +112,4 @@ def servo_step(
     T = matrix_of(pose)
     T[:3, :3] = T_base_surface[:3, :3] @ Rotation.from_rotvec(np.radians(now.angle_deg + turn_deg) * out_of_plane).as_matrix()
     T[:3, 3] += T_base_surface[:3, :3] @ step_mm
-    return Step(pose_of(T, pose), memory, error_mm, error_deg)
+    return LawStep(pose_of(T, pose), memory, error_mm, error_deg)

@@ -14,13 +14,13 @@ import numpy as np
 from hardware.arms.arm import ArmState
 from hardware.errors import DeviceError, StaleDataError
 from hardware.rig.last_axis import HOLD_DEG
-from hardware.safety.decide import Code, Sensed
+from hardware.safety.decide import DecisionCode, Sensed
 from hardware.safety.eyes import NEAR_MM as PIECES_MM
 from hardware.safety.eyes import BlindError, pieces_to
 from hardware.safety.safe_arm import RefusedMoveError
 from hardware.servo.law import Memory, Reading, servo_step, tangent_of
 from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
-from hardware.servo.timing import Spread, Timing
+from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import Rig
 from hardware.workcell.mover import MOVE_TIMEOUT_S, Mover
 from scenes.servo import ServoSpec
@@ -43,7 +43,7 @@ class Decided(StrEnum):
 
 
 @dataclass
-class _View:
+class _NewestFrame:
     """The result of the newest used frame.
 
     Attributes
@@ -88,7 +88,7 @@ class ServoLoop:
         self._held_since: float | None = None  # when the arm began to hold still
         self._sent: np.ndarray | None = None  # pose (6,) where the arm's queue ends, if it has a queue
         self._behind_since: float | None = None  # when the arm began to lag too far behind for a new target
-        self._view, self._memory = _View(), Memory()
+        self._view, self._memory = _NewestFrame(), Memory()
         self._watch, self._axis = self.mover.watch, self.mover.axis
         self._arrived_s: float | None = None  # when the arm came to the object; None once a frame exposed after that was used
         self._started_s = self._ended_s = 0.0
@@ -153,9 +153,9 @@ class ServoLoop:
             len(self.records),
             len(self.records) / spent_s,
             len(fresh) / spent_s,
-            Spread.of([record.latency_s for record in fresh]),
-            Spread.of([age_s for _, age_s in self.decided if np.isfinite(age_s)]),
-            Spread.of([record.compute_s for record in fresh]),
+            TimeSpread.of([record.latency_s for record in fresh]),
+            TimeSpread.of([age_s for _, age_s in self.decided if np.isfinite(age_s)]),
+            TimeSpread.of([record.compute_s for record in fresh]),
             self.source.dropped,
             len(self.decided) / spent_s,
             {str(code): count for code in Decided if (count := sum(one is code for one, _ in self.decided))},
@@ -164,7 +164,7 @@ class ServoLoop:
 
     def _follow(self) -> None:
         """Take frames and decide on each one, until all steps are made or the recording ends."""
-        self._view, self._memory, self._sent, self._behind_since = _View(), Memory(), None, None
+        self._view, self._memory, self._sent, self._behind_since = _NewestFrame(), Memory(), None, None
         self._started_s = self._arrived_s = due_s = time.monotonic()
         while len(self.records) < self.settings.steps:
             if not self.settings.blocking:
@@ -208,7 +208,7 @@ class ServoLoop:
             self._hold(str(blind), blind, age_s)
             return
         except RefusedMoveError as refused:
-            if refused.decision.code not in (Code.STALE_FRAME, Code.SLIPPING, Code.HELD_FORCE):
+            if refused.decision.code not in (DecisionCode.STALE_FRAME, DecisionCode.SLIPPING, DecisionCode.HELD_FORCE):
                 raise
             self._hold(str(refused), refused, age_s)
             return
@@ -353,7 +353,7 @@ class ServoLoop:
             self.mover.go(self.mover.turned_for(self.mover.away_from(here)))
             self.mover.go(self.mover.turned_for(self.mover.away_from(target)))
             self._touch(target)
-        self._view, self._sent, self._arrived_s = _View(), None, time.monotonic()
+        self._view, self._sent, self._arrived_s = _NewestFrame(), None, time.monotonic()
 
 
 def require_labels(mounting: Mounting, names: tuple[str, ...]) -> None:

@@ -15,7 +15,7 @@ from twin.estimate import SensorModel
 from twin.progress import Progress, silent
 from twin.report.charts import save_figure
 from twin.store import text_file, writes
-from twin.types import Readable
+from twin.types import ReadableResult
 
 # Measures that are printed, with their headings.
 SHOWN = {
@@ -56,7 +56,7 @@ class ServoStudyPlan:
 
 
 @dataclass(frozen=True, repr=False)
-class ServoStudy(Readable):
+class ServoStudy(ReadableResult):
     """The result of ``study_servo``.
 
     Attributes

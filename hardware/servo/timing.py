@@ -9,7 +9,7 @@ LEVELS = (50, 95, 99)
 
 
 @dataclass(frozen=True)
-class Spread:
+class TimeSpread:
     """Percentiles of times, in s; NaN if there are no times."""
 
     p50: float
@@ -17,7 +17,7 @@ class Spread:
     p99: float
 
     @classmethod
-    def of(cls, times_s: list[float]) -> "Spread":
+    def of(cls, times_s: list[float]) -> "TimeSpread":
         """The spread of measured times."""
         return cls(*np.percentile(times_s, LEVELS).tolist()) if times_s else cls(*[float("nan")] * 3)
 
@@ -55,9 +55,9 @@ class Timing:
     steps: int
     rate_hz: float
     fresh_hz: float
-    latency_s: Spread
-    age_s: Spread
-    compute_s: Spread
+    latency_s: TimeSpread
+    age_s: TimeSpread
+    compute_s: TimeSpread
     dropped: int
     decided_hz: float = float("nan")
     decided: dict[str, int] = field(default_factory=dict)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from hardware.rig.geometry import PlacedObject, matrix_of
 from hardware.servo.law import Reading, tangent_of
 from hardware.servo.step import StepRecord
-from twin.report.charts import muted, new_figure
+from twin.report.charts import muted_colour, new_figure
 from twin.report.themes import BLUE, RED
 from twin.rig.mounting import Mounting
 from twin.store import text_file
@@ -37,19 +37,19 @@ class Trajectory:
     ----------
     tool_mm : (M, 2) float
         Position of the tool, x and y in the base frame.
-    felt_mm : (M, 2) float
+    surface_mm : (M, 2) float
         Position of the surface by the estimates.
     depth_mm, angle_deg : (M,) float
         Estimated depth and angle.
     true_depth_mm, true_angle_deg, true_indent_mm : (M,) float
     off_mm : (M,) float
-        Distance of ``felt_mm`` from the true surface.
+        Distance of ``surface_mm`` from the true surface.
     along_mm : (M,) float
         Distance along the object's outline to the touched place.
     """
 
     tool_mm: np.ndarray
-    felt_mm: np.ndarray
+    surface_mm: np.ndarray
     depth_mm: np.ndarray
     angle_deg: np.ndarray
     true_depth_mm: np.ndarray
@@ -110,7 +110,7 @@ def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedO
     used = [record for record in records if record.fresh]
     poses = np.array([record.exposed_pose for record in used]).reshape(-1, 6)
     depth, angle = (np.array([getattr(record, key) for record in used]) for key in ("depth_mm", "angle_deg"))
-    felt = np.array([felt_place(mounting, record) for record in used]).reshape(-1, 3)
+    felt = np.array([surface_place(mounting, record) for record in used]).reshape(-1, 3)
     none = np.full(len(used), np.nan)
     if placed is None:
         return Trajectory(poses[:, :2], felt[:, :2], depth, angle, none, none, none, none, none)
@@ -126,11 +126,11 @@ def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedO
         np.array([touch.angle_deg for touch in touches]),
         np.array([touch.indent_mm for touch in touches]),
         np.array([abs(placed.distance_mm(place)) for place in felt]),
-        way_along(outline, places[:, [0, 2]]),
+        distance_along(outline, places[:, [0, 2]]),
     )
 
 
-def felt_place(mounting: Mounting, record: StepRecord) -> np.ndarray:
+def surface_place(mounting: Mounting, record: StepRecord) -> np.ndarray:
     """The place (3,) of the surface from an estimate: the foot of the perpendicular from the dome's centre to the tangent."""
     if np.isnan(record.depth_mm):  # a policy estimates no surface
         return np.full(3, np.nan)
@@ -200,7 +200,7 @@ def lost_contacts(indent_mm: np.ndarray) -> float:
     return float((off[1:] & ~off[:-1]).sum())
 
 
-def way_along(outline_mm: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
+def distance_along(outline_mm: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
     """Distance (M,) along an outline (N, 2) to the places nearest to points (M, 2). On a closed outline it continues past the end."""
     steps = np.linalg.norm(np.diff(outline_mm, axis=0), axis=1)
     way = np.concatenate([[0.0], np.cumsum(steps)])
@@ -236,9 +236,9 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
     )
     for ax in (whole, zoom):
         if outline_mm is not None:
-            ax.plot(*outline_mm.T, color=muted(), lw=3, alpha=0.5, label="object")
+            ax.plot(*outline_mm.T, color=muted_colour(), lw=3, alpha=0.5, label="object")
         ax.plot(*path.tool_mm.T, color=TOOL, lw=1, label="tool")
-        ax.plot(*path.felt_mm.T, ".", color=FELT, ms=3, label="surface as felt")
+        ax.plot(*path.surface_mm.T, ".", color=FELT, ms=3, label="surface as felt")
         ax.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
     whole.set_title("trajectory")
     whole.legend(loc="best", fontsize=8)
@@ -253,7 +253,7 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
         (depth, path.depth_mm, path.true_depth_mm, "depth, mm"),
         (angle, path.angle_deg, path.true_angle_deg, "angle from the normal, deg"),
     ):
-        ax.plot(steps, true, color=muted(), lw=2, label="true")
+        ax.plot(steps, true, color=muted_colour(), lw=2, label="true")
         ax.plot(steps, estimated, color=FELT, lw=0.8, label="estimated")
         ax.set(xlabel="step", ylabel=name)
         ax.legend(fontsize=8)
@@ -266,7 +266,7 @@ def comparison_figure(rows: list[tuple[str, str, Trajectory, np.ndarray]]) -> Fi
     figure, axes = new_figure(len(objects), len(models), panel_inch=3.2)
     for model, name, path, outline in rows:
         ax = axes[models.index(model) * len(objects) + objects.index(name)]
-        ax.plot(*outline.T, color=muted(), lw=3, alpha=0.5)
+        ax.plot(*outline.T, color=muted_colour(), lw=3, alpha=0.5)
         ax.plot(*path.tool_mm.T, color=TOOL, lw=0.9)
         ax.set(title=f"{name}, {model}", aspect="equal", xticks=[], yticks=[])
     return figure

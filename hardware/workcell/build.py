@@ -1,7 +1,7 @@
 """The composition root of live work: the only module that decides whether a device is simulated, recorded or real.
 
-``build_rig`` builds a camera and an arm in front of an object from the user's options. ``given_frame`` selects the no-contact frame from
-which a model measures the pins' displacements.
+``build_rig`` builds a camera and an arm in front of an object from the user's options. ``load_rest_frame`` selects the no-contact frame
+from which a model measures the pins' displacements.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ FRAME_S = 5.0
 TWIN_FRAME_S = 60.0
 
 
-def given_frame(at_rest: str, model: SensorModel) -> Frame | None:
+def load_rest_frame(at_rest: str, model: SensorModel) -> Frame | None:
     """The no-contact frame from a file or from a recording's folder; None for ``first`` and ``none``.
 
     Raises
@@ -111,7 +111,7 @@ class Rig:
 
 def build_rig(
     sensor: SensorSpec,
-    stimulus: ObjectSpec,
+    obj: ObjectSpec,
     placement: PlacementSpec,
     experiment: ExperimentSpec,
     *,
@@ -142,7 +142,7 @@ def build_rig(
         draws a frame only while a reader waits for it.
     """
     form = form or (Form.PROCESSED if sensor.recording else Form.RAW)
-    placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
+    placed = PlacedObject(obj, placement, Mounting.of(sensor, experiment))
     device: Arm = open_arm(arm)
     simulated = kind_of(arm) == "simulated"  # by its name: an arm of another package is guarded, whatever class it has
     if isinstance(device, SimulatedArm) and camera == TWIN and at_once:
@@ -151,17 +151,17 @@ def build_rig(
         device = SafeArm(device, load_limits(limits or kind_of(arm)))
     twin = None
     if camera == TWIN:
-        preview = drawn(sensor, form, plain_light)
+        preview = draw_window(sensor, form, plain_light)
         twin = TwinCamera(sensor, placed, device.state, form, seed=seed, preview=preview, on_demand=at_once)
     return Rig(open_camera(camera, sensor, form, twin=twin), device, placed, camera == TWIN)
 
 
 def twin_camera(sensor: SensorSpec, placed: PlacedObject, pose: PoseSource, form: Form, *, fps: float, plain_light: bool) -> TwinCamera:
     """The twin as a camera on an arm that another process runs. If the connection to the arm is lost, the camera waits for it."""
-    return TwinCamera(sensor, placed, pose, form, fps=fps, preview=drawn(sensor, form, plain_light), waits_for_arm=True)
+    return TwinCamera(sensor, placed, pose, form, fps=fps, preview=draw_window(sensor, form, plain_light), waits_for_arm=True)
 
 
-def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
+def draw_window(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
     """The preview of the window that a form needs. Its shading comes from a path-traced no-contact frame, which is kept between runs.
 
     With ``plain_light`` the preview has no such shading.

@@ -1,6 +1,6 @@
 """The one way in which a program moves an arm to an object and away from it.
 
-Towards the object the arm moves only while the camera gives fresh frames (``Eyes``). A thread stops it if it no longer answers
+Towards the object the arm moves only while the camera gives fresh frames (``FreshFrames``). A thread stops it if it no longer answers
 (``ArmWatch``). At the end it leaves the object straight, or the way it came if the limits forbid that.
 """
 
@@ -14,11 +14,11 @@ import numpy as np
 from hardware.arms.arm import ArmState
 from hardware.arms.motion import turn_between_deg
 from hardware.errors import DeviceError
-from hardware.rig.approach import way_around
-from hardware.rig.geometry import matrix_of, moved
+from hardware.rig.approach import path_around
+from hardware.rig.geometry import matrix_of, shift_in_tool
 from hardware.rig.last_axis import HOLD_DEG, LastAxis
 from hardware.safety.decide import Sensed
-from hardware.safety.eyes import Eyes
+from hardware.safety.eyes import FreshFrames
 from hardware.safety.safe_arm import NoWayBackError, SafeArm, try_each
 from hardware.safety.watch import ArmWatch
 from hardware.workcell.build import Rig
@@ -58,7 +58,7 @@ class Mover:
         self.arm, self.source = rig.arm, rig.source
         self.notes: list[str] = []
         self.watch = ArmWatch(rig.arm)
-        self.eyes = Eyes(rig.arm, rig.source, self.watch.pose_at, lambda pose: float(rig.placed.touch(pose).indent_mm))
+        self.eyes = FreshFrames(rig.arm, rig.source, self.watch.pose_at, lambda pose: float(rig.placed.touch(pose).indent_mm))
         self.axis = LastAxis(getattr(rig.arm, "kinematics", None), rig.mounting.centre_mm)
         self._placed, self._speed, self._clear_mm, self._patience_s = rig.placed, speed, clear_mm, patience_s
         self._safe = rig.arm if isinstance(rig.arm, SafeArm) else None
@@ -67,14 +67,14 @@ class Mover:
     @contextmanager
     def watched(self) -> Iterator[None]:
         """Context in which the threads look at arm and camera."""
-        with self.watch.watched(), self.eyes.watched():
+        with self.watch.watching(), self.eyes.watching():
             yield
 
     def enable(self) -> None:
         """Wait for a fresh frame, then enable the arm and set its speed."""
         self.forget()  # the contact of an earlier run
         with self.watch.doing("waiting for a fresh frame"):
-            self.eyes.await_sight(timeout_s=max(self._patience_s, self.source.first_frame_s))
+            self.eyes.await_frame(timeout_s=max(self._patience_s, self.source.first_frame_s))
         with self.watch.doing("enabling"):
             self.arm.enable()
             self.arm.set_speed(*self._speed)
@@ -104,7 +104,7 @@ class Mover:
 
     def go_around(self, clear: np.ndarray) -> ArmState:
         """Move around the object to a pose (6,) clear of it. Returns the state there."""
-        for pose in way_around(self._placed, self.state().pose, clear):
+        for pose in path_around(self._placed, self.state().pose, clear):
             state = self.go(self.turned_for(pose))
         self._came.clear()
         return state
@@ -112,7 +112,7 @@ class Mover:
     def go(self, target: np.ndarray) -> ArmState:
         """Move straight to a pose (6,), in several pieces if the limits shorten the move. Returns the state that confirms it."""
         for _ in range(MOST_PIECES):
-            self.eyes.await_sight(timeout_s=self._patience_s)
+            self.eyes.await_frame(timeout_s=self._patience_s)
             sent = self.send(target)
             state = self.settle(sent)
             if np.linalg.norm(sent[:3] - target[:3]) < NEAR_MM and turn_between_deg(sent, target) < NEAR_DEG:
@@ -148,7 +148,7 @@ class Mover:
 
     def away_from(self, pose: np.ndarray) -> np.ndarray:
         """The pose (6,) withdrawn by ``clear_mm`` along the sensor's axis."""
-        return moved(pose, -self._clear_mm * self._placed.mounting.axis)
+        return shift_in_tool(pose, -self._clear_mm * self._placed.mounting.axis)
 
     def release(self, *, touching: bool) -> list[str]:
         """Stop the arm, withdraw it if it may touch the object, and disable it. Every step is tried, even if one before it failed.

@@ -9,7 +9,7 @@ import numpy as np
 from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
-from hardware.rig.approach import way_around
+from hardware.rig.approach import path_around
 from hardware.rig.geometry import matrix_of
 from hardware.safety.decide import Action, decide
 from hardware.safety.eyes import NEAR_MM
@@ -65,14 +65,14 @@ def check_plan(
     state = rig.arm.state()
     stands_clear = -rig.placed.touch(state.pose).indent_mm > NEAR_MM
     seen = check_sight(rig.source, pipeline, at_rest=at_rest if stands_clear else None)
-    way = [state.pose, *way_around(rig.placed, state.pose, clear), planned[0]]
+    way = [state.pose, *path_around(rig.placed, state.pose, clear), planned[0]]
     for start, end in pairwise(way):
         if why := _forbidden(rig.arm, start, end):
             raise DeviceError(
                 f"{rig.arm.name}: the limits forbid the way to the {rig.placed.spec.name}: {why}; correct 'placement' in the file for "
                 "`servo` (a Magician reaches that of `servo=magician`), or `limits`"
             )
-    blocked = [n for n, pose in enumerate(planned) if not _way_back(rig, pose)]
+    blocked = [n for n, pose in enumerate(planned) if not _can_retreat(rig, pose)]
     if blocked[:1] == [0]:
         raise DeviceError(f"{rig.arm.name}: the limits allow no way back from the start; correct 'placement' in the file for `servo`")
     way_mm = sum(float(np.linalg.norm(end[:3] - start[:3])) for start, end in pairwise(way))
@@ -130,7 +130,7 @@ def _forbidden(arm: Arm, start: np.ndarray, end: np.ndarray) -> str:
     return "" if decision.action is Action.MOVE else decision.reason
 
 
-def _way_back(rig: Rig, pose: np.ndarray) -> bool:
+def _can_retreat(rig: Rig, pose: np.ndarray) -> bool:
     """Whether the limits allow a part of the retreat from a pose (6,) in contact."""
     if not isinstance(rig.arm, SafeArm):
         return True

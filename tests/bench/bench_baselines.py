@@ -1,4 +1,4 @@
-"""Learn a task as a stranger would: stable-baselines3's PPO with its default settings, 8 environments, 200,000 steps; then judge it.
+"""Learn a task as a stranger would: stable-baselines3's PPO with its default settings, 8 environments, 200,000 steps; then evaluate it.
 
 Run: PYTHONPATH=. python tests/bench/bench_baselines.py --task SurfaceFollow [--seed 0] [--steps 200000] [--out out/bench]. It prints the
 learning curve, and the share of 100 new episodes that the policy's mean action solves.
@@ -24,7 +24,7 @@ from twin.report.charts import new_figure, save_figure  # noqa: E402
 
 ENVIRONMENTS = 8
 EPISODES = 100
-JUDGED_FROM = 10_000  # seed of the first episode in which a policy is judged; learning begins with small ones
+JUDGED_FROM = 10_000  # seed of the first episode in which a policy is evaluated; learning begins with small ones
 
 
 class Curve(BaseCallback):
@@ -54,7 +54,7 @@ def learnt(task, seed, steps, **options):
 
 
 def solved(learner, episodes=EPISODES):
-    """Share of new episodes that the learner's mean action solves; of B rows, row k judges the episodes k, k + B, ..."""
+    """Share of new episodes that the learner's mean action solves; of B rows, row k evaluates the episodes k, k + B, ..."""
     env = learner.get_env()
     env.seed(JUDGED_FROM)
     seen, good = env.reset(), 0

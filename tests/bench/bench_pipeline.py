@@ -1,7 +1,7 @@
 """Time the pipeline against the published method, frame by frame in the same run and thread.
 
 Run by ``make bench``, or: PYTHONPATH=.:tests/helpers python tests/bench/bench_pipeline.py [--sensor mg400-331] [--frames 200]. It takes
-the recordings named by TACTIP_REAL (default ../shared/real) where they are, else drawn frames.
+the recordings named by TACTIP_REAL (default ../shared/real) where they are, else rasterised frames.
 """
 
 import argparse
@@ -38,7 +38,7 @@ def take_frames(spec, count):
     rest = nominal_reference(spec, Form.PROCESSED)
     pitch = rest.spacing_px.mean()
     frames = [drawn_frame(spec, Form.PROCESSED, smooth_warp(rest.pins_px, rng.uniform(0, pitch), rng)) for _ in range(count)]
-    return frames, "drawn frames (no recordings found; set TACTIP_REAL)"
+    return frames, "rasterised frames (no recordings found; set TACTIP_REAL)"
 
 
 def timed(call, *arguments):

@@ -29,7 +29,7 @@ from twin.optics.render import Renderer
 LADDER, CONVERGED = (1, 2, 4, 8, 16), 256  # samples per pixel
 PLAIN_LADDER, PLAIN_CONVERGED = (4, 16, 64), 256
 CHOSEN = 4  # samples per pixel at which ours is compared with plain path tracing
-DRAWN = 0  # samples of a drawn picture
+DRAWN = 0  # samples of a rasterised picture
 FRAME_MS, CENTROID_PX = 250, 0.1  # what a frame of a data set may cost, and be wrong
 INDENT_MM = 2.0
 HEAD = f"{'samples':>8s}{'ms a frame':>12s}{'CPU ms':>8s}{'gray rms':>10s}{'px rms':>8s}"
@@ -100,7 +100,7 @@ class Bench:
             theirs.append((spp, wall, cpu, gray, rms))
             print(f"{spp:8d}{wall:12.0f}{cpu:8.0f}{gray:10.2f}{rms:8.3f}", flush=True)
         ratios = {}
-        for spp, of in ((CHOSEN, f"{CHOSEN} samples"), (DRAWN, "drawn picture")):
+        for spp, of in ((CHOSEN, f"{CHOSEN} samples"), (DRAWN, "rasterised picture")):
             _, _, our_ms, *ours = next(row for row in rows if row[0] == spp)
             for name, column, error in zip(("gray levels", "centroids"), (3, 4), ours, strict=True):
                 needed = time_for(theirs, column, error)

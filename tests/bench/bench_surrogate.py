@@ -15,8 +15,8 @@ from training.data.pins import PinTable
 from training.environments.observe import Eye, caps_px
 from training.estimate.estimator import PoseEstimator
 from training.surrogate.contacts import SurrogateContacts
-from training.surrogate.felt import Contact
 from training.surrogate.model import surrogate_of
+from training.surrogate.reading import EpisodeContact
 from twin.errors import ContactError
 from twin.frames import open_recording
 from twin.geometry.pins import rest_pins
@@ -30,7 +30,7 @@ from twin.studio.contact import experiment_of
 from twin.types import Form
 
 FRAMES = 60
-"""Frames that are drawn from the recording."""
+"""Frames that are sampled from the recording."""
 STEPS = 20
 """Steps of the surrogate on each part of the path."""
 
@@ -60,7 +60,7 @@ class Beside:
 
 
 def measured(sensor: str, data: Path, frames: int = FRAMES) -> Beside:
-    """Both on frames drawn from a recording; frames without a contact that both can compute are left out."""
+    """Both on frames sampled from a recording; frames without a contact that both can compute are left out."""
     spec, estimator = load_sensor(sensor), PoseEstimator.load(sensor)
     recording, experiment = open_recording(data, spec), experiment_of(estimator)
     reference, _ = recording_reference(spec, recording, [])
@@ -73,8 +73,8 @@ def measured(sensor: str, data: Path, frames: int = FRAMES) -> Beside:
         if not (label.executed and seen.valid):
             continue
         try:
-            way, end = rig.way(label), rig.end(label)
-            surrogate.begin(0, Contact(spec, touched, rig.law))
+            way, end = rig.commanded_path(label), rig.end(label)
+            surrogate.begin(0, EpisodeContact(spec, touched, rig.law))
             parts = len(way.path.poses) - 1
             for along in np.linspace(0, parts, STEPS * parts + 1):
                 surrogate.move(np.array([0]), way.path.at(along)[None], np.zeros(1))

@@ -39,7 +39,7 @@ KNOTS = [
     (40.0, ObjectPose(depth_mm=-2.0)),
 ]
 PICTURES = {"press": 6.0, "shear": 13.0}  # name, and time in s of the film
-WHOLE = ".badge:text-is('path-traced')"  # what the page says of a picture that no further pass will mend
+WHOLE = ".badge:text-is('path-traced')"  # what the page says of a picture that no further pass will repair
 SHOWN_S = 120.0  # longest wait for a picture
 
 

@@ -431,7 +431,7 @@ def test_check_says_what_to_do_about_a_camera_that_gives_nothing(monkeypatch):
     monkeypatch.setattr(reader, "START_S", 0.1)
     with pytest.raises(DeviceError, match=r"noisy camera: no new frame within 0\.15 s; check the camera"):
         frames_of("0", None, None, 2)
-    with pytest.raises(FrameError, match="`limit` 2000000000: at most 1000 frames of a camera"):
+    with pytest.raises(FrameError, match="`max_frames` 2000000000: at most 1000 frames of a camera"):
         frames_of("0", None, None, 2_000_000_000)
 
 

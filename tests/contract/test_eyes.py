@@ -18,14 +18,14 @@ from true_estimator import TrueEstimate, TrueEstimator
 
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
-from hardware.cameras.reader import Picture
+from hardware.cameras.reader import DevicePicture
 from hardware.collect.collect import LIFT_MM, Collection, CollectPlan, collect, collect_frames
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
 from hardware.live.feed import CameraFeed
-from hardware.rig.geometry import PlacedObject, moved
+from hardware.rig.geometry import PlacedObject, shift_in_tool
 from hardware.safety.decide import SafetyLimits, load_limits
-from hardware.safety.eyes import NEAR_MM, PIECE_MM, BlindError, Eyes, pieces_to
+from hardware.safety.eyes import NEAR_MM, PIECE_MM, BlindError, FreshFrames, pieces_to
 from hardware.safety.safe_arm import SafeArm
 from hardware.servo.following import FollowPlan, follow
 from hardware.servo.loop import ServoLoop
@@ -105,9 +105,9 @@ def test_an_arm_does_not_leave_standstill_without_a_frame(arm):
     source = Switched()
     source.off = True
     with source:
-        eyes, before = Eyes(arm, source), arm.state().pose
+        eyes, before = FreshFrames(arm, source), arm.state().pose
         with pytest.raises(BlindError, match="moves only with fresh frames"):
-            eyes.await_sight(timeout_s=0.3)
+            eyes.await_frame(timeout_s=0.3)
         with eyes.watched(), pytest.raises(BlindError):
             eyes.move(lambda: arm.move_linear(before + [0, 5, 0, 0, 0, 0]))
     np.testing.assert_array_equal(arm.state().pose, before)
@@ -115,8 +115,8 @@ def test_an_arm_does_not_leave_standstill_without_a_frame(arm):
 
 def test_a_motion_that_is_sent_after_the_stop_is_stopped_too(arm):
     with Switched() as source:
-        eyes, target = Eyes(arm, source), arm.state().pose + [0, 90, 0, 0, 0, 0]
-        eyes.await_sight(timeout_s=2.0)
+        eyes, target = FreshFrames(arm, source), arm.state().pose + [0, 90, 0, 0, 0, 0]
+        eyes.await_frame(timeout_s=2.0)
 
         def send():
             source.off = True
@@ -139,7 +139,7 @@ def test_a_picture_without_noise_may_repeat_at_rest_and_not_in_contact(arm, plac
         return placed.start_pose(poses["indent_mm"] if time_s == source.same_s[1] else poses["before_mm"])
 
     with source:
-        eyes = Eyes(arm, source, pose_at, lambda pose: float(placed.touch(pose).indent_mm))
+        eyes = FreshFrames(arm, source, pose_at, lambda pose: float(placed.touch(pose).indent_mm))
         while source.same_s is None or eyes._source.blind():
             time.sleep(0.01)
         for before_mm, indent_mm, sees in ((-9.0, -3.0, True), (-9.0, 0.5, True), (2.0, 2.0, True), (-9.0, 1.5, False), (1.0, 2.5, False)):
@@ -154,7 +154,7 @@ def test_a_stream_of_thresholded_pictures_is_not_frozen_at_rest():
 
         def _grab(self):
             made = super()._grab()
-            return Picture(np.where(np.indices((360, 360)).sum(axis=0) % 24 < 8, 255, 0).astype(np.uint8), made.time_s)
+            return DevicePicture(np.where(np.indices((360, 360)).sum(axis=0) % 24 < 8, 255, 0).astype(np.uint8), made.time_s)
 
     with (
         CameraEmulator(Thresholded(fps=60)) as emulator,
@@ -274,7 +274,7 @@ def test_the_plan_is_checked_before_anything_moves(kind, servo, refused):
     placed = PlacedObject(load_object("can"), spec.placement, Mounting.of(SENSOR, load_experiment(spec.experiment)))
     with bench(kind) as at, shows(AT_REST) as source, SafeArm(at.arm, load_limits(kind)) as arm:
         rig, start, before = Rig(source, arm, placed, False), placed.start_pose(spec.indent_mm), at.reads()
-        clear = moved(start, -spec.clear_mm * placed.mounting.axis)
+        clear = shift_in_tool(start, -spec.clear_mm * placed.mounting.axis)
         check = partial(check_plan, rig, Pipeline(SENSOR, Form.RAW), clear, [start], linear_mm_s=spec.linear_mm_s, spent_s=1.0)
         if refused:
             with pytest.raises(DeviceError, match=refused):

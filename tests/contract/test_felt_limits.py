@@ -13,7 +13,7 @@ from true_estimator import TrueEstimator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
-from hardware.safety.decide import Code, load_limits
+from hardware.safety.decide import DecisionCode, load_limits
 from hardware.safety.safe_arm import RefusedMoveError, SafeArm
 from hardware.servo.loop import ServoLoop
 from hardware.servo.step import LoopSettings
@@ -55,7 +55,7 @@ def feeling(odd, until=10**6, **limited):
         yield loop, placed, emulator, placed.start_pose(servo.indent_mm)
 
 
-@pytest.mark.parametrize(("odd", "code"), [({"force_z": 40.0}, Code.TOO_STRONG), ({"torque_z": -900.0}, Code.TOO_TWISTED)])
+@pytest.mark.parametrize(("odd", "code"), [({"force_z": 40.0}, DecisionCode.TOO_STRONG), ({"torque_z": -900.0}, DecisionCode.TOO_TWISTED)])
 def test_too_large_a_force_or_torque_ends_the_contact(odd, code):
     with feeling(odd) as (loop, placed, emulator, start):
         with pytest.raises(RefusedMoveError) as refused:

@@ -14,7 +14,7 @@ from arms import bench
 
 from hardware.errors import DeviceError, in_short
 from hardware.servo.following import Followed
-from hardware.servo.timing import Spread, Timing
+from hardware.servo.timing import TimeSpread, Timing
 from hardware.servo.trajectory import Measures
 
 LONGEST = 160
@@ -57,7 +57,7 @@ def test_a_line_tells_what_the_arm_may_do_and_gives_no_advice_to_programs(text, 
 
 def test_a_run_that_ended_early_says_so_in_a_short_line():
     nan = float("nan")
-    spread, failure = Spread(nan, nan, nan), "MG400 at 1: the connection was lost; call connect() again; " + 30 * "more " + "may move"
+    spread, failure = TimeSpread(nan, nan, nan), "MG400 at 1: the connection was lost; call connect() again; " + 30 * "more " + "may move"
     run = Followed(Measures(*[nan] * len(fields(Measures))), Timing(0, 0, 0, spread, spread, spread, 0), None, None, failure, [])
     *_, line = run.lines()
     assert len(line) <= LONGEST and line.startswith("ended early: MG400") and line.endswith("PRESS ITS EMERGENCY STOP") and "()" not in line

@@ -112,7 +112,7 @@ def test_a_lost_arm_is_told_while_a_frame_is_waited_for(emulator, placed, tmp_pa
 def test_what_takes_long_is_said(caplog):
     with Mg400Emulator(port_offset=None) as emulator, mg400_of(emulator) as arm:
         watch = ArmWatch(arm)
-        with watch.watched(), watch.doing("moving"):
+        with watch.watching(), watch.doing("moving"):
             time.sleep(1.7)
             assert f"{arm.name}: moving, 2 s so far" in caplog.text
 
@@ -124,7 +124,7 @@ def test_a_camera_survives_the_death_of_its_arm_and_takes_it_back(placed, caplog
         def _open(self):
             pass
 
-        def _opened(self):
+        def _require_open(self):
             follower = SimpleNamespace(move=lambda T, time_s: T)
             picture = np.full((480, 640), 99.0) + np.random.default_rng(0).random((480, 640))
             return follower, SimpleNamespace(render=lambda state: picture / 255, window_px=(0, 0, 640, 480))

@@ -296,7 +296,7 @@ def test_after_a_lost_connection_it_connects_again_and_reads_once():
 
 
 def test_a_reader_that_ends_late_does_not_live_on():
-    """A reader that was connecting anew when it was told to end must end, though another one has begun."""
+    """A reader that was connecting again when it was told to end must end, though another one has begun."""
     others = set(threading.enumerate())
     with emulated() as emulator:
         feedback = Feedback("arm", "127.0.0.1", (emulator.ports[30004],))
@@ -309,7 +309,7 @@ def test_a_reader_that_ends_late_does_not_live_on():
         feedback.open()
         feedback._connect = slowly
         emulator.faults.add("silent-feedback=0")
-        time.sleep(2.0)  # silence is noticed, the reader connects anew
+        time.sleep(2.0)  # silence is noticed, the reader connects again
         first = feedback._thread
         feedback._thread = None  # as after a join that took too long
         feedback.close()

@@ -7,7 +7,7 @@ import pytest
 
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.twin import TwinCamera
-from hardware.rig.geometry import PlacedObject, moved
+from hardware.rig.geometry import PlacedObject, shift_in_tool
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from twin.mechanics.follow import SETTLED_MM
 from twin.rig.contact import contact_law
@@ -32,10 +32,10 @@ def test_the_object_is_where_the_arms_force_leaves_it_and_rubs_as_the_rig_does(r
     camera = TwinCamera(spec, placed, arm.state, Form.PROCESSED, on_demand=True)
     with camera:
         camera.read(timeout_s=camera.first_frame_s)
-        arm.move_linear(moved(start, DRAG_MM * mounting.across))
+        arm.move_linear(shift_in_tool(start, DRAG_MM * mounting.across))
         camera.read_after(arm.state().time_s, timeout_s=camera.first_frame_s)
         state = camera.state
-    commanded = placed.seen_from(arm.state().pose)
+    commanded = placed.object_from(arm.state().pose)
     law = contact_law(spec.rig, mounting, plate)
     held = law.pose(commanded, state.force_n)
     held[2, 3] += spec.rig.compliance_mm_per_n * state.force_n[2]

@@ -18,7 +18,7 @@ ACROSS = (20, 16, 12)
 
 @job(
     "data.rates.mg400-331",
-    "twin dataset --sensor mg400-331 --experiment surface-2d --images none --states all --across N",
+    "twin dataset --sensor mg400-331 --experiment surface-2d --images none --states all --elements N",
     sensors=(SENSOR,),
     code=("training.generation", "training.data.simulated"),
     minutes=3,

@@ -1,4 +1,4 @@
-"""What the shipped surrogates tell of their errors, how fast the environments step, and what is learnt from nothing."""
+"""The errors that the shipped surrogates state, how fast the environments step, and what is trained from scratch."""
 
 import json
 from functools import partial
@@ -91,24 +91,24 @@ def speed(work: Path) -> Measured:
 
 LEARNT = {
     "EdgeFollow.seeing": ("--randomise moves --fem 20", 12),
-    "EdgeFollow.pins": ("--randomise moves --no-sight --fem 20", 12),
+    "EdgeFollow.pins": ("--randomise moves --no-state-estimator --fem 20", 12),
     "EdgeFollow.oracle": ("--observation oracle", 2),
     "EdgeFollow.image": ("--observation image", 20),
-    "EdgeFollow.forgetful": ("--randomise moves --no-sight --no-memory --fem 20", 12),
-    "SurfaceFollow.pins": ("--no-sight --fem 20", 8),
+    "EdgeFollow.forgetful": ("--randomise moves --no-state-estimator --no-friction-history --fem 20", 12),
+    "SurfaceFollow.pins": ("--no-state-estimator --fem 20", 8),
     "SurfaceFollow.oracle": ("--observation oracle", 3),
     "ContourFollow.pins": ("", 5),
     "ObjectRoll.pins": ("--minutes 8", 10),
     "ObjectPush.pins": ("", 30),
-    "GentlePress.pins": ("--no-sight --minutes 15", 16),
+    "GentlePress.pins": ("--no-state-estimator --minutes 15", 16),
 }
-"""Options of ``twin learn``, and about how many minutes it takes with all judging, by task and what the policy sees."""
-WHERE = {"surrogate": "", "surrogate, friction remembers": "remembers_", "finite elements, drawn frames": "fem_"}
-"""Beginnings of the figures' names, by where ``twin learn`` judged the policy."""
+"""Options of ``twin learn``, and about how many minutes it takes with all evaluating, by task and what the policy sees."""
+WHERE = {"surrogate": "", "surrogate, friction remembers": "remembers_", "finite elements, rasterised frames": "fem_"}
+"""Beginnings of the figures' names, by where ``twin learn`` evaluated the policy."""
 
 
 def learnt(work: Path, *, name: str) -> Measured:
-    """Shares of the episodes that a policy solves, which was learnt from nothing by one command, and how long that took."""
+    """Shares of the episodes that a policy solves, which was trained from scratch by one command, and how long that took."""
     task, options = name.split(".")[0], LEARNT[name][0].split()
     run_twin(work, "learn", "--task", task, "--sensor", "mg400-331", *options, "--out", work / "learnt", "--force")
     told = json.loads((work / "learnt" / "result.json").read_text())

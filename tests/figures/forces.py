@@ -9,7 +9,7 @@ import numpy as np
 
 from figures.jobs import NO_PICTURES, Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
-from twin.fit.sensor_file import write_sensor
+from twin.calibration.sensor_file import write_sensor
 
 CODE = ("training.generation", "training.studies.train", "training.studies.evaluation")
 TAUGHT = {"plane": 300, "ball-40": 300, "cylinder": 300, "edge": 300}  # contacts of the objects that are learnt from
@@ -43,7 +43,7 @@ def contacts(
         randomise,
         *(("--wide",) if wide else ()),
     )
-    run_twin(work, "dataset", *options, "--images", "none", "--states", "all", "--across", ACROSS, "--seed", seed, "--out", work / name)
+    run_twin(work, "dataset", *options, "--images", "none", "--states", "all", "--elements", ACROSS, "--seed", seed, "--out", work / name)
     return work / name
 
 

@@ -26,9 +26,9 @@ from bench_gpu import gpu_name
 
 from scenes import SensorSpec, load_sensor
 from twin import store
-from twin.judge.pictures.aligned import revised
+from twin.evaluation.pictures.aligned import with_changes
 from twin.optics.relief import DETAILS, without
-from twin.store.fingerprint import Code
+from twin.store.fingerprint import CodeOf
 
 ROOT = Path(__file__).parents[2]
 FIGURES = ROOT / "figures.json"
@@ -162,17 +162,17 @@ def specification_digest(sensors: tuple[str, ...], beside: tuple[str, ...] = ())
 def _shortened(spec: SensorSpec, beside: tuple[str, ...]) -> SensorSpec:
     """A specification without some of its parts."""
     if "residual" in beside:
-        spec = revised(spec, response={"residual": None})
+        spec = with_changes(spec, response={"residual": None})
     return without(spec, [name for name in beside if name in DETAILS])
 
 
 DRAWN = ("twin.optics.sampling",)
-"""``Job.beside`` of a job whose pictures are drawn: the random numbers of the picture that shading is fitted to change no figure."""
+"""``Job.beside`` of a job whose pictures are rasterised: the random numbers of the picture that shading is fitted to change no figure."""
 UNMEASURED = ("twin.cli", "twin.report")
 """Packages whose code changes no figure: the command line's words and the pages' looks."""
 
 
-def code_behind(*names: str, beside: tuple[str, ...] = ()) -> Code:
+def code_behind(*names: str, beside: tuple[str, ...] = ()) -> CodeOf:
     """The code that may change a figure of a job which names these modules and packages: modules, and versions of libraries.
 
     Parameters

@@ -1,4 +1,4 @@
-"""On six recordings: what the twin is worth by the number of labelled frames, and whether shipped intervals hold what they say."""
+"""On six recordings: the effect of the twin by the number of labelled frames, and whether shipped intervals hold what they say."""
 
 import json
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from training.data.dataset import load_dataset
 from training.data.targets import unit_of
 from training.estimate.estimator import PoseEstimator
 from training.studies.evaluation import models_of_kinds
-from training.studies.judging import judge
-from training.studies.sim_to_real import Plan
+from training.studies.judging import measure_errors
+from training.studies.sim_to_real import SimToRealPlan
+from training.studies.sim_to_real.label_efficiency import label_efficiency
 from training.studies.sim_to_real.page import errors_figure
-from training.studies.sim_to_real.worth import worth
 from twin.frames import open_recording
 from twin.report.charts import write_chart
 from twin.store import write_json
@@ -36,11 +36,11 @@ CHARTS = ROOT / "docs" / "pictures"
 CHART_DPI = 90
 
 
-def draw(work: Path, plan: Plan, seed: int) -> list[dict[str, Any]]:
+def draw(work: Path, plan: SimToRealPlan, seed: int) -> list[dict[str, Any]]:
     """Rows of one draw of frames. A draw that was measured before the work was interrupted is read."""
     kept = work / f"draw-{seed}.json"
     if not kept.is_file():
-        write_json(kept, worth(plan, work / "worth", (seed,)))
+        write_json(kept, label_efficiency(plan, work / "worth", (seed,)))
     rows: list[dict[str, Any]] = json.loads(kept.read_text())
     return rows
 
@@ -60,7 +60,7 @@ def over_draws(draws: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]
 def by_labels(work: Path, *, recording: str) -> Measured:
     """Mean errors over the draws of frames, the largest for ``Plan.labels`` labels, and their chart."""
     sensor, experiment, count, across, _ = RECORDINGS[recording]
-    plan = Plan(load_sensor(sensor), real_folder(recording), load_experiment(experiment), count=count, across=across, workers=2)
+    plan = SimToRealPlan(load_sensor(sensor), real_folder(recording), load_experiment(experiment), count=count, across=across, workers=2)
     rows = over_draws([draw(work, plan, seed) for seed in SEEDS])
     CHARTS.mkdir(parents=True, exist_ok=True)
     write_chart(CHARTS / f"labels-{recording}.png", lambda: errors_figure(rows, plan.experiment.targets), dpi=CHART_DPI)
@@ -87,7 +87,7 @@ def inside(work: Path, *, recording: str) -> Measured:
     else:  # taught by the twin, with a few labelled frames
         rows = np.flatnonzero(~np.isin(data.pins.image_name, list(estimator.config["labelled"])))
     made = several.predict_rows(data, rows, kinds) if several else estimator.predict_rows(data, rows)
-    judged = judge(made, data, rows)["corrected"]
+    judged = measure_errors(made, data, rows)["corrected"]
     shares = {f"{name}.inside": Value(judged[name]["coverage_90"]) for name in estimator.names}
     return shares | {f"{name}.error": Value(judged[name]["mae"], unit_of(name)) for name in estimator.names} | {"frames": Value(len(rows))}
 
@@ -100,7 +100,7 @@ def register() -> None:
             f"labels.{recording}",
             command,
             sensors=(sensor,),
-            code=("training.studies.sim_to_real.worth",),
+            code=("training.studies.sim_to_real.label_efficiency",),
             recordings=(recording,),
             minutes=minutes,
             beside=NO_PICTURES,

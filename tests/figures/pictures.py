@@ -9,8 +9,8 @@ from bench_render import CHOSEN, DRAWN, Bench
 from figures.jobs import NO_RESIDUAL, Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
 from training.runs.residual import calibrate_residual
+from twin.evaluation.pictures.images import compare_images
 from twin.frames import open_recording
-from twin.judge.pictures.images import compare_images
 from twin.optics.relief import DETAILS
 from twin.simulator import Simulator
 from twin.types import Form
@@ -67,7 +67,8 @@ def judged(work: Path, out: Path, *options: str) -> dict:
     beside=NO_RESIDUAL,
 )
 def residual(work: Path) -> Measured:
-    """The residual network, taught on half of the unfitted frames and judged on the other half: what the two-sample test tells of them."""
+    """The residual network, taught on half of the unfitted frames and evaluated on the other half: what the two-sample test tells of
+    them."""
     found = calibrate_residual(real_folder("ur5-331-raw"), load_sensor("ur5-331"), work / "taught.toml", fitted=FITTED)
     tests = {"before": found.before, "after": found.after, "real": found.real}
     endings = {"small": "", "stronger": "_stronger"}
@@ -87,7 +88,7 @@ def residual(work: Path) -> Measured:
     beside=NO_RESIDUAL,
 )
 def details(work: Path) -> Measured:
-    """What each measured detail is worth: likeness of drawn pictures with all, and without each."""
+    """Ablation of each measured detail: likeness of rasterised pictures with all, and without each."""
     found: Measured = {}
     for name in ("all", *DETAILS):
         left_out = [] if name == "all" else ["--without", name]
@@ -128,7 +129,7 @@ def speed(work: Path) -> Measured:
     "render.at_rest",
     "pytest -m slow -s tests/system/test_real.py",
     sensors=tuple(RECORDED),
-    code=("twin.simulator", "twin.judge.pictures.images"),
+    code=("twin.simulator", "twin.evaluation.pictures.images"),
     recordings=tuple(RECORDED.values()),
     minutes=1,
 )

@@ -20,7 +20,7 @@ FRAMES = 200  # of the bench
 AT_REST = "hex127-flat"  # has frames without contact
 UNKNOWN = (AT_REST, "hex127-deep", "hex127-shapes")  # of another laboratory's sensor
 WHITE, LEAST_PX = 127, 8  # level above which a pixel is white, and least pixels of a component
-VALIDATED, OWN_FRICTION, SEED = 80, 10, 20  # frames drawn at random; of these with a friction of their own
+VALIDATED, OWN_FRICTION, SEED = 80, 10, 20  # frames sampled at random; of these with a friction of their own
 
 
 def found_on(work: Path, *, sensor: str) -> Measured:
@@ -71,7 +71,7 @@ def speed(work: Path, *, sensor: str) -> Measured:
 
 def against_recorded(work: Path, *, sensor: str) -> Measured:
     """The whole twin without anything free, and with one friction a frame."""
-    options = ("--limit", VALIDATED, "--friction-frames", OWN_FRICTION, "--seed", SEED)
+    options = ("--max-frames", VALIDATED, "--friction-frames", OWN_FRICTION, "--seed", SEED)
     run_twin(work, "validate", "--sensor", sensor, "--frames", real_folder(SETS[sensor]), "--out", work / "validate", *options)
     summary = json.loads((work / "validate" / "validation.json").read_text())
     errors = {row["group"]: row["error_px"] for row in summary["table"]}
@@ -99,11 +99,13 @@ for _sensor in ("mg400-331", "mg400-127"):
         recordings=_recording,
         minutes=1,
     )(partial(speed, sensor=_sensor))
-    _command = f"twin validate --sensor {_sensor} --frames DIR --limit {VALIDATED} --friction-frames {OWN_FRICTION} --seed {SEED} --out OUT"
+    _command = (
+        f"twin validate --sensor {_sensor} --frames DIR --max-frames {VALIDATED} --friction-frames {OWN_FRICTION} --seed {SEED} --out OUT"
+    )
     job(f"pins.real.{_sensor}", _command, sensors=(_sensor,), code=("training.studies.validation",), recordings=_recording, minutes=8)(
         partial(against_recorded, sensor=_sensor)
     )
 for _set in UNKNOWN:
-    job(f"pins.new.{_set}", "twin new DIR --out OUT", code=("twin.fit.new_sensor",), recordings=(_set,), minutes=1)(
+    job(f"pins.new.{_set}", "twin new DIR --out OUT", code=("twin.calibration.new_sensor",), recordings=(_set,), minutes=1)(
         partial(named_by_a_new_sensor, recording=_set)
     )

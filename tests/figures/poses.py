@@ -1,4 +1,4 @@
-"""Errors of pose models: trained on recordings, taught by the twin, and on objects never touched."""
+"""Errors of pose models: trained on recordings, taught by the twin, and on unseen objects."""
 
 import csv
 import json
@@ -15,7 +15,7 @@ from figures.jobs import NO_PICTURES, FiguresError, Measured, Value, job, read, 
 from training.data.dataset import load_dataset
 from training.estimate.estimator import PoseEstimator
 from training.studies.evaluation import at_own_rest
-from training.studies.judging import judge
+from training.studies.judging import measure_errors
 from training.studies.tac_vgnn.models import measure_training
 
 SETS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
@@ -38,11 +38,11 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 
 def trained(work: Path, *, model: str, sensor: str, split: int) -> Measured:
-    """Train on four fifths of a recording (the paper's models on raw labels) and judge on the last one, also on changed images."""
+    """Train on four fifths of a recording (the paper's models on raw labels) and evaluate on the last one, also on changed images."""
     labels = "corrected" if model == "vgnn" else "raw"
     data, run = real_folder(SETS[sensor]), work / "run"
     fewer = ("--epochs", EPOCHS[model]) if model in EPOCHS else ()
-    options = ("--target", "surface-2d-shear", "--labels", labels, "--seed", split, "--split", split, *fewer)
+    options = ("--target", "surface-2d-shear", "--label-kind", labels, "--seed", split, "--split", split, *fewer)
     if not (run / "weights.pt").is_file():
         run_twin(work, "train", "--model", model, "--sensor", sensor, "--data", data, *options, "--out", run)
     changed = ("--robustness",) if model == "vgnn" else ()
@@ -76,7 +76,7 @@ def over_splits(work: Path, *, model: str, sensor: str) -> Measured:
 
 def parts_of_vgnn(work: Path) -> Measured:
     """What each part of `vgnn` earns on the 331's split 0."""
-    options = ("--labels", "corrected", "--models", ",".join(PARTS), "--batches", "", "--no-contacts")
+    options = ("--label-kind", "corrected", "--models", ",".join(PARTS), "--batches", "", "--no-contacts")
     run_twin(
         work, "study", "tac-vgnn", "--data", real_folder(SETS["mg400-331"]), "--sensor", "mg400-331", "--out", work / "study", *options
     )
@@ -88,7 +88,7 @@ def parts_of_vgnn(work: Path) -> Measured:
 
 def taught_by_the_twin(work: Path, *, sensor: str, seed: int, extra: tuple = ()) -> Measured:
     """Rows of a study from the twin to real frames, against corrected and raw labels."""
-    options = ("--labels", LABELS, "--seed", seed, "--count", 300, *extra)
+    options = ("--label-kind", LABELS, "--seed", seed, "--count", 300, *extra)
     run_twin(work, "study", "sim-to-real", "--sensor", sensor, "--frames", real_folder(SETS[sensor]), *options, "--out", work / "study")
     found = {}
     for row in rows_of(work / "study" / "study.csv"):
@@ -101,7 +101,7 @@ def taught_by_the_twin(work: Path, *, sensor: str, seed: int, extra: tuple = ())
 
 def never_touched(work: Path) -> Measured:
     """A model taught by nine objects and one by the plane alone, on objects seen and unseen."""
-    options = ("--count", 60, "--tests", 25, "--across", 12, "--seed", 1)
+    options = ("--count", 60, "--tests", 25, "--elements", 12, "--seed", 1)
     run_twin(work, "study", "objects", "--sensor", "mg400-331", *options, "--out", work / "study")
     found = {}
     for row in rows_of(work / "study" / "objects.csv"):
@@ -146,7 +146,7 @@ def without_no_contact(work: Path, *, sensor: str) -> Measured:
             cases["told_by_contacts"] = at_own_rest(estimator, data)
         for which, counted in cases.items():
             rows = np.flatnonzero(counted.pins.valid)
-            judged = judge(estimator.predict_rows(counted, rows), counted, rows)["corrected"]
+            judged = measure_errors(estimator.predict_rows(counted, rows), counted, rows)["corrected"]
             errors[which] = {unit: judged[name]["mae"] for name, unit in UNITS.items()}
     found = {f"{case}_{unit}": Value(error, unit) for case, by in errors.items() for unit, error in by.items()}
     times = {f"{case}_{unit}_times": Value(errors[case][unit] / errors["given"][unit]) for case in errors for unit in UNITS.values()}
@@ -179,7 +179,9 @@ def register() -> None:
                 partial(over_splits, model=model, sensor=sensor)
             )
     real = {"code": ("training.studies.tac_vgnn",), "recordings": (SETS["mg400-331"],), "sensors": ("mg400-331",), "beside": NO_PICTURES}
-    job("training.parts.mg400-331", f"twin study tac-vgnn --labels corrected --models {','.join(PARTS)}", minutes=20, **real)(parts_of_vgnn)
+    job("training.parts.mg400-331", f"twin study tac-vgnn --label-kind corrected --models {','.join(PARTS)}", minutes=20, **real)(
+        parts_of_vgnn
+    )
     for sensor in SETS:
         common = {"sensors": (sensor,), "code": ("training.studies.sim_to_real",), "recordings": (SETS[sensor],), "beside": NO_PICTURES}
         command = f"twin study sim-to-real --sensor {sensor} --frames DIR --labels {LABELS} --count 300 --seed"
@@ -190,7 +192,7 @@ def register() -> None:
         job(f"sim_to_real.{sensor}.calibrated", f"{command} 0 --calibrate", minutes=40, **common)(
             partial(taught_by_the_twin, sensor=sensor, seed=0, extra=("--calibrate",))
         )
-    command = "twin study objects --sensor mg400-331 --count 60 --tests 25 --across 12 --seed 1"
+    command = "twin study objects --sensor mg400-331 --count 60 --tests 25 --elements 12 --seed 1"
     job("objects.mg400-331", command, sensors=("mg400-331",), code=("training.studies.objects",), minutes=30, beside=NO_PICTURES)(
         never_touched
     )

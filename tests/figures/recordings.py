@@ -24,14 +24,14 @@ SETS = {  # by recording: sensor, experiment, elements across
     "ur5-331-edge-2d-shear": (SENSOR, "edge-circle-sheared", 20),
     "tacpad-force": (TACPAD, "surface-3d-tool", 10),
 }
-VALIDATED, OWN_FRICTION, SEED = 40, 5, 20  # frames drawn at random; of the sheared ones with a friction of their own
+VALIDATED, OWN_FRICTION, SEED = 40, 5, 20  # frames sampled at random; of the sheared ones with a friction of their own
 
 
 def options_of(recording: str) -> tuple[object, ...]:
     """Options of ``twin validate`` without folders."""
     sensor, experiment, across = SETS[recording]
-    drawn = ("--limit", VALIDATED, "--friction-frames", OWN_FRICTION, "--seed", SEED)
-    return "--sensor", sensor, "--experiment", experiment, "--across", across, *drawn
+    drawn = ("--max-frames", VALIDATED, "--friction-frames", OWN_FRICTION, "--seed", SEED)
+    return "--sensor", sensor, "--experiment", experiment, "--elements", across, *drawn
 
 
 def against_recorded(work: Path, *, recording: str) -> Measured:

@@ -14,7 +14,7 @@ from figures.jobs import Measured, Value, job, run_twin
     minutes=4,
 )
 def robustness(work: Path) -> Measured:
-    """Conditions in which our pipeline bears as much as the paper's, and twice as much."""
+    """Conditions in which our pipeline tolerates as much as the paper's, and twice as much."""
     run_twin(work, "robustness", "--sensor", "mg400-331", "--jobs", 2, "--out", work / "sweep")
     content = json.loads((work / "sweep" / "envelope.json").read_text())
     beside = next(comparison for comparison in content["comparisons"] if comparison["theirs"] == "legacy")

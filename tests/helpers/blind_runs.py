@@ -24,13 +24,13 @@ from true_estimator import TrueEstimator
 from hardware.arms.magician import Magician
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.cameras.mjpeg import MjpegCamera
-from hardware.cameras.reader import Picture
+from hardware.cameras.reader import DevicePicture
 from hardware.collect.collect import Collection, collect
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
-from hardware.rig.geometry import PlacedObject, moved
+from hardware.rig.geometry import PlacedObject, shift_in_tool
 from hardware.safety.decide import SafetyLimits
 from hardware.safety.eyes import NEAR_MM
 from hardware.safety.safe_arm import SafeArm
@@ -81,10 +81,10 @@ class DomeCamera(NoisyCamera):
         dome = 60.0 + 60.0 * ((x % 24 < 8) & (y % 24 < 8))
         self._images = [np.clip(dome + rng.normal(0.0, 1.5, dome.shape), 0, 255).astype(np.uint8) for _ in range(9)]
 
-    def _grab(self) -> Picture:
+    def _grab(self) -> DevicePicture:
         self._end.wait(self._period_s)
         self._number += 1
-        return Picture(self._images[self._number % len(self._images)], time.monotonic())
+        return DevicePicture(self._images[self._number % len(self._images)], time.monotonic())
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def program(
             track = SimpleNamespace(pose=pose or (lambda time_s: arm.state().pose))
             truth = TrueEstimator(SimpleNamespace(track=track), placed)
             settings = LoopSettings(steps, blocking=command != "stream", period_s=0.1, frame_timeout_s=FRAME_WAIT_S, give_up_s=WAIT_S)
-            law = (lambda here, estimate: moved(here, servo.feed_mm * placed.mounting.across)) if command == "policy" else None
+            law = (lambda here, estimate: shift_in_tool(here, servo.feed_mm * placed.mounting.across)) if command == "policy" else None
             loop = ServoLoop(rig, servo, truth, settings, LoopHooks(law, lambda frame: truth))
             loop.run(placed.start_pose(servo.indent_mm))
             if loop.notes:

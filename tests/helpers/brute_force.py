@@ -7,7 +7,7 @@ from scipy import stats
 from scenes.sensor import SensorSpec
 from twin.optics.lights import lights
 from twin.optics.scene import build_pinhole_camera, build_scene, mesh
-from twin.optics.surfaces import Surface
+from twin.optics.surfaces import PaintedSurface
 
 DEPTH = 24
 RR_DEPTH = 8
@@ -76,7 +76,7 @@ def reference(mi, spec, surfaces, size_px, spp, seed):
         square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ patch.half_mm
         corners = patch.center_mm + np.column_stack([square, np.zeros(4)])
         emitter = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": patch.radiance.tolist()}})
-        surface = Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+        surface = PaintedSurface(corners, np.array([[0, 1, 2], [0, 2, 3]]))
         extra[f"led{k}"] = mesh(mi, f"led{k}", surface, mi.load_dict({"type": "null"}), smooth=False, emitter=emitter)
     scene = build_scene(mi, spec.appearance, spec.gel.refractive_index, surfaces, extra=extra)
     to_world = np.eye(4)

@@ -16,7 +16,7 @@ def solving() -> None:
 
 
 def seeing() -> None:
-    """The surrogate's contacts, drawn pictures, and the pipeline."""
+    """The surrogate's contacts, rasterised pictures, and the pipeline."""
     import gymnasium
 
     import training.environments  # noqa: F401 (registers them)

@@ -48,6 +48,6 @@ def drawn_dataset(folder: Path) -> Dataset:
 
 
 def config_of(model: str, **recipe) -> RunConfig:
-    """A model's recipe with some settings changed; `vgnn` as small as the drawn frames need it."""
+    """A model's recipe with some settings changed; `vgnn` as small as the rasterised frames need it."""
     size = {"width": 16, "modes": 8, "area_modes": 4, "channels": 2, "frequencies": 3} if model == "vgnn" else {}
     return RunConfig(model, recipe_of(model, **recipe), size=size)

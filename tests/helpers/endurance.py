@@ -1,6 +1,6 @@
 """The streamed loop for as long as one likes, with both emulators in processes of their own and a random fault every so often.
 
-What a user would do after an error is done here: the device is mended, the alarm cleared, and the loop begun again.
+What a user would do after an error is done here: the device is repaired, the alarm cleared, and the loop begun again.
 """
 
 import gc

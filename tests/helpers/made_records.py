@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from twin.records import About, Episode, Step
+from twin.records import About, Episode, RecordStep
 from twin.types import Form
 
 PINS = 7
@@ -31,7 +31,7 @@ def made_steps(about: About, seed: int, length: int):
         if "estimate" in values and k == 1:
             values["estimate"][:] = np.nan
         image = rng.integers(0, 256, (height, width) if about.gray else (height, width, 3), np.uint8)
-        yield Step(image, round(0.1 * k + 0.001 * bool(k), 9), values)
+        yield RecordStep(image, round(0.1 * k + 0.001 * bool(k), 9), values)
 
 
 def made_episode(seed: int, length: int = 3, about: About = ABOUT) -> Episode:

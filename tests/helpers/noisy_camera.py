@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from hardware.cameras.reader import LiveSource, Picture
+from hardware.cameras.reader import DevicePicture, LiveSource
 from twin.types import Form
 
 
@@ -23,12 +23,12 @@ class NoisyCamera(LiveSource):
     def _close(self) -> None:
         pass
 
-    def _grab(self) -> Picture:
+    def _grab(self) -> DevicePicture:
         self._end.wait(self._period_s)
         self._number += 1
         image = self._rng.integers(60, 200, self._shape, np.uint8)
         image[:16, :16] = 10 * (self._number % 20) + 30
-        return Picture(image, time.monotonic())
+        return DevicePicture(image, time.monotonic())
 
 
 def number_of(image: np.ndarray) -> int:

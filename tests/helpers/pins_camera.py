@@ -7,7 +7,7 @@ from drawn_frames import cap_radii_px, drawn_frame
 from noisy_camera import NoisyCamera
 from true_estimator import TrueEstimate
 
-from hardware.cameras.reader import Picture
+from hardware.cameras.reader import DevicePicture
 from scenes import load_sensor
 from twin.pins import Pipeline, nominal_reference
 from twin.types import Form
@@ -22,7 +22,7 @@ class Switched(NoisyCamera):
         while self.off and not self._end.wait(0.01):
             pass
         made = super()._grab()
-        return made if self.picture is None else Picture(self.picture, made.time_s)
+        return made if self.picture is None else DevicePicture(self.picture, made.time_s)
 
 
 SENSOR = load_sensor("mg400-331")

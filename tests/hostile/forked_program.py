@@ -1,7 +1,7 @@
 """The program ``twin``, started once: each call is a fork of it, in a session of its own, with limits, and watched until it ends.
 
 Starting Python and importing the libraries costs seconds of one core; a fork of a process that has done so costs milliseconds.
-Apart from that a call is the real thing: the command line is parsed anew, threads are waited for and exit functions run at its end,
+Apart from that a call is the real thing: the command line is parsed again, threads are waited for and exit functions run at its end,
 and stdout, stderr and the exit code are those of a process. Run as a script this file is the process that forks; ``Program`` talks to it.
 """
 
@@ -120,7 +120,7 @@ class Program:
         self._server = subprocess.Popen([sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=env, text=True)
 
     def call(self, *arguments: object, folder: Path, limits: Limits | None = None, env: dict[str, str] | None = None) -> Ended:
-        """Call ``twin`` with ``arguments`` in ``folder``, and wait for its end; with an ``env`` of its own Python starts anew for it."""
+        """Call ``twin`` with ``arguments`` in ``folder``, and wait for its end; with an ``env`` of its own Python starts again for it."""
         asked = {"arguments": [str(a) for a in arguments], "folder": str(folder), "env": env or {}, "limits": asdict(limits or Limits())}
         assert self._server.stdin and self._server.stdout
         self._server.stdin.write(json.dumps(asked) + "\n")

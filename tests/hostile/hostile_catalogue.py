@@ -27,9 +27,10 @@ READ_LABELS = {
     "study tac-vgnn": f"study tac-vgnn --data {{data}} {S} --out {{out}} --models gnn --epochs 1 --batches 8 --no-contacts",
 }
 SLOWLY_READ_LABELS = {  # refused tables only: with others these simulate contacts for minutes
-    "validate": f"validate {S} --frames {{data}} --out {{out}} --across 6 --limit 1 --friction-frames 0",
-    "calibrate contact": f"calibrate contact {S} --frames {{data}} --out {{out}}/spec.toml --labels 4 --across 6 --workers 1",
-    "study sim-to-real": f"study sim-to-real {S} --frames {{data}} --out {{out}} --labels 12 --count 10 --epochs 1 --across 6 --workers 1",
+    "validate": f"validate {S} --frames {{data}} --out {{out}} --elements 6 --max-frames 1 --friction-frames 0",
+    "calibrate contact": f"calibrate contact {S} --frames {{data}} --out {{out}}/spec.toml --num-labelled 4 --elements 6 --workers 1",
+    "study sim-to-real": f"study sim-to-real {S} --frames {{data}} --out {{out}} --num-labelled 12 --count 10 --epochs 1 --elements 6 "
+    f"--workers 1",
 }
 LABELS, MOVES = "targets.csv", "move_executed.csv"
 
@@ -94,15 +95,15 @@ READ_FRAMES = {  # with the exit codes that are right where one picture of four 
     "graph": (f"graph {{data}} {S} --out {{out}}", (DONE,)),
     "predict": (f"predict {SENSOR} {{data}}", (DONE,)),
     "check": (f"check {{data}} {S}", (DONE, REFUSED, BAD_SENSOR)),
-    "tune": (f"tune {S} --frames {{data}} --out {{out}}/mine.toml --limit 4", (DONE,)),
+    "tune": (f"tune {S} --frames {{data}} --out {{out}}/mine.toml --max-frames 4", (DONE,)),
     "live": (f"live --model {SENSOR} --camera {{data}} --headless", (DONE,)),
-    "new": ("new {data} --out {out}/mine.toml --limit 4", (DONE,)),
+    "new": ("new {data} --out {out}/mine.toml --max-frames 4", (DONE,)),
 }
 TAKE_ANY_SIZE = ("tune", "new")
 READ_RAW = {
-    "realism": f"realism {{data}} {U} --out {{out}} --limit 2 --quality preview --no-two-sample",
-    "calibrate optics": f"calibrate optics {U} --frames {{data}} --out {{out}}/spec.toml --limit 1",
-    "robustness": f"robustness {U} --frames {{data}} --out {{out}} --no-rendered --jobs 1 --limit 2",
+    "realism": f"realism {{data}} {U} --out {{out}} --max-frames 2 --quality preview --no-two-sample",
+    "calibrate optics": f"calibrate optics {U} --frames {{data}} --out {{out}}/spec.toml --max-frames 1",
+    "robustness": f"robustness {U} --frames {{data}} --out {{out}} --no-rendered --jobs 1 --max-frames 2",
 }
 READ_NAMED = ("preprocess", "graph", "predict")  # these name every frame that shows no pins
 READ_ALL_PICTURES = ("preprocess", "check")  # the others read them by the same reader
@@ -205,7 +206,7 @@ READ_SPECIFICATIONS = {
     "servo": ("servo --object {spec} --out {out}", "servo --object can --servo {spec} --out {out}"),
     "collect": (
         f"collect --camera twin --arm simulated {S} --experiment {{spec}} --count 1 --out {{out}}",
-        f"collect --camera twin --arm simulated {S} --limits {{spec}} --count 1 --out {{out}}",
+        f"collect --camera twin --arm simulated {S} --safety {{spec}} --count 1 --out {{out}}",
     ),
     "emulate camera": ("emulate camera --arm mg400:127.0.0.1 --sensor {spec} --object plane",),
     "studio": (
@@ -315,15 +316,15 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--threads": "0 -3 100000",
         "--device": "tpu cuda:99",
         "--target": "nonsense pose_2,nonsense , pose_2,pose_2",
-        "--labels": "both",
+        "--label-kind": "both",
         "--model": "transformer",
         "--form": "cooked",
     },
-    "evaluate {run} --data {recording} --out {out}": {"--rows": "some", "--labels": "both"},
+    "evaluate {run} --data {recording} --out {out}": {"--rows": "some", "--label-kind": "both"},
     f"preprocess {{frames}} {S} --out {{out}}": {"--form": "cooked raw"},
-    f"check {{frames}} {S}": {"--limit": "0 -1 1e3", "--pipeline": "nowhere.toml"},
+    f"check {{frames}} {S}": {"--max-frames": "0 -1 1e3", "--pipeline": "nowhere.toml"},
     f"graph {{frames}} {S} --out {{out}}": {"--kind": "star", "--form": "cooked raw"},
-    f"tune {S} --frames {{frames}} --out {{out}}/mine.toml": {"--limit": "0 -1", "--method": "magic"},
+    f"tune {S} --frames {{frames}} --out {{out}}/mine.toml": {"--max-frames": "0 -1", "--method": "magic"},
     f"render {S} --object plane --out {{out}} --quality preview": {
         "--indent-mm": "nan inf 1e9 x -1",
         "--indent-mm 1 --twist-deg": "nan inf",
@@ -332,29 +333,29 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--indent-mm 1 --shear-mm 0": "nan 1e9",
         "--indent-mm 1 --offset-mm 0": "nan",
     },
-    f"dataset --experiment {{experiment}} {S} --images none --across 6 --workers 1 --out {{out}}": {
+    f"dataset --experiment {{experiment}} {S} --images none --elements 6 --workers 1 --out {{out}}": {
         "--count": "0 -1 2000000000 99999999999999999999",
         "--count 1 --seed": "-1",
-        "--count 1 --across": "5 7 0 66 -6",
+        "--count 1 --elements": "5 7 0 66 -6",
         "--count 1 --workers": "0 -1",
         "--count 1 --scheduler": "nowhere tcp://127.0.0.1:1",
     },
-    f"validate {S} --frames {{recording}} --out {{out}} --across 6 --friction-frames 0": {
-        "--limit": "0 -1",
+    f"validate {S} --frames {{recording}} --out {{out}} --elements 6 --friction-frames 0": {
+        "--max-frames": "0 -1",
         "--seed": "-1",
         "--experiment": "nowhere",
         "--friction-frames": "-1",
     },
-    f"realism {{raw}} {U} --out {{out}}": {"--limit": "0 -1", "--quality": "best"},
-    f"calibrate optics {U} --frames {{raw}}": {"--out": "{out} {out}/spec", "--out {out}/spec.toml --limit": "0 -1"},
-    f"calibrate contact {S} --frames {{recording}} --out {{out}}/spec.toml --across 6 --workers 1": {
+    f"realism {{raw}} {U} --out {{out}}": {"--max-frames": "0 -1", "--quality": "best"},
+    f"calibrate optics {U} --frames {{raw}}": {"--out": "{out} {out}/spec", "--out {out}/spec.toml --max-frames": "0 -1"},
+    f"calibrate contact {S} --frames {{recording}} --out {{out}}/spec.toml --elements 6 --workers 1": {
         "--labels": "0 3 -1",
         "--seed": "-1",
         "--hold": "nonsense",
         "--workers": "0 -1",
     },
     f"robustness {U} --frames {{raw}} --out {{out}} --no-rendered": {
-        "--limit": "0 1 -1",
+        "--max-frames": "0 1 -1",
         "--jobs": "0 -1",
         "--pipeline": "magic nowhere.toml",
         "--model": "nowhere",
@@ -367,7 +368,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--model": "nowhere",
         "--camera": "nowhere http://127.0.0.1:1",
         "--arm": "nowhere mg400:127.0.0.1:1 mg400:999.1.1.1 magician:nowhere simulated:nowhere",
-        "--limits": "nowhere",
+        "--safety": "nowhere",
         "--servo": "nowhere",
         "--at-rest": "nowhere.png",
     },
@@ -411,7 +412,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--servo": "nowhere",
         "--model": "nowhere",
     },
-    f"study objects {S} --out {{out}} --across 6 --workers 1": {
+    f"study objects {S} --out {{out}} --elements 6 --workers 1": {
         "--count": "0 1 -1 2000000000",
         "--tests": "0 2000000000",
         "--train": "nowhere , plane,plane",
@@ -419,7 +420,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--epochs": "0",
         "--seed": "-1",
     },
-    f"study sim-to-real {S} --frames {{recording}} --out {{out}} --across 6 --workers 1": {
+    f"study sim-to-real {S} --frames {{recording}} --out {{out}} --elements 6 --workers 1": {
         "--labels": "0 -1 1000000",
         "--count": "0 -1 2000000000",
         "--draws": "0 -1 2000000000",
@@ -430,7 +431,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     },
     f"study tac-vgnn --data {{recording}} {S} --out {{out}} --no-contacts --models gnn": {
         "--seeds": "x -1 1.5",
-        "--labels": "both",
+        "--label-kind": "both",
         "--split": "-2",
         "--epochs": "0 -1",
         "--max-minutes": "nan",
@@ -440,7 +441,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--device": "tpu",
     },
 }
-SAMPLED_NUMBERS = ("--kind star", "--limit -1", "--hold nonsense", "--across 7")
+SAMPLED_NUMBERS = ("--kind star", "--max-frames -1", "--hold nonsense", "--elements 7")
 
 
 def _numbers() -> list[Entry]:
@@ -498,15 +499,16 @@ WRITE = {
     "preprocess": f"preprocess {{frames}} {S} --out {{there}}",
     "graph": f"graph {{frames}} {S} --out {{there}}",
     "pack": "pack {run} --out {there}",
-    "tune": f"tune {S} --frames {{frames}} --out {{there}}/mine.toml --limit 2",
-    "new": "new {frames} --out {there}/mine.toml --limit 2",
-    "dataset": f"dataset --experiment {{experiment}} {S} --count 1 --images none --across 6 --workers 1 --out {{there}}",
+    "tune": f"tune {S} --frames {{frames}} --out {{there}}/mine.toml --max-frames 2",
+    "new": "new {frames} --out {there}/mine.toml --max-frames 2",
+    "dataset": f"dataset --experiment {{experiment}} {S} --count 1 --images none --elements 6 --workers 1 --out {{there}}",
     "render": f"render {S} --object plane --indent-mm 1 --quality preview --out {{there}}",
-    "realism": f"realism {{raw}} {U} --out {{there}} --limit 1 --quality preview --no-two-sample",
-    "robustness": f"robustness {U} --frames {{raw}} --out {{there}} --no-rendered --jobs 1 --limit 2",
-    "validate": f"validate {S} --frames {{recording}} --out {{there}} --across 6 --limit 1 --friction-frames 0",
-    "calibrate optics": f"calibrate optics {U} --frames {{raw}} --out {{there}}/spec.toml --limit 1",
-    "calibrate contact": f"calibrate contact {S} --frames {{recording}} --out {{there}}/spec.toml --labels 4 --across 6 --workers 1",
+    "realism": f"realism {{raw}} {U} --out {{there}} --max-frames 1 --quality preview --no-two-sample",
+    "robustness": f"robustness {U} --frames {{raw}} --out {{there}} --no-rendered --jobs 1 --max-frames 2",
+    "validate": f"validate {S} --frames {{recording}} --out {{there}} --elements 6 --max-frames 1 --friction-frames 0",
+    "calibrate optics": f"calibrate optics {U} --frames {{raw}} --out {{there}}/spec.toml --max-frames 1",
+    "calibrate contact": f"calibrate contact {S} --frames {{recording}} --out {{there}}/spec.toml --num-labelled 4 --elements 6 "
+    f"--workers 1",
     "collect": f"collect --camera twin --arm simulated {S} --count 1 --out {{there}}",
     "servo": "servo --object can --steps 1 --out {there}",
     "live": f"live --model {SENSOR} --camera {{frames}} --headless --record {{there}}",
@@ -516,8 +518,9 @@ WRITE = {
     "learn": f"learn --task SurfaceFollow {S} --minutes 0.02 --environments 2 --out {{there}}",
     "policy": "policy {policy} --object can --steps 1 --plain-light --out {there}",
     "surrogate": f"surrogate {S} --paths 10 --workers 1 --out {{there}}/mine.safetensors",
-    "study objects": f"study objects {S} --count 2 --tests 1 --across 6 --workers 1 --epochs 1 --out {{there}}",
-    "study sim-to-real": f"study sim-to-real {S} --frames {{recording}} --labels 12 --count 10 --epochs 1 --workers 1 --out {{there}}",
+    "study objects": f"study objects {S} --count 2 --tests 1 --elements 6 --workers 1 --epochs 1 --out {{there}}",
+    "study sim-to-real": f"study sim-to-real {S} --frames {{recording}} --num-labelled 12 --count 10 --epochs 1 --workers 1 "
+    f"--out {{there}}",
     "study tac-vgnn": f"study tac-vgnn --data {{recording}} {S} --out {{there}} --models gnn --epochs 1 --batches 8 --no-contacts",
 }
 # commands that take seconds and may be given again for the same folder
@@ -612,7 +615,7 @@ def _outputs() -> list[Entry]:
     for command in AGAIN:
         call = WRITE[command].replace("{there}", "{out}")
         found.append(Entry("outputs", "its own, once more", call, exit=(DONE,), first=call, seconds=60, sample=command == "graph"))
-    own = "tune --sensor {spec} --frames {frames} --limit 2 --out {spec}"
+    own = "tune --sensor {spec} --frames {frames} --max-frames 2 --out {spec}"
     found.append(
         Entry("outputs", "its own specification", own, {"spec": shipped(f"sensors/{SENSOR}.toml", "my.toml")}, (REFUSED,), ("my.toml",))
     )
@@ -629,7 +632,7 @@ USE_RUN = {
     "pack": "pack {data} --out {out}",
     "live": "live --model {data} --camera {frames} --headless",
     "servo": "servo --object can --model {data} --steps 1 --out {out}",
-    "robustness": f"robustness {S} --model {{data}} --frames {{frames}} --no-rendered --jobs 1 --limit 2 --out {{out}}",
+    "robustness": f"robustness {S} --model {{data}} --frames {{frames}} --no-rendered --jobs 1 --max-frames 2 --out {{out}}",
     "study servo": "study servo --model {data} --objects can --steps 1 --out {out}",
 }
 WEIGHTS: dict[str, Callable[[Path], object]] = {
@@ -712,7 +715,7 @@ def _gone_on() -> list[Entry]:
     """The same command again, after what it works on has changed under the same name."""
     learn = f"train --model gnn {S} --data {{recording}} --epochs 3 --out {{out}}"
     study = f"study tac-vgnn --data {{recording}} {S} --out {{out}} --models gnn --epochs 1 --batches 8 --no-contacts"
-    simulate = f"dataset --experiment {{experiment}} {S} --object {{mesh}} --images none --across 6 --workers 1 --out {{out}} --count"
+    simulate = f"dataset --experiment {{experiment}} {S} --object {{mesh}} --images none --elements 6 --workers 1 --out {{out}} --count"
     changes: dict[str, Callable[[Path], object]] = {
         "labels": lambda path: given.text(lambda t: t.replace("-", ""))(path / LABELS),
         "frames": lambda path: shutil.copy(path / "frames_bw" / "f_9.png", path / "frames_bw" / BAD),
@@ -774,7 +777,7 @@ def _sessions() -> list[Entry]:
 
 def _collected() -> list[Entry]:
     """Data sets and tuned files that were damaged."""
-    again = f"dataset --experiment {{experiment}} {S} --images none --count 3 --across 6 --workers 1 --out {{out}}"
+    again = f"dataset --experiment {{experiment}} {S} --images none --count 3 --elements 6 --workers 1 --out {{out}}"
     found = []
     for what, name, edit in (
         ("generation.json empty", "generation.json", given.with_bytes(lambda data: b"")),
@@ -823,7 +826,7 @@ def _ends() -> list[Entry]:
         ):
             end = (after_s, int(number), processes)
             found.append(Entry("ends", what, call, exit=exits, leaves=("*",), end=end, seconds=60))
-    workers = f"dataset --experiment {{experiment}} {S} --count 4 --images none --across 6 --workers 2 --out {{out}}"
+    workers = f"dataset --experiment {{experiment}} {S} --count 4 --images none --elements 6 --workers 2 --out {{out}}"
     found.append(Entry("ends", "with two workers", workers, exit=(DONE,), seconds=120))
     found.append(Entry("ends", "with an unwritable home", f"preprocess {{frames}} {S} --out {{out}}", exit=(DONE,), env=NO_HOME))
     found.append(Entry("ends", "with an unwritable home", "doctor", exit=(DONE,), env=NO_HOME, seconds=90))

@@ -49,7 +49,7 @@ class Entry:
     end : (float, int, int)
         After so many seconds it is sent this signal, counted from when it consists of so many processes.
     env : dict of str to str
-        Environment of a Python that is started anew for this call.
+        Environment of a Python that is started again for this call.
     sample : bool
         Part of the quick tests.
     """

@@ -125,7 +125,7 @@ class Harmless:
         return self._made("run", "train", "--model", "gnn", "--sensor", SENSOR, "--data", self.recording, "--epochs", 1)
 
     @cached_property
-    def begun(self) -> Path:
+    def begin_info(self) -> Path:
         """A run that ended before it was finished, with its checkpoint."""
         asked = ("train", "--model", "gnn", "--sensor", SENSOR, "--data", self.recording, "--epochs", 3, "--max-minutes", 0)
         return self._made("begun", *asked)
@@ -138,7 +138,7 @@ class Harmless:
     @cached_property
     def tuned(self) -> Path:
         """What 'twin tune' writes."""
-        return self._made("tuned.toml", "tune", "--sensor", SENSOR, "--frames", self.frames, "--limit", 2)
+        return self._made("tuned.toml", "tune", "--sensor", SENSOR, "--frames", self.frames, "--max-frames", 2)
 
     @cached_property
     def session(self) -> Path:
@@ -162,7 +162,7 @@ class Harmless:
     @cached_property
     def dataset(self) -> Path:
         """A small simulated data set."""
-        size = ("--images", "none", "--count", 2, "--across", 6, "--workers", 1)
+        size = ("--images", "none", "--count", 2, "--elements", 6, "--workers", 1)
         return self._made("dataset", "dataset", "--experiment", self.experiment, "--sensor", SENSOR, *size)
 
     def _made(self, name: str, *arguments: object, out: str = "--out") -> Path:

@@ -1,4 +1,4 @@
-"""What is wrong now: a part of what the test of an entry reports, and the names of the entries. Each mend removes its lines."""
+"""What is wrong now: a part of what the test of an entry reports, and the names of the entries. Each repair removes its lines."""
 
 WRONG: dict[str, tuple[str, ...]] = {}
 TOGETHER: tuple[str, ...] = ()  # both run in one folder and write over each other

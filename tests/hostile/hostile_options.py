@@ -96,7 +96,7 @@ TOLD_TABLE: dict[str, tuple[Edit, str]] = {
 READ_TABLES = {  # by option
     "audit": f"audit {{recording}} {S} --table {{data}} --out {{out}}",
     "train": f"train --model gnn {S} --data {{recording}} --table {{data}} --epochs 1 --out {{out}}",
-    "new": "new {frames} --table {data} --limit 2 --out {out}/mine.toml",
+    "new": "new {frames} --table {data} --max-frames 2 --out {out}/mine.toml",
     "predict": f"predict {SENSOR} {{frames}} --table {{data}}",
 }
 
@@ -226,7 +226,7 @@ def _options() -> list[Entry]:
         alone = {"data": lambda folder, good, make=one["data"]: make(folder, good) / BAD}
         found.append(Entry("formats", what, f"preprocess {{data}} {S} --out {{out}}", one, (DONE,), (BAD,), sample=what == "damaged JPEG"))
         for call in (
-            "new {frames} --no-contact {data} --limit 4 --out {out}/mine.toml",
+            "new {frames} --no-contact {data} --max-frames 4 --out {out}/mine.toml",
             f"live --model {SENSOR} --camera {{frames}} --headless --at-rest {{data}}",
             "servo --object can --steps 1 --out {out} --at-rest {data}",
         ):
@@ -243,10 +243,10 @@ def _options() -> list[Entry]:
     for call in READ_TABLES.values():
         found += [Entry("tables elsewhere", what, call, {"data": make}, (REFUSED,), ("table.csv",)) for what, make in TABLES.items()]
     for layout in LAYOUTS:
-        call = f"new {{frames}} --layout {layout} --limit 2 --out {{out}}/mine.toml"
+        call = f"new {{frames}} --layout {layout} --max-frames 2 --out {{out}}/mine.toml"
         found.append(Entry("layouts", layout, call, {}, (REFUSED, USAGE), ("|".join(filter(None, layout.split(":"))),)))
     for what, content in PLACES.items():
-        call = "new {frames} --layout positions:{data} --limit 2 --out {out}/mine.toml"
+        call = "new {frames} --layout positions:{data} --max-frames 2 --out {out}/mine.toml"
         found.append(Entry("layouts", f"places: {what}", call, {"data": written("places.csv", content)}, (REFUSED,), ("places.csv|pins",)))
     for what, pins in PINS.items():
         make = {"data": written("mine.toml", OWN_SENSOR.format(pins=pins))}

@@ -78,7 +78,7 @@ class Laboratory:
             anew = [word.format_map(paths | {"out": place / "anew"}) for word in entry.call.split()]
             fresh = self._end(entry, anew, place, paths)
             if self._plain(fresh, place / "anew") != self._plain(ended, paths["out"]):
-                found.append("another answer than begun anew, and no word about it")
+                found.append("another answer than begun again, and no word about it")
         shutil.rmtree(place)
         return found
 
@@ -213,7 +213,7 @@ def test_a_hostile_call_ends_well(laboratory: Laboratory, entry: Entry) -> None:
 
 TWO_AT_ONCE = {  # calls that take seconds, in one folder
     "train": f"train --model vgnn --sensor {SENSOR} --data {{recording}} --epochs 40 --members 1 --no-kernel --out {{out}}",
-    "dataset": f"dataset --experiment {{experiment}} --sensor {SENSOR} --count 40 --images none --across 6 --workers 1 --out {{out}}",
+    "dataset": f"dataset --experiment {{experiment}} --sensor {SENSOR} --count 40 --images none --elements 6 --workers 1 --out {{out}}",
     "preprocess": f"preprocess {{recording}} --sensor {SENSOR} --overlay --out {{out}}",
 }
 
@@ -249,7 +249,7 @@ def test_names_are_unique_and_known_faults_are_of_entries() -> None:
 
 @pytest.mark.slow
 def test_the_laws_refuse_what_they_should() -> None:
-    """The judge itself: each kind of bad end is called one."""
+    """The evaluate itself: each kind of bad end is called one."""
     good = Ended(1, "", f"{ERROR}f_3.png: cut; copy it again\n", 1.0, 1.0, 2**28, False, 0)
     entry = Entry("pictures", "cut", f"predict {SENSOR} x", says=("f_3.png",))
     assert how_it_ended(entry, good) == []

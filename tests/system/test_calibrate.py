@@ -6,10 +6,10 @@ import pytest
 from command import run_twin
 
 from scenes import load_object, load_sensor
-from twin.fit import optics as calibration
-from twin.fit.optics import fit_optics
-from twin.fit.sensor_file import write_sensor
-from twin.judge.pictures.aligned import revised
+from twin.calibration import optics as calibration
+from twin.calibration.optics import fit_optics
+from twin.calibration.sensor_file import write_sensor
+from twin.evaluation.pictures.aligned import with_changes
 from twin.mechanics import ContactPose
 from twin.simulator import Simulator
 
@@ -36,7 +36,7 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path):
     """A stage that has been done is read, not run: its result is the file's."""
     spec = load_sensor(SENSOR)
     log = calibration._Log(tmp_path, spec, [("a.png", np.zeros((2, 2), np.uint8), None)])
-    done = log.stage("00-one", lambda s: revised(s, gel={"haze": 0.125}), spec)
+    done = log.stage("00-one", lambda s: with_changes(s, gel={"haze": 0.125}), spec)
     again = calibration._Log(tmp_path, spec, [("a.png", np.zeros((2, 2), np.uint8), None)])
     assert again.stage("00-one", lambda s: pytest.fail("run again"), spec) == done
     other = calibration._Log(tmp_path, spec, [("a.png", np.ones((2, 2), np.uint8), None)])
@@ -48,7 +48,7 @@ def test_a_known_sensor_is_found_again(tmp_path):
     """Frames of a sensor with its own print, lights and sharpness; the shipped specification is the start."""
     start = load_sensor(SENSOR)
     rng = np.random.default_rng(2)
-    truth = revised(
+    truth = with_changes(
         start,
         leds={"power": 1.3 * start.leds.power, "balance": (1.15, 0.9, 1.0, 1.1, 0.85, 1.0)},
         appearance={"cap_levels": tuple((1 + 0.1 * rng.standard_normal(331)).tolist()), "cap_shapes": (), "specks": ()},

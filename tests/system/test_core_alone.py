@@ -19,7 +19,7 @@ WORKING = {
     "new": "new frames/frame.png --layout hexagon:6 --out mine.toml",
     "tune": f"tune --frames frames/frame.png --sensor {SENSOR} --out tuned.toml",
     "check": f"check frames/frame.png --sensor {SENSOR}",
-    "validate": f"validate --sensor {SENSOR} --frames taps --experiment gentle.toml --friction-frames 0 --across {ACROSS} --out fit",
+    "validate": f"validate --sensor {SENSOR} --frames taps --experiment gentle.toml --friction-frames 0 --elements {ACROSS} --out fit",
     "robustness": f"robustness --sensor {SENSOR} --pipeline twin --frames taps --conditions torn.toml --no-rendered --jobs 1 --out borne",
 }
 NEEDING = {
@@ -51,7 +51,7 @@ def test_the_core_is_enough_for(ended, name):
 
 def test_calibration_needs_no_library_of_an_extra():
     """It takes minutes; the code behind it, with all that it imports, names none."""
-    assert "torch" not in code_of("twin.fit.optics", "twin.fit.contact.calibrate", "twin.fit.go_on").libraries
+    assert "torch" not in code_of("twin.calibration.optics", "twin.calibration.contact.calibrate", "twin.calibration.go_on").libraries
 
 
 @pytest.mark.parametrize("extra", NEEDING)

@@ -30,7 +30,7 @@ class Job:
     def arguments(self, workers: int, *options: str) -> list[str]:
         """Of ``twin``."""
         fixed = ["dataset", "--experiment", self.experiment, "--sensor", SENSOR, "--images", "none", "--randomise", "contact"]
-        sized = ["--count", self.count, "--across", ACROSS, "--out", self.out]
+        sized = ["--count", self.count, "--elements", ACROSS, "--out", self.out]
         return [str(part) for part in (*fixed, *sized, "--workers", workers, *options)]
 
     def start(self, *options: str, workers: int = 1) -> subprocess.Popen:

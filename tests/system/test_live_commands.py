@@ -20,12 +20,12 @@ from true_estimator import TrueEstimate, TrueEstimator
 from typer.testing import CliRunner
 
 from hardware.arms.simulated import SimulatedArm
-from hardware.cameras.reader import LiveSource, Picture
+from hardware.cameras.reader import DevicePicture, LiveSource
 from hardware.cameras.session import SessionSource
 from hardware.cameras.twin import preview_of
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.emulators.running import run_until_told
+from hardware.emulators.running import run_until_signal
 from hardware.errors import DeviceError
 from hardware.live.live import LiveSession, Shower, WatchPlan, watch
 from hardware.rig.geometry import PlacedObject
@@ -44,7 +44,7 @@ from twin.pins import Pipeline
 from twin.pins.batch import voronoi_map
 from twin.records import open_records
 from twin.rig.mounting import Mounting
-from twin.studio.live_page import LivePage, shot_pictures
+from twin.studio.live_page import LivePage, frame_pictures
 from twin.types import Form, Frame
 
 STEPS = 6
@@ -61,7 +61,7 @@ class StandIn:
     def check(self, sensor, form) -> None:
         assert form == self.form
 
-    def remembering(self) -> "StandIn":
+    def with_history(self) -> "StandIn":
         return self
 
     def seeking_rest(self) -> "StandIn":
@@ -230,10 +230,10 @@ class ShownPictures(LiveSource):
     def _close(self) -> None:
         pass
 
-    def _grab(self) -> Picture:
+    def _grab(self) -> DevicePicture:
         self._end.wait(0.02)
         self._next += 1
-        return Picture(self._images[self._next % len(self._images)], time.monotonic())
+        return DevicePicture(self._images[self._next % len(self._images)], time.monotonic())
 
 
 @pytest.mark.slow
@@ -291,7 +291,7 @@ def test_a_view_draws_pins_graph_cells_and_text():
     other = voronoi_map(image.shape, seen, 0.5 * seen.graph.area_px2)
     inside = tuple(np.round(seen.graph.nodes_px[0]).astype(int)[::-1])
     assert tuple(same[inside]) != tuple(other[inside])
-    camera, cells = shot_pictures(sensor, pipeline.reference, frame, seen)
+    camera, cells = frame_pictures(sensor, pipeline.reference, frame, seen)
     assert camera.shape == cells.shape == (*image.shape, 3)
     assert (camera[inside] != image[inside]).any()
     assert tuple(cells[inside]) == tuple(voronoi_map(image.shape, seen, pipeline.reference.area_px2)[inside])
@@ -380,7 +380,7 @@ def test_pins_are_not_counted_from_a_pressed_sensor(tmp_path):
 
 def test_an_emulator_that_fails_ends_with_its_error():
     with pytest.raises(DeviceError, match="the arm is gone"):
-        run_until_told(nullcontext(), lambda: "a device", failure=lambda: DeviceError("the arm is gone"))
+        run_until_signal(nullcontext(), lambda: "a device", failure=lambda: DeviceError("the arm is gone"))
 
 
 @pytest.mark.slow

@@ -7,9 +7,9 @@ import pytest
 
 from scenes import load_object, load_sensor
 from twin.camera.projection import project
+from twin.evaluation.pictures.images import compare_images
 from twin.frames import open_recording
 from twin.frames.forms import recording_to_raw
-from twin.judge.pictures.images import compare_images
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.pins import Pipeline, nominal_reference

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from scenes import load_experiment, load_object, load_sensor
-from twin.judge.labelled import ContactModel, compare, measure_frames, table_of
-from twin.judge.labelled.compare import pin_errors
+from twin.evaluation.labelled import ContactModel, compare, measure_frames, table_of
+from twin.evaluation.labelled.compare import pin_errors
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 

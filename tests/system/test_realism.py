@@ -8,7 +8,7 @@ import pytest
 from command import run_twin
 
 from scenes import load_object, load_sensor
-from twin.judge.pictures.realism import run_realism
+from twin.evaluation.pictures.realism import run_realism
 from twin.mechanics import ContactPose
 from twin.simulator import Simulator
 

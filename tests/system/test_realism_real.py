@@ -7,8 +7,8 @@ import pytest
 from scenes import load_sensor
 from training.data.two_sample import two_sample
 from twin.camera.projection import lens_disc
-from twin.judge.pictures.frames import read_real
-from twin.judge.pictures.statistics import TARGET, TARGET_MEASURES, compare_statistics, measure_frame
+from twin.evaluation.pictures.frames import read_real
+from twin.evaluation.pictures.statistics import TARGET, TARGET_MEASURES, compare_statistics, measure_frame
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 

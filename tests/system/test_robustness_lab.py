@@ -5,14 +5,14 @@ import pytest
 from command import run_twin as run
 
 from scenes import load_sensor
+from twin.evaluation.degradation.condition import DegradedCase
+from twin.evaluation.degradation.conditions import CONDITIONS
+from twin.evaluation.degradation.envelope import curves_of, envelopes_of
+from twin.evaluation.degradation.shots import CONTACTS, RenderedSource
+from twin.evaluation.degradation.study import consensus
+from twin.evaluation.degradation.sweep import SweepSettings, run_sweep
 from twin.frames import open_recording
 from twin.frames.images import write_image
-from twin.judge.degradation.condition import Case
-from twin.judge.degradation.conditions import CONDITIONS
-from twin.judge.degradation.envelope import curves_of, envelopes_of
-from twin.judge.degradation.shots import CONTACTS, RenderedSource
-from twin.judge.degradation.study import consensus
-from twin.judge.degradation.sweep import Plan, run_sweep
 from twin.pins import make_detector, shipped_detector, tune
 from twin.pins.reference import nominal_reference
 from twin.types import Form
@@ -35,7 +35,7 @@ def test_tune_check_and_robustness_from_the_command_line(tmp_path):
     frames = tmp_path / "frames"
     frames.mkdir()
     for k, name in enumerate(("noise", "motion-blur")):
-        shot = source.shoot(Case((CONDITIONS[name],)), 0.01)[0]
+        shot = source.render(DegradedCase((CONDITIONS[name],)), 0.01)[0]
         write_image(frames / f"{k}.png", shot.frame.image)
     tuned = run("tune", "--sensor", "mg400-127", "--frames", frames, "--out", tmp_path / "mine.toml")
     assert tuned.returncode == 0, tuned.stderr
@@ -44,7 +44,7 @@ def test_tune_check_and_robustness_from_the_command_line(tmp_path):
     assert checked.returncode == 0 and "GOOD" in checked.stdout, checked.stdout + checked.stderr
     plan = tmp_path / "plan.toml"
     plan.write_text('steps = [1.0]\n[[condition]]\nname = "hot-pixels"\n[[condition]]\nname = "caps-faded"\n')
-    pipelines = ("--pipeline", "twin", "--pipeline", tmp_path / "mine.toml", "--conditions", plan, "--jobs", "1", "--limit", "2")
+    pipelines = ("--pipeline", "twin", "--pipeline", tmp_path / "mine.toml", "--conditions", plan, "--jobs", "1", "--max-frames", "2")
     swept = run("robustness", "--sensor", "mg400-127", "--frames", frames, "--out", tmp_path / "out", *pipelines)
     assert swept.returncode == 0, swept.stderr
     assert "hot-pixels" in swept.stdout and "caps-faded" in (tmp_path / "out" / "index.html").read_text()  # named as left out
@@ -85,11 +85,11 @@ def test_real_frames_fail_where_rendered_ones_do(real_dir, tmp_path):
     ours = shipped_detector(spec, Form.RAW)
     real, refused = consensus(spec, frames, [ours, tune(frames, spec, "adaptive").detector])
     assert len(refused) <= 1
-    cases = tuple(Case((CONDITIONS[name],)) for name in COMPARED)
+    cases = tuple(DegradedCase((CONDITIONS[name],)) for name in COMPARED)
     pitch_px = float(nominal_reference(spec, Form.RAW).spacing_px.mean())
     found = []
     for kind, source in (("real", real), ("rendered", RenderedSource(spec, CONTACTS))):
-        rows = run_sweep(Plan(source, (ours,), cases, STEPS), tmp_path / kind, jobs=2, progress=lambda done, total: None)
+        rows = run_sweep(SweepSettings(source, (ours,), cases, STEPS), tmp_path / kind, jobs=2, progress=lambda done, total: None)
         found.append([e.severity for e in envelopes_of(curves_of(rows, cases, pitch_px), cases)])
     ends = np.minimum(found, 1.0)  # where neither fails within the range they agree
     ratio = ends[0] / ends[1]

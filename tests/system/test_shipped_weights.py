@@ -14,7 +14,7 @@ from fresh_contacts import read_for, simulate_contacts
 
 from training.estimate.estimator import PoseEstimator
 from training.runs.packed import shipped_names
-from training.studies.judging import judge
+from training.studies.judging import measure_errors
 from twin.frames import open_recording
 from twin.types import Form
 
@@ -31,7 +31,7 @@ class Stated:
     inside: tuple[float, ...]
 
 
-TACPAD = "ur5-tacpad"  # learnt from real frames alone, and judged on them
+TACPAD = "ur5-tacpad"  # learnt from real frames alone, and evaluated on them
 LOOKED_AT = 30  # of its frames
 EXPERIMENTS = {"mg400-331": "surface-2d", "mg400-127": "surface-2d", "ur5-331": "surface-3d"}
 QUICK, FULL = (5, 12), (40, 16)  # contacts, elements across
@@ -72,7 +72,7 @@ def test_shipped_weights_predict_within_their_stated_error(name, size, tmp_path)
     folder = simulate_contacts(tmp_path, name, EXPERIMENTS[name], contacts, seed=SEED, across=across, raw=raw)
     data = read_for(estimator, folder)
     rows = np.arange(len(data))
-    found = judge(estimator.predict_rows(data, rows), data, rows)["corrected"]
+    found = measure_errors(estimator.predict_rows(data, rows), data, rows)["corrected"]
     error, inside = ([found[label][key] for label in estimator.names] for key in ("mae", "coverage_90"))
     print(f"{name}, {contacts} contacts, {across} across, {len(rows)} states: errors {np.round(error, 4)}, inside {np.round(inside, 3)}")
     assert error == pytest.approx(STATED[name, size].error, rel=RELATIVE)

@@ -76,11 +76,11 @@ def test_each_mode_opens(studio, mode):
     with open_page(studio.page.url) as (page, messages):
         studio.page.choose(mode)
         wanted = {
-            "Degrade": "Find the edge",
-            "Recording": "Next doubt",
+            "Degrade": "Find breaking point",
+            "Recording": "Next doubtful label",
             "Live": "EMERGENCY STOP",
             "Your own sensor": "Propose a specification",
-            "Twin": "Begin the contact anew",
+            "Twin": "Restart contact",
         }[mode]
         page.get_by_text(wanted).first.wait_for(state="visible", timeout=20_000)
         assert not messages

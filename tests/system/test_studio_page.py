@@ -53,7 +53,7 @@ def client(studio):
 
 
 def write_recording(folder, spec, count):
-    """A labelled recording of drawn frames; its first label can't be right."""
+    """A labelled recording of rasterised frames; its first label can't be right."""
     reference, rng = nominal_reference(spec, Form.PROCESSED), np.random.default_rng(0)
     (folder / "frames_bw").mkdir(parents=True)
     write_image(folder / "init_0.png", drawn_frame(spec, Form.PROCESSED, reference.pins_px).image)
@@ -131,7 +131,7 @@ def test_sliders_undo_and_what_is_shown(client):
     since = len(client.updates)
     client.set("Undo", True)
     client.wait(lambda u: abs(u.depth_mm - 1.0) < 1e-4, WAIT_S, since=since)
-    for label, value, word in (("pins by", "pressure", "MPa"), ("frame", "recording", "mm"), ("frame", "raw", "mm")):
+    for label, value, word in (("colour pins by", "pressure", "MPa"), ("frame", "recording", "mm"), ("frame", "raw", "mm")):
         since = len(client.updates)
         client.set(label, value)
         client.wait(lambda u, word=word: word in u.html, WAIT_S, since=since)
@@ -224,9 +224,9 @@ def test_degrade_shows_the_same_contact_with_its_limits(client):
     client.set("severity 1", 1.0)
     html = wait_html(client, "class='bad'")
     assert since < len(client.updates)
-    client.set("Find the edge", True)
+    client.set("Find breaking point", True)
     assert re.search(r"Edge for this contact: .* is borne up to", wait_html(client, "Edge for this contact"))
-    client.set("Nothing is wrong", True)
+    client.set("Reset", True)
     client.set("mode", "Twin")
 
 
@@ -372,13 +372,13 @@ def test_a_name_that_leads_to_this_machine_by_chance_is_refused():
 
 
 def test_values_that_no_browser_gives_are_refused_and_put_back(client):
-    held = {name: client.value(name) for name in ("friction", "object", "frame", "pins by")}
+    held = {name: client.value(name) for name in ("friction", "object", "frame", "colour pins by")}
     for label, value, reason in (
         ("friction", -1.0, "friction -1: give a number from 0 to"),
         ("friction", float("nan"), "friction nan"),
         ("object", "../../x", "../../x"),
         ("frame", "cooked", "cooked&#x27; is no value"),
-        ("pins by", "smell", "smell&#x27; is no value"),
+        ("colour pins by", "smell", "smell&#x27; is no value"),
     ):
         client.set(label, value)
         wait_html(client, reason)

@@ -1,4 +1,4 @@
-"""From a recording on disk to a trained, judged and used model, by the commands a user types (in this process: starting is slow)."""
+"""From a recording on disk to a trained, evaluated and used model, by the commands a user types (in this process: starting is slow)."""
 
 import csv
 import json
@@ -16,12 +16,12 @@ from scenes import load_experiment, load_sensor
 from training.data.dataset import load_dataset
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
-from training.studies.sim_to_real import Plan
+from training.studies.sim_to_real import SimToRealPlan
+from training.studies.sim_to_real.inverse_estimates import READ, read_twin
+from training.studies.sim_to_real.label_efficiency import label_efficiency
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
-from training.studies.sim_to_real.read import READ, read_twin
 from training.studies.sim_to_real.steps import arm_labels
 from training.studies.sim_to_real.taught import teach
-from training.studies.sim_to_real.worth import worth
 from twin.cli import command_line
 from twin.errors import FrameError, TwinError
 from twin.pins import nominal_reference
@@ -80,7 +80,7 @@ def test_a_trained_run_is_judged_and_used(recording, run, tmp_path):
 def test_the_papers_models_take_the_same_way(model, recording, tmp_path):
     common = ("--data", recording, "--out")
     twin("train", "--model", model, "--sensor", "mg400-127", *common, tmp_path / "run", "--epochs", 1)
-    twin("evaluate", tmp_path / "run", *common, tmp_path / "judged", "--labels", "raw")
+    twin("evaluate", tmp_path / "run", *common, tmp_path / "judged", "--label-kind", "raw")
     assert "pose_6" in twin("predict", tmp_path / "run", recording / "frames_bw" / "f_3.png")
 
 
@@ -106,7 +106,7 @@ def test_the_papers_comparison_is_one_command_and_goes_on_where_it_was(recording
 def test_objects_never_seen_are_one_command_and_go_on_where_they_were(tmp_path):
     (tmp_path / "gentle.toml").write_text(EXPERIMENT)
     command = ("study", "objects", "--sensor", SENSOR, "--train", "plane,sphere", "--unseen", "cylinder", "--count", 3, "--tests", 2)
-    command += ("--experiment", tmp_path / "gentle.toml", "--epochs", 2, "--workers", 1, "--across", ACROSS, "--out", tmp_path / "study")
+    command += ("--experiment", tmp_path / "gentle.toml", "--epochs", 2, "--workers", 1, "--elements", ACROSS, "--out", tmp_path / "study")
     said = twin(*command)
     rows = list(csv.DictReader((tmp_path / "study" / "objects.csv").open()))
     assert [(row["model"], row["object"], row["seen"]) for row in rows] == [
@@ -133,7 +133,7 @@ def assert_labels_of_frames_without_are_not_used(plan, out):
     """A network is taught the same whatever is written beside the frames whose labels the twin tells."""
     real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets).in_order()
     states = load_dataset(plan.simulated[0], plan.sensor, plan.experiment.targets, form=real.pins.form)
-    read, labels, few = read_twin([states], plan.touched, plan.experiment, seed=0), arm_labels(real), np.arange(0, len(real), 3)
+    read, labels, few = read_twin([states], plan.target_object, plan.experiment, seed=0), arm_labels(real), np.arange(0, len(real), 3)
     others, wrong = np.setdiff1d(np.arange(len(real)), few), real.targets.corrected.copy()
     wrong[others] += 100
     odd = [ArmLabel(label.pose + 100 * (row in others), label.move) for row, label in enumerate(labels)]
@@ -149,9 +149,9 @@ def assert_labels_of_frames_without_are_not_used(plan, out):
 @pytest.mark.parametrize("left_out", [(), WITHOUT_ONE], ids=["full", "ablation"])
 def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_was(tmp_path, left_out):
     (tmp_path / "gentle.toml").write_text(EXPERIMENT)
-    gentle = ("--sensor", SENSOR, "--experiment", tmp_path / "gentle.toml", "--across", ACROSS, "--workers", 1)
+    gentle = ("--sensor", SENSOR, "--experiment", tmp_path / "gentle.toml", "--elements", ACROSS, "--workers", 1)
     twin("dataset", *gentle, "--images", "none", "--count", 20, "--seed", 7, "--randomise", "contact", "--out", tmp_path / "frames")
-    command = ("study", "sim-to-real", *gentle, "--frames", tmp_path / "frames", "--labels", 10, "--count", 16, "--draws", 1)
+    command = ("study", "sim-to-real", *gentle, "--frames", tmp_path / "frames", "--num-labelled", 10, "--count", 16, "--draws", 1)
     command += (*(["--ablate"] if left_out else []), "--epochs", 2, "--out", tmp_path / "study")
     said, sims = twin(*command), tmp_path / "study" / "sim"
     rows = list(csv.DictReader((tmp_path / "study" / "study.csv").open()))
@@ -164,8 +164,10 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
     judged = [line for line in said.splitlines() if "labelled" in line and "pose_2" in line]
     assert len(judged) == len(rows) and [line for line in twin(*command).splitlines() if line in judged] == judged
     assert [weights.stat().st_mtime_ns for weights in trained] == written, "trained once"
-    plan = Plan(load_sensor(SENSOR), tmp_path / "frames", load_experiment(str(tmp_path / "gentle.toml")), labels=8, simulated=(sims,))
-    curves = worth(plan, tmp_path / "worth", (0, 1))
+    plan = SimToRealPlan(
+        load_sensor(SENSOR), tmp_path / "frames", load_experiment(str(tmp_path / "gentle.toml")), labels=8, simulated=(sims,)
+    )
+    curves = label_efficiency(plan, tmp_path / "worth", (0, 1))
     assert not any("without labels" in row["trained_on"] for row in curves), "a plate's frames without labels would tell nothing"
     assert {row["labelled_frames"] for row in curves if row["model"] == READ and row["trained_on"] == BOTH} >= {0, 5, 8}
     assert {row["trained_on"] for row in curves} == {REAL, BOTH, REAL + EVENLY, BOTH + EVENLY}
@@ -179,7 +181,7 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
 
 def test_an_audit_of_few_frames_says_that_they_are_too_few(recording, tmp_path):
     said = twin("audit", recording, "--sensor", "mg400-127", "--out", tmp_path)
-    assert "70 frames: 70 frames in contact are too few to tell which moves were executed" in said
+    assert "70 frames: 70 frames in contact are too few to find out which moves were executed" in said
     assert set(json.loads((tmp_path / "audit.json").read_text())) >= {"no_contact", "not_told"}
     assert "<h1>" in (tmp_path / "audit.html").read_text() and not (tmp_path / "labels_corrected.csv").exists()
 

@@ -76,7 +76,7 @@ def trained(data, made_once):
 
 @pytest.fixture(scope="session")
 def contacts(made_once):
-    """Folder of a simulated data set, and of a run of ``touch`` that learnt from it."""
+    """Folder of a simulated data set, and of a run of ``touch`` that was trained on it."""
 
     def make(home):
         (home / "presses.toml").write_text(PRESSES)

@@ -8,27 +8,27 @@ import numpy as np
 
 from scenes import load_experiment, load_object, load_randomisation, load_sensor
 from scenes.randomisation import FrictionSpread
-from training.data.audit import STORIES, Audit
+from training.data.audit import HYPOTHESES, Audit
 from training.data.pins import PinTable
 from training.data.targets import PRESETS
 from training.studies.label_audit import summary_of, write_audit
-from training.studies.objects import Plan, verdicts
+from training.studies.objects import ObjectsPlan, verdicts
 from training.studies.tac_vgnn import page as study_report
 from training.studies.tac_vgnn.contacts import AreaChange
 from training.studies.tac_vgnn.models import plan_run
+from twin.calibration.contact.report import write_calibration
+from twin.calibration.optics import Calibration
+from twin.calibration.optics import write_page as write_calibration_page
 from twin.demo.page import ContactContent
 from twin.demo.page import write_page as write_demo_page
 from twin.demo.stages import DepthRow
-from twin.fit.contact.report import write_calibration
-from twin.fit.optics import Calibration
-from twin.fit.optics import write_page as write_calibration_page
-from twin.judge.labelled.model import MeasuredFrames
-from twin.judge.pictures import report as realism
-from twin.judge.pictures.compare import Pair
-from twin.judge.pictures.frames import RealFrame
-from twin.judge.pictures.images import ImageFigures
-from twin.judge.pictures.spectra import RadialRow
-from twin.judge.pictures.statistics import RADIAL_MEASURES
+from twin.evaluation.labelled.model import MeasuredFrames
+from twin.evaluation.pictures import report as realism
+from twin.evaluation.pictures.compare import Pair
+from twin.evaluation.pictures.frames import RealFrame
+from twin.evaluation.pictures.images import ImageFigures
+from twin.evaluation.pictures.spectra import RadialRow
+from twin.evaluation.pictures.statistics import RADIAL_MEASURES
 from twin.pins import make_graph, nominal_reference
 from twin.report.charts import new_figure, write_chart
 from twin.report.table import write_table
@@ -91,7 +91,7 @@ def across_objects(out: Path) -> Path:
 
     experiment = load_experiment("objects-2d")
     train, unseen = (load_object("plane"), load_object("sphere")), (load_object("edge"),)
-    plan = Plan(load_sensor(SENSOR), experiment, load_randomisation("moves"), train, unseen, count=100, tests=50, across=24)
+    plan = ObjectsPlan(load_sensor(SENSOR), experiment, load_randomisation("moves"), train, unseen, count=100, tests=50, across=24)
     rows = [
         {"model": model, "object": thing.name, "seen": thing.name in seen, "contacts": 50, "states": 1204}
         | {f"{label}_{part}": (-0.1 if part == "bias" else 1.2) * (1 + k) for label in LABELS for part in ("error", "bias", "times")}
@@ -181,8 +181,8 @@ def audit(out: Path) -> Path:
     flags = {name: np.arange(frames) % 7 == k for k, name in enumerate(("no_contact", "wrong_sign", "odd"))}
     found = Audit(
         executed=np.ones(frames),
-        chi2=rng.uniform(1, 99, (frames, len(STORIES))),
-        twins=np.arange(frames),
+        chi2=rng.uniform(1, 99, (frames, len(HYPOTHESES))),
+        duplicates=np.arange(frames),
         depth_per_move=0.015,
         drift={"r2": 0.07},
         **flags,

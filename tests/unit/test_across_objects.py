@@ -1,4 +1,4 @@
-"""Several objects as one data set, and a model judged on those it never saw."""
+"""Several objects as one data set, and a model evaluated on those it never saw."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,10 +8,10 @@ import pytest
 from small_generation import small_config
 
 from scenes import RandomisationSpec, load_object
-from training.data.dataset import joined, split_rows, with_common_labels
+from training.data.dataset import join_datasets, split_rows, with_common_labels
 from training.errors import TrainingError
 from training.runs.run import fold_rows
-from training.studies.objects import Plan, rows_in_range, verdicts
+from training.studies.objects import ObjectsPlan, rows_in_range, verdicts
 from training.studies.objects.plan import MIXED
 from twin.errors import FrameError
 from twin.pins import make_reference
@@ -33,7 +33,7 @@ def places(found, rows):
 
 def test_contacts_of_different_sets_stay_apart_and_whole(data):
     parts = [named(data, "sim/plane", 0, 45), named(data, "sim/ball", 45, 45)]
-    both = joined(parts)
+    both = join_datasets(parts)
     assert len(both) == 90 and len(np.unique(both.group)) == 10, "the sets number their contacts alike, and mean different ones"
     for rows in (split_rows(len(both), 3, both.group)[1], fold_rows(np.arange(90), 0, 0, both.group)[0]):
         assert 0 < len(rows) < 90 and len(rows) == STATES * len(np.unique(both.group[rows]))
@@ -44,7 +44,7 @@ def test_contacts_of_different_sets_stay_apart_and_whole(data):
 
 def test_the_order_in_which_sets_are_given_changes_nothing(data):
     parts = [named(data, f"sim/{name}", 30 * k, 27) for k, name in enumerate(("plane", "ball", "edge"))]
-    one, other = joined(parts), joined(parts[::-1])
+    one, other = join_datasets(parts), join_datasets(parts[::-1])
     for seed in range(3):
         for mine, theirs in zip(split_rows(len(one), seed, one.group), split_rows(len(other), seed, other.group), strict=True):
             assert places(one, mine) == places(other, theirs)
@@ -53,21 +53,21 @@ def test_the_order_in_which_sets_are_given_changes_nothing(data):
 
 def test_frames_that_belong_to_no_contact_form_groups_of_one(data):
     real = replace(named(data, "real/tap", 0, 40), group=None)
-    both = joined([real, named(data, "sim/plane", 40, 45)])
+    both = join_datasets([real, named(data, "sim/plane", 40, 45)])
     assert len(np.unique(both.group)) == 40 + 5
 
 
 def test_pins_are_counted_from_one_layout(data):
     moved = make_reference(data.pins.reference.pins_px + [3.0, -2.0], data.pins.sensor.pins)
     other = named(data, "sim/b", 45, 45)
-    both = joined([named(data, "sim/a", 0, 45), replace(other, pins=other.pins.seen_from(moved))])
+    both = join_datasets([named(data, "sim/a", 0, 45), replace(other, pins=other.pins.relative_to(moved))])
     assert np.allclose(both.pins.nodes_px[45:], other.pins.nodes_px)
 
 
 def test_contacts_of_several_objects_keep_the_labels_that_vary_with_all(data):
     first, second = named(data, "sim/a", 0, 45), named(data, "sim/b", 45, 45)
     less = replace(second, targets=second.targets.only(("pose_6",)))
-    both = joined(with_common_labels([first, less]))
+    both = join_datasets(with_common_labels([first, less]))
     assert both.targets.names == ("pose_6",)
     np.testing.assert_array_equal(both.targets.raw[:, 0], data.targets.raw[:90, 1])
     with pytest.raises(FrameError, match="no label varies in all of them"):
@@ -77,18 +77,18 @@ def test_contacts_of_several_objects_keep_the_labels_that_vary_with_all(data):
 def test_what_can_not_be_joined_is_named(data):
     part = named(data, "sim/a")
     with pytest.raises(FrameError, match="given twice"):
-        joined([part, part])
+        join_datasets([part, part])
     with pytest.raises(FrameError, match=r"form \(raw\) differs"):
-        joined([part, replace(named(data, "sim/b"), pins=replace(data.pins, form=Form.RAW))])
+        join_datasets([part, replace(named(data, "sim/b"), pins=replace(data.pins, form=Form.RAW))])
     with pytest.raises(FrameError, match="one recording at a time"):
-        _ = joined([part, named(data, "sim/b")]).folder
+        _ = join_datasets([part, named(data, "sim/b")]).folder
 
 
 def plan_of(tmp_path, train=("plane", "sphere"), unseen=("edge",)):
     config = small_config(tmp_path)
     things = [tuple(load_object(name) for name in names) for names in (train, unseen)]
     randomisation = RandomisationSpec(name="none", description="nothing")
-    return Plan(config.sensor, config.experiment, randomisation, *things, count=2, tests=1, seed=4, across=config.across)
+    return ObjectsPlan(config.sensor, config.experiment, randomisation, *things, count=2, tests=1, seed=4, across=config.across)
 
 
 def test_both_models_learn_from_equally_many_contacts_and_are_judged_on_others(data, tmp_path):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hardware.errors import DeviceError
-from hardware.rig.approach import way_around
-from hardware.rig.geometry import PlacedObject, matrix_of, moved
+from hardware.rig.approach import path_around
+from hardware.rig.geometry import PlacedObject, matrix_of, shift_in_tool
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 
@@ -23,7 +23,7 @@ def placed():
 
 
 def clear_of(placed):
-    return moved(placed.start_pose(3.0), -50.0 * placed.mounting.axis)
+    return shift_in_tool(placed.start_pose(3.0), -50.0 * placed.mounting.axis)
 
 
 def gaps_mm(placed, way):
@@ -39,14 +39,14 @@ def test_from_any_side_the_dome_stays_clear_of_the_object(placed, side_deg):
     away = np.array([np.cos(np.radians(side_deg)), np.sin(np.radians(side_deg)), 0.0])
     start = clear.copy()
     start[:3] = middle + 150.0 * away - matrix_of(clear)[:3, :3] @ placed.mounting.centre_mm
-    way = [start, *way_around(placed, start, clear)]
+    way = [start, *path_around(placed, start, clear)]
     assert np.allclose(way[-1], clear)
     assert gaps_mm(placed, way).min() > 5.0
 
 
 def test_in_the_open_it_is_straight(placed):
     clear = clear_of(placed)
-    (only,) = way_around(placed, moved(clear, -100.0 * placed.mounting.axis), clear)
+    (only,) = path_around(placed, shift_in_tool(clear, -100.0 * placed.mounting.axis), clear)
     assert only is clear
 
 
@@ -55,7 +55,7 @@ def test_from_behind_and_near_it_first_goes_outward(placed):
     middle, inward = placed.T_base_object[:3, 3] + 40.0 * placed.T_base_object[:3, 2], placed.T_base_object[:3, 2]
     start = clear.copy()
     start[:3] = middle + 65.0 * inward - matrix_of(clear)[:3, :3] @ placed.mounting.centre_mm  # 5 mm behind the square
-    way = [start, *way_around(placed, start, clear)]
+    way = [start, *path_around(placed, start, clear)]
     assert np.allclose((way[1] - start)[:3] / np.linalg.norm((way[1] - start)[:3]), inward)
     gaps = gaps_mm(placed, way)
     assert gaps.min() == pytest.approx(5.0, abs=0.1) and gaps[SAMPLES:].min() > 5.0
@@ -65,8 +65,8 @@ def test_from_behind_and_near_it_first_goes_outward(placed):
 def test_to_an_object_without_an_end_it_is_straight_from_the_front_and_from_contact(name):
     placed = before(name)
     clear = clear_of(placed)
-    for start in (moved(clear, 60.0 * placed.mounting.across), placed.start_pose(4.0)):
-        (only,) = way_around(placed, start, clear)
+    for start in (shift_in_tool(clear, 60.0 * placed.mounting.across), placed.start_pose(4.0)):
+        (only,) = path_around(placed, start, clear)
         assert only is clear
 
 
@@ -76,4 +76,4 @@ def test_through_an_object_without_an_end_there_is_no_way(name):
     behind = placed.start_pose(70.0)
     behind[:3] += 30.0 * placed.T_base_object[:3, 0]  # of the edge, too
     with pytest.raises(DeviceError, match=f"the {name} leads .* behind its surface.*jog the arm"):
-        way_around(placed, behind, clear_of(placed))
+        path_around(placed, behind, clear_of(placed))

@@ -48,8 +48,8 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "policy",
     "simulator",
     "one_contact",
-    "judge",
-    "fit",
+    "evaluation",
+    "calibration",
     "demo",
     "studio",
     "cli",
@@ -126,8 +126,8 @@ def test_twin_imports_only_what_lies_further_in(part):
 
 
 def test_the_order_refuses_an_import_that_points_outwards():
-    names = {"numpy", "twin.types", "twin.pins.graph", "twin.fit.optics", "twin"}
-    assert against_the_order("pins", names, TWIN_LAYERS) == {"twin.fit.optics", "twin"}
+    names = {"numpy", "twin.types", "twin.pins.graph", "twin.calibration.optics", "twin"}
+    assert against_the_order("pins", names, TWIN_LAYERS) == {"twin.calibration.optics", "twin"}
 
 
 def test_twin_itself_imports_its_names_when_they_are_used():

@@ -63,8 +63,8 @@ def test_what_does_not_come_to_rest_there_is_an_error(told, says):
 
 def test_a_watched_move_that_fails_stops_the_arm_and_a_good_one_does_not():
     good, bad = ToldArm((0, TARGET, False, "")), ToldArm((0, TARGET, False, ""))
-    with good._watched():
+    with good._watch_move():
         pass
-    with pytest.raises(KeyboardInterrupt), bad._watched():
+    with pytest.raises(KeyboardInterrupt), bad._watch_move():
         raise KeyboardInterrupt
     assert bad.stopped and not hasattr(good, "stopped")

@@ -43,7 +43,7 @@ def test_the_nominal_lengths_are_off_by_little():
 
 
 def test_fitting_finds_the_lengths_from_the_pairs():
-    fitted = MG400_NOMINAL.fitted(JOINTS, POSES)
+    fitted = MG400_NOMINAL.fit_lengths(JOINTS, POSES)
     assert off_mm(fitted).max() < FITTED_MM
     found = [fitted.l1_mm, fitted.l2_mm, fitted.r0_mm, fitted.z0_mm]
     assert np.allclose(found, [MG400.l1_mm, MG400.l2_mm, MG400.r0_mm, MG400.z0_mm], atol=0.01)
@@ -51,7 +51,7 @@ def test_fitting_finds_the_lengths_from_the_pairs():
 
 def test_pairs_of_one_posture_leave_the_lengths_open():
     with pytest.raises(ValueError, match="different J2 and J3"):
-        MG400.fitted(np.repeat(JOINTS[:1], 5, axis=0), np.repeat(POSES[:1], 5, axis=0))
+        MG400.fit_lengths(np.repeat(JOINTS[:1], 5, axis=0), np.repeat(POSES[:1], 5, axis=0))
 
 
 @pytest.mark.parametrize("arm", [MG400, MAGICIAN])

@@ -55,7 +55,7 @@ def test_planted_faults_are_found(planted):
     pins, labels, executed, sign, untouched = planted
     found = audit_labels(pins, *arm(labels))
     assert np.flatnonzero(found.no_contact).tolist() == untouched.tolist()
-    assert found.twins[411] == 410 and (found.twins == np.arange(FRAMES)).sum() == FRAMES - 1
+    assert found.duplicates[411] == 410 and (found.duplicates == np.arange(FRAMES)).sum() == FRAMES - 1
     clear = (np.abs(labels[:, 2:]).max(axis=1) > 1) & ~found.no_contact & ~sign
     clear[411] = False
     assert ((found.executed > 0.5) == executed)[clear].mean() > 0.97
@@ -94,10 +94,13 @@ def test_too_few_frames_are_an_answer_and_not_a_clean_bill(planted, frames):
     touching = np.setdiff1d(np.arange(FRAMES), [100, 300])
     rows = touching[:frames]
     found = audit_labels(pins.rows(rows), *arm(labels[rows]))
-    assert f"{frames} frames in contact are too few to tell which moves were executed" in found.untold and "280 are needed" in found.untold
+    assert (
+        f"{frames} frames in contact are too few to find out which moves were executed" in found.not_assessed
+        and "280 are needed" in found.not_assessed
+    )
     assert np.isnan(found.executed).all() and np.isnan(found.chi2).all() and np.isnan(found.depth_per_move)
     enough = audit_labels(pins.rows(touching[:280]), *arm(labels[touching[:280]]))
-    assert not enough.untold and np.isfinite(enough.executed).all()
+    assert not enough.not_assessed and np.isfinite(enough.executed).all()
 
 
 def test_of_too_few_frames_no_corrected_labels_are_written(planted, tmp_path):
@@ -141,7 +144,7 @@ def test_a_recording_of_an_edge_around_the_circle_is_audited_as_a_plate_is():
     names, shape = np.array([f"f_{k}.png" for k in range(900)]), (900, 127)
     pins = PinTable(spec, Form.PROCESSED, reference, names, nodes, np.ones(shape), np.zeros(shape, bool), np.ones(900, bool))
     found = audit_labels(pins, pose, move)
-    assert not found.untold and set(np.flatnonzero(found.wrong_sign)) >= {40, 500} and found.wrong_sign.sum() < 5
+    assert not found.not_assessed and set(np.flatnonzero(found.wrong_sign)) >= {40, 500} and found.wrong_sign.sum() < 5
     clear = (np.abs(move[:, :2]).max(axis=1) > 1) & ~found.wrong_sign
     assert ((found.executed > 0.5) == executed)[clear].mean() > 0.98
     taps = audit_labels(pins.rows(np.flatnonzero(executed)), pose[executed], 0 * move[executed])

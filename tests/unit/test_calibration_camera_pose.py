@@ -1,11 +1,11 @@
-"""The camera's fit to pins at rest: known cameras are found again, and what the pins cannot tell is held and named."""
+"""The camera's fit to pins at rest: known cameras are found again, and what the pins cannot determine is held and named."""
 
 import numpy as np
 import pytest
 
+from twin.calibration.camera_pose import PARAMETERS, fit_camera, nearest_order
 from twin.camera.projection import project
 from twin.errors import FrameError
-from twin.fit.camera_pose import PARAMETERS, fit_camera, nearest_order
 from twin.geometry.pins import rest_pins
 
 NOISE_PX = 0.05

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from plain_sensor import plain
 
+from twin.calibration.light.caps import ORDERS, fit_caps, outline_steps
+from twin.calibration.light.photometry import fit_photometry
+from twin.calibration.light.response import apparent_mm, defocus_px, fit_blur, fit_focus, fit_haze, fit_noise, fit_response, sharpness
+from twin.calibration.light.rim import fit_rim
 from twin.camera.capture import expose
 from twin.camera.projection import lens_disc, project
-from twin.fit.light.caps import ORDERS, fit_caps, outline_steps
-from twin.fit.light.photometry import fit_photometry
-from twin.fit.light.response import apparent_mm, defocus_px, fit_blur, fit_focus, fit_haze, fit_noise, fit_response, sharpness
-from twin.fit.light.rim import fit_rim
+from twin.evaluation.pictures.aligned import Aligned, levels_slope, to_levels, to_light, with_changes
+from twin.evaluation.pictures.spectra import noise_sd
+from twin.evaluation.pictures.statistics import bare_skin
 from twin.frames.forms import gray_levels
 from twin.geometry.pins import rest_pins
-from twin.judge.pictures.aligned import Aligned, levels_slope, revised, to_levels, to_light
-from twin.judge.pictures.spectra import noise_sd
-from twin.judge.pictures.statistics import bare_skin
 from twin.mechanics.skin_fit import FittedPins
 from twin.optics.render import Renderer
 
@@ -26,7 +26,7 @@ SPP = 64
 @pytest.fixture(scope="module")
 def known():
     """37 large caps on a 200 x 160 px film, evenly printed, LEDs of differing power; nothing but the gel in sight."""
-    return revised(
+    return with_changes(
         plain(),
         pins={"rings": 3, "cap_diameter_mm": 2.6, "max_polar_deg": 45.0},
         camera={"width_px": 200, "height_px": 160, "fx_px": 200.0, "fy_px": 200.0, "cx_px": 99.0, "cy_px": 80.0, "k1": 0.0},
@@ -73,7 +73,7 @@ def quiet(*_):
 def test_the_haze_is_found_again_where_light_around_the_disc_was_added_later(known, light, frame):
     """What the veil adds cannot be taken away where the light is 0: a share that is too large must be corrected."""
     inside = np.ones(light.shape[:2], bool)
-    found = fit_haze(revised(known, gel={"haze": 0.08}), [frame], [light], inside)
+    found = fit_haze(with_changes(known, gel={"haze": 0.08}), [frame], [light], inside)
     assert found.gel.haze == pytest.approx(known.gel.haze, abs=0.003)
     kept = fit_haze(known, [frame], [light], inside)
     assert kept.gel.haze == pytest.approx(known.gel.haze, abs=0.003)
@@ -90,7 +90,7 @@ def test_levels_and_light_are_inverse(known):
 
 def test_lights_and_colours_are_recovered(known, frame):
     """What is seen: cap light (power times albedo), its colour, each LED's share. Haze and the skin's light trade in a small frame."""
-    start = revised(
+    start = with_changes(
         known,
         leds={"balance": (1.0,) * 6, "power": 0.5},
         appearance={"skin_albedo": (0.02, 0.02, 0.02), "pin_albedo": (0.01, 0.01, 0.03), "cap_albedo": (0.5, 0.5, 0.5)},
@@ -116,7 +116,7 @@ def test_each_caps_reflectance_and_outline_are_recovered(known):
         "cap_shapes": list(map(tuple, shapes.tolist())),
         "cap_offsets": list(map(tuple, offsets.tolist())),
     }
-    printed = revised(known, appearance=own)
+    printed = with_changes(known, appearance=own)
     real = [aligned(printed, shoot(printed, [aligned(printed, None)])[0])]
     found = fit_caps(fit_caps(known, real, shoot), real, shoot)
     seen = np.linalg.norm(rest_pins(known.geometry).caps_mm[:, :2], axis=1) < 10.0
@@ -134,11 +134,11 @@ def test_outlines_that_fit_are_not_changed(known, frame):
 def test_the_rims_light_is_recovered(known):
     """A blot of light at the opening's edge, put there by a table, is found again: pixel by pixel, and in a plain specification."""
     edge_mm = 8.0
-    bare = revised(known, housing={"aperture_radius_mm": edge_mm, "outer_radius_mm": 60.0, "center_mm": (0.0, 0.0)}, gel={"haze": 0.0})
+    bare = with_changes(known, housing={"aperture_radius_mm": edge_mm, "outer_radius_mm": 60.0, "center_mm": (0.0, 0.0)}, gel={"haze": 0.0})
     turn = np.arange(24)[:, None, None] * 2 * np.pi / 24
     blot = np.rint(np.maximum(np.cos(turn - 1.0), 0) * np.hanning(6)[:, None] * np.array([60, 80, 120]))
     rim = {"inner_mm": edge_mm - 1.5, "outer_mm": edge_mm + 0.3, "light": blot.astype(int).tolist()}
-    glued, start = revised(bare, housing={"rim": rim}), Renderer(bare, spp=4).render()
+    glued, start = with_changes(bare, housing={"rim": rim}), Renderer(bare, spp=4).render()
     real = aligned(glued, expose(Renderer(glued, spp=4).render(), glued.capture))
     found = fit_rim(bare, [real], [start])
     shown = [expose(Renderer(spec, spp=4).render(), spec.capture).astype(float) for spec in (bare, found)]
@@ -148,7 +148,7 @@ def test_the_rims_light_is_recovered(known):
 
 
 def test_blur_and_sharpening_are_recovered(known, light, frame):
-    real = revised(known, response={"blur_sigma_px": 1.1, "sharpening": 0.8, "sharpening_sigma_px": 1.6}, camera={"red_scale": 1.004})
+    real = with_changes(known, response={"blur_sigma_px": 1.1, "sharpening": 0.8, "sharpening_sigma_px": 1.6}, camera={"red_scale": 1.004})
     seen = replace(frame, image=expose(light, real.capture))
     found = fit_response(known, [seen], [light], np.ones(light.shape[:2], bool))
     left = expose(light, found.capture).astype(float) - seen.image
@@ -159,8 +159,8 @@ def test_blur_and_sharpening_are_recovered(known, light, frame):
 
 
 def test_blur_is_found_from_edges_alone(known, light, frame):
-    sharp = revised(known, response={"blur_sigma_px": 1.3, "sharpening": 0.4})
-    start = revised(sharp, response={"blur_sigma_px": 0.5})
+    sharp = with_changes(known, response={"blur_sigma_px": 1.3, "sharpening": 0.4})
+    start = with_changes(sharp, response={"blur_sigma_px": 0.5})
     found = fit_blur(start, [replace(frame, image=expose(light, sharp.capture))], [light])
     assert found.response.blur_sigma_px == pytest.approx(1.3, abs=0.02)
 
@@ -177,7 +177,7 @@ def test_aperture_and_focus_follow_from_edges_that_widen_with_distance(known):
 
 
 def sharpness_of(distance):
-    from twin.fit.light.response import Sharpness
+    from twin.calibration.light.response import Sharpness
 
     return Sharpness(distance, np.full(len(distance), 1.5), np.full(len(distance), 1.5))
 
@@ -192,7 +192,7 @@ def test_caps_near_the_rim_are_nearer_to_the_pupil(known):
 
 
 def test_noise_is_recovered(known, light, frame):
-    loud = revised(known, response={"read_noise": 6e-4, "shot_noise": 2e-4})
+    loud = with_changes(known, response={"read_noise": 6e-4, "shot_noise": 2e-4})
     real = replace(frame, image=expose(light, loud.capture, np.random.default_rng(5)))
     found = fit_noise(known, [real], [light])
     again = expose(light, found.capture, np.random.default_rng(6))
@@ -201,6 +201,6 @@ def test_noise_is_recovered(known, light, frame):
 
 
 def test_sharper_frames_have_narrower_edges(known, light, frame):
-    soft = replace(frame, image=expose(light, revised(known, response={"blur_sigma_px": 1.6}).capture))
+    soft = replace(frame, image=expose(light, with_changes(known, response={"blur_sigma_px": 1.6}).capture))
     found = sharpness(known, [soft], [frame.image], bins=2)
     assert (found.real_px > found.rendered_px).all()

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from plain_sensor import plain
 
+from twin.calibration.light.photometry import fit_photometry
+from twin.calibration.light.surroundings import fit_surroundings
+from twin.calibration.optics import _stages
 from twin.camera.capture import expose
 from twin.camera.projection import lens_disc, project
 from twin.errors import FrameError
-from twin.fit.light.photometry import fit_photometry
-from twin.fit.light.surroundings import fit_surroundings
-from twin.fit.optics import _stages
+from twin.evaluation.pictures.aligned import Aligned, read_frames, require_cameras_own, with_changes
 from twin.geometry.pins import rest_pins
-from twin.judge.pictures.aligned import Aligned, read_frames, require_cameras_own, revised
 from twin.mechanics.skin_fit import FittedPins
 from twin.optics.preview import Preview
 from twin.progress import silent, stage
@@ -33,7 +33,7 @@ def drawn():
     blob = shipped.pipeline.raw
     center = tuple(0.6 * x for x in blob.mask_center_px)
     raw = blob.model_copy(update={"mask_center_px": center, "mask_radius_px": 0.6 * blob.mask_radius_px})
-    spec = revised(shipped, camera=camera, pipeline={"raw": raw})
+    spec = with_changes(shipped, camera=camera, pipeline={"raw": raw})
     return spec, expose(Preview(spec).render(), spec.capture)
 
 
@@ -45,7 +45,7 @@ def aligned(spec, image):
 
 def test_a_mono_specification_refuses_colour_frames_by_name(drawn, tmp_path):
     spec, image = drawn
-    mono = revised(spec, camera={"channels": "mono"})
+    mono = with_changes(spec, camera={"channels": "mono"})
     cv2.imwrite(str(tmp_path / "seen.png"), image[..., ::-1])
     assert len(read_frames(tmp_path, spec, 6, quiet)[0]) == 1
     with pytest.raises(FrameError, match=r'seen.png: a colour frame.*channels = "color"'):
@@ -56,7 +56,7 @@ def test_a_mono_specification_refuses_colour_frames_by_name(drawn, tmp_path):
 
 def test_gray_frames_stored_as_colour_suit_a_mono_specification(drawn, tmp_path):
     spec, image = drawn
-    mono = revised(spec, camera={"channels": "mono"})
+    mono = with_changes(spec, camera={"channels": "mono"})
     cv2.imwrite(str(tmp_path / "seen.png"), np.repeat(image[..., 1:2], 3, axis=2))
     ((_, found, _),), _ = read_frames(tmp_path, mono, 6, quiet)
     np.testing.assert_array_equal(found, image[..., 1])
@@ -113,4 +113,4 @@ def test_a_cap_too_few_in_the_appearance_is_refused_where_it_enters(drawn):
     """Offsets of another layout would otherwise end the fit of the caps in a broadcasting error."""
     spec, _ = drawn
     with pytest.raises(ValueError, match=f"cap_offsets needs one pair for each of the {spec.pins.count} pins"):
-        revised(spec, appearance={"cap_offsets": ((0.0, 0.0),) * (spec.pins.count - 1)})
+        with_changes(spec, appearance={"cap_offsets": ((0.0, 0.0),) * (spec.pins.count - 1)})

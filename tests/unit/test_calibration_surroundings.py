@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from plain_sensor import plain
 
+from twin.calibration.light.leds import fit_reflections
+from twin.calibration.light.still import median_still
+from twin.calibration.light.surroundings import fit_surroundings
 from twin.camera.capture import expose
 from twin.camera.projection import project
 from twin.errors import FrameError
-from twin.fit.light.leds import fit_reflections
-from twin.fit.light.still import median_still
-from twin.fit.light.surroundings import fit_surroundings
+from twin.evaluation.pictures.aligned import SATURATED, with_changes
 from twin.geometry.pins import rest_pins
-from twin.judge.pictures.aligned import SATURATED, revised
 from twin.optics.static_layer import static_layer
 
 SIZE = 0.6  # of the shipped camera's frames: fast, and still sharp enough
@@ -64,8 +64,8 @@ def known():
     camera = {name: SIZE * getattr(shipped.camera, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
     camera |= {name: round(SIZE * getattr(shipped.camera, name)) for name in ("width_px", "height_px")}
     haze = {"haze": 0.02, "haze_sigma_px": 40.0 * SIZE}
-    start = revised(shipped, camera=camera, leds={"power": 0.7}, gel=haze, appearance={"specks": ()})
-    spec = revised(start, housing=HOUSING, leds=LEDS, appearance={"specks": SPECKS})
+    start = with_changes(shipped, camera=camera, leds={"power": 0.7}, gel=haze, appearance={"specks": ()})
+    spec = with_changes(start, housing=HOUSING, leds=LEDS, appearance={"specks": SPECKS})
     light, cover = static_layer(spec, (0, 0, spec.camera.width_px, spec.camera.height_px))
     rng = np.random.default_rng(5)
     at_rest = project(spec.view, rest_pins(spec.geometry).caps_mm)
@@ -110,8 +110,8 @@ def test_leds_are_found_by_their_reflections(known, found):
 def test_reflections_that_the_housing_dims_are_met(known):
     """Spots of the whole LEDs' light, over which a camera sharpens, would be white with black rings around them."""
     _, spec, images, _ = known
-    dim = revised(spec, leds={"mirror_share": 0.01, "core_share": 0.5, "core_mm": 0.2, "size_mm": 1.0}, appearance={"specks": ()})
-    real, start = drawn(dim, images), revised(dim, leds={"mirror_share": 1.0, "core_share": 0.0})
+    dim = with_changes(spec, leds={"mirror_share": 0.01, "core_share": 0.5, "core_mm": 0.2, "size_mm": 1.0}, appearance={"specks": ()})
+    real, start = drawn(dim, images), with_changes(dim, leds={"mirror_share": 1.0, "core_share": 0.0})
     miss = drawn(fit_reflections(start, median_still(start, real[None])), images).astype(float) - real
     assert np.abs(miss).max() < DIM_LEVELS
 

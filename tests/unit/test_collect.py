@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
-from hardware.cameras.reader import LiveSource, Picture
+from hardware.cameras.reader import DevicePicture, LiveSource
 from hardware.collect.collect import COLUMNS, META, Collection, WorkFrame, collect, draw_contact
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, matrix_of
@@ -46,7 +46,7 @@ class PoseCamera(LiveSource):
         image = np.zeros((16, 16), np.uint8)
         image[0, :3], image[1, :3], image[2, :3] = levels >> 16, (levels >> 8) & 255, levels & 255
         image[3:] = 100 + self._number % 100
-        return Picture(image, exposed_s)
+        return DevicePicture(image, exposed_s)
 
 
 def seen_mm(image: np.ndarray) -> np.ndarray:

@@ -29,7 +29,14 @@ FEW = 8  # statements of a command beside its imports: specifications loaded, a 
 ENTRY = {"main", "command_line"}  # what others may take from the command line
 ROOTS = {ROOT / "twin" / "__init__.py", ROOT / "twin" / "__main__.py"}  # they offer its functions to Python, and start it
 NO_LOGIC = (ast.For, ast.While, ast.AsyncFor, ast.Try, ast.Lambda, ast.FunctionDef, ast.ClassDef, ast.ListComp, ast.DictComp, ast.SetComp)
-NOT_COMMANDS = {"twin alone", "twin and labelled frames", "twin read", "twin read, no label", "twin read, evenly chosen frames", "twin of "}
+NOT_COMMANDS = {
+    "twin alone",
+    "twin and labelled frames",
+    "twin read",
+    "model inversion, no label",
+    "model inversion, evenly chosen frames",
+    "twin of ",
+}
 HEAVY = {"numpy", "scipy", "torch", "cv2", "mitsuba", "drjit", "numba", "pyvista", "matplotlib"}
 
 
@@ -237,7 +244,7 @@ def test_what_could_not_be_let_go_of_is_printed_after_ctrl_c(monkeypatch, tmp_pa
     told = [
         "twin: interrupted",
         "twin: note: stop failed: press its emergency stop",
-        "twin: note: what is finished is kept; the same command goes on from there",
+        "twin: note: what is finished is kept; the same command resumes from there",
     ]
     assert ended.stderr.splitlines()[-3:] == told
 
@@ -303,7 +310,7 @@ def test_the_version_is_that_of_the_package():
         ["robustness"],
         ["graph", "frame.png", "--sensor", "mg400-127"],
         ["preprocess", "frames", "--sensor", "mg400-127"],
-        ["dataset", "--experiment", "surface-2d", "--sensor", "mg400-127", "--count", "1", "--out", "out", "--across", "7"],
+        ["dataset", "--experiment", "surface-2d", "--sensor", "mg400-127", "--count", "1", "--out", "out", "--elements", "7"],
         ["live", "--headless"],
     ],
     ids=lambda words: " ".join(words[:2]),

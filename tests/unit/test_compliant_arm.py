@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_generation import small_config
 
-from twin.judge.labelled.model import ContactModel
+from twin.evaluation.labelled.model import ContactModel
 from twin.rig.labels import ArmLabel
 from twin.types import Form
 

@@ -11,13 +11,13 @@ from scenes import load_experiment
 from scenes.body import ASSUMED_FACTOR
 from scenes.rig import ForceSensorSpec
 from training.generation.config import draw_label
+from twin.calibration.contact import PARAMETERS, fit_contact
+from twin.calibration.contact.fit import expect, held_out_px
+from twin.calibration.contact.newtons import assume_stiffness, compare_forces, pressed_n, simulated_n
+from twin.calibration.contact.parameters import values_of, with_quantities
+from twin.calibration.contact.simulate import CalibrationSetup
 from twin.errors import FrameError
-from twin.fit.contact import PARAMETERS, fit_contact
-from twin.fit.contact.fit import expect, held_out_px
-from twin.fit.contact.newtons import assumed, compared, pressed_n, simulated_n
-from twin.fit.contact.parameters import changed, values_of
-from twin.fit.contact.simulate import Setup
-from twin.judge.labelled.model import ContactModel, MeasuredFrames
+from twin.evaluation.labelled.model import ContactModel, MeasuredFrames
 from twin.types import Form
 
 FITTED = tuple(p for p in PARAMETERS if p.name in ("rig.contact_offset_mm", "rig.tcp_lateral_mm", "rig.image_turn_deg"))
@@ -58,7 +58,7 @@ def prepared(tmp_path_factory):
     config = small_config(home, experiment=load_experiment(telling(home)))
     true = config.sensor.model_copy(update={"rig": config.sensor.rig.model_copy(update=TRUTH)})
     measured, done = frames(config, true, range(FRAMES), bad=(4,))
-    setup = Setup(config.sensor, config.experiment, config.object, Form.PROCESSED, ACROSS, home / "contacts", parameters=FITTED)
+    setup = CalibrationSetup(config.sensor, config.experiment, config.object, Form.PROCESSED, ACROSS, home / "contacts", parameters=FITTED)
     held, _ = frames(config, true, range(100, 103))
     return setup, measured, done, held
 
@@ -97,7 +97,7 @@ def test_frames_that_were_not_fitted_are_met_as_well(calibrated):
 @pytest.mark.slow
 def test_a_continued_calibration_computes_nothing_twice(calibrated, monkeypatch):
     setup, measured, _, fit, _ = calibrated
-    monkeypatch.setattr("twin.fit.contact.simulate._contact", None)  # not callable: a new contact would fail
+    monkeypatch.setattr("twin.calibration.contact.simulate._contact", None)  # not callable: a new contact would fail
     again = fit_contact(setup, measured)
     assert np.array_equal(again.value, fit.value) and np.array_equal(again.executed, fit.executed)
 
@@ -114,7 +114,7 @@ def test_values_go_into_the_specification_and_come_back(tmp_path):
     config = small_config(tmp_path)
     values = values_of(config.sensor, config.experiment)
     moved = values + [0.1 * p.step for p in PARAMETERS]
-    there = changed(config.sensor, config.experiment, moved, 1)
+    there = with_quantities(config.sensor, config.experiment, moved, 1)
     assert np.allclose(values_of(there, config.experiment), moved)
     assert there.rig.turn_offset_deg[:2] == (0, 0) and there.rig.turn_offset_deg[2] == pytest.approx(moved[3])
 
@@ -132,7 +132,7 @@ def test_weighed_presses_fix_the_scale_of_forces_and_leave_the_pins_where_they_a
     labels = [replace(draw_label(config.experiment, np.random.default_rng(seed)), executed=False) for seed in range(3)]
     simulated = simulated_n(sensor, config.experiment, config.object, labels, across=ACROSS)
     weighed = 1.4 * simulated * np.exp([0.02, -0.02, 0.0])
-    found = compared(weighed, simulated, sensor)
+    found = compare_forces(weighed, simulated, sensor)
     assert found.presses == 3 and found.scale == pytest.approx(1.4, rel=0.02) and 1.0 < found.factor < 1.1
     stiffer = found.of(sensor)
     assert stiffer.skin.stiffness_factor == found.factor
@@ -146,10 +146,10 @@ def test_weighed_presses_fix_the_scale_of_forces_and_leave_the_pins_where_they_a
 
 def test_without_enough_weighed_presses_it_says_which_stiffness_is_assumed(tmp_path):
     sensor = small_config(tmp_path).sensor
-    for found in (assumed(sensor, "none was measured"), compared([1.0, 2.0, 0.01], [1.0, 2.0, 0.01], sensor)):
+    for found in (assume_stiffness(sensor, "none was measured"), compare_forces([1.0, 2.0, 0.01], [1.0, 2.0, 0.01], sensor)):
         assert (found.presses, found.scale, found.factor) == (0, 1.0, ASSUMED_FACTOR)
         assert f"skin {sensor.skin.young_modulus_mpa:.3g} MPa" in found.said and "weigh 3 presses" in found.said
-    wide, narrow = (compared(np.exp(spread * np.linspace(-1, 1, 5)), np.ones(5), sensor).factor for spread in (0.3, 0.03))
+    wide, narrow = (compare_forces(np.exp(spread * np.linspace(-1, 1, 5)), np.ones(5), sensor).factor for spread in (0.3, 0.03))
     assert wide > 1.2 > narrow > 1.0
 
 

@@ -13,7 +13,7 @@ from training.models.touch.model import TOUCH
 from training.runs.packed import pack
 from training.runs.run_files import MAPS
 from training.studies.prediction import Predictions, write_frame_maps
-from training.touch.contact_maps import judge_maps, read_maps, write_maps
+from training.touch.contact_maps import compare_maps, read_maps, write_maps
 from twin.errors import StoreError
 from twin.geometry.mesh import build_mesh
 from twin.mechanics.skin_map import SIDE, ContactMaps, between_nodes, skin_grid
@@ -62,7 +62,7 @@ def test_every_second_node_of_the_grid_is_one_of_the_mesh_and_averaging_keeps_th
     apart = np.linalg.norm(between - grid.nodes_mm, axis=1).reshape(SIDE, SIDE)
     assert apart[::2, ::2].max() < EXACT_MM and apart.max() < FACET_MM
     values = np.random.default_rng(0).random((2, SIDE * SIDE))
-    found = grid.averaged(values, 1.0)
+    found = grid.smooth_values(values, 1.0)
     np.testing.assert_allclose(found.sum(axis=1), values.sum(axis=1), rtol=1e-5)
     assert found.std() < 0.5 * values.std()
 
@@ -73,13 +73,13 @@ def test_maps_of_simulated_contacts_are_learnt_and_agree_with_the_forces_told(co
     data = load_dataset(folder, sensor, estimator.names)
     made = estimator.predict_table(data.pins)
     maps = estimator.maps_of(data.pins, made.mean)
-    rated = judge_maps(maps, data, np.arange(len(data)))
+    rated = compare_maps(maps, data, np.arange(len(data)))
     assert rated.states > 20 and rated.patch_iou > 0.8 and rated.pressure_correlation > 0.9 and rated.skin_mm < 0.1
     column = [estimator.names.index(name) for name in ("force_x", "force_y", "force_z")]
     k = int(made.mean[:, column[2]].argmax())
     np.testing.assert_allclose(maps[k].resultant_n, made.mean[k, column], atol=1e-6)
-    turned = judge_maps([replace(each, force_n=each.force_n[::-1]) for each in maps], data, np.arange(len(data)))
-    assert turned.pressure_correlation < rated.pressure_correlation  # the judge can tell
+    turned = compare_maps([replace(each, force_n=each.force_n[::-1]) for each in maps], data, np.arange(len(data)))
+    assert turned.pressure_correlation < rated.pressure_correlation  # the classifier can tell
 
 
 def test_a_small_copy_keeps_its_maps_and_damaged_ones_are_refused(contacts, tmp_path):

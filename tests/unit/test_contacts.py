@@ -1,4 +1,4 @@
-"""Kinds of contact: told apart, known again from a file, and none of them where a frame shows something else."""
+"""Kinds of contact: distinguished, known again from a file, and none of them where a frame shows something else."""
 
 import shutil
 from dataclasses import replace
@@ -10,7 +10,7 @@ import pytest
 from drawn_frames import drawn_frame
 from drawn_recording import config_of
 
-from training.data.dataset import joined
+from training.data.dataset import join_datasets
 from training.data.label_code import label_error
 from training.data.targets import Targets
 from training.errors import TrainingError
@@ -18,7 +18,7 @@ from training.estimate.contact_estimator import ContactEstimator, KindOfContact,
 from training.estimate.contacts import CONTACTS, fit_contacts, read_contacts, write_contacts
 from training.estimate.estimator import PoseEstimator
 from training.runs.run import train_run
-from training.studies.judging import intervals_on, judge
+from training.studies.judging import intervals_on, measure_errors
 from training.studies.sim_to_real.steps import widen_intervals
 from training.studies.train import add_domain
 from twin.camera.capture import record
@@ -123,7 +123,7 @@ def test_a_recording_is_judged_by_the_kinds_whose_labels_it_varies(data, models)
     assert models.for_labels(both) == ["bump", "ridge"]
     with pytest.raises(TrainingError, match="varies the labels of no kind"):
         models.for_labels(table_of({"pose_2": [0, 1], "pose_6": [3, 3]}))
-    shown = joined([drawn_kind(replace(data, folders=(Path(name),)), name, 40, 30) for name in ("bump", "ridge")])
+    shown = join_datasets([drawn_kind(replace(data, folders=(Path(name),)), name, 40, 30) for name in ("bump", "ridge")])
     rows = np.arange(0, 80, 2)
     made, told = models.predict_rows(shown, rows, ["bump", "ridge"]), models.contacts.likeliest(shown.pins.rows(rows), ["bump", "ridge"])
     for name in ("bump", "ridge"):
@@ -136,7 +136,7 @@ def test_intervals_hold_nine_of_ten_of_the_rows_they_are_set_by(data, trained, t
     shutil.copytree(trained, tmp_path / "run")
     rows = np.arange(len(data))
     widen_intervals(tmp_path / "run", intervals_on(tmp_path / "run", data, rows))
-    found = judge(PoseEstimator.load(tmp_path / "run").predict_rows(data, rows), data, rows)
+    found = measure_errors(PoseEstimator.load(tmp_path / "run").predict_rows(data, rows), data, rows)
     for name in data.targets.names:
         assert found["corrected"][name]["coverage_90"] == pytest.approx(0.9, abs=0.02), name
 

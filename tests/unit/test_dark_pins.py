@@ -9,16 +9,16 @@ from unknown_sensor import frames_of, rest_of
 
 from scenes.pins import PinsSpec
 from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, SensorSpec
+from twin.calibration.new_sensor import DARK_CAPS, new_sensor
 from twin.camera.capture import expose
 from twin.errors import FrameError
-from twin.fit.new_sensor import DARK_CAPS, new_sensor
+from twin.evaluation.degradation.conditions.skin import faded, missing, pale
 from twin.frames.forms import is_two_level
-from twin.judge.degradation.conditions.skin import faded, missing, pale
 from twin.optics.preview import Preview
 from twin.optics.surfaces import cap_albedo
 from twin.pins import Grade, Pipeline, examine, tune
 from twin.pins.caps import measure_caps
-from twin.pins.identify import Seen, _at_likelier_spots, identify, judge_layout
+from twin.pins.identify import LayoutInFrame, _at_likelier_spots, identify, score_layout
 from twin.pins.legacy import LegacyPipeline
 from twin.pins.matching import match
 from twin.pins.reference import make_reference
@@ -69,8 +69,8 @@ def test_dots_are_named_in_both_polarities_and_gaps_in_none(look):
 def test_a_given_layout_that_fits_the_gaps_is_not_seen_in_them(columns):
     images, _ = dots(share=0.4)
     gaps = PinsSpec(layout="grid", columns=columns, rows=columns + 2)
-    assert judge_layout(gaps, images) is None
-    assert judge_layout(GRID, [255 - image for image in images]) is not None
+    assert score_layout(gaps, images) is None
+    assert score_layout(GRID, [255 - image for image in images]) is not None
 
 
 @pytest.fixture(scope="module")
@@ -196,9 +196,9 @@ def test_a_pin_put_on_a_spot_beside_the_sensor_is_moved_to_the_spot_that_fits_th
     rest = rest_of(GRID, size=SIZE, radius=76.0)
     wrong = rest.copy()
     wrong[0] += 0.8 * (rest[0] - rest[8])
-    seen = [Seen(wrong, wrong, 0, rest[:1] + 0.1)] * 3
+    seen = [LayoutInFrame(wrong, wrong, 0, rest[:1] + 0.1)] * 3
     np.testing.assert_allclose(_at_likelier_spots(GRID, wrong, seen)[0], rest[0] + 0.1)
-    assert np.array_equal(_at_likelier_spots(GRID, rest, [Seen(rest, rest, 0, wrong[:1])] * 3), rest)
+    assert np.array_equal(_at_likelier_spots(GRID, rest, [LayoutInFrame(rest, rest, 0, wrong[:1])] * 3), rest)
 
 
 def test_a_layout_with_a_missing_pin_is_seen_in_a_curved_view():
@@ -207,5 +207,5 @@ def test_a_layout_with_a_missing_pin_is_seen_in_a_curved_view():
     rest = np.array(SIZE) / 2 + away / (1 + away[:, 1:] / 180)  # a camera that looks from the side
     pins = GRID.model_copy(update={"missing": (10,)})
     image = draw_discs(SIZE, np.delete(rest, 10, axis=0), 2.2, blur_px=0.8)
-    shown = judge_layout(pins, [image])
+    shown = score_layout(pins, [image])
     assert shown is not None and shown.explained > 0.9 and len(shown.rest_px) == 62

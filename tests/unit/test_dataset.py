@@ -11,7 +11,7 @@ from drawn_frames import drawn_frame, smooth_warp
 from scenes import load_sensor
 from training.data.dataset import load_dataset, split_rows
 from training.data.pins import pin_table
-from training.data.targets import corrected, unit_of
+from training.data.targets import correct_labels, unit_of
 from training.models.cnn.inputs import image_inputs
 from twin.errors import FrameError
 from twin.pins import make_reference, nominal_reference
@@ -119,14 +119,14 @@ def test_kept_pins_of_recordings_do_not_depend_on_the_simulations_code():
 def test_moves_that_were_not_executed_are_taken_out():
     names = ("pose_2", "pose_6", "move_1", "move_6")
     raw = np.array([[-2.0, 10, 3, 4], [-2.0, 10, 3, 4], [-2.0, 10, 3, 4]])
-    out = corrected(names, raw, np.array([1.0, 0.0, np.nan]), raw[:, 2:], 0.01)
+    out = correct_labels(names, raw, np.array([1.0, 0.0, np.nan]), raw[:, 2:], 0.01)
     assert np.allclose(out, [[-2, 10, 3, 4], [-1.97, 6, 0, 0], [-2, 10, 3, 4]])
 
 
 def test_a_tilted_plate_is_as_deep_on_the_way_of_a_tap_as_where_the_move_was_not_executed():
     """A tap at pose_1 = -3, and the same frame labelled as if it had been moved by 3 to the middle, are one contact."""
     names, move = ("pose_2", "pose_6"), np.array([[0.0, 0.0], [3.0, 0.0]])
-    out = corrected(names, np.array([[-2.0, 10], [-2.0, 10]]), np.array([1.0, 0.0]), move, 0.01, np.array([-3.0, 0.0]))
+    out = correct_labels(names, np.array([[-2.0, 10], [-2.0, 10]]), np.array([1.0, 0.0]), move, 0.01, np.array([-3.0, 0.0]))
     assert np.allclose(out, [[-1.97, 10], [-1.97, 10]])
 
 
@@ -146,8 +146,8 @@ def test_a_column_tells_its_unit(name, unit):
 def test_copies_of_a_row_stay_together(tmp_path):
     spec = write_recording(tmp_path / "r", ["f_0.png,-1,5,1,2", "f_1.png,-2,5,1,2"], ["f_0.png", "f_1.png"])
     data = load_dataset(tmp_path / "r", spec)
-    other = data.pins.seen_from(make_reference(data.pins.reference.pins_px + 1.0, spec.pins))
-    both = data.beside([other])
+    other = data.pins.relative_to(make_reference(data.pins.reference.pins_px + 1.0, spec.pins))
+    both = data.with_copies([other])
     assert both.group.tolist() == [0, 1, 0, 1] and np.array_equal(both.targets.raw, np.tile(data.targets.raw, (2, 1)))
     assert np.array_equal(both.pins.nodes_px, np.concatenate([data.pins.nodes_px, other.nodes_px]))
     train, held = split_rows(len(both), 0, both.group)

@@ -129,13 +129,13 @@ class PinsSeen:
     def at_known_rest(self):
         return PinsSeen(self.known)
 
-    def told_rest(self, nodes_px, name):
+    def rest_from_contacts(self, nodes_px, name):
         if self.turned:
             raise FrameError(f"{name}: the camera's picture is turned")
         other = other_rest(self.known, START, nodes_px)
         return (self.at_known_rest(), False) if other is None else (PinsSeen(self.known, make_reference(other, PINS)), True)
 
-    def unseen(self, seen, started):
+    def estimate_without_pose(self, seen, started):
         return SimpleNamespace(valid=False, reason=seen.reason, seen=seen.seen)
 
     def __call__(self, pins_px):

@@ -20,7 +20,7 @@ OF_THE_PROGRAM |= {"OpenSection", "Layout", "LatticeLayout", "RingedLayout", "Ma
 
 
 def test_every_public_function_class_and_method_is_explained():
-    assert not api.undocumented()
+    assert not api.list_undocumented()
 
 
 def test_a_function_without_a_docstring_is_found(monkeypatch, tmp_path):
@@ -29,7 +29,7 @@ def test_a_function_without_a_docstring_is_found(monkeypatch, tmp_path):
         '"""A module."""\ndef said():\n    """Says."""\ndef silent():\n    pass\nclass A:\n    """A."""\n    def mute(self): pass\n'
     )
     monkeypatch.setattr(api, "modules", lambda: [api.Module("twin.silent", source)])
-    assert api.undocumented() == ["twin.silent.silent", "twin.silent.A.mute"]
+    assert api.list_undocumented() == ["twin.silent.silent", "twin.silent.A.mute"]
 
 
 def test_every_module_stands_on_a_page():
@@ -69,7 +69,7 @@ SECTIONS = {
 
 @pytest.mark.parametrize("section", SECTIONS.values(), ids=SECTIONS)
 def test_every_key_is_explained(section):
-    assert not specifications.unexplained(section), f"{section.__name__}: name these keys under 'Attributes' of its docstring"
+    assert not specifications.list_unexplained(section), f"{section.__name__}: name these keys under 'Attributes' of its docstring"
 
 
 @pytest.mark.parametrize("section", SECTIONS.values(), ids=SECTIONS)
@@ -101,8 +101,8 @@ def test_a_key_that_is_not_explained_is_found():
         length_mm: float = 2.5
         count: int = 1
 
-    assert specifications.explained(Springs)["length_mm"] == Explained("float", "Of one.")
-    assert specifications.unexplained(Springs) == ["count"]
+    assert specifications.explain_attributes(Springs)["length_mm"] == Explained("float", "Of one.")
+    assert specifications.list_unexplained(Springs) == ["count"]
     text = specifications.text_of(SpecificationFile("springs", "Springs", Springs, "Nowhere."))
     assert "| `length_mm` | mm | `2.5` | number | Of one. |" in text and "| `rate_n` | N | **must be given** | number, > 0 |" in text
 

@@ -9,7 +9,7 @@ import pytest
 
 from scenes import load_sensor
 from training.errors import TrainingError
-from training.estimate.domain import FEWEST, Verdict, learn_domain, read_domain, write_domain
+from training.estimate.domain import FEWEST, DomainVerdict, learn_domain, read_domain, write_domain
 from training.estimate.estimator import PoseEstimator
 from twin.pins import nominal_reference
 from twin.types import Form
@@ -38,7 +38,7 @@ def domain():
 
 
 def judged(moved, lost=NONE_LOST, **options):
-    return domain().judge(moved, lost, REFERENCE, **options)
+    return domain().assess(moved, lost, REFERENCE, **options)
 
 
 def test_contacts_like_those_of_the_training_are_usual():
@@ -96,7 +96,7 @@ def test_the_cameras_place_follows_from_contacts_of_which_most_are_known():
 def test_intervals_grow_with_the_distance_and_never_shrink_until_there_is_no_estimate():
     straight, strange = contacts(1, 5)[0][0], np.random.default_rng(6).normal(size=(len(PLACES), 2))
     loose = replace(domain(), limits=domain().limits * [1, 1, 1, 9, 9, 9, 9, 1, 1, 1, 1])  # the parts alone would refuse before
-    verdicts = [loose.judge(straight + size * strange, NONE_LOST, REFERENCE) for size in np.linspace(0, 0.2, 41)]
+    verdicts = [loose.assess(straight + size * strange, NONE_LOST, REFERENCE) for size in np.linspace(0, 0.2, 41)]
     first = next(k for k, each in enumerate(verdicts) if each.reason)
     factors = [each.factor for each in verdicts[:first]]
     assert factors == sorted(factors) and factors[-1] > 1.2 and all(each.reason for each in verdicts[first:])
@@ -114,9 +114,9 @@ def test_lost_pins_are_filled_in_and_what_is_not_known_of_them_widens():
     moved = contacts(1, 9)[0][0]
     few, half = NONE_LOST.copy(), np.hypot(*(PLACES - [0.5, 0.0]).T) < 3.0
     few[::25] = True
-    filled, unsure = domain().filled(np.where(few[:, None], 9.0, moved), few)
+    filled, unsure = domain().fill_lost(np.where(few[:, None], 9.0, moved), few)
     assert np.abs(filled - moved)[few].max() < 0.05 and np.array_equal(filled[~few], moved[~few])
-    assert domain().filled(moved, half)[1] > unsure > 0 and not judged(np.where(few[:, None], 9.0, moved), few).reason
+    assert domain().fill_lost(moved, half)[1] > unsure > 0 and not judged(np.where(few[:, None], 9.0, moved), few).reason
 
 
 def test_an_estimate_far_outside_the_trained_range_is_named():
@@ -144,6 +144,6 @@ def test_a_model_of_a_sensor_that_was_never_calibrated_says_what_is_assumed():
     calibrated = PoseEstimator.load("mg400-127")
     assumed = copy(calibrated)
     assumed.sensor, assumed.domain = calibrated.sensor.model_copy(update={"rig": None}), replace(calibrated.domain, simulated=True)
-    low, high, _ = assumed._widening(np.array([-3.0, 20.0]), np.array([0.1, 2.0]), 0.0, Verdict(""), np.zeros(2))
+    low, high, _ = assumed._widening(np.array([-3.0, 20.0]), np.array([0.1, 2.0]), 0.0, DomainVerdict(""), np.zeros(2))
     assert high - low == pytest.approx([2 * (0.1 + 0.015 * 20 + 0.1 * 3), 2 * (2.0 + 1.0)])
     assert any("never calibrated" in line for line in assumed.caveats) and not any("never" in line for line in calibrated.caveats)

@@ -28,7 +28,7 @@ from training.environments.tasks import TASKS, ObjectPush, ObjectRoll, SurfaceFo
 from training.environments.world import Surfaces, Tool, inverse, motions, standing_on, turn_about, work_frame
 from training.estimate.estimator import PoseEstimator
 from training.runs.packed import shipped_names
-from training.surrogate.felt import Felt, FiniteElements
+from training.surrogate.reading import ContactReading, FiniteElements
 from twin.errors import ContactError, OptionError
 
 PLACE_TOLERANCE_MM = 1e-6  # of geometry computed in double precision
@@ -54,7 +54,7 @@ def test_a_motion_is_the_rotation_of_its_turn_vector():
 def test_a_tool_stands_as_deep_and_as_turned_as_it_is_put(thing, sensor):
     tool, surface = tool_of(sensor), Surfaces()[load_object(thing)]
     T = standing_on(tool, surface, 4.0, 2.3, 7.0)
-    touch = surface.touched(tool.mounting, tool.seen(T[None], np.eye(4)[None]))
+    touch = surface.depth_and_angle(tool.mounting, tool.object_poses(T[None], np.eye(4)[None]))
     assert touch.indent_mm[0] == pytest.approx(2.3, abs=PLACE_TOLERANCE_MM)
     assert abs(touch.angle_deg[0]) == pytest.approx(7.0, abs=PLACE_TOLERANCE_MM)
 
@@ -75,7 +75,7 @@ def test_z_goes_towards_the_object_and_ry_turns_the_tool():
     T = standing_on(tool, surface, 0.0, 2.0, 0.0)[None]
 
     def touched(step):
-        return surface.touched(tool.mounting, tool.seen(T @ motions(np.array([step])), np.eye(4)[None]))
+        return surface.depth_and_angle(tool.mounting, tool.object_poses(T @ motions(np.array([step])), np.eye(4)[None]))
 
     assert touched([0, 0, 0.5, 0, 0, 0]).indent_mm[0] == pytest.approx(2.5)
     assert touched([1.0, 0, 0, 0, 0, 0]).indent_mm[0] == pytest.approx(2.0)
@@ -95,10 +95,10 @@ def test_a_ball_rolls_without_sliding():
     start = task.begin(0, tool, load_object("sphere"), Surfaces(), np.random.default_rng(1))
     before, T_object = start.T_work[None], start.T_object[None]
     moved = before @ motions(np.array([[0.2, -0.1, 0, 0, 0, 0]]))
-    felt = Felt.at_rest(1, np.zeros((331, 3)))
-    assert np.array_equal(task.carried(felt, moved, before, T_object), T_object)  # nothing holds it
+    felt = ContactReading.at_rest(1, np.zeros((331, 3)))
+    assert np.array_equal(task.carry_object(felt, moved, before, T_object), T_object)  # nothing holds it
     felt.force_n[0, 2] = 0.5
-    after = task.carried(felt, moved, before, T_object)
+    after = task.carry_object(felt, moved, before, T_object)
     middle = [T[0, :3, 3] + task.kept[0, 0] * T[0, :3, 2] for T in (T_object, after)]
     assert middle[1] - middle[0] == pytest.approx([0.1, -0.05, 0.0])
     bottom = np.append(middle[0] + [0, 0, task.kept[0, 0]], 1.0)  # of the ball, on the table
@@ -110,13 +110,13 @@ def test_a_block_rests_while_the_push_is_within_its_friction_and_slides_beyond()
     task, tool = ObjectPush(), tool_of()
     task.prepare(1)
     start = task.begin(0, tool, load_object("square"), Surfaces(), np.random.default_rng(0))
-    felt = Felt.at_rest(1, np.zeros((331, 3)))
+    felt = ContactReading.at_rest(1, np.zeros((331, 3)))
     T_work, T_object = start.T_work[None], start.T_object[None]
     forward = (T_work @ tool.T_work_sensor)[0, :3, :3].T @ [0.0, 0.0, 1.0]
     felt.force_n[0] = 0.9 * task.kept[0, 0] * forward * 0.5
-    assert task.pushed(felt, T_work, T_object, tool) is None
+    assert task.push_object(felt, T_work, T_object, tool) is None
     felt.force_n[0] = 3.0 * task.kept[0, 0] * forward
-    pushed = task.pushed(felt, T_work, T_object, tool)
+    pushed = task.push_object(felt, T_work, T_object, tool)
     assert pushed is not None and pushed[0, 2, 3] > 0.1
 
 
@@ -131,7 +131,7 @@ def test_a_push_pays_what_it_gains_and_waiting_and_going_back_pay_nothing():
     for middle in (10.0, 20.0, 20.0, 15.0, 19.0):
         batch.T_object[0, 2, 3] = middle
         batch.T_work[0, :3, 3] = start + [0.0, 0.0, middle]
-        judged = task.judge(batch._seen_now())
+        judged = task.judge(batch._observe_world())
         told.append((judged.reward[0], judged.terms["gain_mm"][0], judged.terms["off_mm"][0]))
         assert judged.terms["miss_mm"][0] == pytest.approx(0.0)
     reward, gain, off = np.array(told).T
@@ -147,8 +147,10 @@ def test_a_way_back_and_forth_covers_nothing():
     for along in (0.0, 0.5, 1.0, 0.5, 1.0, 1.5):
         batch.T_work[0] = standing_on(batch.tool, surface, along, 3.0, 0.0)
         if not rewards:
-            task.kept[0, 2:4] = surface.touched(batch.tool.mounting, batch.tool.seen(batch.T_work, batch.T_object)).place_mm[0, [0, 2]]
-        rewards.append(task.judge(batch._seen_now()).reward[0])
+            task.kept[0, 2:4] = surface.depth_and_angle(batch.tool.mounting, batch.tool.seen(batch.T_work, batch.T_object)).place_mm[
+                0, [0, 2]
+            ]
+        rewards.append(task.judge(batch._observe_world()).reward[0])
     assert rewards == pytest.approx([0.0, 1.0, 1.0, 0.0, 0.0, 1.0]) and task.kept[0, 0] == pytest.approx(1.5)
 
 
@@ -167,7 +169,7 @@ def test_failing_is_never_cheaper_than_going_on(name):
             lost = done.terminated[rows] & ~done.info["is_success"][rows]
             assert (done.reward[rows][lost] == batch.task.failed_reward).all()
             assert (done.reward[rows][~lost] >= batch.task.failed_reward).all()
-            assert np.isfinite([done.info[key] for key in ("indent_mm", *batch.task.judge(batch._seen_now()).terms)]).all()
+            assert np.isfinite([done.info[key] for key in ("indent_mm", *batch.task.evaluate(batch._observe_world()).terms)]).all()
             failed, gone_on = failed + lost.sum(), gone_on + (~lost).sum()
             rows = rows[~done.terminated[rows]]
             if not len(rows):
@@ -180,7 +182,7 @@ def test_the_goal_of_a_push_is_told_as_the_tool_sees_it():
     goal = np.array([[3.0, 40.0], [3.0, 40.0]])
     T = np.stack([np.eye(4), turn_about((0, 1, 0), 90.0)])
     T[:, :3, 3] = [3.0, 0.0, 20.0]
-    assert np.allclose(ObjectPush().asked(goal, T), [[0.0, 2.0], [-2.0, 0.0]])
+    assert np.allclose(ObjectPush().goals_for_agents(goal, T), [[0.0, 2.0], [-2.0, 0.0]])
 
 
 def test_a_sensor_that_knows_its_angle_gets_around_the_sharpest_corner():
@@ -188,7 +190,7 @@ def test_a_sensor_that_knows_its_angle_gets_around_the_sharpest_corner():
     task, tool, surface = TASKS["ContourFollow"](), tool_of(), Surfaces()[load_object("prism")]
     T, way = standing_on(tool, surface, 20.0, 3.0, 0.0)[None], []
     for _ in range(200):
-        touch = surface.touched(tool.mounting, tool.seen(T, np.eye(4)[None]))
+        touch = surface.depth_and_angle(tool.mounting, tool.object_poses(T, np.eye(4)[None]))
         way.append((touch.angle_deg[0], touch.indent_mm[0]))
         step = [*task.feed_mm, 0.0, np.clip(touch.angle_deg[0], -5, 5), 0.0]
         step[2] += np.clip(3.0 - touch.indent_mm[0], -1, 1)
@@ -216,7 +218,7 @@ def test_reward_is_largest_where_the_task_wants_the_sensor():
     rewards = []
     for off_mm in (0.0, 0.5, 1.0):
         batch.T_work[0] = standing_on(batch.tool, surface, 0.0, batch.goal[0, 0] + off_mm, 0.0)
-        judged = batch.task.judge(batch._seen_now())
+        judged = batch.task.evaluate(batch._observe_world())
         rewards.append(float(judged.reward[0]))
         assert judged.terms["off_mm"][0] == pytest.approx(off_mm)
     assert rewards[0] == pytest.approx(1.0) and rewards == sorted(rewards, reverse=True)
@@ -232,7 +234,7 @@ def test_a_state_without_touch_is_not_good_and_a_lost_object_ends_the_episode(ta
     batch.begin(0, np.random.default_rng(0))
     batch.T_work[0], batch.T_object[0], batch.goal[0] = np.eye(4), np.eye(4), 0.0
     batch.T_work[0, :3, 3] = -batch.tool.T_work_sensor[:3, 3] + [0.0, 0.0, indent_mm - batch.tool.mounting.skin_apex_mm]
-    judged = batch.task.judge(batch._seen_now())
+    judged = batch.task.evaluate(batch._observe_world())
     assert judged.failed[0] == fails and (judged.good & ~judged.failed)[0] == good
 
 
@@ -260,7 +262,7 @@ def test_a_state_without_touch_is_not_good_and_a_lost_object_ends_the_episode(ta
 )
 def test_an_option_that_cannot_be_meant_is_named(given, named):
     with pytest.raises(OptionError, match=named.replace("(", r"\(")):
-        Options.given(given)
+        Options.from_keywords(given)
 
 
 @pytest.mark.parametrize(("task", "thing"), [("ObjectRoll", "can"), ("EdgeFollow", "plane")])

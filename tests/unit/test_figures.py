@@ -15,7 +15,7 @@ from scenes import load_sensor
 from twin.errors import RenderError
 from twin.optics.relief import DETAILS, without
 from twin.optics.render import Renderer
-from twin.store.fingerprint import Code
+from twin.store.fingerprint import CodeOf
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_what_it_was_made_from_decides_whether_it_counts(counted, tmp_path, monk
     run(job, path, tmp_path)
     other = Job(job.name, job.measure, job.command, ("mg400-331",), job.code, (), 0.0)
     assert not is_kept(other, path), "another specification"
-    monkeypatch.setattr(module, "code_behind", lambda *names, beside=(): Code({"scenes": "changed"}, {}))
+    monkeypatch.setattr(module, "code_behind", lambda *names, beside=(): CodeOf({"scenes": "changed"}, {}))
     assert not is_kept(job, path), "other code"
     run(job, path, tmp_path)
     assert is_kept(job, path) and values(path)["probe.force.force"].value == 1.0
@@ -66,7 +66,7 @@ def test_every_jobs_code_and_files_are_found():
 def test_only_code_that_a_figure_comes_from_makes_it_old():
     pins, poses = (set(module.code_behind(name).modules) for name in ("twin.pins.batch", "training.studies.sim_to_real"))
     assert "twin.pins.blobs" in pins and "twin.mechanics.solver" not in pins
-    assert {"twin.mechanics.solver", "training.studies.sim_to_real.inverted"} <= poses
+    assert {"twin.mechanics.solver", "training.studies.sim_to_real.model_inversion"} <= poses
     assert not [name for name in pins | poses if name.startswith(module.UNMEASURED)]
 
 
@@ -92,9 +92,9 @@ def test_another_version_of_a_library_makes_a_figure_old(counted, monkeypatch):
     job, _ = counted
     now, before = module.code_behind("twin.pins.batch"), module.fingerprint(job)
     assert "numpy" in now.libraries
-    monkeypatch.setattr(module, "code_behind", lambda *names, beside=(): Code({}, {"numpy": "1.0"}))
+    monkeypatch.setattr(module, "code_behind", lambda *names, beside=(): CodeOf({}, {"numpy": "1.0"}))
     first = module.fingerprint(job)
-    monkeypatch.setattr(module, "code_behind", lambda *names, beside=(): Code({}, {"numpy": "2.0"}))
+    monkeypatch.setattr(module, "code_behind", lambda *names, beside=(): CodeOf({}, {"numpy": "2.0"}))
     assert len({before, first, module.fingerprint(job)}) == 3
 
 

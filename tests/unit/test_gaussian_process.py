@@ -15,11 +15,11 @@ from training.runs.gaussian_process import (
     Points,
     Posterior,
     Processes,
-    climbed,
-    drawn_rows,
+    climb_likelihood,
     fit_processes,
     fit_two_fidelities,
     likeliest,
+    sample_rows,
 )
 
 ROWS, INPUTS = 14, 3
@@ -109,7 +109,7 @@ def test_climbing_finds_likelier_parameters():
     rng = np.random.default_rng(5)
     points, start = points_of(rng, 30, mixed=False), Kernel(SMOOTH_AND_LINEAR, np.full(INPUTS, 5.0), np.array([1.0, 0.3]), np.array([0.05]))
     label = np.sin(points.inputs[:, 0]) + 0.5 * points.inputs[:, 1] + 0.1 * rng.normal(size=30)
-    found = climbed(start, points, label)
+    found = climb_likelihood(start, points, label)
     assert found.log_likelihood(points, label) > start.log_likelihood(points, label) + 10
     assert found.lengths[2] > found.lengths[0], "the third input tells nothing"
 
@@ -171,6 +171,6 @@ def test_a_simulated_state_says_nothing_of_the_real_offset_and_a_real_frame_does
 
 
 def test_rows_are_drawn_once_each_and_never_more_than_needed():
-    assert sorted(drawn_rows(50, 0)) == list(range(50))
-    many = drawn_rows(3 * FIT_ROWS, 1)
-    assert len(set(many.tolist())) == FIT_ROWS and not np.array_equal(many, drawn_rows(3 * FIT_ROWS, 2))
+    assert sorted(sample_rows(50, 0)) == list(range(50))
+    many = sample_rows(3 * FIT_ROWS, 1)
+    assert len(set(many.tolist())) == FIT_ROWS and not np.array_equal(many, sample_rows(3 * FIT_ROWS, 2))

@@ -15,7 +15,7 @@ from small_generation import contents, small_config
 from scenes import load_object, load_sensor
 from training.data.dataset import load_dataset, split_rows
 from training.data.simulated import open_simulated
-from training.data.targets import corrected
+from training.data.targets import correct_labels
 from training.generation import DatasetError, generate
 from training.generation.config import draw_contact
 from training.runs.run import fold_rows
@@ -29,7 +29,7 @@ from twin.pins import nominal_reference
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import read_arm_labels, read_executed
-from twin.store import atomic, locked
+from twin.store import atomic, lock_folder
 from twin.types import Form
 
 COUNT = 4
@@ -186,7 +186,7 @@ def test_a_damaged_data_set_is_refused_by_the_name_of_its_file(made, tmp_path, w
     copy = tmp_path / "set"
     shutil.copytree(folder, copy)
     DAMAGES[what](copy)
-    with pytest.raises(TwinError, match=rf"set/{what.split()[0]}.*(copy the data set anew)") as error:
+    with pytest.raises(TwinError, match=rf"set/{what.split()[0]}.*(copy the data set again)") as error:
         load_dataset(copy, config.sensor)
     assert len(str(error.value).splitlines()) == 1
 
@@ -233,7 +233,7 @@ def test_pins_alone_are_read_like_frames_and_split_by_contact(made):
     assert np.allclose(data.pins.reference.pins_px, nominal_reference(config.sensor, Form.PROCESSED).pins_px)
     assert np.isfinite(data.pins.area_px2).all() and np.array_equal(data.pins.lost, ~truth["visible"][:])
     slope = np.tan(np.radians(rig_of(config.sensor).plate_tilt_deg))
-    flat = corrected(data.targets.names, data.targets.raw, data.targets.executed, data.targets.move, slope, truth["pose"][:, 0])
+    flat = correct_labels(data.targets.names, data.targets.raw, data.targets.executed, data.targets.move, slope, truth["pose"][:, 0])
     assert np.abs(data.targets.corrected - flat).max() < ARC_MM, "on a plate the surface that was touched has the arm's labels"
     undone = data.targets.executed == 0
     assert undone.any() and np.allclose(data.targets.corrected[undone, 2:], 0)
@@ -328,7 +328,7 @@ def test_a_data_set_made_by_other_code_is_refused_and_left_as_it_was(made, tmp_p
 
 def test_two_runs_at_once_in_one_folder_are_refused(made):
     folder, config, _ = made
-    with locked(folder), pytest.raises(StoreError, match="another run is at work there"):
+    with lock_folder(folder), pytest.raises(StoreError, match="another run is at work there"):
         generate(folder, config, COUNT)
     assert generate(folder, config, COUNT).before == COUNT
 

@@ -6,8 +6,8 @@ import pytest
 
 from hardware.collect.gather import gather_frames
 from hardware.errors import DeviceError
+from twin.calibration.go_on import experiment_like, whole_sensor
 from twin.errors import OptionError
-from twin.fit.go_on import experiment_like, whole_sensor
 from twin.frames import open_recording
 from twin.types import Form, Frame
 

@@ -1,4 +1,4 @@
-"""A well sensor is well; each planted fault is named."""
+"""A sound sensor is reported healthy; each planted fault is named."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -11,12 +11,12 @@ from plain_sensor import changed, plain
 from hardware.live.examining import examine_sensor
 from scenes import load_sensor
 from twin.camera.truth import cap_truth
+from twin.evaluation.degradation.condition import DegradedCase
+from twin.evaluation.degradation.conditions import CONDITIONS
+from twin.evaluation.degradation.shots import CONTACTS, ObjectContact, RenderedSource, pins_under
 from twin.frames.forms import blob_spec, frame_size
 from twin.frames.images import write_image
 from twin.geometry.pins import rest_pins
-from twin.judge.degradation.condition import Case
-from twin.judge.degradation.conditions import CONDITIONS
-from twin.judge.degradation.shots import CONTACTS, Contact, RenderedSource, pins_under
 from twin.mechanics.path import ContactPose
 from twin.pins import DetectorSpec, Grade, examine
 from twin.pins.check import drift_of
@@ -30,8 +30,8 @@ def sensor():
 
 
 def frames(name, severity):
-    source = RenderedSource(sensor(), (Contact("none", "plane", ContactPose(0.0)),))
-    return [shot.frame for shot in source.shoot(Case((CONDITIONS[name],)), severity)]
+    source = RenderedSource(sensor(), (ObjectContact("none", "plane", ContactPose(0.0)),))
+    return [shot.frame for shot in source.render(DegradedCase((CONDITIONS[name],)), severity)]
 
 
 def verdicts(shown):
@@ -92,7 +92,7 @@ def test_frames_that_cannot_be_used_are_named():
     shown = [drawn_frame(spec, Form.PROCESSED, rest, name=f"frame_{k}.png") for k in range(4)]
     shown[2] = replace(shown[2], image=np.zeros_like(shown[2].image))
     found = {each.name: each for each in examine(shown, spec)}["pins"]
-    assert "3 of 4 frames can be used; not frame_2.png" in found.text and "no pins" in found.remedy
+    assert "3 of 4 frames are valid; not frame_2.png" in found.text and "no pins" in found.remedy
     assert "frame_" not in {each.name: each for each in examine(shown[:2], spec)}["pins"].text
 
 

@@ -27,10 +27,10 @@ from scenes.load import SHIPPED
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from twin.errors import ContactError, FrameError, OptionError, TwinError
+from twin.evaluation.degradation.plan import load_plan
 from twin.frames import open_recording
 from twin.frames.forms import form_of, known_frames
 from twin.geometry.solid import Resolution
-from twin.judge.degradation.plan import load_plan
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.one_contact import render_contact

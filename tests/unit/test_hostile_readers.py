@@ -273,7 +273,7 @@ def test_pins_from_a_named_pipe_are_not_waited_for(tmp_path, spec):
 def test_a_specification_whose_pins_lie_beyond_any_frame_is_refused(spec):
     with np.errstate(over="ignore"):
         far = spec.model_copy(update={"camera": spec.camera.model_copy(update={"fx_px": 1e308})})
-        with pytest.raises(TwinError, match=r"pins at rest .* far off any frame; mend \[camera\]"):
+        with pytest.raises(TwinError, match=r"pins at rest .* far off any frame; repair \[camera\]"):
             nominal_reference(far, Form.PROCESSED)
 
 

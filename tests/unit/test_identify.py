@@ -1,4 +1,4 @@
-"""A layout is identified from frames alone, and a wrong one is never sure: by drawn frames of cameras that nobody knows."""
+"""A layout is identified from frames alone, and a wrong one is never sure: by rasterised frames of cameras that nobody knows."""
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
 from twin.pins import tune
 from twin.pins.bumps import find_bumps
-from twin.pins.identify import _matched, identify, judge_layout, symmetries
+from twin.pins.identify import _match_known, identify, score_layout, symmetries
 from twin.types import Form, Frame
 
 LAYOUTS = [
@@ -113,9 +113,9 @@ def test_a_layout_whose_pins_fall_together_explains_nothing():
     pins = PinsSpec(rings=3)
     rest = rest_of(pins)
     spots = find_bumps(frames_of(rest, 1)[0], 6.0)
-    assert _matched(pins, rest, spots).explained > 0.9
+    assert _match_known(pins, rest, spots).explained > 0.9
     rest[5] = rest[6]
-    assert _matched(pins, rest, spots).explained == 0.0
+    assert _match_known(pins, rest, spots).explained == 0.0
 
 
 def test_a_pin_that_the_rim_lacks_may_be_dark_and_is_not_sure():
@@ -183,7 +183,7 @@ def test_given_positions_are_seen_wherever_they_lie():
     rng = np.random.default_rng(3)
     places = pin_lattice(PinsSpec(rings=4)).places + rng.normal(0, 0.04, (61, 2))
     pins = PinsSpec(layout="positions", positions=tuple(map(tuple, places.tolist())))
-    shown = judge_layout(pins, frames_of(rest_of(pins, turn_deg=140.0)))
+    shown = score_layout(pins, frames_of(rest_of(pins, turn_deg=140.0)))
     assert shown is not None and shown.explained > 0.97
     assert len(symmetries(pins)) == 1
 

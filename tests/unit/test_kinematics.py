@@ -179,8 +179,8 @@ def test_an_object_is_turned_about_the_approach_and_shifted_in_the_robots_axes()
     plan = load_experiment("edge-circle")
     placed = PlacedSpec(object="edge", contact_offset_mm=0.5, object_shift_mm=(0.0, 1.0), object_turn_deg=90.0)
     rig = RigSpec(tcp_to_dome_mm=-RADIUS_MM, placed=(placed,))
-    before, field = rig.before("edge"), build_field(load_object("edge"))
-    assert before.placed == () and before.contact_offset_mm == 0.5 and rig.before("plane") == rig.model_copy(update={"placed": ()})
+    before, field = rig.for_object("edge"), build_field(load_object("edge"))
+    assert before.placed == () and before.contact_offset_mm == 0.5 and rig.for_object("plane") == rig.model_copy(update={"placed": ()})
     for turn in (0.0, 77.0, -150.0):
         for y, beside in ((-14.0, True), (9.0, False)):
             T = object_pose(before, plan, np.array([3.0, y, 2.0, 0, 0, turn]), RADIUS_MM)

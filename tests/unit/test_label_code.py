@@ -11,7 +11,7 @@ from training.data.targets import Targets
 from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
 from training.runs.run import train_run
-from training.studies.judging import judge
+from training.studies.judging import measure_errors
 
 UNITS = ("mm", "deg")
 
@@ -51,7 +51,7 @@ def test_a_judge_takes_the_short_way_and_so_do_the_intervals():
     targets = Targets(("pose_2", "pose_6"), truth, truth, np.full(2, np.nan), np.zeros((2, 2)))
     data = type("Data", (), {"targets": targets})()
     half = np.full((2, 2), 1.5)
-    found = judge(Prediction(-truth, half, half, np.full(2, np.nan)), data, np.arange(2))
+    found = measure_errors(Prediction(-truth, half, half, np.full(2, np.nan)), data, np.arange(2))
     assert found["corrected"]["pose_6"]["mae"] == pytest.approx(1.0) and found["raw"]["pose_6"]["coverage_90"] == 1.0
 
 

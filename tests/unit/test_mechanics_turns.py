@@ -16,7 +16,7 @@ from twin.mechanics.body.material import law_coefficients
 from twin.mechanics.contact import contact_points
 from twin.mechanics.law import ContactLaw
 from twin.mechanics.path import plan_path
-from twin.mechanics.turns import Turns, turned, turned_back, turned_matrix
+from twin.mechanics.turns import Turns, turn_vectors, turned_back, turned_matrix
 from twin.objects import build_field
 
 EXACT = 1e-9  # rotations: the polar decomposition's own end
@@ -66,8 +66,8 @@ def test_turned_vectors_are_the_matrix_times_them(solid, body):
     found = turns.since(turns.strains(solid.control_mm), pressed(solid.control_mm, 2.0))
     matrix, vector = rng.normal(size=(2, *[3 * len(found)] * 2)), rng.normal(size=3 * len(found))
     symmetric = matrix[0] + matrix[0].T
-    assert np.allclose(turned_back(found, turned(found, vector)), vector, atol=EXACT)
-    assert np.allclose(turned_matrix(found, symmetric) @ vector, turned(found, symmetric @ turned_back(found, vector)), atol=1e-6)
+    assert np.allclose(turned_back(found, turn_vectors(found, vector)), vector, atol=EXACT)
+    assert np.allclose(turned_matrix(found, symmetric) @ vector, turn_vectors(found, symmetric @ turned_back(found, vector)), atol=1e-6)
 
 
 def effort(sensor):

@@ -20,11 +20,11 @@ from training.models import MODELS, model_named, recipe_of, register, variant_na
 from training.models.part import PinModel
 from training.models.recipes import Recipe
 from training.models.vgnn.network import mode_components
-from training.models.vgnn.registration import fit_registration, spanned
+from training.models.vgnn.registration import count_modes, fit_registration
 from training.runs.config import RunConfig
 from training.runs.packed import SHIPPED, WEIGHTS, pack, shipped_names
 from training.runs.run import train_run
-from training.studies.judging import judge, rows_to_judge
+from training.studies.judging import measure_errors, rows_to_evaluate
 from twin.errors import FrameError
 from twin.pins import make_graph
 from twin.types import Form, Frame
@@ -82,9 +82,9 @@ def test_a_new_model_trains_is_judged_estimates_and_is_kept_with_no_other_change
     assert train_run(RunConfig(toy, recipe_of(toy)), data, tmp_path)
     assert json.loads((tmp_path / "config.json").read_text())["model"] == toy and (tmp_path / "weights.pt").is_file()
     estimator = PoseEstimator.load(tmp_path)
-    rows = rows_to_judge(estimator, data, "validation")
+    rows = rows_to_evaluate(estimator, data, "validation")
     made = estimator.predict_rows(data, rows)
-    errors = judge(made, data, rows)["corrected"]
+    errors = measure_errors(made, data, rows)["corrected"]
     for k, name in enumerate(data.targets.names):
         truth = data.targets.corrected[:, k]
         assert errors[name]["mae"] < LEARNT * np.abs(truth - truth.mean()).mean()
@@ -256,7 +256,7 @@ def test_rounding_is_no_mode_wherever_modes_are_taken():
     registration, _ = fit_registration(flat.reshape(12, 60, 2), rest)
     assert registration.components.shape[1] == 3
     assert int((mode_components(torch.from_numpy(flat - flat.mean(axis=0)), 40).norm(dim=0) > 0).sum()) == 3
-    assert spanned(np.array([1.0, 0.5, 0.2]), 2) == 2
+    assert count_modes(np.array([1.0, 0.5, 0.2]), 2) == 2
 
 
 def test_a_small_copy_holds_the_processes_beside_the_networks_up_to_a_number_of_rows(data, tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from plain_sensor import changed, plain
 
-from twin.fit.light.response import apparent_mm, defocus_px
+from twin.calibration.light.response import apparent_mm, defocus_px
 from twin.optics.defocus import circles_px, defocused
 
 

@@ -99,7 +99,7 @@ def test_all_light_that_enters_the_gel_crosses_each_plane_in_it(depth_mm):
 
 def test_a_way_to_the_camera_is_the_ray_of_the_pixel(small):
     rest = rest_pins(small.geometry)
-    toward, length = direct_light(small).ways(rest.caps_mm, np.array([0.0, 0.0, -small.camera.distance_mm]))
+    toward, length = direct_light(small).refracted_rays(rest.caps_mm, np.array([0.0, 0.0, -small.camera.distance_mm]))
     entry, inward = pixel_rays(small.view, project(small.view, rest.caps_mm))
     rounding = 1e-12
     np.testing.assert_allclose(toward, -inward, atol=rounding)

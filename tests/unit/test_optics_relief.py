@@ -7,11 +7,11 @@ from plain_sensor import changed, plain
 
 from scenes.pins import PinsSpec
 from scenes.sensor import BackgroundSpec, ReliefSpec, SensorSpec
+from twin.calibration.details import CELLS, REACH, fit_details, undetermined_tiles
 from twin.camera.capture import expose
 from twin.errors import FrameError, RenderError
-from twin.fit.details import CELLS, REACH, fit_details, undetermined_tiles
+from twin.evaluation.pictures.aligned import Aligned
 from twin.geometry.pins import rest_pins
-from twin.judge.pictures.aligned import Aligned
 from twin.mechanics.skin_fit import FittedPins
 from twin.optics.measured import picture_of, values_of
 from twin.optics.preview import Preview

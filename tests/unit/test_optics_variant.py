@@ -10,7 +10,7 @@ import pytest
 
 from twin.errors import RenderError
 from twin.optics.variants import probes, variant
-from twin.optics.variants.probes import Verdict
+from twin.optics.variants.probes import ProbeResult
 
 RENDER_TINY = """
 import sys
@@ -105,7 +105,7 @@ def test_newest_library_is_tried_first_and_old_ones_without_a_probe(tmp_path, mo
 
     def refuse(backend, path):
         probed.append(path.name)
-        return Verdict(False, "", "refused")
+        return ProbeResult(False, "", "refused")
 
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(variant, "probe", refuse)
@@ -118,8 +118,8 @@ def test_verdicts_are_remembered_until_the_library_changes(tmp_path, monkeypatch
     library, runs = tmp_path / "libLLVM.so.19.1", []
     library.touch()
     monkeypatch.setenv("TACTIP_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(probes, "_run", lambda backend, path: runs.append(path) or Verdict(True, "19.1", ""))
-    assert probes.probe("llvm", library) == probes.probe("llvm", library) == Verdict(True, "19.1", "")
+    monkeypatch.setattr(probes, "_run", lambda backend, path: runs.append(path) or ProbeResult(True, "19.1", ""))
+    assert probes.probe("llvm", library) == probes.probe("llvm", library) == ProbeResult(True, "19.1", "")
     assert len(runs) == 1
     os.utime(library, ns=(1, 1))
     probes.probe("llvm", library)

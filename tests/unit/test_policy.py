@@ -14,13 +14,13 @@ from hardware.servo.policy_law import load_for_outlines, policy_law
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.environments import learn, policy_domain
 from training.environments.batch import Batch, Options
-from training.environments.learn import LearnPlan, Learnt, judge_policy, learn_policy
+from training.environments.learn import LearnPlan, Learnt, evaluate_policy, learn_policy
 from training.environments.policy_domain import contacts_of
 from training.environments.world import Surfaces, standing_on
 from twin.cli import command_line
 from twin.errors import FrameError, OptionError
 from twin.geometry.pins import rest_pins
-from twin.policy import Policy, PolicyError, PolicyModel, flattened, load_policy, with_goal
+from twin.policy import Policy, PolicyError, PolicyModel, flatten, load_policy, with_goal
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
 
@@ -170,7 +170,7 @@ def start_on(batch, depth_mm):
 
 def test_a_policy_without_sight_sees_fewer_directions_alone(few_looks):
     vector = learn.TactileVectorEnv("SurfaceFollow", 2, sensor="mg400-127", objects=("plane",))
-    with_sight, without = (learn._untrained(LearnPlan("SurfaceFollow", SMALL, sight=sight), vector) for sight in (True, False))
+    with_sight, without = (learn._untrained_inputs(LearnPlan("SurfaceFollow", SMALL, sight=sight), vector) for sight in (True, False))
     assert len(with_sight.basis) == 2 * len(without.basis) and with_sight.sight and not without.sight
 
 
@@ -201,13 +201,15 @@ def test_a_policy_is_learnt_from_pictures_in_small(tmp_path, few_looks):
 def test_pictures_are_seen_as_means_of_squares():
     picture = np.zeros((1, 128, 128, 2), np.uint8)
     picture[0, 4:8, 8:10, 1] = 255
-    seen = flattened(picture).reshape(32, 32, 2)
+    seen = flatten(picture).reshape(32, 32, 2)
     assert seen[1, 2, 1] == pytest.approx(0.5) and seen.sum() == pytest.approx(0.5)
 
 
 def test_a_policy_that_learnt_without_friction_memory_is_also_judged_with_it(tmp_path, few_looks, monkeypatch):
     asked = []
-    monkeypatch.setattr(learn, "judge_policy", lambda policy, task, options, episodes, seed: asked.append(options.friction_memory) or 0.5)
+    monkeypatch.setattr(
+        learn, "evaluate_policy", lambda policy, task, options, episodes, seed: asked.append(options.friction_memory) or 0.5
+    )
     made = learn_policy(LearnPlan("SurfaceFollow", replace(SMALL, friction_memory=False), minutes=0.001, environments=2), tmp_path)
     assert asked == [False, True] and len(made.success) == 2
 
@@ -216,8 +218,8 @@ def test_a_policys_sight_tells_what_the_pins_do_not_say_at_once():
     """The network learns the product of two numbers, which no linear one could tell."""
     given = np.random.default_rng(0).uniform(-1, 1, (4000, 3))
     truth = np.column_stack([given[:, 0] * given[:, 1], np.zeros(4000)])
-    layers = learn._sight((given[:, :2], given[:, 2:]), truth, 0)
-    told = Policy({}, np.zeros(2), np.eye(2), (), layers).reduced(given[:, :2], given[:, 2:])[:, 3:]
+    layers = learn._train_state_estimator((given[:, :2], given[:, 2:]), truth, 0)
+    told = Policy({}, np.zeros(2), np.eye(2), (), layers).reduce_inputs(given[:, :2], given[:, 2:])[:, 3:]
     assert np.abs(told[:, 0] - truth[:, 0] / truth[:, 0].std()).mean() < 0.1 and np.abs(told[:, 1]).max() < 0.1  # of a deviation
 
 
@@ -241,14 +243,14 @@ def test_judging_counts_long_episodes_as_well_as_short_ones(policy, monkeypatch)
             return self.seen(), 0.0, ended, np.zeros_like(ended), {"final_info": {"is_success": ended & (self.lasts > 1)}}
 
     monkeypatch.setattr(learn, "TactileVectorEnv", Rows)
-    assert [judge_policy(policy, "SurfaceFollow", SMALL, episodes) for episodes in (2, 8, 24)] == [0.5] * 3
+    assert [evaluate_policy(policy, "SurfaceFollow", SMALL, episodes) for episodes in (2, 8, 24)] == [0.5] * 3
 
 
 def test_a_policy_is_kept_where_judging_it_is_interrupted(tmp_path, few_looks, monkeypatch):
     def interrupted(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(learn, "judge_policy", interrupted)
+    monkeypatch.setattr(learn, "evaluate_policy", interrupted)
     with pytest.raises(KeyboardInterrupt):
         learn_policy(LearnPlan("SurfaceFollow", SMALL, minutes=0.001, environments=2, episodes=2), tmp_path)
     assert load_policy(tmp_path / "policy.safetensors").axes == ("z", "Ry") and (tmp_path / "learning.csv").is_file()

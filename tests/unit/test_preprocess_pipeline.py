@@ -1,4 +1,4 @@
-"""The pipeline on drawn frames with known truth, and on recordings where they are."""
+"""The pipeline on rasterised frames with known truth, and on recordings where they are."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from twin.errors import FrameError
 from twin.frames import open_recording
 from twin.frames.forms import raw_to_recording
 from twin.pins import Pipeline, measure_reference, nominal_reference
-from twin.pins.blobs import SPECK_LEVELS, circular_mask, despeckled, find_blobs
+from twin.pins.blobs import SPECK_LEVELS, circular_mask, despeckle, find_blobs
 from twin.pins.legacy import LegacyPipeline
 from twin.pins.matching import confirm, match, rematch
 from twin.pins.pipeline import lower_levels
@@ -92,10 +92,10 @@ def test_hot_and_dead_pixels_are_put_right_and_nothing_else():
     clean = drawn_frame(spec, Form.RAW, rest).image
     for sd in (0.0, 8.0, 30.0):
         noisy = np.clip(clean + rng.normal(0, sd, clean.shape), 0, 255).astype(np.uint8)
-        assert np.mean(despeckled(noisy) != noisy) < 1e-3
+        assert np.mean(despeckle(noisy) != noisy) < 1e-3
     odd = rng.random(clean.shape) < 0.03
     damaged = np.where(odd, rng.choice([0, 255], clean.shape), clean).astype(np.uint8)
-    assert np.mean(np.abs(despeckled(damaged).astype(int) - clean) > SPECK_LEVELS) < 0.03 * odd.mean()
+    assert np.mean(np.abs(despeckle(damaged).astype(int) - clean) > SPECK_LEVELS) < 0.03 * odd.mean()
     seen = Pipeline(spec, Form.RAW)(Frame(damaged, Form.RAW))
     assert seen.found == len(rest) and rms(errors_px(seen, rest)) < 0.15
 

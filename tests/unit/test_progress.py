@@ -6,7 +6,7 @@ import time
 import pytest
 from rich.console import Console
 
-from twin.cli.progress import GOES_ON, Bars, Lines, shown
+from twin.cli.progress import GOES_ON, Bars, Lines, show_progress
 from twin.progress import silent, stage
 
 
@@ -96,6 +96,6 @@ def test_each_stage_has_a_bar_also_when_its_title_comes_again():
 
 @pytest.mark.parametrize("goes_on", [True, False])
 def test_an_interrupted_command_says_whether_the_same_one_goes_on(goes_on):
-    with pytest.raises(KeyboardInterrupt) as ended, shown(goes_on=goes_on):
+    with pytest.raises(KeyboardInterrupt) as ended, show_progress(goes_on=goes_on):
         raise KeyboardInterrupt
     assert getattr(ended.value, "__notes__", []) == [GOES_ON] * goes_on

@@ -5,8 +5,7 @@ import pytest
 
 from scenes import RigSpec, load_experiment, load_sensor
 from twin.errors import FrameError
-from twin.geometry.solid import Resolution
-from twin.judge.pictures.poses import (
+from twin.evaluation.pictures.poses import (
     EXPERIMENT,
     PlateTaps,
     TapBank,
@@ -17,6 +16,7 @@ from twin.judge.pictures.poses import (
     label_columns,
     labels_of_rows,
 )
+from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.rig.labels import ArmLabel
 

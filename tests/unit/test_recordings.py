@@ -299,7 +299,7 @@ def test_a_video_cut_within_its_first_frame_is_refused(video, spec, monkeypatch)
         with pytest.raises(FrameError, match="tap.avi: (no frame can be decoded|cut within its first frame)"):
             open_recording(video, spec)
     made_up = [(0, 0.0, np.zeros((480, 640, 3), np.uint8), "")]
-    monkeypatch.setattr("twin.frames.videos._read", lambda *_: iter(made_up))
+    monkeypatch.setattr("twin.frames.videos._read_frames", lambda *_: iter(made_up))
     with pytest.raises(FrameError, match="tap.avi: cut within its first frame"):  # where the decoder made it up
         open_recording(video, spec)
 

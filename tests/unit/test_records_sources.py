@@ -41,7 +41,7 @@ def session(folder, steps=3, about=None):
 
 
 def recording(folder, **columns):
-    """Three drawn frames with a table of these columns."""
+    """Three rasterised frames with a table of these columns."""
     for k, name in enumerate(NAMES):
         (folder / "frames_bw").mkdir(parents=True, exist_ok=True)
         write_image(folder / "frames_bw" / name, shifted(k)[1])

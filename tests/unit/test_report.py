@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from made_up_pages import HOSTILE, PAGES
 from sound_page import PageReader, read_sound_page
 
-from twin.report.charts import muted, new_figure, write_chart
+from twin.report.charts import muted_colour, new_figure, write_chart
 from twin.report.numbers import GROUP, LONGEST, MINUS, NOTHING, column, number
-from twin.report.page import Page, Picture, bad, code, good, link_to, sentence, strong
+from twin.report.page import Page, PagePicture, bad, code, good, link_to, sentence, strong
 from twin.report.table import Cell, Column, make_table, write_rows, write_table
 from twin.report.themes import DARK, LIGHT, SERIES, Theme, dark_of, stylesheet
 
@@ -56,7 +56,7 @@ def test_hostile_names_stay_text(tmp_path):
     page.items([HOSTILE])
     page.notice(HOSTILE, [HOSTILE, HOSTILE])
     page.table([{"a": HOSTILE, "b": Cell(1.5, note=HOSTILE, href=link_to(HOSTILE))}], [Column("a", HOSTILE, HOSTILE), "b"], caption=HOSTILE)
-    page.figures(Picture(tmp_path / f"{HOSTILE}.png", HOSTILE, HOSTILE), Picture(Path("javascript:x"), "x", kind="photo"))
+    page.figures(PagePicture(tmp_path / f"{HOSTILE}.png", HOSTILE, HOSTILE), PagePicture(Path("javascript:x"), "x", kind="photo"))
     page.download(tmp_path / f"{HOSTILE}.csv", HOSTILE)
     read = read_sound_page(page.html(tmp_path))
     assert read.text.count(HOSTILE) == 25, "each of the texts above, the title twice"
@@ -82,7 +82,7 @@ def test_an_unsound_page_is_refused():
 @pytest.mark.parametrize("alt", ["", "  "])
 def test_a_picture_without_a_text_is_refused(alt):
     with pytest.raises(ValueError, match="says what it shows"):
-        Picture(Path("a.png"), alt)
+        PagePicture(Path("a.png"), alt)
 
 
 def test_an_embedded_page_needs_no_other_file(tmp_path, monkeypatch):
@@ -90,7 +90,7 @@ def test_an_embedded_page_needs_no_other_file(tmp_path, monkeypatch):
     Path("out").mkdir()
     chart = write_chart(Path("out/chart.png"), lambda: new_figure(1, panel_inch=1.0)[0])
     page = Page("A", "twin a")
-    page.figures(Picture(chart, "a chart"))
+    page.figures(PagePicture(chart, "a chart"))
     embedded = PageReader(page.write(Path("out/index.html"), embed=True).read_text(encoding="utf-8"))
     assert len(embedded.addresses) == 2 and all(address.startswith("data:image/png;base64,") for address in embedded.addresses)
     beside = PageReader(page.html(Path("out")))
@@ -171,8 +171,8 @@ def test_a_chart_is_drawn_for_each_theme(tmp_path):
 
     def draw():
         figure, (ax,) = new_figure(1, panel_inch=1.0)
-        ax.axhline(0.5, color=muted())
-        grounds.append(muted())
+        ax.axhline(0.5, color=muted_colour())
+        grounds.append(muted_colour())
         return figure
 
     path = write_chart(tmp_path / "a.b.png", draw)

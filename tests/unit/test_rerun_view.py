@@ -16,7 +16,7 @@ from scenes import load_sensor
 from training.estimate.estimator import PoseEstimate
 from twin.errors import OptionError
 from twin.pins import Pipeline
-from twin.studio.live_page import LiveShot
+from twin.studio.live_page import LiveFrame
 from twin.types import Form
 
 
@@ -82,7 +82,7 @@ def test_frame_pins_and_pose_are_in_the_file(tmp_path):
     estimate = PoseEstimate(("pose_2", "pose_6"), ("mm", "deg"), value, value - 1, value + 1, np.nan, True, "", 1.0)
     file = tmp_path / "live.rrd"
     with RerunView("twin", str(file)) as view:
-        view.show(LiveShot(frame, estimate, ("pose",)), seen)
+        view.show(LiveFrame(frame, estimate, ("pose",)), seen)
     content = file.read_bytes()
     for entity in (b"camera/pins", b"camera/edges", b"pose/pose_2", b"pose/pose_6", b"figures"):
         assert entity in content

@@ -12,7 +12,7 @@ from training.runs import residual as teaching
 from training.runs.residual import ResidualNetwork, spec_of, teach
 from twin.camera.capture import before_stream, expose, luma_weights
 from twin.camera.projection import Disc, lens_disc
-from twin.camera.residual import averaged, change, differences, refined, with_residual
+from twin.camera.residual import average_colours, change, differences, refine, with_residual
 from twin.errors import RenderError
 from twin.optics.preview import Preview
 from twin.pins import Pipeline
@@ -59,7 +59,7 @@ def test_the_frame_is_changed_as_the_taught_network_says(network, residual):
 def test_outside_the_disc_only_colours_are_shared_and_luma_stays(residual):
     gray = np.random.default_rng(1).uniform(0, 255, (80, 100, 3)).astype(np.float32)
     luma = luma_weights("bt709")
-    found = refined(gray, residual, luma, 2, np.random.default_rng(2))
+    found = refine(gray, residual, luma, 2, np.random.default_rng(2))
     inside = a_disc(radius=38.0).inside
     np.testing.assert_allclose((found @ luma)[~inside], (gray @ luma)[~inside], atol=ROUNDING * 10)
     assert np.abs((found - gray) @ luma)[inside].mean() > 0.1
@@ -69,16 +69,16 @@ def test_outside_the_disc_only_colours_are_shared_and_luma_stays(residual):
 
 def test_a_window_of_a_frame_is_refined_as_in_the_whole_frame(residual):
     gray = np.random.default_rng(1).uniform(0, 255, (80, 100, 3)).astype(np.float32)
-    whole = refined(gray, residual, luma_weights("bt709"), 2)
-    part = refined(gray[10:70, 21:], residual, luma_weights("bt709"), 2, origin_px=(21, 10))
+    whole = refine(gray, residual, luma_weights("bt709"), 2)
+    part = refine(gray[10:70, 21:], residual, luma_weights("bt709"), 2, origin_px=(21, 10))
     reach = 5  # px that the four kernels see
     np.testing.assert_allclose(part[reach:-reach, reach:], whole[10 + reach : 70 - reach, 21 + reach :], atol=ROUNDING * 10)
 
 
 def test_groups_of_columns_begin_at_the_full_frames_first_column():
     chroma = np.arange(5, dtype=np.float32).reshape(1, 5, 1)
-    assert averaged(chroma, 2, 0).ravel().tolist() == [0.5, 0.5, 2.5, 2.5, 4]
-    assert averaged(chroma, 2, 3).ravel().tolist() == [0, 1.5, 1.5, 3.5, 3.5]
+    assert average_colours(chroma, 2, 0).ravel().tolist() == [0.5, 0.5, 2.5, 2.5, 4]
+    assert average_colours(chroma, 2, 3).ravel().tolist() == [0, 1.5, 1.5, 3.5, 3.5]
 
 
 def test_it_is_off_unless_it_is_asked_for_and_gray_frames_never_have_it(residual):

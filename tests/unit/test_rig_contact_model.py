@@ -115,7 +115,7 @@ def test_a_label_commands_the_pose_that_its_path_ends_at():
     spec = rigged()
     contact = RigContact(SkinSolver(spec, resolution=COARSE), SURFACE, PLANE)
     label = ArmLabel(np.array([1.0, -3.0, 0, 0, 0, 8.0]), np.array([1.0, 0, 0, 0, 0, 3.0]))
-    poses = contact.way(label).path.poses
+    poses = contact.commanded_path(label).path.poses
     np.testing.assert_allclose(poses[-1], object_pose(spec.rig, SURFACE, label.pose, 20.0), atol=1e-12)
     assert all(np.abs(one - other).max() > 1e-3 for one, other in pairwise(poses))
 

@@ -8,7 +8,7 @@ import pytest
 from drawn_frames import drawn_frame
 
 from training.estimate.estimator import PoseEstimator
-from training.studies.judging import CHANGES, judge_changes
+from training.studies.judging import CHANGES, measure_changes
 from twin.report.table import write_table
 from twin.types import Form, Frame
 
@@ -45,7 +45,7 @@ def test_the_table_has_every_change_and_every_frame(data, estimator, tmp_path):
         cv2.imwrite(str(folder / "frames_bw" / data.pins.image_name[k]), image if k else 0 * image)  # the first shows nothing
         lines.append(f"{data.pins.image_name[k]},0,0")
     (folder / "targets.csv").write_text("\n".join(lines) + "\n")
-    found = judge_changes(estimator, replace(data, folders=(folder,)), rows)
+    found = measure_changes(estimator, replace(data, folders=(folder,)), rows)
     assert [row["change"] for row in found] == ["none", *CHANGES]
     assert all(row["frames"] == 6 and row["not_valid"] == 1 for row in found) and found[0]["pose_2_more"] == 0
     assert write_table(tmp_path / "robustness.csv", found).read_text().count("\n") == 1 + len(found)

@@ -10,10 +10,10 @@ from scenes import load_sensor
 from twin.camera.capture import expose
 from twin.camera.projection import project
 from twin.errors import TwinError
+from twin.evaluation.degradation.condition import DegradedCase, PictureView
+from twin.evaluation.degradation.conditions import CONDITIONS, condition
+from twin.evaluation.degradation.shots import CONTACTS, RenderedSource, degraded_state, pins_under
 from twin.geometry.pins import rest_pins
-from twin.judge.degradation.condition import Case, View
-from twin.judge.degradation.conditions import CONDITIONS, condition
-from twin.judge.degradation.shots import CONTACTS, RenderedSource, degraded_state, pins_under
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview
 from twin.pins import shipped_detector
@@ -65,7 +65,7 @@ def sensor():
 
 @lru_cache(maxsize=1)
 def view():
-    return View.of(sensor(), project(sensor().view, rest_pins(sensor().geometry).caps_mm))
+    return PictureView.of(sensor(), project(sensor().view, rest_pins(sensor().geometry).caps_mm))
 
 
 @lru_cache(maxsize=1)
@@ -94,18 +94,18 @@ def test_there_are_many_conditions_and_each_acts_somewhere():
 
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_severity_zero_changes_nothing(name):
-    case = Case((CONDITIONS[name],))
+    case = DegradedCase((CONDITIONS[name],))
     assert case.on_spec(sensor(), 0.0) == sensor()
     assert np.array_equal(case.on_light(light(), 0.0, view(), 0), light())
     assert np.array_equal(case.on_frame(image(), 0.0, view(), 0), image())
     assert np.array_equal(case.on_points(view().caps_px, 0.0, view()), view().caps_px)
-    assert not case.gone(0.0, view()).any()
+    assert not case.missing_caps(0.0, view()).any()
     assert case.on_setting(detector(), 0.0) == detector()
 
 
 @pytest.mark.parametrize("name", ACTS_ON)
 def test_a_degraded_specification_is_valid_and_grows(name):
-    case = Case((CONDITIONS[name],))
+    case = DegradedCase((CONDITIONS[name],))
     specs = [case.on_spec(sensor(), severity) for severity in LADDER]
     for spec in specs:
         type(spec).model_validate(spec.model_dump())
@@ -115,7 +115,7 @@ def test_a_degraded_specification_is_valid_and_grows(name):
 
 @pytest.mark.parametrize("name", those_with("light"))
 def test_degraded_light_departs_further_and_stays_light(name):
-    case = Case((CONDITIONS[name],))
+    case = DegradedCase((CONDITIONS[name],))
     away = []
     for severity in LADDER:
         degraded = case.on_light(light(), severity, view(), 0)
@@ -128,7 +128,7 @@ def test_degraded_light_departs_further_and_stays_light(name):
 
 @pytest.mark.parametrize("name", those_with("frame"))
 def test_degraded_frames_depart_further_and_stay_frames(name):
-    case = Case((CONDITIONS[name],))
+    case = DegradedCase((CONDITIONS[name],))
     away = []
     for severity in LADDER:
         degraded = case.on_frame(image(), severity, view(), 0)
@@ -141,7 +141,7 @@ def test_degraded_frames_depart_further_and_stay_frames(name):
 @pytest.mark.parametrize("name", those_with("moves"))
 def test_points_go_where_the_picture_goes(name):
     """A single bright spot's centroid is where the truth says."""
-    case, at = Case((CONDITIONS[name],)), view().center_px + [10.0, 25.0]
+    case, at = DegradedCase((CONDITIONS[name],)), view().center_px + [10.0, 25.0]
     y, x = np.mgrid[: light().shape[0], : light().shape[1]]
     spot = np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 8).astype(np.float32)
     for severity in (0.05, 0.2):
@@ -153,20 +153,20 @@ def test_points_go_where_the_picture_goes(name):
 
 @pytest.mark.parametrize("name", those_with("hides"))
 def test_more_caps_are_gone_and_none_comes_back(name):
-    gone = [Case((CONDITIONS[name],)).gone(severity, view()) for severity in LADDER]
+    gone = [DegradedCase((CONDITIONS[name],)).missing_caps(severity, view()) for severity in LADDER]
     assert all((later >= earlier).all() and later.sum() > earlier.sum() for earlier, later in zip(gone, gone[1:], strict=False))
 
 
 def test_caps_that_have_come_off_are_dark():
-    case = Case((CONDITIONS["caps-missing"],))
+    case = DegradedCase((CONDITIONS["caps-missing"],))
     spec = case.on_spec(sensor(), 0.5)
-    levels, gone = np.array(spec.appearance.cap_levels), case.gone(0.5, view())
+    levels, gone = np.array(spec.appearance.cap_levels), case.missing_caps(0.5, view())
     assert (levels[gone] < 1e-3).all() and (levels[~gone] > 0.1).all()
 
 
 @pytest.mark.parametrize("name", those_with("setting"))
 def test_a_wrong_setting_becomes_worse_with_severity(name):
-    thresholds = [Case((CONDITIONS[name],)).on_setting(detector(), severity).blob.threshold for severity in LADDER]
+    thresholds = [DegradedCase((CONDITIONS[name],)).on_setting(detector(), severity).blob.threshold for severity in LADDER]
     steps = np.diff(thresholds)
     assert (steps > 0).all() or (steps < 0).all()
 
@@ -175,16 +175,16 @@ def test_mechanics_conditions_move_the_pins():
     rest = SkinSolver(sensor()).rest()
     for name in ("gel-soft", "skin-swollen"):
         assert CONDITIONS[name].solves
-    swollen = SkinSolver(Case((CONDITIONS["skin-swollen"],)).on_spec(sensor(), 0.5)).rest()
+    swollen = SkinSolver(DegradedCase((CONDITIONS["skin-swollen"],)).on_spec(sensor(), 0.5)).rest()
     assert np.linalg.norm(swollen.caps_mm, axis=1).mean() > np.linalg.norm(rest.caps_mm, axis=1).mean() + 0.5
 
 
 def test_a_pair_acts_as_one_after_the_other():
     a, b = CONDITIONS["room-light"], CONDITIONS["noise"]
-    pair = Case((a, b))
+    pair = DegradedCase((a, b))
     assert pair.name == "room-light+noise"
-    assert pair.on_spec(sensor(), 0.4) == Case((b,)).on_spec(sensor(), 0.4)
-    assert np.array_equal(pair.on_light(light(), 0.4, view(), 1), Case((a,)).on_light(light(), 0.4, view(), 1))
+    assert pair.on_spec(sensor(), 0.4) == DegradedCase((b,)).on_spec(sensor(), 0.4)
+    assert np.array_equal(pair.on_light(light(), 0.4, view(), 1), DegradedCase((a,)).on_light(light(), 0.4, view(), 1))
 
 
 def test_an_unknown_condition_names_the_nearest():
@@ -206,8 +206,8 @@ def test_px_per_mm_is_the_projection_s_scale():
 
 @pytest.mark.parametrize("name", ["defocus", "caps-missing", "camera-rolled", "noise"])
 def test_a_state_is_degraded_as_a_contact_of_a_sweep(name):
-    spec, contact, case = load_sensor("mg400-127"), CONTACTS[0], Case((condition(name),))
-    swept = RenderedSource(spec, (contact,)).shoot(case, 0.5)[0]
+    spec, contact, case = load_sensor("mg400-127"), CONTACTS[0], DegradedCase((condition(name),))
+    swept = RenderedSource(spec, (contact,)).render(case, 0.5)[0]
     alone = degraded_state(spec, pins_under(spec, contact), [(case, 0.5)], touched=False)
     assert np.array_equal(alone.frame.image, swept.frame.image) and np.array_equal(alone.visible, swept.visible)
     np.testing.assert_array_equal(alone.caps_px, swept.caps_px)
@@ -215,9 +215,9 @@ def test_a_state_is_degraded_as_a_contact_of_a_sweep(name):
 
 def test_two_cases_act_each_at_its_own_severity():
     spec, contact = load_sensor("mg400-127"), CONTACTS[0]
-    one, other = (Case((condition(name),)) for name in ("defocus", "noise"))
+    one, other = (DegradedCase((condition(name),)) for name in ("defocus", "noise"))
     state = pins_under(spec, contact)
     both = degraded_state(spec, state, [(one, 0.3), (other, 0.0)])
     assert np.array_equal(both.frame.image, degraded_state(spec, state, [(one, 0.3)]).frame.image)
     with pytest.raises(TwinError, match="changes the mechanics.*use 'twin robustness'"):
-        degraded_state(spec, state, [(Case((next(c for c in CONDITIONS.values() if c.solves),)), 0.1)])
+        degraded_state(spec, state, [(DegradedCase((next(c for c in CONDITIONS.values() if c.solves),)), 0.1)])

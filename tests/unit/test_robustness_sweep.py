@@ -14,15 +14,15 @@ from sound_page import read_sound_page
 from scenes import load_sensor
 from training.studies import degradation
 from twin.errors import TwinError
-from twin.judge.degradation.condition import Case
-from twin.judge.degradation.conditions import CONDITIONS
-from twin.judge.degradation.envelope import Envelope, crossing, curves_of, envelopes_of, shares_of
-from twin.judge.degradation.measures import MEASURES, judge_shot
-from twin.judge.degradation.plan import ConditionPlan, SweepPlan, load_plan
-from twin.judge.degradation.report import _share_row, compare
-from twin.judge.degradation.shots import DegradedShot, RealSource
-from twin.judge.degradation.study import check_pipelines, consensus, study
-from twin.judge.degradation.sweep import Answer, Plan, cells_of, run_sweep
+from twin.evaluation.degradation.condition import DegradedCase
+from twin.evaluation.degradation.conditions import CONDITIONS
+from twin.evaluation.degradation.envelope import Envelope, crossing, curves_of, envelopes_of, shares_of
+from twin.evaluation.degradation.measures import MEASURES, measure_frame
+from twin.evaluation.degradation.plan import ConditionPlan, SweepPlan, load_plan
+from twin.evaluation.degradation.report import _share_row, compare
+from twin.evaluation.degradation.shots import DegradedFrame, RealSource
+from twin.evaluation.degradation.study import check_pipelines, consensus, study
+from twin.evaluation.degradation.sweep import ModelAnswer, SweepSettings, cells_of, run_sweep
 from twin.pins import Found, make_detector, shipped_detector
 from twin.pins.reference import nominal_reference
 from twin.types import Form, Frame
@@ -49,7 +49,7 @@ def detector(spec):
 def shot_of(rest, gone=()):
     visible = np.ones(len(rest), bool)
     visible[list(gone)] = False
-    return DegradedShot("planted", Frame(np.zeros((480, 640), np.uint8), Form.RAW), rest, visible)
+    return DegradedFrame("planted", Frame(np.zeros((480, 640), np.uint8), Form.RAW), rest, visible)
 
 
 def found_of(detector, pins_px, extra=()):
@@ -58,7 +58,7 @@ def found_of(detector, pins_px, extra=()):
 
 
 def test_a_perfect_answer_is_perfect(detector, rest):
-    assert judge_shot(detector, found_of(detector, rest), shot_of(rest)) == {
+    assert measure_frame(detector, found_of(detector, rest), shot_of(rest)) == {
         "valid": 1.0, "recall": 1.0, "precision": 1.0, "centroid_px": 0.0, "swaps": 0.0, "area_error": 0.0, "edges": 1.0,
     }  # fmt: skip
 
@@ -67,22 +67,22 @@ def test_injected_errors_are_counted(detector, rest):
     n = len(rest)
     pins = rest.copy()
     pins[:5] = np.nan
-    lost = judge_shot(detector, found_of(detector, pins), shot_of(rest))
+    lost = measure_frame(detector, found_of(detector, pins), shot_of(rest))
     assert lost["recall"] == pytest.approx(1 - 5 / n) and lost["precision"] == 1 and np.isnan(lost["area_error"])
-    extra = judge_shot(detector, found_of(detector, rest, extra=[[5.0, 5.0], [9.0, 400.0]]), shot_of(rest))
+    extra = measure_frame(detector, found_of(detector, rest, extra=[[5.0, 5.0], [9.0, 400.0]]), shot_of(rest))
     assert extra["precision"] == pytest.approx(n / (n + 2)) and extra["recall"] == 1
-    moved = judge_shot(detector, found_of(detector, rest + [0.3, 0.4]), shot_of(rest))
+    moved = measure_frame(detector, found_of(detector, rest + [0.3, 0.4]), shot_of(rest))
     assert moved["centroid_px"] == pytest.approx(0.5) and moved["area_error"] < 1e-9
     pins = rest.copy()
     pins[[10, 11]] = pins[[11, 10]]
-    swapped = judge_shot(detector, found_of(detector, pins), shot_of(rest))
+    swapped = measure_frame(detector, found_of(detector, pins), shot_of(rest))
     assert swapped["swaps"] == pytest.approx(2 / n) and swapped["recall"] == 1
 
 
 def test_a_pin_that_is_gone_is_not_missed(detector, rest):
     pins = rest.copy()
     pins[[3, 4]] = np.nan
-    measured = judge_shot(detector, found_of(detector, pins), shot_of(rest, gone=[3, 4]))
+    measured = measure_frame(detector, found_of(detector, pins), shot_of(rest, gone=[3, 4]))
     assert measured["recall"] == 1 and measured["precision"] == 1
 
 
@@ -95,7 +95,7 @@ def test_crossings_lie_between_the_steps():
 
 
 def test_curves_envelopes_and_their_comparison():
-    case = Case((CONDITIONS["noise"],))
+    case = DegradedCase((CONDITIONS["noise"],))
     rows = [
         {"case": "noise", "severity": s, "pipeline": p, "frame": f, **dict.fromkeys(("valid", "precision", "edges"), 1.0)}
         | {"recall": r, "centroid_px": 0.1, "swaps": 0.0, "area_error": 0.0}
@@ -129,7 +129,7 @@ def answer(value, half=0.1, valid=True):
     ],
 )
 def test_a_confidently_wrong_pose_is_narrow_and_far_off(now, wrong):
-    case = Case((CONDITIONS["noise"],))
+    case = DegradedCase((CONDITIONS["noise"],))
     poses = {0.0: answer([1.0, 5.0]) | {"touched": True}, 1.0: now | {"touched": True}}
     rows = [{"case": "noise", "severity": s, "pipeline": "run", "frame": "x", "pose": pose} for s, pose in poses.items()]
     curve = next(c for c in curves_of(rows, (case,), pitch_px=10.0) if c.measure.name == "pose_wrong")
@@ -137,7 +137,7 @@ def test_a_confidently_wrong_pose_is_narrow_and_far_off(now, wrong):
 
 
 def test_poses_are_judged_against_the_undegraded_frame():
-    case = Case((CONDITIONS["noise"],))
+    case = DegradedCase((CONDITIONS["noise"],))
     rows = [
         {
             "case": "noise",
@@ -163,8 +163,10 @@ def real_plan(spec, frames):
     detectors = (shipped_detector(spec, Form.RAW), shipped_detector(spec, Form.RAW, "adaptive"))
     source, refused = consensus(spec, frames, list(detectors))
     assert not refused
-    cases = tuple(Case((CONDITIONS[name],)) for name in ("hot-pixels", "wrong-crop")) + (Case((CONDITIONS["noise"], CONDITIONS["jpeg"])),)
-    return Plan(source, detectors, cases, (0.0, 0.3, 1.0))
+    cases = tuple(DegradedCase((CONDITIONS[name],)) for name in ("hot-pixels", "wrong-crop")) + (
+        DegradedCase((CONDITIONS["noise"], CONDITIONS["jpeg"])),
+    )
+    return SweepSettings(source, detectors, cases, (0.0, 0.3, 1.0))
 
 
 def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path, undrawn_charts):
@@ -207,7 +209,7 @@ def levels_of_light(source):
 
 def measured_light(frame):
     light = np.array([frame.image.mean()])
-    return Answer(light, light - 1, light + 1, ("mm",), np.array([255.0]), True)
+    return ModelAnswer(light, light - 1, light + 1, ("mm",), np.array([255.0]), True)
 
 
 def test_models_are_asked_about_every_frame(spec, frames, tmp_path):
@@ -223,7 +225,7 @@ def test_models_are_asked_about_every_frame(spec, frames, tmp_path):
 def test_cells_depend_on_what_they_were_computed_from(spec, frames):
     plan = real_plan(spec, frames)
     names = {cell.file for cell in cells_of(plan)}
-    other = Plan(plan.source, plan.detectors[:1], plan.cases, plan.severities)
+    other = SweepSettings(plan.source, plan.detectors[:1], plan.cases, plan.severities)
     assert names.isdisjoint(cell.file for cell in cells_of(other))
     assert names == {cell.file for cell in cells_of(real_plan(spec, frames))}
 
@@ -243,7 +245,9 @@ def test_undegraded_real_frames_stay_as_they_are(spec, frames, rest):
     source = RealSource(spec, tuple(frames), np.stack([rest, rest]))
     for condition in CONDITIONS.values():
         if condition.image_level:
-            assert all(np.array_equal(s.frame.image, f.image) for s, f in zip(source.shoot(Case((condition,)), 0.0), frames, strict=True))
+            assert all(
+                np.array_equal(s.frame.image, f.image) for s, f in zip(source.render(DegradedCase((condition,)), 0.0), frames, strict=True)
+            )
 
 
 def test_a_sweep_can_be_read_from_a_file(tmp_path):
@@ -276,7 +280,7 @@ def test_a_sweep_can_be_read_from_a_file(tmp_path):
 
 def test_an_envelope_ends_at_the_severest_step(tmp_path):
     """A pipeline that never fails is as wide as the severest step, not as the condition's range."""
-    case = Case((CONDITIONS["noise"],))
+    case = DegradedCase((CONDITIONS["noise"],))
     rows = [
         {"case": "noise", "severity": s, "pipeline": "a", "frame": "x", **dict.fromkeys(("valid", "precision", "edges", "recall"), 1.0)}
         | {"centroid_px": 0.1, "swaps": 0.0, "area_error": 0.0}
@@ -288,7 +292,7 @@ def test_an_envelope_ends_at_the_severest_step(tmp_path):
 
 
 def test_shares_tell_the_bad_side():
-    case = Case((CONDITIONS["noise"],))
+    case = DegradedCase((CONDITIONS["noise"],))
     whole, half = Envelope(case, "a", 0.8, "recall"), Envelope(case, "a", 0.4, "recall")
     assert shares_of([half], [whole], "a")[0].short and shares_of([half], [whole], "a")[0].value == 0.5
     assert not shares_of([whole], [half], "a")[0].short
@@ -337,7 +341,7 @@ def test_code_of_the_user_is_judged_like_the_others(spec, frames, tmp_path, undr
     out.mkdir()
 
     def recall(name):
-        plan = degradation.Plan(spec, pipelines=(f"{mine}:{name}",), sweep=sweep, frames=recording, rendered=False)
+        plan = degradation.DegradationPlan(spec, pipelines=(f"{mine}:{name}",), sweep=sweep, frames=recording, rendered=False)
         degradation.run(plan, out)
         rows = list(csv.DictReader((out / "frames.csv").read_text().splitlines()))
         return {float(row["severity"]): float(row["recall"]) for row in rows if row["pipeline"] == name}
@@ -349,6 +353,7 @@ def test_code_of_the_user_is_judged_like_the_others(spec, frames, tmp_path, undr
         recall("careless")
     with pytest.raises(TwinError, match="careless failed"):
         degradation.run(
-            degradation.Plan(spec, pipelines=(f"{mine}:careless",), sweep=sweep, frames=recording, rendered=False), tmp_path / "new"
+            degradation.DegradationPlan(spec, pipelines=(f"{mine}:careless",), sweep=sweep, frames=recording, rendered=False),
+            tmp_path / "new",
         )
     assert not (tmp_path / "new").exists()

@@ -135,7 +135,7 @@ def test_a_damaged_checkpoint_is_refused_and_left_alone(data, tmp_path, what):
     train_run(config, data, tmp_path, max_minutes=0)
     damage(tmp_path / "checkpoint.pt", what)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(TrainingError, match=r"checkpoint\.pt.*remove it to begin anew, or give another `out`"):
+    with pytest.raises(TrainingError, match=r"checkpoint\.pt.*remove it to begin again, or give another `out`"):
         train_run(config, data, tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 

@@ -11,7 +11,7 @@ from hardware.arms.arm import ArmState
 from hardware.arms.kinematics import MG400
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.errors import DeviceError
-from hardware.safety.decide import SHIPPED_LIMITS, Action, Code, SafetyLimits, Sensed, clip, decide, decide_joints, load_limits
+from hardware.safety.decide import SHIPPED_LIMITS, Action, DecisionCode, SafetyLimits, Sensed, clip, decide, decide_joints, load_limits
 from hardware.safety.safe_arm import RefusedMoveError, SafeArm
 
 NOW_S = 1000.0
@@ -39,37 +39,37 @@ def decided(target, limits=FREE, *, at=HOME, sensed=None, **told):
 @pytest.mark.parametrize(
     ("decision", "action", "code"),
     [
-        (decided(HOME + 1), Action.MOVE, Code.OK),
-        (decided(HOME + [50, 0, 0, 0, 0, 0], LIMITS), Action.MOVE, Code.STEP_SHORTENED),
-        (decided(HOME * np.nan), Action.REFUSE, Code.NOT_A_NUMBER),
-        (decided("home"), Action.REFUSE, Code.NOT_A_NUMBER),
-        (decided(None), Action.REFUSE, Code.NOT_A_NUMBER),
-        (decided(HOME[:3]), Action.REFUSE, Code.NOT_A_NUMBER),
-        (decided(HOME, enabled=False), Action.REFUSE, Code.NOT_ENABLED),
-        (decided(HOME, error="alarm 17"), Action.HOLD, Code.ARM_ERROR),
-        (decided(HOME, age_s=1.1), Action.HOLD, Code.STALE_FEEDBACK),
-        (decide(HOME, lost_state(), FREE, now_s=NOW_S, kinematics=MG400), Action.HOLD, Code.NOT_A_NUMBER),
-        (decided(HOME, sensed=Sensed(1.0, NOW_S - 0.6)), Action.HOLD, Code.STALE_FRAME),
-        (decided(HOME, sensed=Sensed(1.0, np.nan)), Action.HOLD, Code.STALE_FRAME),
-        (decided(HOME, sensed=Sensed(6.1, NOW_S)), Action.RETRACT, Code.TOO_DEEP),
-        (decided(HOME, sensed=Sensed(np.nan, NOW_S)), Action.MOVE, Code.OK),
-        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, force_n=9.9)), Action.MOVE, Code.OK),
-        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, force_n=10.1)), Action.RETRACT, Code.TOO_STRONG),
-        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, torque_nmm=-301.0)), Action.RETRACT, Code.TOO_TWISTED),
-        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, slip_share=0.6)), Action.HOLD, Code.SLIPPING),
-        (decided(HOME + [0, 0, 160, 0, 0, 0]), Action.REFUSE, Code.OUTSIDE_BOX),
-        (decided([400, 290, 0, 0, 0, 0]), Action.REFUSE, Code.OUTSIDE_ANNULUS),
-        (decided([30, 300, 0, 0, 0, 90], RING, at=[0, -300, 0, 0, 0, -90]), Action.REFUSE, Code.OUTSIDE_ANNULUS),
-        (decided([480.0, 0, 0, 0, 0, 0], WIDE), Action.REFUSE, Code.OUT_OF_REACH),
-        (decided([120.0, 0, 60, 0, 0, 0], WIDE), Action.REFUSE, Code.JOINT_LIMIT),
-        (decided(MG400.forward(np.array([0.0, 0, 61, 0])), WIDE), Action.REFUSE, Code.LINKAGE_LIMIT),
-        (decided([0, 250, 0, 0, 0, 90], WIDE, at=[-120, -220, 0, 0, 0, -110]), Action.REFUSE, Code.LINE_BLOCKED),
+        (decided(HOME + 1), Action.MOVE, DecisionCode.OK),
+        (decided(HOME + [50, 0, 0, 0, 0, 0], LIMITS), Action.MOVE, DecisionCode.STEP_SHORTENED),
+        (decided(HOME * np.nan), Action.REFUSE, DecisionCode.NOT_A_NUMBER),
+        (decided("home"), Action.REFUSE, DecisionCode.NOT_A_NUMBER),
+        (decided(None), Action.REFUSE, DecisionCode.NOT_A_NUMBER),
+        (decided(HOME[:3]), Action.REFUSE, DecisionCode.NOT_A_NUMBER),
+        (decided(HOME, enabled=False), Action.REFUSE, DecisionCode.NOT_ENABLED),
+        (decided(HOME, error="alarm 17"), Action.HOLD, DecisionCode.ARM_ERROR),
+        (decided(HOME, age_s=1.1), Action.HOLD, DecisionCode.STALE_FEEDBACK),
+        (decide(HOME, lost_state(), FREE, now_s=NOW_S, kinematics=MG400), Action.HOLD, DecisionCode.NOT_A_NUMBER),
+        (decided(HOME, sensed=Sensed(1.0, NOW_S - 0.6)), Action.HOLD, DecisionCode.STALE_FRAME),
+        (decided(HOME, sensed=Sensed(1.0, np.nan)), Action.HOLD, DecisionCode.STALE_FRAME),
+        (decided(HOME, sensed=Sensed(6.1, NOW_S)), Action.RETRACT, DecisionCode.TOO_DEEP),
+        (decided(HOME, sensed=Sensed(np.nan, NOW_S)), Action.MOVE, DecisionCode.OK),
+        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, force_n=9.9)), Action.MOVE, DecisionCode.OK),
+        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, force_n=10.1)), Action.RETRACT, DecisionCode.TOO_STRONG),
+        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, torque_nmm=-301.0)), Action.RETRACT, DecisionCode.TOO_TWISTED),
+        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, slip_share=0.6)), Action.HOLD, DecisionCode.SLIPPING),
+        (decided(HOME + [0, 0, 160, 0, 0, 0]), Action.REFUSE, DecisionCode.OUTSIDE_BOX),
+        (decided([400, 290, 0, 0, 0, 0]), Action.REFUSE, DecisionCode.OUTSIDE_ANNULUS),
+        (decided([30, 300, 0, 0, 0, 90], RING, at=[0, -300, 0, 0, 0, -90]), Action.REFUSE, DecisionCode.OUTSIDE_ANNULUS),
+        (decided([480.0, 0, 0, 0, 0, 0], WIDE), Action.REFUSE, DecisionCode.OUT_OF_REACH),
+        (decided([120.0, 0, 60, 0, 0, 0], WIDE), Action.REFUSE, DecisionCode.JOINT_LIMIT),
+        (decided(MG400.forward(np.array([0.0, 0, 61, 0])), WIDE), Action.REFUSE, DecisionCode.LINKAGE_LIMIT),
+        (decided([0, 250, 0, 0, 0, 90], WIDE, at=[-120, -220, 0, 0, 0, -110]), Action.REFUSE, DecisionCode.LINE_BLOCKED),
     ],
 )
 def test_every_code(decision, action, code):
     assert (decision.action, decision.code) == (action, code), decision
     assert (decision.pose is not None) == (action is Action.MOVE)
-    assert decision.reason or code is Code.OK
+    assert decision.reason or code is DecisionCode.OK
 
 
 @given(st.tuples(*[st.floats(-500, 500)] * 3, *[st.floats(-180, 180)] * 3))
@@ -88,7 +88,7 @@ def test_what_may_be_sent_keeps_every_limit(target):
 def test_what_a_target_is_clipped_to_may_be_sent(target, limits):
     clipped = clip(np.array(target), HOME, limits, MG400)
     assert decided(clipped, limits).action is Action.MOVE
-    if decided(target, limits).code is Code.OK:
+    if decided(target, limits).code is DecisionCode.OK:
         np.testing.assert_allclose(clipped, decided(target, limits).pose)
 
 
@@ -117,13 +117,13 @@ def test_joint_moves_are_checked_on_their_way():
         return decide_joints(np.asarray(joints, float), state(), limits, now_s=NOW_S, kinematics=MG400).code
 
     here = MG400.inverse(HOME)
-    assert decided(here + [1, 0, 0, 0]) == Code.OK
-    assert decided(here + [0, 0, 0, 500]) == Code.JOINT_LIMIT
-    assert decided(here + [80, 0, 0, 0]) == Code.OUTSIDE_BOX
-    assert decided(here + [5, 0, 0, 0], LIMITS) == Code.STEP_TOO_LONG
-    assert decided([np.nan] * 4) == decided([0.0, 0.0]) == Code.NOT_A_NUMBER
+    assert decided(here + [1, 0, 0, 0]) == DecisionCode.OK
+    assert decided(here + [0, 0, 0, 500]) == DecisionCode.JOINT_LIMIT
+    assert decided(here + [80, 0, 0, 0]) == DecisionCode.OUTSIDE_BOX
+    assert decided(here + [5, 0, 0, 0], LIMITS) == DecisionCode.STEP_TOO_LONG
+    assert decided([np.nan] * 4) == decided([0.0, 0.0]) == DecisionCode.NOT_A_NUMBER
     outside_between = [*(-here[:1] + 100), *here[1:]]  # both ends may be allowed: the way between is looked at too
-    assert decided(outside_between) == Code.OUTSIDE_BOX
+    assert decided(outside_between) == DecisionCode.OUTSIDE_BOX
 
 
 def test_limits_are_checked_data(tmp_path):
@@ -179,10 +179,14 @@ def test_a_safe_arm_sends_what_is_allowed_and_logs_it(arm):
     assert np.allclose(safe.move_linear(HOME + [20, 0, 0, 0, 0, 0]), HOME + [5, 0, 0, 0, 0, 0])
     with pytest.raises(RefusedMoveError, match="outside-box") as refused:
         SafeArm(arm, FREE).move_linear(HOME + [0, 0, 500, 0, 0, 0])
-    assert refused.value.decision.code is Code.OUTSIDE_BOX
+    assert refused.value.decision.code is DecisionCode.OUTSIDE_BOX
     safe.set_speed(1e4, 1e4)
     assert arm._speeds.linear_mm_s == LIMITS.linear_mm_s
-    assert [entry.decision.code for entry in told] == [Code.STEP_SHORTENED, Code.SPEED_CAPPED] == [e.decision.code for e in safe.decisions]
+    assert (
+        [entry.decision.code for entry in told]
+        == [DecisionCode.STEP_SHORTENED, DecisionCode.SPEED_CAPPED]
+        == [e.decision.code for e in safe.decisions]
+    )
 
 
 def test_too_deep_a_contact_makes_it_retreat_along_the_normal(arm):
@@ -242,7 +246,7 @@ def test_stop_and_its_like_are_never_refused(arm):
     safe.sense(Sensed(99.0, -np.inf))
     for call in (safe.stop, safe.emergency_stop, safe.clear_error, safe.disable, safe.disconnect):
         call()
-    assert {entry.decision.code for entry in safe.decisions} == {Code.UNGATED} and not arm.is_connected
+    assert {entry.decision.code for entry in safe.decisions} == {DecisionCode.UNGATED} and not arm.is_connected
 
 
 def test_a_failed_stop_does_not_keep_it_from_disabling(arm, monkeypatch):
@@ -265,6 +269,6 @@ def test_what_a_model_tells_of_force_torque_and_slip_is_sensed_and_what_it_does_
     assert Sensed.of(1.0, NOW_S, ("Fx", "Fy", "Fz"), np.array([0, 6.0, 8.0])).force_n == 10.0
     nothing = Sensed.of(1.0, NOW_S, ("pose_2",), np.zeros(1))
     tight = FREE.model_copy(update={"force_n": 1e-9, "torque_nmm": 1e-9, "slip_share": 0.0})
-    assert decided(HOME, tight, sensed=nothing).code is Code.OK
+    assert decided(HOME, tight, sensed=nothing).code is DecisionCode.OK
     for name in ("mg400", "magician", "simulated"):
         assert load_limits(name).force_n is not None  # on by default

@@ -8,7 +8,7 @@ from scenes import SpecError, load_sensor
 from scenes.load import SHIPPED
 from scenes.sensor import SensorSpec
 from scenes.tables import MOST_INLINE, fill_in_tables, take_out_tables
-from twin.fit.sensor_file import write_sensor
+from twin.calibration.sensor_file import write_sensor
 
 NAME = "ur5-331"
 LEVELS = f"{NAME}.appearance.cap_levels.csv"

@@ -4,7 +4,7 @@ import pytest
 
 from scenes import load_sensor
 from scenes.sensor import SensorSpec
-from twin.fit.sensor_file import write_sensor
+from twin.calibration.sensor_file import write_sensor
 
 
 def rounded(value):

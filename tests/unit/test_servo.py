@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from hardware.rig.geometry import PlacedObject, matrix_of, moved, pose_of
+from hardware.rig.geometry import PlacedObject, matrix_of, pose_of, shift_in_tool
 from hardware.servo.law import Memory, Reading, reading_at, servo_step, tangent_of
-from hardware.servo.trajectory import jerk, local_smoothness, lost_contacts, smoothness, way_along
+from hardware.servo.trajectory import distance_along, jerk, local_smoothness, lost_contacts, smoothness
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting
 
@@ -85,7 +85,7 @@ def test_a_perfect_estimator_goes_round_each_object(mounting, name):
 
 def test_the_integral_and_the_step_are_bounded(mounting):
     scene = placed(mounting, "plane")
-    pose = moved(scene.start_pose(0.0), -40 * mounting.axis)  # far from the surface: the error never goes away
+    pose = shift_in_tool(scene.start_pose(0.0), -40 * mounting.axis)  # far from the surface: the error never goes away
     pose[5] += 80.0
     memory = Memory()
     for _ in range(200):
@@ -101,7 +101,7 @@ def test_an_old_frame_serves_as_well_as_a_new_one_on_a_plane(mounting):
     scene = placed(mounting, "plane", turn_deg=-35.0)
     then = scene.start_pose(2.0)
     then[5] += 5.0
-    now = moved(then, [3.0, 0.7, 0.0])
+    now = shift_in_tool(then, [3.0, 0.7, 0.0])
     now[5] -= 2.0
     steps = []
     for seen_at in (then, now):
@@ -155,5 +155,5 @@ def test_the_way_goes_on_over_the_start():
     turn = np.linspace(0, 2 * np.pi, 201)
     circle = np.column_stack([np.cos(turn), np.sin(turn)])
     angles = np.linspace(0, 3 * np.pi, 50)
-    way = way_along(circle, np.column_stack([np.cos(angles), np.sin(angles)]))
+    way = distance_along(circle, np.column_stack([np.cos(angles), np.sin(angles)]))
     np.testing.assert_allclose(way, angles, atol=0.05)

@@ -15,11 +15,11 @@ from training.models.vgnn import network as vgnn
 from training.runs.gaussian_process import Points, fit_two_fidelities
 from training.runs.packed import pack, shipped_names
 from training.runs.run import train_run, write_tensors
-from training.studies.sim_to_real import inverted
-from training.studies.sim_to_real.inverted import TwinBackwards
+from training.studies.sim_to_real import model_inversion
+from training.studies.sim_to_real.inverse_estimates import TwinForwards, TwinRead, _share
 from training.studies.sim_to_real.missed import Left, Missed
-from training.studies.sim_to_real.read import TwinForwards, TwinRead, _share
-from training.studies.sim_to_real.steps import choose_frames, put_beside, quadratic_row, states_like, widen_intervals
+from training.studies.sim_to_real.model_inversion import ModelInversion
+from training.studies.sim_to_real.steps import choose_frames, combine_co_kriging, quadratic_row, states_like, widen_intervals
 from twin.pins import make_reference
 from twin.rig.labels import ArmLabel
 
@@ -37,7 +37,7 @@ def run(data, tmp_path_factory):
 def other_camera(pins):
     """The same frames by a camera that sits otherwise, with its own no-contact layout."""
     moved = pins.reference.pins_px + [3.0, -2.0] + 0.3 * np.random.default_rng(5).normal(size=(127, 2))
-    return replace(pins, measured=True).seen_from(make_reference(moved, pins.sensor.pins))
+    return replace(pins, measured=True).relative_to(make_reference(moved, pins.sensor.pins))
 
 
 def test_pins_are_counted_from_the_no_contact_frame_in_hand(data, run):
@@ -79,7 +79,7 @@ def corrected(data, run, tmp_path_factory):
     content = torch.load(alone / "weights.pt", weights_only=True)
     write_tensors(alone / "weights.pt", content | {"quantile": 1e-3 * content["quantile"]})
     before = files_of(alone)
-    made = put_beside(alone, out, data.rows(SIMULATED), off.rows(FEW), seed=0)
+    made = combine_co_kriging(alone, out, data.rows(SIMULATED), off.rows(FEW), seed=0)
     assert files_of(alone) == before, "the run that frames are put beside stays as it is"
     widen_intervals(alone, made.intervals)
     return out, off.targets, made.left_out
@@ -99,7 +99,7 @@ def test_a_study_that_is_gone_on_with_finds_the_same_again(data, corrected, tmp_
     """The run beside which frames are put has its intervals widened by then."""
     out, alone = corrected[0], corrected[0].with_name("sim_only")
     kept = {folder: torch.load(folder / "weights.pt", weights_only=True) for folder in (out, alone)}
-    again = put_beside(alone, tmp_path / "again", data.rows(SIMULATED), mislabelled(data).rows(FEW), seed=0)
+    again = combine_co_kriging(alone, tmp_path / "again", data.rows(SIMULATED), mislabelled(data).rows(FEW), seed=0)
     assert all(np.array_equal(kept[alone][key].numpy(), wider) for key, wider in again.intervals.items())
     assert np.array_equal(again.left_out, corrected[2])
     made = torch.load(tmp_path / "again" / "weights.pt", weights_only=True)
@@ -109,7 +109,7 @@ def test_a_study_that_is_gone_on_with_finds_the_same_again(data, corrected, tmp_
 def test_a_run_is_not_written_over_itself(data, run):  # noqa: F811
     before = files_of(run)
     with pytest.raises(TrainingError, match="over itself"):
-        put_beside(run, run.parent / "." / run.name, data.rows(SIMULATED), data.rows(FEW), seed=0)
+        combine_co_kriging(run, run.parent / "." / run.name, data.rows(SIMULATED), data.rows(FEW), seed=0)
     assert files_of(run) == before
 
 
@@ -218,7 +218,7 @@ def test_the_twin_read_backwards_finds_labels_and_learns_what_the_twin_misses(se
         return moved * [sense, 1]
 
     simulated, few, asked = contacts(300), contacts(30), contacts(30)
-    twin = TwinBackwards(pins(simulated), simulated, rest, ranges)
+    twin = ModelInversion(pins(simulated), simulated, rest, ranges)
     shifted = rng.normal(0, 0.2, (60, 2))
     real = [1.1 * pins(each) + shifted + rng.normal(0, 0.02, (len(each), 60, 2)) for each in (few, asked)]
     truth = np.stack([np.concatenate([label.pose, label.move]) for label in asked])
@@ -241,14 +241,14 @@ def test_a_twin_without_unknown_labels_or_without_noise_is_read_as_well():
     ranges[[1, 2, 5]] = [[1, 1], [4, 4], [-180, 180]]
     only = [ArmLabel(each[:6], each[6:]) for each in rng.uniform(*ranges.T, (200, 12))]
     truth = np.array([label.pose[5] for label in only])
-    found = TwinBackwards(edge_pins(only, rest), only, rest, ranges).estimate(np.zeros((0, 60, 2)), [], edge_pins(only[:20], rest))
+    found = ModelInversion(edge_pins(only, rest), only, rest, ranges).estimate(np.zeros((0, 60, 2)), [], edge_pins(only[:20], rest))
     assert np.abs((found[:, 5] - truth[:20] + 180) % 360 - 180).max() < 1.0, "the direction alone is unknown, the pins have no noise"
     known = ranges.copy()
     known[1:3], known[5] = [[-6, 6], [3, 5]], 30.0
     ranges[1:3] = known[1:3]
     around = [ArmLabel(each[:6], each[6:]) for each in rng.uniform(*ranges.T, (300, 12))]
     asked = [ArmLabel(each[:6], each[6:]) for each in rng.uniform(*known.T, (20, 12))]
-    twin = TwinBackwards(edge_pins(around, rest), around, rest, known)
+    twin = ModelInversion(edge_pins(around, rest), around, rest, known)
     found = twin.estimate(np.zeros((0, 60, 2)), [], edge_pins(asked, rest) + rng.normal(0, 0.01, (20, 60, 2)))
     assert (found[:, 5] == 30.0).all(), "the direction is known"
     assert np.median(np.abs(found[:, 1] - [label.pose[1] for label in asked])) < 0.2
@@ -283,7 +283,7 @@ def test_frames_without_labels_teach_what_the_twin_misses_where_few_have_labels(
     simulated, few, more, asked = ([ArmLabel(each[:6], each[6:]) for each in rng.uniform(*ranges.T, (n, 12))] for n in (300, 4, 150, 60))
     shifted = rng.normal(0, 0.4, (60, 2))
     seen = [1.1 * edge_pins(each, rest) + shifted + rng.normal(0, 0.02, (len(each), 60, 2)) for each in (few, more, asked)]
-    twin = TwinBackwards(edge_pins(simulated, rest), simulated, rest, ranges)
+    twin = ModelInversion(edge_pins(simulated, rest), simulated, rest, ranges)
     truth = np.array([label.pose[5] for label in asked])
 
     def error(*unlabelled):
@@ -299,7 +299,7 @@ def test_frames_without_labels_teach_what_the_twin_misses_where_few_have_labels(
             taught.append(len(known) - len(few))
             super().__init__(field, known, seen, noisier)
 
-    monkeypatch.setattr(inverted, "Missed", Counted)
+    monkeypatch.setattr(model_inversion, "Missed", Counted)
     error(np.concatenate([seen[1][:60], empty]))
     assert 40 < taught[-1] < 66, "frames that show no direction teach nothing"
 
@@ -328,7 +328,7 @@ def test_a_twin_read_both_ways_is_as_good_as_the_better_reading_and_better_than_
     real, judged = seen(few), seen(asked)
     truth, told = (np.array([label.pose[[2, 3]] for label in labels]) for labels in (asked, few))
     twin = TwinRead(plate_pins(simulated, rest), simulated, rest, ranges)
-    back = TwinBackwards(plate_pins(simulated, rest), simulated, rest, ranges).estimate(real, few, judged)[:, [2, 3]]
+    back = ModelInversion(plate_pins(simulated, rest), simulated, rest, ranges).estimate(real, few, judged)[:, [2, 3]]
     states = np.array([label.pose[[2, 3]] for label in simulated])
     forwards = TwinForwards(plate_pins(simulated, rest), states)
     forth = forwards.estimate(real, told, judged)

@@ -1,4 +1,4 @@
-"""Slip over time: what simulated drags tell, that it is learnt from them, and that memory begins anew with every contact."""
+"""Slip over time: what simulated drags tell, that it is learnt from them, and that memory begins again with every contact."""
 
 import shutil
 from dataclasses import replace
@@ -23,12 +23,12 @@ from training.touch.slip import (
     NAMES,
     Drag,
     SlipTracker,
+    compare_slip,
     drags_of,
-    gone_through,
-    judge_slip,
     learn_slip,
     random_places,
     read_slip,
+    resample_path,
     write_slip,
 )
 from twin.geometry.pins import rest_pins
@@ -67,11 +67,11 @@ def learnt():
 
 def unseen_ways(count=20):
     rng = np.random.default_rng(7)
-    return [gone_through(plain_drag(rng), random_places(20, rng), plain_eyes, rng) for _ in range(count)]
+    return [resample_path(plain_drag(rng), random_places(20, rng), plain_eyes, rng) for _ in range(count)]
 
 
 def test_slip_is_told_before_the_whole_contact_slides(learnt):
-    found = judge_slip(learnt, unseen_ways())
+    found = compare_slip(learnt, unseen_ways())
     assert found.contacts == 20 and found.whole_accuracy > 0.95
     assert found.lead_mm > 0.5 and found.late < 0.1 and found.false_alarms < 0.05
     assert found.share < 0.08 and 0.75 < found.share_covered <= 1.0
@@ -96,7 +96,7 @@ def test_a_drag_that_is_turned_or_mirrored_is_seen_by_the_pins_that_stand_there(
     lost[0, 17] = True
     drag = Drag(rest[None], lost, np.zeros(1), np.zeros(1), np.array([1.0, 0.0]))
     for symmetry in symmetries(sensor.pins.phase_deg):
-        found = drag.turned(symmetry, sensor.pins.rings)
+        found = drag.turn(symmetry, sensor.pins.rings)
         np.testing.assert_allclose(found.caps_mm, drag.caps_mm, atol=ALMOST)
         assert np.flatnonzero(found.lost[0]).tolist() == [symmetry.places(sensor.pins.rings)[17]]
         assert np.linalg.norm(found.direction) == pytest.approx(1.0)
@@ -124,13 +124,13 @@ def test_drags_of_a_data_set_are_as_long_as_their_moves(contacts):
 def test_a_model_that_remembers_tells_slip_besides_and_forgets_a_contact_that_ends(contacts):
     folder, run, sensor = contacts
     estimator = PoseEstimator.load(run)
-    assert estimator.remembering() is estimator  # too few drags to learn slip from
+    assert estimator.with_history() is estimator  # too few drags to learn slip from
     data = load_dataset(folder, sensor, estimator.names)
     modes = estimator.modes_of(data.pins)
     network = slip.SlipNetwork(2 * modes.shape[1]).eval()
     estimator.slip = slip.SlipModel(network, 1.0, np.abs(modes).max(axis=0), 0.5, 1.0, 1.0)
-    remembering = estimator.remembering()
-    assert remembering.names == (*estimator.names, *NAMES) and remembering.remembering().names == remembering.names
+    remembering = estimator.with_history()
+    assert remembering.names == (*estimator.names, *NAMES) and remembering.with_history().names == remembering.names
     frames = iter([data.pins.rows(np.array([k])) for k in (0, 1)] + [None] + [data.pins.rows(np.array([0]))])
 
     def pins_in(model, trained, frame):
@@ -171,7 +171,7 @@ def test_a_run_that_learnt_from_drags_remembers_them_and_its_small_copy_does(con
     assert add_slip(tmp_path / "run", config, parts) == []
     pack(tmp_path / "run", tmp_path / "small")
     for place in ("run", "small"):
-        made = PoseEstimator.load(tmp_path / place).remembering().estimate_one(OneFrame(parts[0].pins.rows(np.array([5]))), 0.0, "")
+        made = PoseEstimator.load(tmp_path / place).with_history().estimate_one(OneFrame(parts[0].pins.rows(np.array([5]))), 0.0, "")
         told = dict(zip(made.names, made.value, strict=True))
         assert 0 <= told["slip_begins"] <= 1 and told["slip_left"] >= 0 and -180 <= told["slip_direction"] <= 180
 

@@ -15,7 +15,7 @@ from training.models.steered.field import waves_of
 from training.models.steered.network import Steered, SteeredSize
 from training.runs.packed import pack
 from training.runs.run import train_run
-from training.studies.sim_to_real.steps import model_for, put_beside
+from training.studies.sim_to_real.steps import combine_co_kriging, model_for
 from twin.pins import nominal_reference
 from twin.types import Form
 
@@ -117,7 +117,7 @@ def test_labelled_frames_are_put_beside_it(learnt, tmp_path):
     run, edges, judged = learnt
     off = replace(edges, targets=replace(edges.targets, corrected=edges.targets.corrected + [0.2, 0.0]))
     others = np.setdiff1d(np.arange(len(edges)), judged)
-    put_beside(run, tmp_path / "beside", edges.rows(others), off.rows(others[:30]), seed=0)
+    combine_co_kriging(run, tmp_path / "beside", edges.rows(others), off.rows(others[:30]), seed=0)
     assert errors(tmp_path / "beside", off, judged)[0] < 0.7 * errors(run, off, judged)[0]
     assert errors(tmp_path / "beside", off, judged)[1] < 2 * errors(run, off, judged)[1]
 

@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 
 from scenes import load_sensor
+from twin.calibration.optics import _Log
 from twin.errors import StoreError
-from twin.fit.optics import _Log
 from twin.mechanics.skin_fit import FittedPins
 from twin.mechanics.solver import SkinSolver
 from twin.optics.variants import probes
-from twin.optics.variants.probes import Verdict
+from twin.optics.variants.probes import ProbeResult
 from twin.store import (
     ArrayFile,
     Item,
@@ -35,7 +35,7 @@ from twin.store import (
     inputs_digest,
     kept_arrays,
     kept_json,
-    locked,
+    lock_folder,
     made_by,
     remove_parts,
     require_same_code,
@@ -48,23 +48,28 @@ from twin.store.fingerprint import PACKAGES, ROOT
 
 SOLVER = "twin/mechanics/solver.py"
 KEEPERS = (  # the module of every function whose results are kept between runs
-    "twin.fit.contact.simulate",
+    "twin.calibration.contact.simulate",
     "training.data.dataset",
     "training.estimate.estimator",
     "training.generation.make",
     "training.models.cnn.inputs",
-    "twin.fit.optics",
+    "twin.calibration.optics",
     "twin.pins.tune",
     "twin.mechanics.skin_fit",
     "twin.geometry.solid",
     "twin.optics.preview",
     "twin.optics.variants.probes",
     "twin.optics.render",
-    "twin.judge.degradation.shots",
-    "twin.judge.degradation.sweep",
+    "twin.evaluation.degradation.shots",
+    "twin.evaluation.degradation.sweep",
     "twin.objects.mesh_field",
 )
-SOLVED = ("twin.fit.contact.simulate", "training.generation.make", "twin.judge.degradation.shots", "twin.judge.degradation.sweep")
+SOLVED = (
+    "twin.calibration.contact.simulate",
+    "training.generation.make",
+    "twin.evaluation.degradation.shots",
+    "twin.evaluation.degradation.sweep",
+)
 
 
 def not_source(folder: str, names: list[str]) -> list[str]:
@@ -296,14 +301,14 @@ HOLDER = """
 import sys, time
 from pathlib import Path
 import fcntl
-from twin.store import locked
+from twin.store import lock_folder
 
-def held(folder):  # as where the folder itself can't be locked
+def held(folder):  # as where the folder itself can't be lock_folder
     file = (folder / ".lock").open("w")
     fcntl.flock(file, fcntl.LOCK_EX)
     return file
 
-with locked(Path(sys.argv[1])):
+with lock_folder(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
 """
@@ -323,13 +328,13 @@ def test_a_folder_is_held_by_one_run_and_let_go_of_when_that_is_killed(tmp_path,
     with subprocess.Popen(run, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True) as holder:
         try:
             assert holder.stdout.readline() == "held\n"
-            with pytest.raises(StoreError, match="another run is at work there; wait .* or give another `out`"), locked(tmp_path):
+            with pytest.raises(StoreError, match="another run is at work there; wait .* or give another `out`"), lock_folder(tmp_path):
                 pass
         finally:
             holder.kill()
-    with locked(tmp_path), pytest.raises(StoreError, match="another run"), locked(tmp_path):
+    with lock_folder(tmp_path), pytest.raises(StoreError, match="another run"), lock_folder(tmp_path):
         pass
-    with locked(tmp_path):
+    with lock_folder(tmp_path):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ([] if lockable else [".lock"])
 
@@ -339,8 +344,8 @@ def test_probes_keep_nothing_where_the_cache_is_off(tmp_path, monkeypatch):
     library.touch()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TACTIP_CACHE", "off")
-    monkeypatch.setattr(probes, "_run", lambda backend, path: runs.append(path) or Verdict(True, "19.1", ""))
-    assert probes.probe("llvm", library) == probes.probe("llvm", library) == Verdict(True, "19.1", "")
+    monkeypatch.setattr(probes, "_run", lambda backend, path: runs.append(path) or ProbeResult(True, "19.1", ""))
+    assert probes.probe("llvm", library) == probes.probe("llvm", library) == ProbeResult(True, "19.1", "")
     assert list(tmp_path.iterdir()) == [library] and len(runs) == 1
 
 
@@ -355,10 +360,10 @@ def test_frames_of_the_same_stem_do_not_share_a_fitted_skin(tmp_path, monkeypatc
         def __call__(self, pins_px):
             return FittedPins(pins_px, pins_px, pins_px, *([np.zeros(1)] * (len(FittedPins.__dataclass_fields__) - 3)))
 
-    monkeypatch.setattr("twin.fit.optics.SkinFit", Fit)
+    monkeypatch.setattr("twin.calibration.optics.SkinFit", Fit)
     image = np.zeros((4, 4), np.uint8)
     raw = [("frame.png", image, np.zeros((3, 2))), ("frame.jpg", image, np.ones((3, 2)))]
-    frames = _Log(tmp_path, sensor, raw).aligned(sensor, raw, lambda *_: None)
+    frames = _Log(tmp_path, sensor, raw).align_frames(sensor, raw, lambda *_: None)
     assert [float(frame.state.base_mm.mean()) for frame in frames] == [0.0, 1.0]
 
 
@@ -368,7 +373,7 @@ KIND = ArrayFile("model of dreams", "twin dream", version=3, error=StoreError)
 def test_arrays_and_what_is_said_of_them_are_read_again(tmp_path):
     arrays = {"one": np.arange(6.0).reshape(2, 3), "half": np.ones(4, np.float16)}
     assert KIND.write(tmp_path / "a", arrays, {"of": "a night"}) == (tmp_path / "a").stat().st_size
-    with KIND.opened(tmp_path / "a") as (about, found):
+    with KIND.open_arrays(tmp_path / "a") as (about, found):
         assert about == {"of": "a night"} == KIND.about(tmp_path / "a")
         assert all(np.array_equal(found[key], array) and found[key].dtype == np.float32 for key, array in arrays.items())
 
@@ -391,17 +396,17 @@ def test_a_file_of_arrays_that_is_not_whole_is_refused_with_the_remedy(damage, s
         whole, changed = path.read_bytes(), damage(path.read_bytes())
         assert changed != whole
         path.write_bytes(changed)
-    with pytest.raises(StoreError, match=f"{path}: .*{says}.*'twin dream'"), KIND.opened(path):
+    with pytest.raises(StoreError, match=f"{path}: .*{says}.*'twin dream'"), KIND.open_arrays(path):
         pass
 
 
 def test_a_kind_of_file_has_its_own_remedy(tmp_path):
     (tmp_path / "a").write_bytes(b"")
-    with pytest.raises(StoreError, match="damaged.*; copy it anew"), replace(KIND, again="copy it anew").opened(tmp_path / "a"):
+    with pytest.raises(StoreError, match="damaged.*; copy it again"), replace(KIND, again="copy it again").open_arrays(tmp_path / "a"):
         pass
 
 
 def test_what_a_reader_misses_in_a_file_of_arrays_is_told_as_damage(tmp_path):
     KIND.write(tmp_path / "a", {"one": np.arange(6.0)}, {})
-    with pytest.raises(StoreError, match="damaged, or no model of dreams .*two"), KIND.opened(tmp_path / "a") as (_, found):
+    with pytest.raises(StoreError, match="damaged, or no model of dreams .*two"), KIND.open_arrays(tmp_path / "a") as (_, found):
         found["two"]

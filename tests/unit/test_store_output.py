@@ -16,7 +16,7 @@ import pyvista as pv
 from twin.cli import main
 from twin.errors import StoreError
 from twin.report.skin3d import write_surface
-from twin.store import contents, locked, output, output_file, overwriting, write_result, write_text, writes, writes_file, written_by_us
+from twin.store import contents, lock_folder, output, output_file, overwriting, write_result, write_text, writes, writes_file, written_by_us
 from twin.store.output import WRITTEN
 
 NAMES = ("table.csv", "page.html", "pictures")
@@ -140,7 +140,7 @@ def test_a_file_beside_others_is_not_lost_and_its_folder_is_free_meanwhile(tmp_p
     fitted(tmp_path / "mine.toml")
     fitted(tmp_path / "mine.toml", "again")
     assert written_by_us(tmp_path) == ["mine.light.csv", "mine.toml"]
-    with output_file(tmp_path / "other.toml"), locked(tmp_path):
+    with output_file(tmp_path / "other.toml"), lock_folder(tmp_path):
         pass
     fitted(None)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.light.csv", "mine.toml"], "the user's folder shows results alone"

@@ -14,9 +14,9 @@ from twin.mechanics.path import deepest_mm
 from twin.optics.preview import Preview
 from twin.pins import Pipeline
 from twin.rig.kinematics import object_pose, rig_of
-from twin.rig.touch import Surface, tilted_labels
-from twin.studio.camera import DomeCamera, dome_window
-from twin.studio.contact import Light, Mesh, MovingContact, Setup
+from twin.rig.touch import SmoothSurface, tilted_labels
+from twin.studio.camera import StudioCamera, dome_window
+from twin.studio.contact import ContactSetup, Light, MovingContact, SolvedMesh
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, bend_mm
 from twin.types import Form, Frame
 
@@ -27,7 +27,7 @@ PIN_PX, FORCE_SHARE = 0.5, 0.05  # largest mean error of the pins and of the for
 
 @pytest.fixture(scope="module")
 def contact():
-    return MovingContact(Setup(SENSOR, SPHERE))
+    return MovingContact(ContactSetup(SENSOR, SPHERE))
 
 
 def pressed(contact, wish, most=60):
@@ -86,7 +86,7 @@ def test_any_wish_leads_to_a_possible_place(contact):
 
 
 def test_every_answer_belongs_to_one_pose_on_the_way(contact):
-    contact.begin_anew()
+    contact.restart()
     pressed(contact, ObjectPose())
     wish, depths, numbers = ObjectPose(x_mm=1.0, depth_mm=2.5), [], []
     for _ in range(40):
@@ -111,13 +111,13 @@ def test_the_dome_alone_is_as_good_as_the_whole_frame(contact):
 
 def test_what_moves_is_near_the_fine_mesh():
     """A press with a shear, where friction remembers the way."""
-    contact = MovingContact(Setup(SENSOR, PLANE))
+    contact = MovingContact(ContactSetup(SENSOR, PLANE))
     pressed(contact, ObjectPose())
     usual = pressed(contact, ObjectPose(depth_mm=3.0))
     usual = pressed(contact, ObjectPose(x_mm=1.5, depth_mm=3.0, tilt_y_deg=4.0))
     while not contact.refined:
         fine = contact.refine()
-    assert fine is not None and fine.mesh is Mesh.FINE and usual.mesh is Mesh.USUAL
+    assert fine is not None and fine.mesh is SolvedMesh.FINE and usual.mesh is SolvedMesh.USUAL
     assert fine.pose == usual.pose
     assert np.linalg.norm(fine.caps_px - usual.caps_px, axis=1).mean() < PIN_PX
     assert np.linalg.norm(fine.state.force_n - usual.state.force_n) < FORCE_SHARE * np.linalg.norm(fine.state.force_n)
@@ -126,10 +126,10 @@ def test_what_moves_is_near_the_fine_mesh():
 def test_an_old_picture_is_refused(contact):
     answer = pressed(contact, ObjectPose(depth_mm=1.0))
     light = np.asarray(answer.light)
-    traced = contact.traced(answer.solved, light, Light.TRACED, 5.0)
+    traced = contact.newest_traced(answer.solved, light, Light.TRACED, 5.0)
     assert traced is not None and traced.lit is Light.TRACED and traced.number > answer.number and traced.state is answer.state
     pressed(contact, ObjectPose(depth_mm=1.1))
-    assert contact.traced(answer.solved, light, Light.TRACED, 5.0) is None
+    assert contact.newest_traced(answer.solved, light, Light.TRACED, 5.0) is None
 
 
 def test_the_solvers_failure_leaves_the_object_where_it_is(contact, monkeypatch):
@@ -153,16 +153,16 @@ def test_a_changed_friction_begins_the_contact_anew(contact):
     contact.change(friction=0.0)
     answer = pressed(contact, ObjectPose(x_mm=2.0, depth_mm=2.0))
     assert np.linalg.norm(answer.state.tangential_n) < 1e-6
-    contact.change(touched=PLANE)
+    contact.change(obj=PLANE)
     assert contact.setup.friction is None
-    contact.change(touched=SPHERE)
+    contact.change(obj=SPHERE)
 
 
 def test_the_recordings_form_is_refused_where_there_is_none():
-    camera = DomeCamera.__new__(DomeCamera)
+    camera = StudioCamera.__new__(StudioCamera)
     camera.spec = SENSOR.model_copy(update={"recording": None})
     with pytest.raises(FrameError, match="has no recordings' form; show raw frames"):
-        camera.recorded(Frame(np.zeros((4, 4), np.uint8), Form.RAW))
+        camera.as_recorded(Frame(np.zeros((4, 4), np.uint8), Form.RAW))
 
 
 @pytest.mark.parametrize("name", ["mg400-331", "mg400-127", "ur5-331"])
@@ -179,7 +179,7 @@ def test_the_window_holds_mask_and_recording(name):
 
 def test_depth_and_both_tilts_are_the_inverse_of_the_arms_way():
     sensor, experiment, rng = load_sensor("ur5-331"), load_experiment("surface-3d"), np.random.default_rng(0)
-    radius, surface = sensor.skin.outer_radius_mm, Surface(PLANE)
+    radius, surface = sensor.skin.outer_radius_mm, SmoothSurface(PLANE)
     odd = rig_of(sensor).model_copy(update={"turn_offset_deg": (0.3, -0.5, 2.0), "plate_tilt_deg": 3.0, "tcp_aside_mm": 0.4})
     for rig in (rig_of(sensor), odd):
         for _ in range(20):
@@ -192,7 +192,7 @@ def test_depth_and_both_tilts_are_the_inverse_of_the_arms_way():
 def test_the_pins_of_a_frame_are_sought_once(monkeypatch):
     """Where the model takes the frame that is shown, what is drawn over it is what the estimate was made from."""
     model = PoseEstimator.load("mg400-127")
-    contact = MovingContact(Setup(model.sensor, SPHERE, form=model.form), model)
+    contact = MovingContact(ContactSetup(model.sensor, SPHERE, form=model.form), model)
     sought = []
     monkeypatch.setattr(Pipeline, "__call__", lambda self, frame, seek=Pipeline.__call__: sought.append(frame) or seek(self, frame))
     answer = pressed(contact, ObjectPose(depth_mm=0.5))

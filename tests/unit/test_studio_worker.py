@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from twin.errors import ContactError, TwinError
-from twin.studio.contact import Light, Mesh
-from twin.studio.page import PORTS_TRIED, Page, free_port
+from twin.studio.contact import Light, SolvedMesh
+from twin.studio.page import PORTS_TRIED, StudioPage, free_port
 from twin.studio.pose import NAMES, ObjectPose
-from twin.studio.state import MOST_BYTES, StudioState, first_state, read_way, save_way, tap_and_shear
+from twin.studio.state import MOST_BYTES, StudioState, first_state, read_trajectory, save_trajectory, tap_and_shear
 from twin.studio.tracing import Failed, Traced
 from twin.studio.video import RATE_HZ, FilmWriter
 from twin.studio.worker import Newest, Worker
@@ -25,7 +25,7 @@ WAIT_S = 20.0
 class Stand:
     """Stands in for an answer."""
 
-    def __init__(self, number, pose, arrived, lit=Light.DRAWN, mesh=Mesh.USUAL):
+    def __init__(self, number, pose, arrived, lit=Light.DRAWN, mesh=SolvedMesh.USUAL):
         self.number, self.pose, self.arrived, self.lit, self.mesh, self.state = number, pose, arrived, lit, mesh, None
         self.solved = number
 
@@ -52,7 +52,7 @@ class SlowContact:
         self.left, self.refined = 2, False
         return self._made(arrived=self.depth == wished.depth_mm)
 
-    def traced(self, solved, light, lit, ms):
+    def newest_traced(self, solved, light, lit, ms):
         if self.newest is None or solved != self.newest.solved:
             return None
         made = self._made(arrived=True, lit=lit, mesh=self.newest.mesh)
@@ -62,7 +62,7 @@ class SlowContact:
     def refine(self):
         self.left -= 1
         self.refined = self.left <= 0
-        return self._made(arrived=True, mesh=Mesh.FINE) if self.refined else None
+        return self._made(arrived=True, mesh=SolvedMesh.FINE) if self.refined else None
 
     def again(self):
         return self._made(arrived=True)
@@ -119,11 +119,11 @@ def test_what_stands_still_is_traced_then_refined_and_shown_with_its_own_picture
     worker, answers, _, wait = run(contact, tracer)
     with worker:
         worker.ask(ObjectPose(depth_mm=2.0))
-        wait(lambda a: a.lit is Light.TRACED and a.mesh is Mesh.FINE)
+        wait(lambda a: a.lit is Light.TRACED and a.mesh is SolvedMesh.FINE)
     kinds = [(a.lit, a.mesh) for a in answers if a.arrived]
-    usual = [(lit, Mesh.USUAL) for lit in (Light.DRAWN, Light.ROUGH, Light.TRACED)]
-    assert kinds == [*usual, (Light.TRACED, Mesh.FINE)]  # the fine mesh's picture comes when it is as good as the one before
-    assert len(tracer.asked) == 2
+    usual = [(lit, SolvedMesh.USUAL) for lit in (Light.DRAWN, Light.ROUGH, Light.TRACED)]
+    assert kinds == [*usual, (Light.TRACED, SolvedMesh.FINE)]  # the fine mesh's picture comes when it is as good as the one before
+    assert len(tracer.goals_for_agents) == 2
     assert tracer.started >= 1
 
 
@@ -132,7 +132,7 @@ def test_without_a_tracer_the_fine_answer_comes_drawn():
     worker, answers, said, wait = run(contact, tracer)
     with worker:
         worker.ask(ObjectPose(depth_mm=1.0))
-        wait(lambda a: a.mesh is Mesh.FINE)
+        wait(lambda a: a.mesh is SolvedMesh.FINE)
     assert said == ["no path tracing here"] and answers[-1].lit is Light.DRAWN
 
 
@@ -225,7 +225,7 @@ def test_a_page_that_can_not_listen_says_so_and_does_not_wait():
     with socket.create_server(("127.0.0.1", 65535)):
         for host, port in (("999.1.1.1", 8090), ("nowhere.invalid", 8090), ("127.0.0.1", 65535)):
             with pytest.raises(TwinError, match=f"`host` {host} `port` {port}: can't listen there"):
-                Page("page", host=host, port=port)
+                StudioPage("page", host=host, port=port)
 
 
 def test_the_next_free_port_is_taken():
@@ -244,7 +244,7 @@ def test_a_state_is_read_from_a_file_alone(tmp_path):
 
 def test_a_way_is_written_and_read(tmp_path):
     way = tap_and_shear(ObjectPose(tilt_x_deg=5.0))
-    again = read_way(save_way(tmp_path / "way.csv", way).read_bytes(), "way.csv")
+    again = read_trajectory(save_trajectory(tmp_path / "way.csv", way).read_bytes(), "way.csv")
     assert len(again) == len(way) and again[0][0] == 0.0
     for (t, pose), (s, other) in zip(way, again, strict=True):
         assert s == pytest.approx(t, abs=1e-3)
@@ -256,17 +256,17 @@ def test_a_way_is_written_and_read(tmp_path):
     [
         (b"x_mm\n1\n", "expected the columns"),
         (b"time_s,up\n1,2\n", "expected the columns"),
-        (b"time_s,x_mm\n0,a\n", "not readable as a way"),
+        (b"time_s,x_mm\n0,a\n", "not readable as a trajectory"),
         (b"time_s,x_mm\n0,1\n0,2\n", "time_s does not rise"),
         (b"time_s,x_mm\n", "0 rows"),
         (b"time_s,x_mm\n0,nan\n", "no finite number"),
-        (b"time_s,x_mm\n0,1,2\n", "not readable as a way"),
-        (b"\xff\xfe", "not readable as a way"),
+        (b"time_s,x_mm\n0,1,2\n", "not readable as a trajectory"),
+        (b"\xff\xfe", "not readable as a trajectory"),
     ],
 )
 def test_what_is_no_way_is_refused(content, why):
     with pytest.raises(TwinError, match=why):
-        read_way(content, "way.csv")
+        read_trajectory(content, "way.csv")
 
 
 def test_a_video_shows_each_picture_for_its_time(tmp_path):

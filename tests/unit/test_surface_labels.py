@@ -6,7 +6,7 @@ import pytest
 from scenes import load_experiment, load_object, load_sensor
 from twin.rig.kinematics import object_pose, rig_of
 from twin.rig.mounting import Mounting
-from twin.rig.touch import Surface, surface_labels
+from twin.rig.touch import SmoothSurface, surface_labels
 
 SAME_MM, SAME_DEG = 3e-3, 1e-4  # what a plate that leans by a degree, or an arm whose other axes are off a little, leaves out
 SURFACE = load_experiment("surface-2d")
@@ -25,7 +25,7 @@ def test_on_the_flat_plate_labels_are_the_arms_own(name):
     level = {"turn_offset_deg": (0.0, 0.0, rig_of(sensor).turn_offset_deg[2])}  # not out of the angle's plane
     sensor = sensor.model_copy(update={"rig": rig_of(sensor).model_copy(update=level)})
     poses, T = poses_of(sensor)
-    found = surface_labels(SURFACE, Mounting.of(sensor, SURFACE), Surface(load_object("plane")), T)
+    found = surface_labels(SURFACE, Mounting.of(sensor, SURFACE), SmoothSurface(load_object("plane")), T)
     slope = np.tan(np.radians(rig_of(sensor).plate_tilt_deg))
     assert np.abs(found["pose_6"] - poses[:, 5]).max() < SAME_DEG
     assert np.abs(found["pose_2"] - (poses[:, 1] - slope * poses[:, 0])).max() < SAME_MM
@@ -34,7 +34,7 @@ def test_on_the_flat_plate_labels_are_the_arms_own(name):
 @pytest.mark.parametrize("name", ["sphere", "cylinder", "edge", "square"])
 def test_a_flat_plate_with_an_objects_labels_is_touched_at_the_same_distance_and_angle(name):
     sensor = load_sensor("mg400-331")
-    rig, surface = rig_of(sensor), Surface(load_object(name))
+    rig, surface = rig_of(sensor), SmoothSurface(load_object(name))
     _, T = poses_of(sensor)
     found = surface_labels(SURFACE, Mounting.of(sensor, SURFACE), surface, T)
     for seen, depth, angle in zip(T, found["pose_2"], found["pose_6"], strict=True):
@@ -49,7 +49,7 @@ def test_a_flat_plate_with_an_objects_labels_is_touched_at_the_same_distance_and
 def test_beside_a_balls_pole_depth_and_angle_are_those_of_the_line_between_the_centres():
     sensor, radius_mm = load_sensor("mg400-331"), load_object("sphere").shape.radius_mm
     _, T = poses_of(sensor)
-    touch = Surface(load_object("sphere")).touched(Mounting.of(sensor, SURFACE), T)
+    touch = SmoothSurface(load_object("sphere")).depth_and_angle(Mounting.of(sensor, SURFACE), T)
     to_ball = T[:, :3, 3] + radius_mm * T[:, :3, 2]
     assert np.allclose(touch.indent_mm, sensor.skin.outer_radius_mm + radius_mm - np.linalg.norm(to_ball, axis=1))
     assert np.allclose(np.cos(np.radians(touch.angle_deg)), to_ball[:, 2] / np.linalg.norm(to_ball, axis=1), atol=1e-4)
@@ -60,11 +60,11 @@ def test_a_texture_lifts_the_surface_by_its_height():
     sensor, can = load_sensor("mg400-331"), load_object("mesh-can")
     _, T = poses_of(sensor)
     mounting, bare = Mounting.of(sensor, SURFACE), can.model_copy(update={"texture": None})
-    lifted = Surface(can).touched(mounting, T).indent_mm - Surface(bare).touched(mounting, T).indent_mm
+    lifted = SmoothSurface(can).depth_and_angle(mounting, T).indent_mm - SmoothSurface(bare).depth_and_angle(mounting, T).indent_mm
     assert np.allclose(lifted, can.texture.wire_diameter_mm)
 
 
 def test_turns_about_several_axes_give_no_angle_label():
     sensor, tilted = load_sensor("ur5-331"), load_experiment("surface-3d")
     _, T = poses_of(sensor, 2)
-    assert surface_labels(tilted, Mounting.of(sensor, tilted), Surface(load_object("sphere")), T) == {}
+    assert surface_labels(tilted, Mounting.of(sensor, tilted), SmoothSurface(load_object("sphere")), T) == {}

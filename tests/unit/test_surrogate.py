@@ -13,11 +13,11 @@ from training.surrogate.bending import bend
 from training.surrogate.compliance import NODE_RINGS, compliance_of
 from training.surrogate.contact import LinearContacts, between
 from training.surrogate.contacts import SurrogateContacts
-from training.surrogate.felt import Contact, FiniteElements
-from training.surrogate.fit import _turned, averaged, cut, distil, require_dome, sampled
-from training.surrogate.model import SurrogateError, load_surrogate, representatives, rest_of, surrogate_of, unfolded
+from training.surrogate.fit import _turn_states, average_compliance, cut, distil, require_dome, sample_states
+from training.surrogate.model import SurrogateError, load_surrogate, representatives, rest_of, surrogate_of, unfold_compliance
 from training.surrogate.nodes import AtNodes
 from training.surrogate.paths import FREE, FRICTION, STICKING, draw_path
+from training.surrogate.reading import EpisodeContact, FiniteElements
 from training.surrogate.samples import SolvedPath, lattice_sensor
 from training.surrogate.symmetry import ring_directions, symmetries
 from twin.camera.projection import project
@@ -69,7 +69,7 @@ def beside(polar_deg, depth_mm, ball_mm):
 def contacts(surrogate, sensor, thing="plane", friction=0.5, **options):
     made = SurrogateContacts(surrogate, sensor, 1, **options)
     touched = load_object(thing) if isinstance(thing, str) else ObjectSpec(name="mine", description="", shape=thing)
-    made.begin(0, Contact(sensor, touched, ContactLaw(Friction(friction, friction))))
+    made.begin(0, EpisodeContact(sensor, touched, ContactLaw(Friction(friction, friction))))
     return made
 
 
@@ -87,15 +87,15 @@ def test_the_answers_of_the_linear_skin_are_reciprocal(sensor):
     assert np.allclose(flat, flat.T, atol=1e-9 * np.abs(flat).max())
     ends = np.linalg.eigvalsh(flat)[[0, -1]]
     assert ends[0] > -1e-9 * ends[1]  # more nodes than the coarse mesh has unknowns: some forces cancel
-    answer = averaged(skin.nodes, sensor.pins.phase_deg)
+    answer = average_compliance(skin.nodes, sensor.pins.phase_deg)
     kept = answer[representatives(sensor.pins.phase_deg)]
-    assert np.allclose(unfolded(kept, sensor.pins.phase_deg), answer, rtol=1e-5, atol=1e-5 * np.abs(answer).max())
+    assert np.allclose(unfold_compliance(kept, sensor.pins.phase_deg), answer, rtol=1e-5, atol=1e-5 * np.abs(answer).max())
 
 
 def test_a_path_that_is_learnt_from_turned_is_the_turned_path(sensor):
     """By a sixth of a turn nodes and pins come to lie on one another, so both ways are the same."""
     skin = compliance_of(lattice_sensor(sensor), resolution=COARSE)
-    answer = averaged(skin.nodes, sensor.pins.phase_deg)
+    answer = average_compliance(skin.nodes, sensor.pins.phase_deg)
     rest = rest_pins(lattice_sensor(sensor).geometry)
     poses = np.stack([beside(20.0, depth, 10.0) for depth in (-0.3, 1.0, 2.0)])
     poses[2, :3, 3] += [0.1, 0.5, 0.0]
@@ -106,7 +106,7 @@ def test_a_path_that_is_learnt_from_turned_is_the_turned_path(sensor):
     ball = SphereShape(kind="sphere", radius_mm=10.0)
     path = SolvedPath(ball, 0.4, poses, base, axis, wrench, 2 * wrench, np.ones(3), np.array([0.0, 0.5, 1.0]), *NO_NODES)
     sixth = next(g for g in symmetries(sensor.pins.phase_deg) if g.turns == 1 and not g.mirrored)
-    turned, other = sampled(sensor, skin, answer, path, np.pi / 3), _turned(sampled(sensor, skin, answer, path), sixth)
+    turned, other = sample_states(sensor, skin, answer, path, np.pi / 3), _turn_states(sample_states(sensor, skin, answer, path), sixth)
     for name in turned.__dataclass_fields__:
         assert np.allclose(getattr(turned, name), getattr(other, name), atol=1e-3), name
     assert np.abs(turned.force[2]).max() > 0.01
@@ -187,7 +187,7 @@ def test_a_contact_that_is_lost_keeps_the_last_state_and_the_next_begins_at_rest
     assert "8.0 mm inside" in made.felt.lost[0] and np.linalg.norm(force) > 0.5
     assert np.array_equal(made.felt.caps_mm, caps) and np.array_equal(made.felt.force_n, force)
     assert np.array_equal(made.attitude(0).base_mm, attitude.base_mm)
-    contact = Contact(sensor, load_object("plane"), ContactLaw(Friction(0.5, 0.5)))
+    contact = EpisodeContact(sensor, load_object("plane"), ContactLaw(Friction(0.5, 0.5)))
     made.begin(0, contact)
     true = FiniteElements(sensor, 1)
     true.begin(0, contact)
@@ -226,7 +226,7 @@ def test_a_thousand_steps_do_not_drift(surrogate, sensor):
 
 
 def test_friction_remembers_the_way(surrogate, sensor):
-    """The same pose after a shear and without: with friction the pins tell them apart, without they do not, nor without memory."""
+    """The same pose after a shear and without: with friction the pins distinguish them, without they do not, nor without memory."""
 
     def apart(friction, **options):
         straight = contacts(surrogate, sensor, friction=friction, **options)
@@ -256,7 +256,7 @@ def test_many_contacts_are_those_of_each_alone(surrogate, sensor):
     things = [load_object(name) for name in ("plane", "ball-40", "edge", "cylinder")]
     rows = np.arange(20)
     many = SurrogateContacts(surrogate, sensor, len(rows))
-    laws = [Contact(sensor, things[row % 4], ContactLaw(Friction(0.1 + 0.04 * row, 0.1 + 0.04 * row))) for row in rows]
+    laws = [EpisodeContact(sensor, things[row % 4], ContactLaw(Friction(0.1 + 0.04 * row, 0.1 + 0.04 * row))) for row in rows]
     ways = [[pose(1.0 + 0.05 * row), pose(1.5 + 0.05 * row, across=(0.5, 0.02 * row))] for row in rows]
     for row in rows:
         many.begin(row, laws[row])
@@ -272,7 +272,7 @@ def test_many_contacts_are_those_of_each_alone(surrogate, sensor):
 
 def test_an_arm_that_gives_way_presses_less(surrogate, sensor):
     stiff, soft = contacts(surrogate, sensor), SurrogateContacts(surrogate, sensor, 1)
-    soft.begin(0, Contact(sensor, load_object("plane"), ContactLaw(Friction(0.5, 0.5), compliance_mm_per_n=0.5)))
+    soft.begin(0, EpisodeContact(sensor, load_object("plane"), ContactLaw(Friction(0.5, 0.5), compliance_mm_per_n=0.5)))
     go(stiff, pose(0.0), pose(2.0))
     go(soft, pose(0.0), pose(2.0))
     given = 0.5 * soft.felt.force_n[0, 2]
@@ -284,7 +284,7 @@ def test_an_arm_that_gives_way_presses_less(surrogate, sensor):
 def test_pins_and_force_are_near_those_of_the_finite_elements(surrogate, sensor, thing):
     """Tap, shear and back: a path that no surrogate was trained on."""
     touched = load_object(thing)
-    contact = Contact(sensor, touched, ContactLaw(Friction(0.46, 0.46)))
+    contact = EpisodeContact(sensor, touched, ContactLaw(Friction(0.46, 0.46)))
     fast, true = SurrogateContacts(surrogate, sensor, 1), FiniteElements(sensor, 1)
     way = [pose(-0.2), pose(1.2), pose(2.2), pose(2.2, across=(1.0, 0.4)), pose(2.2, across=(0.3, 0.1))]
     fast.begin(0, contact)

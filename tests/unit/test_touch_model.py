@@ -25,7 +25,7 @@ def learnt():
     light = rng.normal(size=(200, 1)) * np.ones(PINS)
     lost = np.zeros((200, PINS), bool)
     lost[:, 7] = True
-    return Bases.learnt(moved, light, lost, modes=MODES, light_modes=2), moved, light
+    return Bases.learn_bases(moved, light, lost, modes=MODES, light_modes=2), moved, light
 
 
 def test_a_pin_that_is_mostly_lost_tells_nothing(learnt):
@@ -81,6 +81,6 @@ def test_light_tells_what_pins_do_not(tmp_path):
     modes = TOUCH.modes(None, prepared.inputs, torch.arange(len(lit))).inputs
     _, left_out = fit_smooth_processes(modes, told[:, None])
     assert np.abs(left_out[:, 0] - told).mean() < 0.1
-    assert not np.array_equal(TOUCH.seen(lit)[1], TOUCH.seen(data)[1])
+    assert not np.array_equal(TOUCH.inputs_seen(lit)[1], TOUCH.inputs_seen(data)[1])
     with pytest.raises(TrainingError, match="come without it; give it frames"):
         TOUCH.inputs(data.pins, prepared.learnt, data.pins.reference, together=False)

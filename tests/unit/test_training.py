@@ -1,4 +1,4 @@
-"""Runs: kept, continued, judged; and what a trained model refuses."""
+"""Runs: kept, continued, evaluated; and what a trained model refuses."""
 
 import json
 import shutil
@@ -12,7 +12,7 @@ from drawn_frames import drawn_frame
 from drawn_recording import FRAMES, config_of
 
 from scenes import load_sensor
-from training.data.dataset import Dataset, joined
+from training.data.dataset import Dataset, join_datasets
 from training.data.pins import PinTable
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
@@ -20,12 +20,12 @@ from training.estimate.loading import digest_of, models_by_sensor
 from training.models import recipe_of
 from training.models.part import Prediction
 from training.runs.config import training_rows
-from training.runs.identity import changed_since, learnt_before
+from training.runs.identity import changed_since, trained_before
 from training.runs.packed import folder_of
 from training.runs.run import fold_rows, is_finished, train_run
 from training.runs.run_files import read_tensors
 from training.studies.evaluation import Evaluation
-from training.studies.judging import judge, leak_check, rows_to_judge, write_evaluation
+from training.studies.judging import leak_check, measure_errors, rows_to_evaluate, write_evaluation
 from training.studies.prediction import Predictions
 from twin.errors import FrameError, warn_once
 from twin.pins import Pipeline, nominal_reference
@@ -121,8 +121,8 @@ def test_the_frames_kept_out_are_judged_whatever_the_order_of_the_table(data, tr
     kept = json.loads((trained / "config.json").read_text())["rows"]["kept_out"]
     assert len(kept) == 18
     for each in (data, mixed, mixed.rows(np.flatnonzero(np.isin(mixed.pins.image_name, kept)))):
-        assert each.pins.image_name[rows_to_judge(estimator, each, "validation")].tolist() == kept
-    made = [estimator.predict_rows(each, rows_to_judge(estimator, each, "validation")).mean for each in (data, mixed)]
+        assert each.pins.image_name[rows_to_evaluate(estimator, each, "validation")].tolist() == kept
+    made = [estimator.predict_rows(each, rows_to_evaluate(estimator, each, "validation")).mean for each in (data, mixed)]
     assert np.array_equal(*made)
     assert not changed_since(estimator.config, mixed, estimator.part)
     (said,) = changed_since(estimator.config, with_other_labels(data), estimator.part)
@@ -132,15 +132,15 @@ def test_the_frames_kept_out_are_judged_whatever_the_order_of_the_table(data, tr
 def test_frames_that_a_run_learnt_from_are_known_again_under_any_name(data, trained, tmp_path):
     learnt = PoseEstimator.load(trained).learnt_from
     kept = np.isin(data.pins.image_name, json.loads((trained / "config.json").read_text())["rows"]["kept_out"])
-    (said,) = learnt_before(learnt, data)
-    assert said.startswith(f"{(~kept).sum()} of these {FRAMES} frames") and "the run learnt from" in said
-    assert not learnt_before(learnt, data.rows(np.flatnonzero(kept)))
+    (said,) = trained_before(learnt, data)
+    assert said.startswith(f"{(~kept).sum()} of these {FRAMES} frames") and "the run was trained on" in said
+    assert not trained_before(learnt, data.rows(np.flatnonzero(kept)))
     few = in_another_order(data.rows(np.flatnonzero(~kept)[:7]))
     renamed = replace(few, pins=replace(few.pins, image_name=np.array([f"other_{k}.png" for k in range(7)])))
-    assert learnt_before(learnt, renamed)[0].startswith("7 of these 7 frames")
+    assert trained_before(learnt, renamed)[0].startswith("7 of these 7 frames")
     other = replace(data.rows(np.flatnonzero(kept)), folders=(tmp_path / "a",))
-    assert learnt_before(learnt, joined([other, replace(renamed, folders=(tmp_path / "b",))]))[0].startswith("7 of these 25 frames")
-    assert "not known" in learnt_before(None, data)[0]
+    assert trained_before(learnt, join_datasets([other, replace(renamed, folders=(tmp_path / "b",))]))[0].startswith("7 of these 25 frames")
+    assert "not known" in trained_before(None, data)[0]
 
 
 def test_a_run_of_an_earlier_version_is_judged_and_says_what_it_cannot_tell(data, trained, tmp_path):
@@ -150,7 +150,7 @@ def test_a_run_of_an_earlier_version_is_judged_and_says_what_it_cannot_tell(data
     kept = config["rows"]["kept_out"]
     (run / "config.json").write_text(json.dumps(config | {"rows": {"usable": FRAMES, "train": 72}}))
     estimator = PoseEstimator.load(run)
-    judged = data.pins.image_name[rows_to_judge(estimator, data, "validation")].tolist()
+    judged = data.pins.image_name[rows_to_evaluate(estimator, data, "validation")].tolist()
     assert sorted(judged) == sorted(kept)
     (said,) = changed_since(estimator.config, data, estimator.part)
     assert "can't be told" in said
@@ -158,10 +158,10 @@ def test_a_run_of_an_earlier_version_is_judged_and_says_what_it_cannot_tell(data
 
 def test_frames_of_folders_of_one_name_are_told_apart(data, tmp_path):
     parts = [replace(data, folders=(tmp_path / place / "taps",)) for place in ("monday", "tuesday")]
-    both = joined(parts)
+    both = join_datasets(parts)
     assert len(set(both.pins.image_name.tolist())) == 2 * FRAMES
     assert both.pins.image_name[0] == "monday/taps/f_0.png"
-    assert joined([parts[0], replace(data, folders=(tmp_path / "tilts",))]).pins.image_name[0] == "taps/f_0.png"
+    assert join_datasets([parts[0], replace(data, folders=(tmp_path / "tilts",))]).pins.image_name[0] == "taps/f_0.png"
 
 
 def test_the_split_of_several_recordings_goes_by_name(data, tmp_path):
@@ -169,7 +169,7 @@ def test_the_split_of_several_recordings_goes_by_name(data, tmp_path):
     config = config_of("vgnn")
     kept = []
     for each in (parts, [in_another_order(part) for part in parts]):
-        both = joined(each).in_order()
+        both = join_datasets(each).in_order()
         kept.append(np.delete(both.pins.image_name, training_rows(config, both)).tolist())
     assert kept[0] == kept[1] and len(kept[0]) == 36
 
@@ -208,9 +208,9 @@ def test_a_run_keeps_all_that_made_it(trained):
 
 def test_a_trained_model_tells_the_pose(data, trained, tmp_path):
     estimator = PoseEstimator.load(trained)
-    rows = rows_to_judge(estimator, data, "validation")
+    rows = rows_to_evaluate(estimator, data, "validation")
     made = estimator.predict_rows(data, rows)
-    metrics = judge(made, data, rows)
+    metrics = measure_errors(made, data, rows)
     assert metrics["corrected"]["pose_2"]["mae"] < 0.3 and metrics["corrected"]["pose_6"]["mae"] < 5
     assert metrics["without_prediction"] == 0 and metrics["frames"] == 18
     written = write_evaluation(tmp_path, made, data, rows, metrics, "corrected")
@@ -225,7 +225,7 @@ def test_no_share_above_one_and_no_area_below_zero_is_judged_or_written(data, tm
     mean, half = np.tile([1.5, -2.0], (len(data), 1)), np.tile([0.6, 1.0], (len(data), 1))
     rows = np.arange(5)
     made = Prediction(mean[rows], half[rows], half[rows], np.full(5, np.nan))
-    found = judge(made, told, rows)["corrected"]
+    found = measure_errors(made, told, rows)["corrected"]
     assert found["slip_share"]["mae"] == 0.0 and found["slip_share"]["coverage_90"] == 1.0
     assert found["contact_area"]["mae"] == 3.0 and found["contact_area"]["coverage_90"] == 0.0
     table = write_evaluation(tmp_path, made, told, rows, {}, "corrected")[0].read_text().splitlines()
@@ -277,10 +277,10 @@ def test_a_frame_without_pins_is_not_valid_and_says_why(trained):
 
 def test_rows_a_model_learnt_from_are_not_judged(data, trained):
     estimator = PoseEstimator.load(trained)
-    assert len(rows_to_judge(estimator, data, "all")) == FRAMES
+    assert len(rows_to_evaluate(estimator, data, "all")) == FRAMES
     fewer = Dataset(data.pins.rows(np.arange(50)), data.targets.rows(np.arange(50)), data.folders)
     with pytest.raises(TrainingError, match="of the 18 frames that the run kept out of its training are not among its 50 usable ones"):
-        rows_to_judge(estimator, fewer, "validation")
+        rows_to_evaluate(estimator, fewer, "validation")
 
 
 def test_each_network_watches_rows_of_its_own():
@@ -327,7 +327,7 @@ def test_the_time_of_an_estimate_is_without_that_of_compiling():
     seen = []
 
     class Counting:
-        def remembering(self):
+        def with_history(self):
             return self
 
         def __call__(self, frame):

@@ -3,13 +3,13 @@
 import numpy as np
 
 from scenes import load_sensor
-from twin.camera.truth import cap_truth, occluded, segment_distance
+from twin.camera.truth import cap_truth, find_occluded, segment_distance
 from twin.geometry.pins import rest_pins
 from twin.types import ContactState, Form
 
 
 def state_at(base, axis, caps):
-    return ContactState.untouched(np.zeros((0, 3)), base, axis, caps)
+    return ContactState.undeformed(np.zeros((0, 3)), base, axis, caps)
 
 
 def rest_state(spec):
@@ -29,7 +29,7 @@ def test_segment_distance_matches_a_fine_sampling():
 
 
 def test_every_cap_is_in_sight_at_rest(sensor):
-    assert not occluded(sensor.view, 0.5 * sensor.pins.cap_diameter_mm, rest_state(sensor)).any()
+    assert not find_occluded(sensor.view, 0.5 * sensor.pins.cap_diameter_mm, rest_state(sensor)).any()
 
 
 def test_a_pin_between_camera_and_cap_hides_it():
@@ -40,7 +40,7 @@ def test_a_pin_between_camera_and_cap_hides_it():
     toward = (eye - caps[0]) / np.linalg.norm(eye - caps[0])
     caps[1] = caps[0] + 3 * toward
     base[1] = caps[1] + [0.5, 0, 0]
-    hidden = occluded(spec.view, 0.5 * spec.pins.cap_diameter_mm, state_at(base, pins.axis, caps))
+    hidden = find_occluded(spec.view, 0.5 * spec.pins.cap_diameter_mm, state_at(base, pins.axis, caps))
     assert hidden[0] and hidden.sum() == 1
 
 

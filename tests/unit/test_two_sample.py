@@ -6,13 +6,22 @@ import torch
 
 from scenes import load_sensor
 from training.data import two_sample as module
-from training.data.two_sample import JUDGES, Judge, accuracy_text, judged, patch_corners, patch_network, real_halves, two_sample
+from training.data.two_sample import (
+    JUDGES,
+    PatchClassifier,
+    accuracy_text,
+    evaluate_classifiers,
+    patch_corners,
+    patch_network,
+    real_halves,
+    two_sample,
+)
 from training.studies.realism import _verdict, compare_with_renders
 from twin.errors import FrameError, OptionError
 
 INSIDE = np.ones((72, 72), bool)
 PAIRS = 10
-QUICK, QUICKER = Judge((16, 32, 64, 64), first_stride=2, epochs=5), Judge((16, 32, 64, 64), first_stride=2, epochs=1)
+QUICK, QUICKER = PatchClassifier((16, 32, 64, 64), first_stride=2, epochs=5), PatchClassifier((16, 32, 64, 64), first_stride=2, epochs=1)
 CHANCE = 0.2  # few held-out pairs of few patches
 
 
@@ -34,25 +43,25 @@ def pictures(count, seed, *, blue=1.0):
 
 @pytest.mark.slow
 def test_sets_of_one_distribution_are_not_distinguished():
-    outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1), INSIDE, judge=QUICK)
+    outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1), INSIDE, classifier=QUICK)
     assert outcome.accuracy == pytest.approx(0.5, abs=CHANCE)
     assert outcome.low <= outcome.accuracy <= outcome.high
 
 
 def test_different_sets_are_distinguished_in_unseen_frames():
-    outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1, blue=0.8), INSIDE, judge=QUICK)
+    outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1, blue=0.8), INSIDE, classifier=QUICK)
     assert outcome.accuracy > 0.95
 
 
 def test_the_same_seed_gives_the_same_outcome():
-    first, second = (two_sample(pictures(6, 0), pictures(6, 1), INSIDE, judge=QUICKER, seed=2) for _ in range(2))
+    first, second = (two_sample(pictures(6, 0), pictures(6, 1), INSIDE, classifier=QUICKER, seed=2) for _ in range(2))
     assert (first.by_pair == second.by_pair).all()
 
 
 def test_halves_of_one_set_are_not_distinguished_however_different_their_frames_are():
     """Frames of two kinds, as contacts are of many: a half has some of each."""
     images, steps = pictures(PAIRS, 0) + pictures(PAIRS, 1, blue=0.8), []
-    outcome = real_halves(images, INSIDE, judge=QUICK, progress=lambda done, total: steps.append((done, total)))
+    outcome = real_halves(images, INSIDE, classifier=QUICK, progress=lambda done, total: steps.append((done, total)))
     assert outcome.accuracy == pytest.approx(0.5, abs=CHANCE)
     assert len(outcome.by_pair) == module.DIVISIONS * PAIRS
     parts = module.DIVISIONS * module.FOLDS
@@ -60,7 +69,7 @@ def test_halves_of_one_set_are_not_distinguished_however_different_their_frames_
 
 
 def test_judges_grow_in_strength_and_see_the_patches_of_any_texture():
-    """The stronger judge has more weights and more epochs, and its first convolution has an output for every pixel."""
+    """The stronger classifier has more weights and more epochs, and its first convolution has an output for every pixel."""
     small, stronger = (patch_network(judge) for judge in JUDGES.values())
     weights = [sum(part.numel() for part in network.parameters()) for network in (small, stronger)]
     assert weights[1] > 2 * weights[0] and JUDGES["stronger"].epochs > JUDGES["small"].epochs
@@ -85,8 +94,8 @@ def test_sets_of_different_length_are_refused():
 
 def test_each_judge_tells_what_it_tells_alone():
     sets = pictures(6, 0), pictures(6, 1)
-    told = judged(*sets, INSIDE, judges={"quick": QUICKER})
-    assert (told["quick"].by_pair == two_sample(*sets, INSIDE, judge=QUICKER).by_pair).all()
+    told = evaluate_classifiers(*sets, INSIDE, judges={"quick": QUICKER})
+    assert (told["quick"].by_pair == two_sample(*sets, INSIDE, classifier=QUICKER).by_pair).all()
     assert told["quick"].text() == accuracy_text(told["quick"].accuracy, told["quick"].low, told["quick"].high)
     assert accuracy_text(0.5, 0.4, 0.625) == "50.0 % (40.0 to 62.5 %)"
 

@@ -11,8 +11,8 @@ from sound_page import read_sound_page
 
 from training.generation.config import draw_label
 from twin.errors import FrameError
-from twin.judge.labelled import ContactModel, compare, measure_frames, table_of
-from twin.judge.labelled.report import summary_of, write_validation
+from twin.evaluation.labelled import ContactModel, compare, measure_frames, table_of
+from twin.evaluation.labelled.report import summary_of, write_validation
 from twin.pins import nominal_reference
 from twin.types import Form
 

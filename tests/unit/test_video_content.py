@@ -13,7 +13,7 @@ from hardware.cameras.mjpeg import decode_jpeg
 from twin.errors import FrameError
 from twin.frames import frames_at, open_recording
 from twin.frames.videos import describe_pauses
-from twin.records import Episode, Step, open_writer
+from twin.records import Episode, RecordStep, open_writer
 from twin.records.record import Records
 
 WIDTH, HEIGHT, COUNT = 64, 48, 10
@@ -195,7 +195,7 @@ def test_the_codec_that_cannot_be_decoded_is_named(tmp_path, name, codec):
 
 def episode_at(times_s):
     image = np.zeros((30, 20, 3), np.uint8)
-    return Episode("e", "t", lambda: (Step(image, t, {"pose": np.zeros(6, np.float32)}) for t in times_s), len(times_s))
+    return Episode("e", "t", lambda: (RecordStep(image, t, {"pose": np.zeros(6, np.float32)}) for t in times_s), len(times_s))
 
 
 @pytest.mark.parametrize(

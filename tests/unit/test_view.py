@@ -12,9 +12,9 @@ from scenes.pins import PinsSpec
 from training.data.pins import PinTable
 from training.estimate.estimator import PoseEstimator
 from training.studies.prediction import predict_frames
+from twin.calibration.camera_view import register_files, registered_view
 from twin.camera.projection import pixel_rays, project
 from twin.errors import FrameError
-from twin.fit.camera_view import register_files, registered_view
 from twin.frames import open_recording
 from twin.frames.forms import from_raw
 from twin.geometry.pins import namings, pin_lattice, rest_pins
@@ -101,7 +101,9 @@ def test_another_unit_is_not_taken_for_the_known_one(name):
     for _ in range(10):
         other = nominal.pins_px + PRINT_PITCHES * nominal.spacing_px.mean() * rng.standard_normal(nominal.pins_px.shape)
         view = view_of(carried(other, turn_deg=1.0), make_reference(known_of(name), model.sensor.pins), model.sensor.pins)
-        assert not view.sure and not view.same and not view.mirrored and not view.displacements() and "two pushes" in view.undecided()
+        assert (
+            not view.sure and not view.same and not view.mirrored and not view.displacements() and "two pushes" in view.describe_ambiguity()
+        )
 
 
 @pytest.mark.parametrize("name", WEIGHTS)
@@ -150,7 +152,7 @@ def test_displacements_from_rest_are_turned_scaled_and_stretched_as_their_view()
     none = np.zeros(area.shape, bool)
     area_px2 = area * np.linalg.det(linear)
     table = PinTable(spec, Form.PROCESSED, own, np.array(list("abc")), view(nodes), area_px2, none, np.ones(3, bool), measured=True)
-    again = table.seen_from(rest)
+    again = table.relative_to(rest)
     assert np.allclose(again.nodes_px, nodes) and np.allclose(again.area_px2, area, rtol=0.02)  # cells at rest are not stretched exactly
 
 

@@ -15,17 +15,17 @@ from scenes import load_sensor
 from scenes.pins import PinsSpec
 from training.estimate.estimator import PoseEstimator
 from training.studies.prediction import predict_frames
+from twin.calibration.camera_pose import CameraReport
+from twin.calibration.new_sensor import _camera, _compare_layout, _doubtful, _health, new_sensor
 from twin.camera.projection import project
 from twin.errors import FrameError, OptionError, TwinError
-from twin.fit.camera_pose import CameraReport
-from twin.fit.new_sensor import _camera, _doubtful, _given, _health, new_sensor
 from twin.frames import frames_at, open_recording
 from twin.geometry.pins import pin_lattice, rest_pins, usual_spacing
 from twin.optics.relief import cap_planes
 from twin.pins import Grade, Pipeline, examine, nominal_reference, tune, with_detector
 from twin.pins.batch import recording_reference
 from twin.pins.detector_spec import shipped_detector
-from twin.pins.identify import Candidate, Seen
+from twin.pins.identify import Candidate, LayoutInFrame
 from twin.pins.rest import Rest, rest_from_contacts
 from twin.pins.rest import rest_of as rest_found
 from twin.pins.tune import _at_rest
@@ -200,7 +200,7 @@ def test_without_a_no_contact_frame_a_rest_layout_is_made_and_said():
         contacts.append(rest + depth * fade * (0.25 * away + rng.normal(0, 1.8, 2)))
     contacts = [px + rng.normal(0, 0.9, px.shape) for px in contacts]  # none looks like a frame without contact
     nothing = np.zeros((0, 2))
-    seen = tuple(Seen(px, px, 0, nothing) for px in contacts)
+    seen = tuple(LayoutInFrame(px, px, 0, nothing) for px in contacts)
     layout = Candidate(PINS, 1.0, 1.0, 0, 0, 0.0, np.median(contacts, axis=0), np.ones(61), seen)
     found = rest_found(layout, [str(k) for k in range(12)])
     error = np.sqrt(np.mean(np.sum((found.pins_px - rest) ** 2, axis=1)))
@@ -223,7 +223,7 @@ def test_deep_contacts_alone_state_the_places_at_rest(kind):
         pressed = np.exp(-((away @ ridge / 0.5) ** 2)) * np.clip(1 - radius**4, 0, None)
         contacts.append(rest + 130 * rng.uniform(0.4, 0.7) * (pressed * (away @ ridge))[:, None] * ridge + rng.normal(0, 0.3, rest.shape))
     nothing = np.zeros((0, 2))
-    seen = tuple(Seen(px, px, 0, nothing) for px in contacts)
+    seen = tuple(LayoutInFrame(px, px, 0, nothing) for px in contacts)
     found = rest_from_contacts(Candidate(pins, 1.0, 1.0, 0, 0, 0.0, np.median(contacts, axis=0), np.ones(127), seen))
     away_px = np.linalg.norm(found - rest, axis=1)
     assert np.median(away_px) < 0.08 * usual_spacing(rest) and away_px.max() < 0.2 * usual_spacing(rest)
@@ -249,11 +249,11 @@ def test_places_at_rest_that_were_made_from_contacts_are_said_to_be(tmp_path):
 
 def test_a_layout_that_was_given_and_is_wrong_is_told_which_one_is_right():
     images = frames_of(rest_of(PINS), 2)
-    found = _given(PinsSpec(rings=3), images)
+    found = _compare_layout(PinsSpec(rings=3), images)
     assert not found.sure and "61 pins in 4 rings explain 100.0 %" in found.doubts[0], found.doubts
     with pytest.raises(FrameError, match="they show 61 pins in 4 rings; leave `layout` out"):
-        _given(PinsSpec(rings=2), images)
-    assert _given(PINS, images).sure
+        _compare_layout(PinsSpec(rings=2), images)
+    assert _compare_layout(PINS, images).sure
 
 
 def test_a_layout_of_no_known_kind_is_asked_for(tmp_path):
@@ -274,9 +274,9 @@ def test_places_that_do_not_count_from_the_axis_are_refused():
     from_axis, from_corner = (
         PinsSpec(layout="positions", positions=tuple(map(tuple, (rest_px - axis).tolist()))) for axis in (rest_px.mean(axis=0), np.zeros(2))
     )
-    assert _given(from_axis, frames_of(rest_px)).sure
+    assert _compare_layout(from_axis, frames_of(rest_px)).sure
     with pytest.raises(FrameError, match="subtract the place of the middle pin"):
-        _given(from_corner, frames_of(rest_px))
+        _compare_layout(from_corner, frames_of(rest_px))
 
 
 def test_stretched_and_few_frames_are_told():
@@ -296,7 +296,9 @@ def test_a_place_that_was_forgotten_is_asked_for():
     places = rest_px - rest_px.mean(axis=0)
     short = np.delete(places, left_out, axis=0)
     images = frames_of(rest_px)
-    whole, found = (_given(PinsSpec(layout="positions", positions=tuple(map(tuple, of.tolist()))), images) for of in (places, short))
+    whole, found = (
+        _compare_layout(PinsSpec(layout="positions", positions=tuple(map(tuple, of.tolist()))), images) for of in (places, short)
+    )
     assert whole.sure and not whole.doubts
     assert not found.sure and len(found.doubts) == 1 and "does the file lack its place?" in found.doubts[0]
     x, y = map(float, re.findall(r"-?\d+", found.doubts[0])[:2])

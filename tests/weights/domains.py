@@ -20,7 +20,7 @@ from training.generation import GenerationConfig, generate
 from training.models.part import LIKELY
 from training.runs.packed import SHIPPED
 from training.runs.run_files import DOMAIN
-from training.touch.touched import TouchAnswer
+from training.touch.contact_probability import TouchAnswer
 from twin.rig.kinematics import rig_of
 
 REAL = Path(os.environ.get("TACTIP_REAL", "../shared/real"))

@@ -1,7 +1,7 @@
 """Audit of a recording: a test of whether its labels agree with its pins.
 
 The pins are a smooth function of the labels that vary: pose p after the move, and move m. Polynomials of these are fitted to the leading
-modes of the recording's own displacements. Then each frame is compared with several explanations ("stories") of what the arm did:
+modes of the recording's own displacements. Then each frame is compared with several hypotheses of what the arm did:
 
 - executed: ``(p, m)``
 - not executed, if the frame was taken before the move: ``(p - m, 0)``
@@ -10,7 +10,8 @@ modes of the recording's own displacements. Then each frame is compared with sev
 If a label is a direction c on the whole circle (an edge's direction), the polynomials use cos c and sin c, the products of the other labels
 with these two, and the moves in the tool's frame, which is turned by c.
 
-The fit of the polynomials and the choice of each frame's story alternate until no choice changes. Only pins and ``targets.csv`` are read.
+The fit of the polynomials and the choice of each frame's hypothesis alternate until no choice changes. Only pins and ``targets.csv`` are
+read.
 """
 
 from dataclasses import dataclass
@@ -31,10 +32,10 @@ LOWEST = 2  # lowest degree of the polynomials
 FRAMES_A_TERM = 4
 ROUNDS = 30  # most rounds of fit and choice
 MOST_LEFT_OUT = 0.02  # share of the frames, those with the largest misfit, that the fit leaves out
-FLAG_CHI2 = 60.0  # least difference of chi^2 by which a sign error must fit better than both other stories
-ODD_CHI2 = 12.0  # ratio of a frame's chi^2 to the median above which the frame fits no story
+FLAG_CHI2 = 60.0  # least difference of chi^2 by which a sign error must fit better than both other hypotheses
+ODD_CHI2 = 12.0  # ratio of a frame's chi^2 to the median above which the frame fits no hypothesis
 STILL = 0.16  # ratio to the median displacement below which there is no contact (published recordings: 0.19 in the shallowest taps)
-STORIES = ("executed", "not executed", "angle's sign", "shear's sign")
+HYPOTHESES = ("executed", "not executed", "angle's sign", "shear's sign")
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,10 @@ class Audit:
     executed : (M,) float
         Probability that the move was executed; 1 for a frame without a move.
     chi2 : (M, 4) float
-        Misfit of each frame to each of ``STORIES``; NaN for frames without contact.
+        Misfit of each frame to each of ``HYPOTHESES``; NaN for frames without contact.
     no_contact, odd, wrong_sign : (M,) bool
-        Frames in which no pin has moved; frames that fit no story; frames that a sign error fits far better than the label.
-    twins : (M,) int
+        Frames in which no pin has moved; frames that fit no hypothesis; frames that a sign error fits far better than the label.
+    duplicates : (M,) int
         Index of the first frame with exactly the same pins; the frame's own index if there is none before it.
     depth_per_move : float
         Change of depth, mm per mm of ``move_1``, over frames whose move was not executed. It shows the plate's tilt. The depth is the last
@@ -57,9 +58,9 @@ class Audit:
     drift : dict
         Share of the row number's variance (R^2) that the pins explain beyond the labels, and the drift in px from the first to the last
         row.
-    untold : str
-        Reason why the stories can't be judged: the frames are too few. Then ``executed``, ``chi2`` and ``depth_per_move`` are NaN, ``odd``
-        and ``wrong_sign`` are false, and ``drift`` is empty. "" if there are enough frames.
+    not_assessed : str
+        Reason why the hypotheses can't be assessed: the frames are too few. Then ``executed``, ``chi2`` and ``depth_per_move`` are NaN,
+        ``odd`` and ``wrong_sign`` are false, and ``drift`` is empty. "" if there are enough frames.
     """
 
     executed: np.ndarray
@@ -67,14 +68,14 @@ class Audit:
     no_contact: np.ndarray
     odd: np.ndarray
     wrong_sign: np.ndarray
-    twins: np.ndarray
+    duplicates: np.ndarray
     depth_per_move: float
     drift: dict
-    untold: str = ""
+    not_assessed: str = ""
 
 
 def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
-    """Find the story that fits each frame. If there are too few frames, no story is judged, and ``Audit.untold`` states this.
+    """Find the hypothesis that fits each frame. If there are too few frames, no hypothesis is evaluated, and ``Audit.untold`` states this.
 
     Parameters
     ----------
@@ -87,22 +88,22 @@ def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
     size = np.linalg.norm(moved, axis=1)
     no_contact = size < STILL * np.median(size)
     labels = LabelColumns.of(pose, move)
-    degree, untold = labels.degree(int((~no_contact).sum()))
-    if untold:
+    degree, not_assessed = labels.degree(int((~no_contact).sum()))
+    if not_assessed:
         nowhere = np.zeros(len(pins), bool)
-        unknown, twins = np.full((len(pins), len(STORIES)), np.nan), _twins(pins.nodes_px)
-        return Audit(unknown[:, 0], unknown, no_contact, nowhere, nowhere, twins, np.nan, {}, untold)
+        unknown, duplicates = np.full((len(pins), len(HYPOTHESES)), np.nan), _find_duplicates(pins.nodes_px)
+        return Audit(unknown[:, 0], unknown, no_contact, nowhere, nowhere, duplicates, np.nan, {}, not_assessed)
     modes = _modes(moved, ~no_contact)
     angles = np.array([1, 1, 1, -1, -1, -1])
     told = [(pose, move), (pose - move, 0 * move), (pose * angles, move), (pose, -move)]
-    stories = np.stack([labels.columns(*each) for each in told])
-    shift, scale = stories[0].mean(axis=0), np.ptp(stories[0], axis=0) / 2 + 1e-9
-    shift[stories.shape[2] - len(labels.moved) :] = 0
-    stories = (stories - shift) / scale
+    hypotheses = np.stack([labels.columns(*each) for each in told])
+    shift, scale = hypotheses[0].mean(axis=0), np.ptp(hypotheses[0], axis=0) / 2 + 1e-9
+    shift[hypotheses.shape[2] - len(labels.moved) :] = 0
+    hypotheses = (hypotheses - shift) / scale
     still = np.abs(move[:, labels.moved]).max(axis=1, initial=0.0) == 0
     done, tilt, used = np.ones(len(pins), bool), 0.0, ~no_contact
     for _ in range(ROUNDS):
-        terms = np.stack([polynomials(story, degree) for story in stories])
+        terms = np.stack([polynomials(story, degree) for story in hypotheses])
         chosen = terms[np.where(done, 0, 1), np.arange(len(pins))]
         weight = np.linalg.lstsq(chosen[used], modes[used], rcond=None)[0]
         residual = modes[used] - chosen[used] @ weight
@@ -116,7 +117,7 @@ def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
         done = now
     if labels.depth is not None:
         depth = labels.depth, degree, scale[labels.depth]
-        tilt = _depth_per_move(terms[1], modes, weight, precision, stories[1], move[:, 0], used & ~done, *depth)
+        tilt = _depth_per_move(terms[1], modes, weight, precision, hypotheses[1], move[:, 0], used & ~done, *depth)
     usual = np.median(best[~no_contact])
     # The polynomials are an approximation, so the misfits are larger than from noise alone. They are divided by the usual misfit.
     odds = np.clip((chi2[:, 1] - chi2[:, 0]) / (2 * max(usual / modes.shape[1], 1.0)), -50, 50)
@@ -127,9 +128,9 @@ def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
         no_contact=no_contact,
         odd=~no_contact & (best > ODD_CHI2 * usual),
         wrong_sign=~no_contact & (np.nan_to_num(chi2[:, 2:], nan=np.inf).min(axis=1) < best - FLAG_CHI2),
-        twins=_twins(pins.nodes_px),
+        duplicates=_find_duplicates(pins.nodes_px),
         depth_per_move=tilt,
-        drift=_drift(pins, terms[np.where(done, 0, 1), np.arange(len(pins))], used, stories.shape[2]),
+        drift=_drift(pins, terms[np.where(done, 0, 1), np.arange(len(pins))], used, hypotheses.shape[2]),
     )
 
 
@@ -182,7 +183,7 @@ class LabelColumns:
         if fitting:
             return fitting[-1], ""
         return lowest, (
-            f"{touching} frames in contact are too few to tell which moves were executed: a map that is fitted to so few follows every "
+            f"{touching} frames in contact are too few to find out which moves were executed: a map that is fitted to so few follows every "
             f"label, right or wrong; {needed[lowest]} are needed"
         )
 
@@ -193,11 +194,11 @@ def _modes(moved: np.ndarray, used: np.ndarray) -> np.ndarray:
     return (moved - mean) @ directions[: min(MODES, len(directions))].T
 
 
-def polynomials(story: np.ndarray, highest: int) -> np.ndarray:
+def polynomials(hypothesis: np.ndarray, highest: int) -> np.ndarray:
     """All products (M, P) of up to ``highest`` columns of labels (M, C). The first column is constant."""
-    columns = [np.ones(len(story))]
+    columns = [np.ones(len(hypothesis))]
     for degree in range(1, highest + 1):
-        columns += [story[:, list(which)].prod(axis=1) for which in combinations_with_replacement(range(story.shape[1]), degree)]
+        columns += [hypothesis[:, list(which)].prod(axis=1) for which in combinations_with_replacement(range(hypothesis.shape[1]), degree)]
     return np.column_stack(columns)
 
 
@@ -210,7 +211,7 @@ def _depth_per_move(
     modes: np.ndarray,
     weight: np.ndarray,
     precision: np.ndarray,
-    story: np.ndarray,
+    hypothesis: np.ndarray,
     shear_mm: np.ndarray,
     rows: np.ndarray,
     depth: int,
@@ -222,30 +223,30 @@ def _depth_per_move(
     Parameters
     ----------
     terms : (M, P) float
-        Polynomials of the story "not executed".
+        Polynomials of the hypothesis "not executed".
     modes : (M, D) float
         Amplitudes of the displacement's modes.
     weight : (P, D) float
         Coefficients of the fit, from polynomials to modes.
     precision : (D, D) float
         Inverse covariance of the fit's residuals.
-    story : (M, C) float
-        The scaled labels of the story.
+    hypothesis : (M, C) float
+        The scaled labels of the hypothesis.
     shear_mm : (M,) float
         ``move_1`` of the table.
     rows : (M,) bool
         Frames whose move was not executed.
     depth : int
-        Column of the depth in ``story``.
+        Column of the depth in ``hypothesis``.
     degree : int
         Degree of the polynomials.
     depth_scale : float
-        Depth in mm that corresponds to the value 1 in ``story``.
+        Depth in mm that corresponds to the value 1 in ``hypothesis``.
     """
     if rows.sum() < 20 or np.ptp(shear_mm[rows]) < 1:
         return 0.0
     step = 1e-3
-    nudged = story.copy()
+    nudged = hypothesis.copy()
     nudged[:, depth] += step
     along = (polynomials(nudged, degree) - terms) @ weight / step
     residual = modes - terms @ weight
@@ -254,7 +255,7 @@ def _depth_per_move(
     return float(np.polyfit(shear_mm[rows], beyond[rows], 1)[0])
 
 
-def _twins(nodes_px: np.ndarray) -> np.ndarray:
+def _find_duplicates(nodes_px: np.ndarray) -> np.ndarray:
     first: dict[bytes, int] = {}
     return np.array([first.setdefault(np.round(frame, 6).tobytes(), k) for k, frame in enumerate(nodes_px)])
 

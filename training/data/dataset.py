@@ -8,7 +8,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from training.data.pins import PIN_COLUMNS, PinTable, pin_table, voronoi_areas
-from training.data.simulated import contact_labels, is_pins_only, is_simulated, open_simulated, touched_labels
+from training.data.simulated import contact_labels, is_pins_only, is_simulated, labels_of_surface, open_simulated
 from training.data.targets import CONTACT, CONTACT_UNITS, Targets, choose_targets, joined_targets
 from twin.errors import FrameError
 from twin.frames import Recording, natural_key, open_recording
@@ -86,7 +86,7 @@ class Dataset:
         _, first, of_row = np.unique(ordered.group, return_index=True, return_inverse=True)
         return replace(ordered, group=np.argsort(np.argsort(first))[of_row.ravel()])
 
-    def beside(self, pins: "list[PinTable]") -> "Dataset":
+    def with_copies(self, pins: "list[PinTable]") -> "Dataset":
         """This data set, followed by copies with each of ``pins`` instead of its own. All copies of a row form a group."""
         copies = np.tile(np.arange(len(self)), 1 + len(pins))
         every = self.rows(copies)
@@ -120,7 +120,7 @@ def load_dataset(
 
     Notes
     -----
-    The corrected labels of a simulated data set are depth and angle of the touched surface: see ``touched_labels``.
+    The corrected labels of a simulated data set are depth and angle of the touched surface: see ``labels_of_surface``.
     """
     problems: list[str] = []
     simulated = is_simulated(Path(folder))
@@ -137,13 +137,13 @@ def load_dataset(
     rows = np.array([row_of[name] for name in pins.image_name], int)
     targets = choose_targets(recording, columns, rows, depth_per_move, problems)
     if simulated:
-        targets = targets.instead(touched_labels(Path(folder), pins.image_name))
+        targets = targets.instead(labels_of_surface(Path(folder), pins.image_name))
     unseen = ~pins.valid
     if unseen.any():
-        problems.append(f"{_named(pins.image_name[unseen])}: pins not found; left out of training")
+        problems.append(f"{_list_names(pins.image_name[unseen])}: pins not found; left out of training")
     unlabelled = pins.valid & ~np.isfinite(targets.raw).all(axis=1)
     if unlabelled.any():
-        problems.append(f"{_named(pins.image_name[unlabelled])}: no number in {', '.join(targets.names)}; left out")
+        problems.append(f"{_list_names(pins.image_name[unlabelled])}: no number in {', '.join(targets.names)}; left out")
     good = np.flatnonzero(pins.valid & ~unlabelled)
     if not len(good):
         raise FrameError(f"{folder}: no frame has both pins and labels; {'; '.join(problems[:3])}")
@@ -152,7 +152,7 @@ def load_dataset(
     return Dataset(pins.rows(good), targets.rows(good), (kept,), group, list(recording.problems) + problems)
 
 
-def joined(parts: list[Dataset]) -> Dataset:
+def join_datasets(parts: list[Dataset]) -> Dataset:
     """Join several data sets of one sensor. Rows that form a group in one of them form a group in the result.
 
     The data sets are joined in the order of their folders' names, whatever the order in which they are given. Displacements are counted
@@ -177,9 +177,9 @@ def joined(parts: list[Dataset]) -> Dataset:
         ):
             if mine != others:
                 raise FrameError(f"{part.folder}: its {what} ({mine}) differs from that of {first.folder} ({others}); train on one kind")
-    tables = [part.pins.seen_from(first.pins.reference) for part in parts]
+    tables = [part.pins.relative_to(first.pins.reference) for part in parts]
     columns = {key: np.concatenate([getattr(table, key) for table in tables]) for key in PIN_COLUMNS}
-    called = told_apart([part.folder.resolve() for part in parts])
+    called = shortest_distinct_ends([part.folder.resolve() for part in parts])
     columns["image_name"] = np.concatenate(
         [np.char.add(f"{name}/", part.pins.image_name) for name, part in zip(called, parts, strict=True)]
     )
@@ -210,7 +210,7 @@ def with_common_labels(parts: Sequence[Dataset]) -> list[Dataset]:
     return [replace(part, targets=part.targets.only(common)) for part in parts]
 
 
-def told_apart(folders: list[Path]) -> list[str]:
+def shortest_distinct_ends(folders: list[Path]) -> list[str]:
     """The shortest ends of the paths that are all different: mostly the folders' names."""
     longest = max(len(folder.parts) for folder in folders)
     ends = (["/".join(folder.parts[-count:]) for folder in folders] for count in range(1, longest + 1))
@@ -254,5 +254,5 @@ def simulated_table(
     )
 
 
-def _named(names: np.ndarray) -> str:
+def _list_names(names: np.ndarray) -> str:
     return f"{len(names)} frames ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"

@@ -23,15 +23,15 @@ def nearest_to_even(labels: np.ndarray, units: Sequence[str], count: int, *, see
     low, high = labels.min(axis=0), labels.max(axis=0)
     circular, varied = np.array(code.circular), np.flatnonzero(high > low)
 
-    def placed(those: np.ndarray) -> np.ndarray:
+    def encode_places(those: np.ndarray) -> np.ndarray:
         return code.encode(np.where(circular, those, (those - low) / np.maximum(high - low, 1e-12)))
 
     even = Sobol(len(varied), scramble=True, rng=np.random.default_rng(seed)).random_base2(int(np.ceil(np.log2(max(count, 2)))))
     wanted = np.tile(low, (count, 1))
     wanted[:, varied] += even[:count] * (high - low)[varied]
-    places, free = placed(labels), np.ones(len(labels), bool)
+    places, free = encode_places(labels), np.ones(len(labels), bool)
     chosen = []
-    for place in placed(wanted):
+    for place in encode_places(wanted):
         far = np.where(free, ((places - place) ** 2).sum(axis=1), np.inf)
         chosen.append(int(far.argmin()))
         free[chosen[-1]] = False

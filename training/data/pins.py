@@ -79,7 +79,7 @@ class PinTable:
         """A table of other frames with the same sensor, form and reference; ``columns`` holds an array for each of ``PIN_COLUMNS``."""
         return PinTable(self.sensor, self.form, self.reference, **columns, measured=self.measured)
 
-    def seen_from(self, reference: Reference) -> "PinTable":
+    def relative_to(self, reference: Reference) -> "PinTable":
         """The table relative to another layout without contact: as its camera would see the displacements.
 
         The displacements are turned, scaled and stretched by the linear map of the two layouts. Ratios of areas do not change.

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from scenes.files import read_regular
-from scenes.load import explained
+from scenes.load import explain_problems
 from scenes.sensor import SensorSpec
 from training.data.targets import CONTACT_UNITS
 from training.generation.config import GenerationConfig
@@ -22,7 +22,7 @@ from twin.frames.tables import LARGEST_BYTES, order_by_table, read_table
 from twin.frames.truth import AGAIN, TRUTH, arrays_of, open_truth, row_of
 from twin.rig.kinematics import object_pose, rig_of
 from twin.rig.mounting import Mounting
-from twin.rig.touch import Surface, surface_labels
+from twin.rig.touch import SmoothSurface, surface_labels
 from twin.types import Form
 
 TABLE = "targets.csv"
@@ -90,15 +90,15 @@ def config_of(folder: Path) -> GenerationConfig:
     try:
         return GenerationConfig.model_validate(read_record(path))
     except ValidationError as error:
-        raise DatasetError(f"{path}: damaged ({explained(error, GenerationConfig)}); {AGAIN}") from error
+        raise DatasetError(f"{path}: damaged ({explain_problems(error, GenerationConfig)}); {AGAIN}") from error
 
 
-def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
+def labels_of_surface(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     """Depth and angle of the touched surface, of any shape, as labels: see ``twin.rig.touch.surface_labels``.
 
-    The object's place follows from the pose to which the arm was sent and from the rig's parameters that were drawn for the contact, minus
-    the object's displacement by its compliance. Therefore the labels of a flat plate are those of the table without moves that were not
-    executed.
+    The object's place follows from the pose to which the arm was sent and from the rig's parameters that were sampled for the contact,
+    minus the object's displacement by its compliance. Therefore the labels of a flat plate are those of the table without moves that were
+    not executed.
 
     Parameters
     ----------
@@ -121,13 +121,13 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     arrays = arrays_of(truth, ("pose", "move", "executed", "force_n", "path_id"))
     pose = (arrays["pose"] - arrays["move"] * ~arrays["executed"][:, None])[rows]
     force_n, contact = arrays["force_n"][rows], np.where(rows < 0, -1, arrays["path_id"][rows])
-    surface = Surface(config.object)
+    surface = SmoothSurface(config.object)
     found: dict[str, np.ndarray] = {}
     for path_id in np.unique(contact[rows >= 0]):
         mine = contact == path_id
         if int(path_id) not in draws:
             raise FrameError(f"{folder / DRAWS}: has no row of contact {path_id}; {AGAIN}")
-        sensor = _rigged(config.sensor, draws[int(path_id)])
+        sensor = _with_rig(config.sensor, draws[int(path_id)])
         rig = rig_of(sensor, config.object.name)
         sent = np.stack([object_pose(rig, config.experiment, each, sensor.skin.apex_mm) for each in pose[mine]])
         sent[:, 2, 3] += config.object.compliance_mm_per_n * force_n[mine, 2]
@@ -155,7 +155,7 @@ def contact_labels(folder: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def _draws(path: Path) -> dict[int, dict[str, float]]:
-    """The rig's parameters that were drawn for each contact, by its number."""
+    """The rig's parameters that were sampled for each contact, by its number."""
     try:
         rows = list(csv.DictReader(io.StringIO(read_regular(path, LARGEST_BYTES).decode(), newline=""), strict=True))
         return {int(row["path_id"]): {key: float(row[key]) for key in row if str(key).startswith("rig.")} for row in rows}
@@ -164,7 +164,7 @@ def _draws(path: Path) -> dict[int, dict[str, float]]:
         raise FrameError(f"{path}: damaged ({how}); {AGAIN}") from error
 
 
-def _rigged(sensor: SensorSpec, drawn: dict[str, float]) -> SensorSpec:
-    """The sensor with the rig's parameters that were drawn for a contact."""
+def _with_rig(sensor: SensorSpec, drawn: dict[str, float]) -> SensorSpec:
+    """The sensor with the rig's parameters that were sampled for a contact."""
     rig = {key.removeprefix("rig."): value for key, value in drawn.items()}
     return sensor.model_copy(update={"rig": rig_of(sensor).model_copy(update=rig)})

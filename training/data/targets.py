@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes.files import shown
+from scenes.files import quote
 from twin.errors import FrameError
 from twin.frames import Recording
 from twin.frames.tables import numbers
@@ -158,7 +158,7 @@ def choose_targets(
     if known:
         executed = np.array([known.get(recording.names[row], np.nan) for row in rows])
     x_mm = _numbers(recording.labels["pose_1"], "pose_1", [])[rows] if "pose_1" in recording.labels else np.zeros(len(rows))
-    right = corrected(names, raw, executed, move, depth_per_move, np.nan_to_num(x_mm))
+    right = correct_labels(names, raw, executed, move, depth_per_move, np.nan_to_num(x_mm))
     undone = 1.0 - np.where(np.isnan(executed), 1.0, executed)
     for k, name in enumerate(names):  # further labels, which published recordings lack: subtract a move that was not executed from each
         made = f"move_{name.removeprefix('pose_')}"
@@ -184,11 +184,11 @@ def contact_columns(recording: Recording) -> tuple[str, ...]:
             if np.ptp(values) > 0 and not twice:  # a column of another convention exists under two names and is used once
                 names.append(name)
     if not names:
-        raise FrameError(f"{recording.path}: no column that varies tells about the contacts; {recording.labels_found()}")
+        raise FrameError(f"{recording.path}: no column that varies contains about the contacts; {recording.labels_found()}")
     return tuple(names)
 
 
-def corrected(
+def correct_labels(
     names: tuple[str, ...], raw: np.ndarray, executed: np.ndarray, move: np.ndarray, depth_per_move: float, x_mm: np.ndarray | float = 0.0
 ) -> np.ndarray:
     """Labels (M, K) without moves (M, 2) that were not executed. A move whose ``executed`` (M,) is not known counts as executed.
@@ -211,5 +211,5 @@ def _numbers(cells: np.ndarray, name: str, problems: list[str]) -> np.ndarray:
     """A column as floats; a cell without a finite number becomes NaN, and such cells are counted in ``problems``."""
     values = numbers(cells)
     if (bad := np.isnan(values)).any():
-        problems.append(f"column {name}: {bad.sum()} cells hold no finite number, the first '{shown(cells[bad][0])}'")
+        problems.append(f"column {name}: {bad.sum()} cells hold no finite number, the first '{quote(cells[bad][0])}'")
     return values

@@ -44,7 +44,7 @@ LEVEL_SCALE = 64.0
 
 
 @dataclass(frozen=True)
-class Judge:
+class PatchClassifier:
     """A network of the test, and how long it learns.
 
     Attributes
@@ -61,8 +61,8 @@ class Judge:
     epochs: int
 
 
-SMALL = Judge((16, 32, 64, 64), first_stride=2, epochs=12)
-STRONGER = Judge((24, 48, 96, 96), first_stride=1, epochs=24)
+SMALL = PatchClassifier((16, 32, 64, 64), first_stride=2, epochs=12)
+STRONGER = PatchClassifier((24, 48, 96, 96), first_stride=1, epochs=24)
 JUDGES = {"small": SMALL, "stronger": STRONGER}
 """The networks of a thorough test."""
 
@@ -96,7 +96,7 @@ def two_sample(
     second: list[np.ndarray],
     inside: np.ndarray,
     *,
-    judge: Judge = SMALL,
+    classifier: PatchClassifier = SMALL,
     seed: int = 0,
     progress: Step | None = None,
 ) -> TwoSample:
@@ -108,7 +108,7 @@ def two_sample(
         M frames each; the k-th frames of both sets are held out together.
     inside : (H, W) bool
         The lens disc.
-    judge : Judge
+    classifier : Evaluate
     seed : int
         Seed of patches, network and folds. The same seed gives the same result.
     progress : callable, optional
@@ -129,7 +129,7 @@ def two_sample(
     correct = np.zeros(pairs)
     for fold in range(folds):
         train, held = np.flatnonzero(fold_of != fold), np.flatnonzero(fold_of == fold)
-        network = _trained(judge, sets, train, corners, np.random.default_rng([seed, fold]), seed + fold)
+        network = _train_classifier(classifier, sets, train, corners, np.random.default_rng([seed, fold]), seed + fold)
         for k in held:
             patches, truth = _patches(sets, np.array([k]), corners, rng, turned=False)
             correct[k] = ((network(patches) > 0) == (truth > 0.5)).double().mean().item()
@@ -138,21 +138,21 @@ def two_sample(
     return _outcome(correct, rng)
 
 
-def judged(
+def evaluate_classifiers(
     real: list[np.ndarray],
     rendered: list[np.ndarray],
     inside: np.ndarray,
     *,
-    judges: Mapping[str, Judge] = JUDGES,
+    judges: Mapping[str, PatchClassifier] = JUDGES,
     progress: Step | None = None,
 ) -> dict[str, TwoSample]:
-    """What each of several judges tells of real and rendered frames, by the judges' names. Parameters are those of `two_sample`."""
-    return {name: two_sample(real, rendered, inside, judge=judge, progress=progress) for name, judge in judges.items()}
+    """Results of several classifiers for real and rendered frames, by the classifiers' names. Parameters are those of `two_sample`."""
+    return {name: two_sample(real, rendered, inside, classifier=judge, progress=progress) for name, judge in judges.items()}
 
 
-def judged_halves(images: list[np.ndarray], inside: np.ndarray, *, progress: Step | None = None) -> dict[str, TwoSample]:
-    """What each of the judges tells of halves of the real frames, by the judges' names. Parameters are those of `real_halves`."""
-    return {name: real_halves(images, inside, judge=judge, progress=progress) for name, judge in JUDGES.items()}
+def evaluate_halves(images: list[np.ndarray], inside: np.ndarray, *, progress: Step | None = None) -> dict[str, TwoSample]:
+    """Results of each classifier for halves of the real frames, by the classifiers' names. Parameters are those of `real_halves`."""
+    return {name: real_halves(images, inside, classifier=judge, progress=progress) for name, judge in JUDGES.items()}
 
 
 def accuracy_text(accuracy: float, low: float, high: float) -> str:
@@ -161,7 +161,7 @@ def accuracy_text(accuracy: float, low: float, high: float) -> str:
 
 
 def real_halves(
-    images: list[np.ndarray], inside: np.ndarray, *, judge: Judge = SMALL, seed: int = 0, progress: Step | None = None
+    images: list[np.ndarray], inside: np.ndarray, *, classifier: PatchClassifier = SMALL, seed: int = 0, progress: Step | None = None
 ) -> TwoSample:
     """Test two halves of one set of frames, for ``DIVISIONS`` random divisions: all pairs of frames together.
 
@@ -169,7 +169,7 @@ def real_halves(
     ----------
     images : list of (H, W, 3) or (H, W) uint8
         4 or more frames; of an odd number one is left out of each division.
-    inside, judge, seed, progress
+    inside, evaluate, seed, progress
         As `two_sample` takes them.
 
     Raises
@@ -182,7 +182,7 @@ def real_halves(
         order = rng.permutation(len(images))
         first, second = ([images[k] for k in part] for part in (order[:half], order[half : 2 * half]))
         step = progress and partial(_part, progress, division, DIVISIONS)
-        correct.append(two_sample(first, second, inside, judge=judge, seed=seed + division, progress=step).by_pair)
+        correct.append(two_sample(first, second, inside, classifier=classifier, seed=seed + division, progress=step).by_pair)
     return _outcome(np.concatenate(correct), rng)
 
 
@@ -220,26 +220,26 @@ def patch_corners(inside: np.ndarray) -> np.ndarray:
     return corners
 
 
-def patch_network(judge: Judge = SMALL) -> nn.Module:
+def patch_network(classifier: PatchClassifier = SMALL) -> nn.Module:
     """A network, not trained, that gives patches (B, 3, p, p) one number each, (B,): the larger, the likelier they are real."""
-    layers, before, stride = [], 3, judge.first_stride
-    for channels in judge.channels:
+    layers, before, stride = [], 3, classifier.first_stride
+    for channels in classifier.channels:
         layers += [nn.Conv2d(before, channels, 3, stride=stride, padding=1), nn.BatchNorm2d(channels), nn.ReLU()]
         before, stride = channels, 2
     return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(before, 1), nn.Flatten(0))
 
 
-def _trained(
-    judge: Judge, sets: list[np.ndarray], frames: np.ndarray, corners: np.ndarray, rng: np.random.Generator, seed: int
+def _train_classifier(
+    classifier: PatchClassifier, sets: list[np.ndarray], frames: np.ndarray, corners: np.ndarray, rng: np.random.Generator, seed: int
 ) -> nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = patch_network(judge)
-    steps = judge.epochs * -(-2 * len(frames) * PATCHES // BATCH)
+        network = patch_network(classifier)
+    steps = classifier.epochs * -(-2 * len(frames) * PATCHES // BATCH)
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
     network.train()
-    for _ in range(judge.epochs):
+    for _ in range(classifier.epochs):
         patches, truth = _patches(sets, frames, corners, rng, turned=True)
         order = torch.from_numpy(rng.permutation(len(truth)))
         for batch in order.split(BATCH):

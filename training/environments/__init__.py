@@ -14,7 +14,7 @@ with extras_named():
 from gymnasium.envs.registration import register, registry
 
 from scenes.plugins import offered
-from twin.lazy import named
+from twin.lazy import offered_name
 
 NAMESPACE = "tactip"
 """First part of the environments' ids."""
@@ -44,7 +44,7 @@ def register_all() -> None:
 
 
 def __getattr__(name: str) -> Any:
-    return named(_PLACES, "training.environments", name)
+    return offered_name(_PLACES, "training.environments", name)
 
 
 register_all()

@@ -10,17 +10,17 @@ import numpy as np
 from gymnasium import spaces
 
 from scenes import ObjectSpec, RandomisationSpec, SensorSpec, load_experiment, load_object, load_randomisation, load_sensor
-from scenes.files import shown
+from scenes.files import quote
 from training.environments.observe import IMAGE_PX, KINDS, LARGEST, PICTURES, Eye, Kind, Pictures
-from training.environments.tasks import TASKS, Judged, Seen, add_tasks
+from training.environments.tasks import TASKS, StepOutcome, WorldState, add_tasks
 from training.environments.world import AXES, Surfaces, Tool, motions
 from training.generation.config import draw_friction, draw_sensor
 from training.surrogate.contacts import SurrogateContacts
-from training.surrogate.felt import Backend, Contact, FiniteElements
 from training.surrogate.model import is_mechanical, surrogate_of
+from training.surrogate.reading import Backend, EpisodeContact, FiniteElements
 from twin.errors import ContactError, OptionError
 from twin.rig.contact import contact_law
-from twin.rig.touch import Touch
+from twin.rig.touch import TrueTouch
 from twin.types import BoolArray, FloatArray, Frame, ImageArray, IntArray
 
 BackendName = Literal["surrogate", "fem"]
@@ -77,10 +77,10 @@ class Options:
     surrogate : str, optional
         File of ``twin surrogate``; the shipped one by default.
     objects : tuple of str, optional
-        Names or files of objects. One of them is drawn for each episode. The task's objects by default.
+        Names or files of objects. One of them is sampled for each episode. The task's objects by default.
     randomise : str, optional
-        Name or file of a randomisation of friction, camera and other properties of the sensor, and noise of the pins. Values are drawn for
-        each episode.
+        Name or file of a randomisation of friction, camera and other properties of the sensor, and noise of the pins. Values are sampled
+        for each episode.
     pictures : {"none", "preview", "traced"}
         Find the pins with the real pipeline in rendered frames. Observation "image" uses previews if the value is "none".
     friction_memory : bool
@@ -135,10 +135,12 @@ class Options:
         if self.objects is not None and not self.objects:
             raise OptionError("objects=(): expected at least one object")
         if self.backend == "fem" and not self.friction_memory:
-            raise OptionError("friction_memory=False goes with backend='surrogate' alone: finite elements always remember")
+            raise OptionError(
+                "friction_memory=False goes with backend='surrogate' alone: finite elements always have history-dependent friction"
+            )
 
     @classmethod
-    def given(cls, options: Mapping[str, Any]) -> "Options":
+    def from_keywords(cls, options: Mapping[str, Any]) -> "Options":
         """Options from keywords.
 
         Raises
@@ -224,7 +226,7 @@ class Batch:
         self.axes = options.axes or self.task.axes
         self.action_scale = np.array([LARGEST_DEG if axis.startswith("R") else LARGEST_MM for axis in self.axes])
         self._rngs: list[np.random.Generator] = [np.random.default_rng(0)] * count
-        self.contacts: list[Contact | None] = [None] * count
+        self.contacts: list[EpisodeContact | None] = [None] * count
         self.T_work, self.T_object = np.tile(np.eye(4), (2, count, 1, 1))
         self.goal = np.zeros((count, len(self.task.goal_names)))
         self.steps_done = np.zeros(count, int)
@@ -246,34 +248,34 @@ class Batch:
         limit = MOST_ORACLE if self.eye is None else LARGEST
         return spaces.Dict({"tactile": spaces.Box(-limit, limit, (stack, *shape), np.float32), "goal": goal})
 
-    def begin(self, row: int, rng: np.random.Generator, asked: Mapping[str, Any] | None = None) -> None:
+    def begin(self, row: int, rng: np.random.Generator, wanted: Mapping[str, Any] | None = None) -> None:
         """Draw an episode of one environment: object, friction, sensor, start and goal. ``settle`` then makes the first contact."""
-        asked = dict(asked or {})
-        for name in asked:
+        wanted = dict(wanted or {})
+        for name in wanted:
             if name not in RESET_OPTIONS:
                 raise OptionError(f"reset(options=...) has no {name!r}; it takes {', '.join(RESET_OPTIONS)}")
-        if not isinstance(asked.get("object", ""), str | PathLike):
-            raise OptionError(f"reset(options=...): object={asked['object']!r}: expected a name or a file")
-        name = str(asked.get("object") or rng.choice(list(self.objects)))
-        touched = self.objects.get(name) or load_object(name)
-        self.task.require(touched)
+        if not isinstance(wanted.get("object", ""), str | PathLike):
+            raise OptionError(f"reset(options=...): object={wanted['object']!r}: expected a name or a file")
+        name = str(wanted.get("object") or rng.choice(list(self.objects)))
+        obj = self.objects.get(name) or load_object(name)
+        self.task.require(obj)
         how, sensor, friction = self.randomisation, self.sensor, None
         if how is not None and how.friction is not None:
             friction = draw_friction(how.friction, rng)
         if how is not None and how.sensor:
             sensor, _ = draw_sensor(self.sensor, how, rng)
-        contact = self._contact(sensor, touched, friction)
+        contact = self._contact(sensor, obj, friction)
         self.backend.begin(row, contact)
         if self._shows is not None:
             self._shows.begin(row, sensor)
-        start = self.task.begin(row, self.tool, touched, self._surfaces, rng)
+        start = self.task.begin(row, self.tool, obj, self._surfaces, rng)
         self.T_work[row], self.T_object[row], self.goal[row] = start.T_work, start.T_object, start.goal
         self._rngs[row], self.contacts[row] = rng, contact
         self.steps_done[row] = self._good[row] = 0
         self._action[row] = 0.0
 
-    def _contact(self, sensor: SensorSpec, touched: ObjectSpec, friction: float | None) -> Contact:
-        return Contact(sensor, touched, contact_law(sensor.rig, self.tool.mounting, touched, friction=friction))
+    def _contact(self, sensor: SensorSpec, obj: ObjectSpec, friction: float | None) -> EpisodeContact:
+        return EpisodeContact(sensor, obj, contact_law(sensor.rig, self.tool.mounting, obj, friction=friction))
 
     def settle(self, rows: IntArray) -> None:
         """Make the first contact of the rows that ``begin`` drew, and fill their stacks of observations."""
@@ -292,7 +294,7 @@ class Batch:
         try:
             numbers = np.asarray(action, float)
         except (TypeError, ValueError):
-            raise OptionError(f"{expected}, got {shown(repr(action))}") from None
+            raise OptionError(f"{expected}, got {quote(repr(action))}") from None
         if numbers.shape != shape:
             raise OptionError(f"{expected}, got {numbers.shape}")
         return numbers
@@ -314,32 +316,32 @@ class Batch:
         steps[:, :3] += self.task.feed_mm
         before = self.T_work.copy()
         self.T_work[rows] = before[rows] @ motions(steps)[rows]
-        carried = self.task.carried(self.backend.felt, self.T_work, before, self.T_object)
+        carried = self.task.carry_object(self.backend.felt, self.T_work, before, self.T_object)
         self.T_object[rows] = carried[rows]
         self.steps_done[rows] += 1
         self._move(rows)
         for _ in range(MOST_TRIALS):
-            pushed = self.task.pushed(self.backend.felt, self.T_work, self.T_object, self.tool)
+            pushed = self.task.push_object(self.backend.felt, self.T_work, self.T_object, self.tool)
             if pushed is None:
                 break
             self.T_object[rows] = pushed[rows]
             self._move(rows)
         self._look(rows, first=False)
-        return self._judged(rows)
+        return self._evaluate_step(rows)
 
     def observation(self) -> dict[str, FloatArray | ImageArray]:
         """The newest observations of all rows; copies."""
         assert self._seen is not None, "settle first"
         seen = np.moveaxis(self._seen, 1, -1) if self.options.observation == "image" else self._seen
-        return {"tactile": seen.copy(), "goal": self.asked().astype(np.float32)}
+        return {"tactile": seen.copy(), "goal": self.goals_for_agents().astype(np.float32)}
 
-    def asked(self) -> FloatArray:
+    def goals_for_agents(self) -> FloatArray:
         """Goals of the episodes as the agents get them, (B, G), by the task's ``goal_names``."""
-        return self.task.asked(self.goal, self.T_work)
+        return self.task.goals_for_agents(self.goal, self.T_work)
 
     def oracle(self) -> FloatArray:
         """Values of the newest states that no real sensor knows, (B, K), by the task's ``oracle_names``."""
-        return np.clip(self.task.oracle(self._seen_now()), -MOST_ORACLE, MOST_ORACLE)
+        return np.clip(self.task.oracle(self._observe_world()), -MOST_ORACLE, MOST_ORACLE)
 
     def picture(self, row: int) -> ImageArray:
         """(H, W, 3) uint8: the sensor's frame of one environment."""
@@ -354,31 +356,31 @@ class Batch:
                 self._shows.begin(begun, contact.sensor if contact else self.sensor)
         return self._shows.frame(row, self.backend.attitude(row), np.random.default_rng(int(self.steps_done[row])))
 
-    def begun(self) -> dict[str, Any]:
+    def begin_info(self) -> dict[str, Any]:
         """Entries of ``info`` at the beginning of the episodes: names (B,) of the objects."""
-        return {"object": np.array([None if contact is None else contact.touched.name for contact in self.contacts], object)}
+        return {"object": np.array([None if contact is None else contact.obj.name for contact in self.contacts], object)}
 
-    def touch(self) -> Touch:
+    def touch(self) -> TrueTouch:
         """Contact of the tools if the sensors were rigid, in all rows."""
-        T = self.tool.seen(self.T_work, self.T_object)
-        parts = {field.name: np.zeros((self.count, 3) if field.name == "place_mm" else self.count) for field in fields(Touch)}
-        things = [None if contact is None else contact.touched for contact in self.contacts]
+        T = self.tool.object_poses(self.T_work, self.T_object)
+        parts = {field.name: np.zeros((self.count, 3) if field.name == "place_mm" else self.count) for field in fields(TrueTouch)}
+        things = [None if contact is None else contact.obj for contact in self.contacts]
         for thing in {id(one): one for one in things if one is not None}.values():
             rows = [row for row, one in enumerate(things) if one is thing]
-            found = self._surfaces[thing].touched(self.tool.mounting, T[rows])
+            found = self._surfaces[thing].depth_and_angle(self.tool.mounting, T[rows])
             for key, values in parts.items():
                 values[rows] = getattr(found, key)
-        return Touch(**parts)
+        return TrueTouch(**parts)
 
-    def _seen_now(self) -> Seen:
-        return Seen(self.touch(), self.backend.felt, self.T_work, self.T_object, self.goal, self._action)
+    def _observe_world(self) -> WorldState:
+        return WorldState(self.touch(), self.backend.felt, self.T_work, self.T_object, self.goal, self._action)
 
-    def _judged(self, rows: IntArray) -> Stepped:
-        seen = self._seen_now()
+    def _evaluate_step(self, rows: IntArray) -> Stepped:
+        seen = self._observe_world()
         active = np.zeros(self.count, bool)
         active[rows] = True
         kept = self.task.kept.copy()
-        judged: Judged = self.task.judge(seen)
+        judged: StepOutcome = self.task.evaluate(seen)
         self.task.kept[~active] = kept[~active]  # rows that only begin, or rest, made no step, so the task's memory of them is kept
         lost = np.array([bool(why) for why in self.backend.felt.lost])
         failed, reached = (judged.failed | lost) & active, judged.reached & active & ~lost
@@ -394,8 +396,8 @@ class Batch:
         info: dict[str, Any] = {
             "indent_mm": seen.touch.indent_mm,
             "angle_deg": seen.touch.angle_deg,
-            "force_n": np.linalg.norm(seen.felt.force_n, axis=1),
-            "slip": seen.felt.slip.copy(),
+            "force_n": np.linalg.norm(seen.reading.force_n, axis=1),
+            "slip": seen.reading.slip.copy(),
             "is_success": success,
             "outside": why,
             **judged.terms,
@@ -403,7 +405,7 @@ class Batch:
         return Stepped(reward, failed | reached, ended & ~(failed | reached), info)
 
     def _move(self, rows: IntArray) -> None:
-        T = self.tool.seen(self.T_work, self.T_object)
+        T = self.tool.object_poses(self.T_work, self.T_object)
         self.backend.move(rows, T[rows], self.steps_done[rows] * PERIOD_S)
 
     def _look(self, rows: IntArray, *, first: bool) -> None:

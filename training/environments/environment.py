@@ -58,7 +58,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
 
     def __init__(self, task: str, *, render_mode: str | None = None, **options: Any) -> None:
         self.render_mode = _render_mode(render_mode)
-        self.batch = Batch(task, 1, Options.given(options))
+        self.batch = Batch(task, 1, Options.from_keywords(options))
         self.observation_space = self.batch.observation_space()
         self.action_space = cast(spaces.Space[FloatArray], self.batch.action_space())
         self._state = "new"
@@ -73,7 +73,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         self.batch.settle(np.zeros(1, int))
         self._state = "begun"
         self._show(0.0)
-        return _row(self.batch.observation()), _row(self.batch.begun())
+        return _row(self.batch.observation()), _row(self.batch.begin_info())
 
     def step(self, action: FloatArray) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
         """Move the tool by an action (A,) from -1 to 1, where 1 is the task's largest move, mm or deg.
@@ -133,10 +133,12 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         if self._page is None:
             self._page = EpisodePage(f"TacTip episode: {self.spec.id if self.spec else batch.sensor.name}", batch.sensor, frame.form)
             print(f"open {self._page.url} in a browser: it shows the episode", file=sys.stderr, flush=True)
-        T = batch.tool.seen(batch.T_work, batch.T_object)[0]
+        T = batch.tool.object_poses(batch.T_work, batch.T_object)[0]
         place_mm, felt = batch.touch().place_mm[0], batch.backend.felt
         told = {
-            "goal": ", ".join(_in_units(name, value) for name, value in zip(batch.task.goal_names, batch.asked()[0].tolist(), strict=True)),
+            "goal": ", ".join(
+                _in_units(name, value) for name, value in zip(batch.task.goal_names, batch.goals_for_agents()[0].tolist(), strict=True)
+            ),
             "contact area, slipping": f"{felt.area_mm2[0]:.0f} mm2, {100 * felt.slip[0]:.0f} %",
             "not computed": felt.lost[0],
         }
@@ -145,7 +147,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
                 int(batch.steps_done[0]),
                 frame,
                 batch.backend.attitude(0),
-                contact.touched,
+                contact.obj,
                 T,
                 felt.force_n[0].copy(),
                 T[:3, :3] @ place_mm + T[:3, 3],
@@ -198,7 +200,7 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS, "autoreset_mode": mode}
         self.render_mode = _render_mode(render_mode)
         self.num_envs = num_envs
-        self.batch = Batch(task, num_envs, Options.given(options))
+        self.batch = Batch(task, num_envs, Options.from_keywords(options))
         self.single_observation_space = self.batch.observation_space()
         self.single_action_space = self.batch.action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -221,7 +223,7 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
         self._restart(rows, options)
         self._ended[:] = False
         self._begun = True
-        return self.batch.observation(), _of_rows(self.batch.begun(), np.ones(self.num_envs, bool))
+        return self.batch.observation(), _of_rows(self.batch.begin_info(), np.ones(self.num_envs, bool))
 
     def step(self, actions: FloatArray) -> tuple[Seen, FloatArray, Any, Any, dict[str, Any]]:
         """Step every row by its action, (B, A) from -1 to 1; a row whose episode ended begins the next one (see ``autoreset_mode``).
@@ -240,7 +242,7 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
             self._restart(again, None)
         done = self.batch.step(actions, rows) if len(rows) else None
         begun = self._ended
-        info = _of_rows(self.batch.begun(), begun)
+        info = _of_rows(self.batch.begin_info(), begun)
         if done is None:
             nothing = np.zeros(self.num_envs, bool)
             self._ended = nothing.copy()
@@ -260,7 +262,7 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
             info["final_obs"], info["_final_obs"] = final, ended.copy()
             info["final_info"], info["_final_info"] = _of_rows(done.info, ended), ended.copy()
             self._restart(np.flatnonzero(ended), None)
-            info |= _of_rows(self.batch.begun(), ended)
+            info |= _of_rows(self.batch.begin_info(), ended)
         return self.batch.observation(), done.reward, done.terminated, done.truncated, info
 
     def render(self) -> tuple[ImageArray, ...] | None:

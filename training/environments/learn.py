@@ -1,8 +1,8 @@
-"""Learning of a policy by proximal policy optimisation (stable-baselines3), and judging it on either backend.
+"""Learning of a policy by proximal policy optimisation (stable-baselines3), and evaluating it on either backend.
 
 The network's input is not the displacement of some hundred pins, but its principal components in random motions. From the same motions, a
-second network, the sight, learns to estimate the values that only the simulation knows, such as place and force. Its estimates are also an
-input of the policy.
+second network, the state estimator, is trained to predict the values that only the simulation knows, such as place and force. Its estimates
+are also an input of the policy.
 """
 
 import time
@@ -25,25 +25,26 @@ from training.environments.environment import TactileVectorEnv
 from training.environments.observe import Pictures
 from training.environments.policy_domain import with_domain
 from twin.errors import OptionError
-from twin.policy import Policy, flattened
+from twin.policy import Policy, flatten
 from twin.progress import Progress, Step, silent, stage
 from twin.report.charts import new_figure, save_figure
 from twin.store import Layers, text_file, write_json, writes
-from twin.types import FloatArray, Readable
+from twin.types import FloatArray, ReadableResult
 
 COMPONENTS, ROUGH_COMPONENTS = 48, 24
-"""Numbers of principal components of the pins' motion that a network gets, with and without sight."""
+"""Numbers of principal components of the pins' motion that a network gets, with and without the state estimator."""
 RANDOM_STEPS = 400
-"""Random steps of each environment, from which the components are computed and the sight is learnt."""
+"""Random steps of each environment, from which the components are computed and the state estimator is trained."""
 SIGHT_LAYERS = (256, 256)
-"""Neurons of the hidden layers of the sight, with tanh. Its error in a rolling ball's place is 0.09 mm; with 24 components and 64 neurons
-it is 0.22 mm."""
+"""Neurons of the hidden layers of the state estimator, with tanh. Its error in a rolling ball's place is 0.09 mm; with 24 components and 64
+neurons it is 0.22 mm."""
 SIGHT_EPOCHS, SIGHT_BATCH, SIGHT_RATE = 30, 256, 2e-3
-"""Training of the sight by Adam: epochs, batch, and learning rate, which falls to 0."""
+"""Training of the state estimator by Adam: epochs, batch, and learning rate, which falls to 0."""
 LEAST_DEVIATION = 1e-3
-"""Least scale of a value that the sight estimates, so that a constant value does not lead to a division by 0."""
+"""Least scale of a value that the state estimator predicts, so that a constant value does not lead to a division by 0."""
 LEAST_SPREAD, ROUGH_SPREAD = 0.01, 0.02
-"""Least scale of a component, with and without sight, as a share of the largest component's spread. Smaller components are noise."""
+"""Least scale of a component, with and without the state estimator, as a share of the largest component's spread. Smaller components are
+noise."""
 LAYERS = (64, 64)
 """Neurons of the policy's hidden layers, with tanh."""
 ROLLOUT = 32
@@ -53,7 +54,7 @@ WINDOW = 100
 ENOUGH = 0.97
 """Share of success that ends the learning."""
 ROWS_JUDGED = 8
-"""Number of episodes that are judged together on the surrogate."""
+"""Number of episodes that are evaluated together on the surrogate."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +72,9 @@ class LearnPlan:
         Number of environments that are stepped together.
     seed : int
     episodes : int
-        Number of episodes in which the policy is judged at the end, on the backend on which it learnt.
+        Number of episodes in which the policy is evaluated at the end, on the backend on which it learnt.
     fem_episodes : int
-        Number of episodes on finite elements, with drawn frames and the real pipeline; 0: none.
+        Number of episodes on finite elements, with rasterised frames and the real pipeline; 0: none.
     sight : bool
         First learn to estimate the values that only the simulation knows. This makes a policy precise on the backend on which it learnt.
         But the policy then depends on small motions of the pins, in which a surrogate has errors.
@@ -97,7 +98,7 @@ class LearnPlan:
 
 
 @dataclass(frozen=True, repr=False)
-class Learnt(Readable):
+class Learnt(ReadableResult):
     """The result of the learning. ``curve`` holds (steps, seconds, share of success, mean reward) after each update."""
 
     policy: Policy
@@ -125,7 +126,7 @@ class SteppedTogether(BaselinesVecEnv):
 
     def seen(self, observed: dict[str, Any]) -> FloatArray:
         """See ``BaselinesVecEnv``."""
-        return self.policy.reduced(*_seen(observed))
+        return self.policy.reduce_inputs(*_split_observation(observed))
 
 
 class _Watch(BaseCallback):
@@ -166,8 +167,8 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
     """
     torch.set_num_threads(1)
     begun_s, used_s = time.monotonic(), time.process_time()
-    vector = TactileVectorEnv(plan.task, plan.environments, autoreset_mode=AutoresetMode.SAME_STEP, **_given(plan.options))
-    blank = _untrained(plan, vector)
+    vector = TactileVectorEnv(plan.task, plan.environments, autoreset_mode=AutoresetMode.SAME_STEP, **_option_values(plan.options))
+    blank = _untrained_inputs(plan, vector)
     env = SteppedTogether(vector, blank)
     env.seed(plan.seed)
     ppo = PPO(
@@ -191,17 +192,17 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
     made = replace(blank, layers=_layers_of([*ppo.policy.mlp_extractor.policy_net, ppo.policy.action_net]))
     made = with_domain(made, vector, seed=plan.seed)
     written = [out / "policy.safetensors", out / "learning.csv", out / "learning.png", out / "result.json"]
-    made.save(written[0])  # saved before it is judged, because judging takes long and may be interrupted
+    made.save(written[0])  # saved before it is evaluated, because evaluating takes long and may be interrupted
     _write_curve(watch.curve, written[1], written[2])
     success: dict[str, float] = {
-        str(plan.options.backend): judge_policy(made, plan.task, plan.options, plan.episodes, seed=10_000 + plan.seed)
+        str(plan.options.backend): evaluate_policy(made, plan.task, plan.options, plan.episodes, seed=10_000 + plan.seed)
     }
     if not plan.options.friction_memory:
         remembering = replace(plan.options, friction_memory=True)
-        success["surrogate, friction remembers"] = judge_policy(made, plan.task, remembering, plan.episodes, seed=10_000 + plan.seed)
+        success["surrogate, friction remembers"] = evaluate_policy(made, plan.task, remembering, plan.episodes, seed=10_000 + plan.seed)
     if plan.fem_episodes:
         true = on_finite_elements(plan.options, tuple(vector.batch.objects))
-        success["finite elements, drawn frames"] = judge_policy(made, plan.task, true, plan.fem_episodes, seed=20_000 + plan.seed)
+        success["finite elements, rasterised frames"] = evaluate_policy(made, plan.task, true, plan.fem_episodes, seed=20_000 + plan.seed)
     steps, seconds = watch.curve[-1][:2] if watch.curve else (ppo.num_timesteps, time.monotonic() - begun_s)
     told = {"success": success, "steps": steps, "minutes": round(seconds / 60, 2), "core_minutes": round(used_s / 60, 2)}
     write_json(written[3], {"task": plan.task, "options": asdict(plan.options), **told})
@@ -209,7 +210,7 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
 
 
 def on_finite_elements(options: Options, objects: tuple[str, ...]) -> Options:
-    """The same environment and objects on finite elements, with drawn frames and the real pipeline."""
+    """The same environment and objects on finite elements, with rasterised frames and the real pipeline."""
     seen: Pictures = "preview" if options.observation != "oracle" else "none"
     return replace(options, backend="fem", surrogate=None, friction_memory=True, pictures=seen, objects=objects)
 
@@ -225,36 +226,36 @@ def _write_curve(curve: Sequence[tuple[int, float, float, float]], table: Path, 
     save_figure(picture, figure)
 
 
-def judge_policy(policy: Policy, task: str, options: Options, episodes: int, *, seed: int = 0) -> float:
+def evaluate_policy(policy: Policy, task: str, options: Options, episodes: int, *, seed: int = 0) -> float:
     """Share of episodes that a policy solves, with its mean action, eight at a time (one on finite elements).
 
-    Of B rows, row k judges the episodes k, k + B, ... If instead the first episodes that end were counted, short failures would replace
+    Of B rows, row k evaluates the episodes k, k + B, ... If instead the first episodes that end were counted, short failures would replace
     long successes.
     """
     rows = min(episodes, ROWS_JUDGED if options.backend == "surrogate" else 1)
-    vector = TactileVectorEnv(task, rows, autoreset_mode="SameStep", **_given(options))
+    vector = TactileVectorEnv(task, rows, autoreset_mode="SameStep", **_option_values(options))
     seen, _ = vector.reset(seed=seed)
     share = np.array([len(range(row, episodes, rows)) for row in range(rows)])
     ended = solved = np.zeros(rows, int)
     while (ended < share).any():
-        seen, _, terminated, truncated, told = vector.step(policy.act(*_seen(seen)))
+        seen, _, terminated, truncated, told = vector.step(policy.act(*_split_observation(seen)))
         counted = (terminated | truncated) & (ended < share)
         if counted.any():
             ended, solved = ended + counted, solved + (counted & told["final_info"]["is_success"])
     return float(solved.sum() / episodes)
 
 
-def _given(options: Options) -> dict[str, Any]:
+def _option_values(options: Options) -> dict[str, Any]:
     return {name: getattr(options, name) for name in Options.__dataclass_fields__}
 
 
-def _seen(observed: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
+def _split_observation(observed: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
     """The parts of an observation in the form of a policy's input."""
     return observed["tactile"], observed["goal"]
 
 
-def _untrained(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
-    """The policy's inputs (components and sight) from random motions, without the network of the actions."""
+def _untrained_inputs(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
+    """The policy's inputs (components and state estimator) from random motions, without the network of the actions."""
     batch, task = vector.batch, vector.batch.task
     rng = np.random.default_rng(plan.seed)
     vector.reset(seed=plan.seed)
@@ -263,7 +264,7 @@ def _untrained(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
     for _ in range(RANDOM_STEPS):
         drift = np.clip(0.8 * drift + 0.4 * rng.normal(size=drift.shape), -1, 1)
         seen, *_ = vector.step(drift)
-        rows.append(flattened(seen["tactile"]))
+        rows.append(flatten(seen["tactile"]))
         goals.append(seen["goal"])
         truths.append(batch.oracle())
     flat, goal = np.concatenate(rows).astype(np.float32), np.concatenate(goals)
@@ -288,10 +289,10 @@ def _untrained(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
     blank = Policy(about, mean, basis[:, largest].T / spread[:, None], ())
     if plan.options.observation == "oracle" or not plan.sight:
         return blank
-    return replace(blank, sight=_sight(((flat - mean) @ blank.basis.T, goal), np.concatenate(truths), plan.seed))
+    return replace(blank, sight=_train_state_estimator(((flat - mean) @ blank.basis.T, goal), np.concatenate(truths), plan.seed))
 
 
-def _sight(given: Sequence[FloatArray], truth: FloatArray, seed: int) -> Layers:
+def _train_state_estimator(given: Sequence[FloatArray], truth: FloatArray, seed: int) -> Layers:
     """A network that estimates the values that only a simulation knows (S, O), scaled to about 1, from the inputs (S, ...)."""
     inputs = torch.tensor(np.concatenate(given, axis=1), dtype=torch.float32)
     wanted = torch.tensor((truth - truth.mean(axis=0)) / np.maximum(truth.std(axis=0), LEAST_DEVIATION), dtype=torch.float32)

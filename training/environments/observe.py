@@ -13,7 +13,7 @@ from training.data.pins import PinTable, cap_light
 from training.estimate.estimator import PoseEstimator
 from training.models.part import PinModel
 from training.runs.packed import shipped_names
-from training.surrogate.felt import Backend, Felt
+from training.surrogate.reading import Backend, ContactReading
 from twin.camera.capture import expose, record
 from twin.camera.projection import project
 from twin.errors import FrameError, OptionError
@@ -29,7 +29,7 @@ KINDS: tuple[str, ...] = get_args(Kind)
 """Names of the observations."""
 Pictures = Literal["none", "preview", "traced"]
 PICTURES: tuple[str, ...] = get_args(Pictures)
-"""Ways to make frames: none, drawn, or path-traced."""
+"""Ways to make frames: none, rasterised, or path-traced."""
 IMAGE_PX = 128
 """Side of the pictures that an agent gets, px, as in Tactile Gym."""
 LARGEST = 10.0
@@ -39,15 +39,15 @@ POSE_SCALES = {"mm": 1.0, "deg": 10.0, "N": 1.0, "Nmm": 10.0, "mm2": 100.0, "": 
 
 
 @dataclass(frozen=True)
-class View:
-    """The view of an episode's sensor: the drawn specification, the form of its frames, and how they are made."""
+class SensorView:
+    """The view of an episode's sensor: the sampled specification, the form of its frames, and how they are made."""
 
     sensor: SensorSpec
     form: Form
     pictures: Pictures
 
     def __getstate__(self) -> dict[str, Any]:
-        """The fields alone: what is cached is made anew."""
+        """The fields alone: what is cached is made again."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     @cached_property
@@ -114,8 +114,8 @@ class Eye:
         self.form = self._estimator.form if self._estimator else Form.PROCESSED if sensor.recording else Form.RAW
         self.reference = nominal_reference(sensor, self.form)
         self._spacing = float(self.reference.spacing_px.mean())
-        self._nominal = View(sensor, self.form, pictures)
-        self._views: list[View] = [self._nominal] * count
+        self._nominal = SensorView(sensor, self.form, pictures)
+        self._views: list[SensorView] = [self._nominal] * count
 
     @property
     def _sees_light(self) -> bool:
@@ -135,11 +135,11 @@ class Eye:
         return (pins, 2) if self.kind == "pins" else (pins, 5)
 
     def begin(self, row: int, sensor: SensorSpec) -> None:
-        """Use the camera and light that were drawn for an environment's episode."""
-        self._views[row] = self._nominal if sensor is self.sensor else View(sensor, self.form, self.pictures)
+        """Use the camera and light that were sampled for an environment's episode."""
+        self._views[row] = self._nominal if sensor is self.sensor else SensorView(sensor, self.form, self.pictures)
 
     def frame(self, row: int, pins: PinState, rng: np.random.Generator) -> Frame:
-        """The frame of one environment's sensor as drawn for the episode; a preview if no kind of pictures was chosen."""
+        """The frame of one environment's sensor as sampled for the episode; a preview if no kind of pictures was chosen."""
         return self._views[row].paint(pins, rng)
 
     def look(self, backend: Backend, rows: IntArray, rngs: list[np.random.Generator]) -> tuple[FloatArray | ImageArray, BoolArray]:
@@ -155,9 +155,9 @@ class Eye:
         rest_px = np.stack([self._views[row].rest_px for row in rows.tolist()])
         return self._of_pins(self.reference.pins_px + (pins_px - rest_px)), np.ones(len(rows), bool)
 
-    def pins_px(self, felt: Felt, rows: IntArray) -> FloatArray:
+    def pins_px(self, reading: ContactReading, rows: IntArray) -> FloatArray:
         """Projected caps (R, N, 2) of some rows, px of the sensor's frames."""
-        caps = felt.caps_mm[rows]
+        caps = reading.caps_mm[rows]
         if all(self._views[row] is self._nominal for row in rows.tolist()):
             return caps_px(self.sensor, self.form, caps)
         return np.stack([caps_px(self._views[row].sensor, self.form, seen) for row, seen in zip(rows.tolist(), caps, strict=True)])
@@ -185,7 +185,7 @@ class Eye:
             light=np.zeros(0) if light is None else light,
         )
         told = self._estimator.predict_table(table)
-        return self._scaled(told.mean, told.executed)
+        return self._scale_estimate(told.mean, told.executed)
 
     def _of_frames(self, rows: IntArray, frames: list[Frame]) -> tuple[FloatArray, BoolArray]:
         """Observations (R, ...) from frames, through the real pipeline of each row's sensor, and whether each could be made (R,)."""
@@ -201,7 +201,7 @@ class Eye:
             )
         return self._of_pins(self.reference.pins_px + np.stack(moved), light), valid
 
-    def _scaled(self, value: FloatArray, executed: FloatArray) -> FloatArray:
+    def _scale_estimate(self, value: FloatArray, executed: FloatArray) -> FloatArray:
         assert self._estimator is not None
         scale = np.array([POSE_SCALES[unit] for unit in self._estimator.units])
         known = np.nan_to_num(np.asarray(executed, float).reshape(len(value), 1), nan=1.0)

@@ -80,9 +80,9 @@ class LearntContacts:
 
         def displacements(nodes_px: FloatArray, lost: BoolArray) -> tuple[FloatArray, str]:
             moved = (nodes_px - rest.pins_px) @ linear / float(self.reference.spacing_px.mean())
-            reason = self.domain.judge(moved, lost, self.reference, corrects=False).reason
+            reason = self.domain.assess(moved, lost, self.reference, corrects=False).reason
             if lost.any() and not reason:
-                moved = self.domain.filled(moved, lost)[0]
+                moved = self.domain.fill_lost(moved, lost)[0]
             return moved, reason
 
         return displacements

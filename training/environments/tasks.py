@@ -8,9 +8,9 @@ import numpy as np
 from scenes.object import ObjectSpec, SphereShape
 from scenes.plugins import others
 from training.environments.world import Surfaces, Tool, motions, standing_on, turn_about
-from training.surrogate.felt import Felt
+from training.surrogate.reading import ContactReading
 from twin.errors import OptionError
-from twin.rig.touch import Touch
+from twin.rig.touch import TrueTouch
 from twin.types import BoolArray, FloatArray
 
 LOST_MM = -1.0
@@ -44,22 +44,22 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """The world after a step, for a task to judge. Rows are environments.
+class WorldState:
+    """The world after a step, for a task to evaluate. Rows are environments.
 
     Attributes
     ----------
     touch : Touch
         Contact of the tools if the sensors were rigid.
-    felt : Felt
+    reading : Felt
     T_work, T_object : (B, 4, 4) float
     goal : (B, G) float
     action : (B, A) float
         Actions in [-1, 1].
     """
 
-    touch: Touch
-    felt: Felt
+    touch: TrueTouch
+    reading: ContactReading
     T_work: FloatArray
     T_object: FloatArray
     goal: FloatArray
@@ -67,7 +67,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Judged:
+class StepOutcome:
     """A task's judgement of a state.
 
     Attributes
@@ -101,7 +101,7 @@ class Task(ABC):
     experiment : str
         Experiment that defines the approach, and with it the work frame.
     objects : tuple of str
-        Objects of which one is drawn for each episode.
+        Objects of which one is sampled for each episode.
     axes : tuple of str
         Axes that an agent moves by default.
     goal_names, oracle_names : tuple of str
@@ -128,7 +128,7 @@ class Task(ABC):
     failed_reward: float = 0.0
     columns = 1
 
-    def require(self, touched: ObjectSpec) -> None:
+    def require(self, obj: ObjectSpec) -> None:
         """Raise ``OptionError`` if the task can't be done with an object. Most tasks can be done with any object."""
         return
 
@@ -137,28 +137,28 @@ class Task(ABC):
         self.kept = np.zeros((count, self.columns))
 
     @abstractmethod
-    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+    def begin(self, row: int, tool: Tool, obj: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
         """Draw the start of an episode."""
 
     @abstractmethod
-    def judge(self, seen: Seen) -> Judged:
-        """Judge the state after a step."""
+    def evaluate(self, seen: WorldState) -> StepOutcome:
+        """Evaluate the state after a step."""
 
-    def pushed(self, felt: Felt, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
+    def push_object(self, reading: ContactReading, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
         """Response of the object's pose to the skin's forces: poses (B, 4, 4) to try next, or None if the object is held."""
         return None
 
-    def carried(self, felt: Felt, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
-        """The object's poses (B, 4, 4) after tools that felt ``felt`` moved from ``before`` to ``T_work``. Held objects do not move."""
+    def carry_object(self, reading: ContactReading, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
+        """The object's poses (B, 4, 4) after tools that felt ``reading`` moved from ``before`` to ``T_work``. Held objects do not move."""
         return T_object
 
-    def asked(self, goal: FloatArray, T_work: FloatArray) -> FloatArray:
+    def goals_for_agents(self, goal: FloatArray, T_work: FloatArray) -> FloatArray:
         """The goals (B, G), by ``goal_names``, as the agents get them with the tools at ``T_work`` (B, 4, 4)."""
         return goal
 
-    def oracle(self, seen: Seen) -> FloatArray:
+    def oracle(self, seen: WorldState) -> FloatArray:
         """Values that a real sensor can't know, (B, K), by ``oracle_names``."""
-        felt, touch = seen.felt, seen.touch
+        felt, touch = seen.reading, seen.touch
         columns = [touch.indent_mm, touch.angle_deg / TURN_DEG, felt.force_n / FORCE_N, felt.area_mm2 / 100.0, felt.slip]
         return np.column_stack(columns)
 
@@ -168,12 +168,12 @@ def closeness(off: FloatArray) -> FloatArray:
     return 1.0 / (1.0 + off)
 
 
-def lost_or_deep(touch: Touch) -> BoolArray:
+def lost_or_deep(touch: TrueTouch) -> BoolArray:
     """Rows (B,) where the object is lost, or the sensor too deep."""
     return (touch.indent_mm < LOST_MM) | (touch.indent_mm > DEEPEST_MM)
 
 
-def out_of_touch(touch: Touch) -> BoolArray:
+def out_of_touch(touch: TrueTouch) -> BoolArray:
     """Rows (B,) where the object is lost, or the sensor too deep or too steep."""
     return lost_or_deep(touch) | (np.abs(touch.angle_deg) > STEEPEST_DEG)
 
@@ -190,21 +190,21 @@ class SurfaceFollow(Task):
     off_mm, off_deg, beside_mm = 1.0, 12.0, 5.0
     good_mm, good_deg = 0.5, 5.0
 
-    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+    def begin(self, row: int, tool: Tool, obj: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
         self.kept[row] = 0.0
         goal = float(rng.uniform(*self.indents_mm))
         indent = max(goal + rng.uniform(-self.off_mm, self.off_mm), 0.8)
         beside = rng.uniform(-self.beside_mm, self.beside_mm)
-        T = standing_on(tool, surfaces[touched], beside, indent, rng.uniform(-self.off_deg, self.off_deg))
+        T = standing_on(tool, surfaces[obj], beside, indent, rng.uniform(-self.off_deg, self.off_deg))
         return Start(T, (goal, 0.0), np.eye(4))
 
-    def judge(self, seen: Seen) -> Judged:
+    def evaluate(self, seen: WorldState) -> StepOutcome:
         off_mm = np.abs(seen.touch.indent_mm - seen.goal[:, 0])
         off_deg = np.abs(seen.touch.angle_deg - TURN_DEG * seen.goal[:, 1])
         failed = out_of_touch(seen.touch)
         good = (off_mm <= self.good_mm) & (off_deg <= self.good_deg)
         reward = closeness(off_mm + off_deg / TURN_DEG)
-        return Judged(reward, failed, np.zeros(len(failed), bool), good, {"off_mm": off_mm, "off_deg": off_deg})
+        return StepOutcome(reward, failed, np.zeros(len(failed), bool), good, {"off_mm": off_mm, "off_deg": off_deg})
 
 
 class ContourFollow(SurfaceFollow):
@@ -224,14 +224,16 @@ class ContourFollow(SurfaceFollow):
     success_share = 0.0
     columns = 5  # path length covered, total length, the place (x, z) that was touched last, and the largest length covered
 
-    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
-        start, surface = super().begin(row, tool, touched, surfaces, rng), surfaces[touched]
+    def begin(self, row: int, tool: Tool, obj: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+        start, surface = super().begin(row, tool, obj, surfaces, rng), surfaces[obj]
         self.kept[row, 1] = np.linalg.norm(np.diff(surface.outline, axis=0), axis=1).sum()
-        self.kept[row, 2:4] = surface.touched(tool.mounting, tool.seen(start.T_work[None], start.T_object[None])).place_mm[0, [0, 2]]
+        self.kept[row, 2:4] = surface.depth_and_angle(tool.mounting, tool.object_poses(start.T_work[None], start.T_object[None])).place_mm[
+            0, [0, 2]
+        ]
         return start
 
-    def judge(self, seen: Seen) -> Judged:
-        judged = super().judge(seen)
+    def evaluate(self, seen: WorldState) -> StepOutcome:
+        judged = super().evaluate(seen)
         covered, length, x, z, farthest = self.kept.T
         place = seen.touch.place_mm[:, [0, 2]]
         moved = place - np.column_stack([x, z])
@@ -241,7 +243,7 @@ class ContourFollow(SurfaceFollow):
         self.kept = np.column_stack([covered, length, place, farthest + gain_mm])
         reached = (covered >= self.covered_share * length) & ~judged.failed
         reward = judged.reward * gain_mm / self.feed_mm[0]
-        return Judged(reward, judged.failed, reached, judged.good, judged.terms | {"gain_mm": gain_mm})
+        return StepOutcome(reward, judged.failed, reached, judged.good, judged.terms | {"gain_mm": gain_mm})
 
 
 class EdgeFollow(Task):
@@ -258,31 +260,31 @@ class EdgeFollow(Task):
     good_mm, good_deg = 1.0, 6.0
     farthest_mm = 6.0
 
-    def require(self, touched: ObjectSpec) -> None:
-        if touched.shape.kind != "edge":
-            raise OptionError(f"EdgeFollow follows edges; {touched.name} is none, give objects such as 'edge'")
+    def require(self, obj: ObjectSpec) -> None:
+        if obj.shape.kind != "edge":
+            raise OptionError(f"EdgeFollow follows edges; {obj.name} is none, give objects such as 'edge'")
 
-    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+    def begin(self, row: int, tool: Tool, obj: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
         dome = tool.T_work_sensor[:3, 3]
         T = turn_about((0, 0, 1), rng.uniform(-self.off_deg, self.off_deg))
         centre = np.array([rng.uniform(-self.off_mm, self.off_mm), 0.0, self.indent_mm - tool.mounting.skin_apex_mm])
         T[:3, 3] = centre - T[:3, :3] @ dome
         return Start(T, (0.0, 0.0), np.eye(4))
 
-    def place(self, seen: Seen) -> tuple[FloatArray, FloatArray]:
+    def place(self, seen: WorldState) -> tuple[FloatArray, FloatArray]:
         """Place of the dome's apex across the edge (B,), mm, and angle between the sensor and the edge (B,), deg."""
         turn = np.degrees(np.arctan2(seen.T_work[:, 1, 0], seen.T_work[:, 0, 0]))
         return seen.T_work[:, 0, 3], turn
 
-    def judge(self, seen: Seen) -> Judged:
+    def evaluate(self, seen: WorldState) -> StepOutcome:
         across, turn = self.place(seen)
         off_mm, off_deg = np.abs(across - seen.goal[:, 0]), np.abs(turn - TURN_DEG * seen.goal[:, 1])
         failed = (off_mm > self.farthest_mm) | (np.abs(turn) > STEEPEST_DEG + self.off_deg) | lost_or_deep(seen.touch)
         good = (off_mm <= self.good_mm) & (off_deg <= self.good_deg) & (seen.touch.indent_mm > 0)
         reward = closeness((off_mm + off_deg / TURN_DEG) / 2)
-        return Judged(reward, failed, np.zeros(len(failed), bool), good, {"off_mm": off_mm, "off_deg": off_deg})
+        return StepOutcome(reward, failed, np.zeros(len(failed), bool), good, {"off_mm": off_mm, "off_deg": off_deg})
 
-    def oracle(self, seen: Seen) -> FloatArray:
+    def oracle(self, seen: WorldState) -> FloatArray:
         across, turn = self.place(seen)
         return np.column_stack([across, turn / TURN_DEG, super().oracle(seen)[:, 2:]])
 
@@ -302,24 +304,24 @@ class GentlePress(Task):
     columns = 1  # sideways drift per step
     success_share = 0.8
 
-    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+    def begin(self, row: int, tool: Tool, obj: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
         self.kept[row] = rng.uniform(-self.drift_mm, self.drift_mm)
-        T = standing_on(tool, surfaces[touched], 0.0, -0.5, rng.uniform(-self.off_deg, self.off_deg))
+        T = standing_on(tool, surfaces[obj], 0.0, -0.5, rng.uniform(-self.off_deg, self.off_deg))
         return Start(T, (float(rng.uniform(*self.forces_n)),), np.eye(4))
 
-    def carried(self, felt: Felt, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
+    def carry_object(self, reading: ContactReading, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
         drifted = T_object.copy()
         drifted[:, 0, 3] += self.kept[:, 0]
         return drifted
 
-    def judge(self, seen: Seen) -> Judged:
-        force, goal = np.linalg.norm(seen.felt.force_n, axis=1), seen.goal[:, 0]
+    def evaluate(self, seen: WorldState) -> StepOutcome:
+        force, goal = np.linalg.norm(seen.reading.force_n, axis=1), seen.goal[:, 0]
         off_n, gap_mm = np.abs(force - goal), np.maximum(-seen.touch.indent_mm, 0.0)
-        slips = (seen.felt.slip > self.slip_share) & (force > 0.2)
+        slips = (seen.reading.slip > self.slip_share) & (force > 0.2)
         failed = (seen.touch.indent_mm > DEEPEST_MM) | (seen.touch.indent_mm < 2 * LOST_MM)
         good = (off_n <= self.good_share * goal) & ~slips
-        reward = closeness(off_n / goal + gap_mm + seen.felt.slip)
-        return Judged(reward, failed, np.zeros(len(failed), bool), good, {"off_n": off_n, "gap_mm": gap_mm})
+        reward = closeness(off_n / goal + gap_mm + seen.reading.slip)
+        return StepOutcome(reward, failed, np.zeros(len(failed), bool), good, {"off_n": off_n, "gap_mm": gap_mm})
 
 
 class ObjectRoll(Task):
@@ -343,13 +345,13 @@ class ObjectRoll(Task):
     """Least force of the skin, N, on a ball that rolls with it."""
     columns = 1  # radius of the ball
 
-    def require(self, touched: ObjectSpec) -> None:
-        if touched.shape.kind != "sphere":
-            raise OptionError(f"ObjectRoll rolls balls; {touched.name} is none, give objects such as 'ball-10'")
+    def require(self, obj: ObjectSpec) -> None:
+        if obj.shape.kind != "sphere":
+            raise OptionError(f"ObjectRoll rolls balls; {obj.name} is none, give objects such as 'ball-10'")
 
-    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
-        assert isinstance(touched.shape, SphereShape)  # required
-        self.kept[row] = touched.shape.radius_mm
+    def begin(self, row: int, tool: Tool, obj: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+        assert isinstance(obj.shape, SphereShape)  # required
+        self.kept[row] = obj.shape.radius_mm
         self._apex = tool.T_work_sensor[:2, 3]
         indent = rng.uniform(*self.indents_mm)
         away, toward = self.within_mm * np.sqrt(rng.uniform(size=2)), rng.uniform(0.0, 2 * np.pi, 2)
@@ -360,8 +362,8 @@ class ObjectRoll(Task):
         T_object[:2, 3] = start
         return Start(T, tuple(map(float, goal)), T_object)
 
-    def carried(self, felt: Felt, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
-        held = np.linalg.norm(felt.force_n, axis=1, keepdims=True) > self.holds_n
+    def carry_object(self, reading: ContactReading, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
+        held = np.linalg.norm(reading.force_n, axis=1, keepdims=True) > self.holds_n
         moved = 0.5 * held * (T_work[:, :3, 3] - before[:, :3, 3])  # a ball between two plates moves half as far as the upper one
         turn = np.cross([0.0, 0.0, -1.0], moved)  # about its middle, which lies one radius along z from its pole
         step = np.concatenate([np.zeros_like(moved), np.degrees(turn / self.kept)], axis=1)
@@ -371,20 +373,20 @@ class ObjectRoll(Task):
         out[:, :3, 3] = middle - self.kept * out[:, :3, 2]
         return out
 
-    def place(self, seen: Seen) -> FloatArray:
+    def place(self, seen: WorldState) -> FloatArray:
         """Place of the ball's middle relative to the dome's apex, (B, 2) mm, in the work frame."""
         middle = seen.T_object[:, :3, 3] + self.kept * seen.T_object[:, :3, 2]
         turned: FloatArray = np.einsum("bji,bj->bi", seen.T_work[:, :3, :3], middle - seen.T_work[:, :3, 3])
         return turned[:, :2] - self._apex
 
-    def judge(self, seen: Seen) -> Judged:
+    def evaluate(self, seen: WorldState) -> StepOutcome:
         place = self.place(seen)
         off_mm = np.linalg.norm(place - seen.goal, axis=1)
         failed = (np.linalg.norm(place, axis=1) > self.farthest_mm) | lost_or_deep(seen.touch)
         good = (off_mm <= self.near_mm) & (seen.touch.indent_mm > 0)
-        return Judged(closeness(off_mm / 2), failed, np.zeros(len(failed), bool), good, {"off_mm": off_mm})
+        return StepOutcome(closeness(off_mm / 2), failed, np.zeros(len(failed), bool), good, {"off_mm": off_mm})
 
-    def oracle(self, seen: Seen) -> FloatArray:
+    def oracle(self, seen: WorldState) -> FloatArray:
         return np.column_stack([self.place(seen), super().oracle(seen)[:, 2:]])
 
 
@@ -404,7 +406,7 @@ class ObjectPush(Task):
     feed_mm = (0.0, 0.0, 1.0)
     near_mm = 3.0
     holds_n = (0.6, 1.5)
-    """Range of the support's friction force, N. One value is drawn for each episode."""
+    """Range of the support's friction force, N. One value is sampled for each episode."""
     lever_mm = 15.0
     """Lever of the support's friction, mm: largest friction torque divided by the friction force."""
     give_mm_per_n = 1.0
@@ -414,23 +416,23 @@ class ObjectPush(Task):
     success_share = 0.0
     reached_reward = 10.0
 
-    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
-        T = standing_on(tool, surfaces[touched], 0.0, 0.5, rng.uniform(-8.0, 8.0))
+    def begin(self, row: int, tool: Tool, obj: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+        T = standing_on(tool, surfaces[obj], 0.0, 0.5, rng.uniform(-8.0, 8.0))
         goal = np.array([rng.uniform(-12.0, 12.0), rng.uniform(40.0, 60.0)])
         self.kept[row] = rng.uniform(*self.holds_n), np.linalg.norm(goal - self._middle(np.eye(4)[None])[0, [0, 2]])
         return Start(T, (float(goal[0]), float(goal[1])), np.eye(4))
 
-    def asked(self, goal: FloatArray, T_work: FloatArray) -> FloatArray:
+    def goals_for_agents(self, goal: FloatArray, T_work: FloatArray) -> FloatArray:
         """The goals' places relative to the tools, whose own poses a robot knows."""
-        return _seen_in_plane(goal - T_work[:, [0, 2], 3], T_work)
+        return _shift_in_plane(goal - T_work[:, [0, 2], 3], T_work)
 
-    def pushed(self, felt: Felt, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
+    def push_object(self, reading: ContactReading, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
         T_sensor = T_work @ tool.T_work_sensor
         turn = T_sensor[:, :3, :3]
-        force = (turn @ felt.force_n[:, :, None])[:, :, 0]
+        force = (turn @ reading.force_n[:, :, None])[:, :, 0]
         middle = self._middle(T_object)
         arm = T_sensor[:, :3, 3] - middle
-        torque = (turn[:, 1] * felt.torque_nmm).sum(axis=1) + arm[:, 2] * force[:, 0] - arm[:, 0] * force[:, 2]  # about its middle
+        torque = (turn[:, 1] * reading.torque_nmm).sum(axis=1) + arm[:, 2] * force[:, 0] - arm[:, 0] * force[:, 2]  # about its middle
         load = np.stack([force[:, 0], force[:, 2], torque / self.lever_mm], axis=1)
         size = np.sqrt((load * load).sum(axis=1))
         over = np.maximum(size - self.kept[:, 0], 0.0)
@@ -449,26 +451,26 @@ class ObjectPush(Task):
         """Centre of a block's weight: ``lever_mm`` behind its touched face, (B, 3)."""
         return T_object[:, :3, 3] + self.lever_mm * T_object[:, :3, 2]
 
-    def place(self, seen: Seen) -> FloatArray:
+    def place(self, seen: WorldState) -> FloatArray:
         """Vector from the block's middle to the goal, (B, 2) mm: x and z of the world."""
         return seen.goal - self._middle(seen.T_object)[:, [0, 2]]
 
-    def judge(self, seen: Seen) -> Judged:
+    def evaluate(self, seen: WorldState) -> StepOutcome:
         place = self.place(seen)
         off_mm = np.linalg.norm(place, axis=1)
         failed = out_of_touch(seen.touch) | (place[:, 1] < -self.near_mm)
         reached = (off_mm <= self.near_mm) & ~failed
         gain_mm = np.maximum(self.kept[:, 1] - off_mm, 0.0)  # so neither waiting nor a way back and forth gives a reward
-        miss_mm = np.abs(10.0 * _seen_in_plane(place, seen.T_work)[:, 0])
+        miss_mm = np.abs(10.0 * _shift_in_plane(place, seen.T_work)[:, 0])
         self.kept[:, 1] -= gain_mm
         reward = gain_mm * closeness(miss_mm / self.near_mm) + self.reached_reward * reached
-        return Judged(reward, failed, reached, reached, {"off_mm": off_mm, "gain_mm": gain_mm, "miss_mm": miss_mm})
+        return StepOutcome(reward, failed, reached, reached, {"off_mm": off_mm, "gain_mm": gain_mm, "miss_mm": miss_mm})
 
-    def oracle(self, seen: Seen) -> FloatArray:
-        return np.column_stack([_seen_in_plane(self.place(seen), seen.T_work), super().oracle(seen)])
+    def oracle(self, seen: WorldState) -> FloatArray:
+        return np.column_stack([_shift_in_plane(self.place(seen), seen.T_work), super().oracle(seen)])
 
 
-def _seen_in_plane(away_mm: FloatArray, T_work: FloatArray) -> FloatArray:
+def _shift_in_plane(away_mm: FloatArray, T_work: FloatArray) -> FloatArray:
     """Shifts (B, 2) along x and z of the world, relative to tools at ``T_work`` (B, 4, 4), in cm."""
     turned = np.column_stack([away_mm[:, 0], np.zeros(len(away_mm)), away_mm[:, 1]])
     here: FloatArray = np.einsum("bji,bj->bi", T_work[:, :3, :3], turned)

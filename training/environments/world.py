@@ -9,7 +9,7 @@ from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.rig.mounting import Mounting
-from twin.rig.touch import Surface
+from twin.rig.touch import SmoothSurface
 from twin.types import FloatArray
 
 AXES = ("x", "y", "z", "Rx", "Ry", "Rz")
@@ -35,7 +35,7 @@ class Tool:
         mounting = Mounting.of(sensor, experiment)
         return cls(mounting, np.linalg.inv(work_frame(mounting)) @ mounting.T_tool_sensor)
 
-    def seen(self, T_world_work: FloatArray, T_world_object: FloatArray) -> FloatArray:
+    def object_poses(self, T_world_work: FloatArray, T_world_object: FloatArray) -> FloatArray:
         """``T_sensor_object`` (B, 4, 4) of tools and objects in poses (B, 4, 4)."""
         return inverse(T_world_work @ self.T_work_sensor) @ T_world_object
 
@@ -79,7 +79,7 @@ def turn_about(axis: Sequence[float], deg: float) -> FloatArray:
     return motions(np.concatenate([np.zeros(3), deg * np.asarray(axis, float)])[None])[0]
 
 
-def place_beside(surface: Surface, along_mm: float) -> tuple[FloatArray, float]:
+def side_place(surface: SmoothSurface, along_mm: float) -> tuple[FloatArray, float]:
     """The place (3,) of a surface beside its object's origin along x, and the surface's turn about y there (deg)."""
     at = np.array([[along_mm, 0.0, 0.0]])
     for _ in range(20):
@@ -88,7 +88,7 @@ def place_beside(surface: Surface, along_mm: float) -> tuple[FloatArray, float]:
     return at[0], float(np.degrees(np.arctan2(-normal[0, 0], -normal[0, 2])))
 
 
-def standing_on(tool: Tool, surface: Surface, along_mm: float, indent_mm: float, angle_deg: float) -> FloatArray:
+def standing_on(tool: Tool, surface: SmoothSurface, along_mm: float, indent_mm: float, angle_deg: float) -> FloatArray:
     """``T_object_work`` (4, 4) of a tool that presses the dome against a surface beside its object's origin.
 
     Parameters
@@ -100,7 +100,7 @@ def standing_on(tool: Tool, surface: Surface, along_mm: float, indent_mm: float,
     angle_deg : float
         Angle of the tool from the surface's normal, about the work frame's y.
     """
-    place, turned_deg = place_beside(surface, along_mm)
+    place, turned_deg = side_place(surface, along_mm)
     outward = turn_about((0, 1, 0), turned_deg)[:3, :3] @ [0.0, 0.0, -1.0]
     T = turn_about((0, 1, 0), turned_deg + angle_deg)
     dome = tool.T_work_sensor[:3, 3]
@@ -113,9 +113,9 @@ class Surfaces:
     """The surfaces of the objects that a task uses, each built once."""
 
     def __init__(self) -> None:
-        self._built: dict[ObjectSpec, Surface] = {}
+        self._built: dict[ObjectSpec, SmoothSurface] = {}
 
-    def __getitem__(self, touched: ObjectSpec) -> Surface:
-        if touched not in self._built:  # the key is the whole specification, because two files in different folders may have one name
-            self._built[touched] = Surface(touched)
-        return self._built[touched]
+    def __getitem__(self, obj: ObjectSpec) -> SmoothSurface:
+        if obj not in self._built:  # the key is the whole specification, because two files in different folders may have one name
+            self._built[obj] = SmoothSurface(obj)
+        return self._built[obj]

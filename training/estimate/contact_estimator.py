@@ -2,7 +2,7 @@
 model.
 
 Its folder holds the small copies of runs, the classifier of the kinds (``training.estimate.contacts``), and ``contacts.json``: the run of
-each kind, with the intervals for this kind. Several kinds may share a run that learnt from all of them. The shipped weights of a sensor
+each kind, with the intervals for this kind. Several kinds may share a run that was trained on all of them. The shipped weights of a sensor
 may have such a folder inside: ``contacts``.
 """
 
@@ -23,7 +23,7 @@ from training.estimate.contacts import CONTACTS, Contacts, fit_contacts, read_co
 from training.estimate.estimator import PoseEstimate, PoseEstimator
 from training.models.part import Prediction, Unseen
 from training.runs.packed import folder_of, pack
-from training.runs.run_files import damaged
+from training.runs.run_files import damage_error
 from twin.camera.capture import in_form
 from twin.frames import Recording
 from twin.frames.tables import numbers
@@ -36,7 +36,7 @@ INSIDE = "contacts"
 KINDS = "contacts.json"
 # Names of intervals in that file.
 INTERVALS = ("quantile", "raw_quantile")
-AGAIN = "copy the model's folder anew"
+AGAIN = "copy the model's folder again"
 
 
 class ContactEstimator:
@@ -81,9 +81,9 @@ class ContactEstimator:
             kinds = {name: (str(kind.pop("model")), kind) for name, kind in json.loads(path.read_text(encoding="utf-8")).items()}
             unlike = [key for _, intervals in kinds.values() for key in intervals if key not in INTERVALS]
         except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-            raise damaged(path, "it does not say which model is of which kind", AGAIN) from error
+            raise damage_error(path, "it does not say which model is of which kind", AGAIN) from error
         if unlike:
-            raise damaged(path, f"no intervals are called {unlike[0]}", AGAIN)
+            raise damage_error(path, f"no intervals are called {unlike[0]}", AGAIN)
         models = {model: PoseEstimator.load(folder / model) for model, _ in kinds.values()}
         parts = {name: models[model].with_intervals(intervals) for name, (model, intervals) in kinds.items()}
         return cls(parts, read_contacts(folder / CONTACTS))
@@ -107,7 +107,7 @@ class ContactEstimator:
         """As for ``PoseEstimator``; of all models."""
         return list(dict.fromkeys(line for part in self.parts.values() for line in part.caveats))
 
-    def remembering(self) -> "ContactEstimator":
+    def with_history(self) -> "ContactEstimator":
         """The estimator itself, because models of several kinds of contact do not estimate slip."""
         return self
 
@@ -140,7 +140,7 @@ class ContactEstimator:
         started = perf_counter()
         seen = self._any.pins_in(in_form(frame, self.form, self.sensor.recording))
         if isinstance(seen, Unseen):
-            return self._any.unseen(seen, started)
+            return self._any.estimate_without_pose(seen, started)
         kind = str(self.contacts.likeliest(seen.pins, tuple(self.parts))[0])
         return self.parts[kind].estimate_one(seen, started, kind)
 

@@ -31,7 +31,7 @@ LEAST_DEVIATION = 1e-6
 
 
 @dataclass(frozen=True)
-class Modes:
+class DisplacementModes:
     """Principal components of displacements (M, N, 2), each of standard deviation 1: ``mean`` (2 N,) and ``components`` (2 N, K)."""
 
     mean: np.ndarray
@@ -42,7 +42,7 @@ class Modes:
         return (moved.reshape(len(moved), -1) - self.mean) @ self.components
 
     @classmethod
-    def fit(cls, moved: np.ndarray, most: int) -> "Modes":
+    def fit_modes(cls, moved: np.ndarray, most: int) -> "DisplacementModes":
         """The first modes of displacements, at most ``most``."""
         flat = moved.reshape(len(moved), -1)
         mean = flat.mean(axis=0)
@@ -66,7 +66,7 @@ class Contacts:
     """
 
     kinds: tuple[str, ...]
-    modes: Modes
+    modes: DisplacementModes
     layers: Layers = field(repr=False)
 
     def likeliest(self, pins: PinTable, among: Sequence[str]) -> np.ndarray:
@@ -97,10 +97,10 @@ def fit_contacts(frames: Mapping[str, Sequence[Dataset]], *, seed: int) -> Conta
         There are fewer than two kinds.
     """
     if len(frames) < 2:
-        raise TrainingError("to tell kinds of contact apart, frames of at least two are needed")
+        raise TrainingError("to distinguish kinds of contact, frames of at least two are needed")
     moved = {name: np.concatenate([moved_of(each.pins) for each in frames[name]]) for name in sorted(frames)}
     together = np.concatenate(list(moved.values()))
-    modes = Modes.fit(together, COMMON_MODES)
+    modes = DisplacementModes.fit_modes(together, COMMON_MODES)
     right = np.repeat(np.arange(len(moved)), [len(each) for each in moved.values()])
     return Contacts(tuple(moved), modes, _layers(modes(together), right, seed))
 
@@ -143,7 +143,7 @@ def read_contacts(path: Path) -> Contacts:
     TrainingError
         The file can't be read, or is damaged.
     """
-    with FILE.opened(path) as (about, single):
+    with FILE.open_arrays(path) as (about, single):
         found = {key: array.astype(float) for key, array in single.items()}
         kinds = about.get("kinds") or sorted({key.split(".")[1] for key in found if key.startswith("kinds.")})
-        return Contacts(tuple(kinds), Modes(found["modes.mean"], found["modes.components"]), layers_from(found))
+        return Contacts(tuple(kinds), DisplacementModes(found["modes.mean"], found["modes.components"]), layers_from(found))

@@ -18,7 +18,7 @@ import numpy as np
 
 from training.errors import TrainingError
 from training.runs.run_files import AGAIN
-from twin.frames import spread
+from twin.frames import spread_indices
 from twin.pins import Reference
 from twin.store import ArrayFile
 
@@ -55,7 +55,7 @@ OTHER_UNIT = (
 
 
 @dataclass(frozen=True)
-class Displacements:
+class DisplacementModel:
     """Model of the displacements of N pins; arrays as in the module's equation, px.
 
     Attributes
@@ -112,11 +112,11 @@ class RestFound:
     left_px: float
 
 
-def learn_displacements(moved_px: np.ndarray) -> Displacements | None:
+def learn_displacements(moved_px: np.ndarray) -> DisplacementModel | None:
     """Learn the model from displacements (M, N, 2) of contacts; None for fewer than ``FEWEST_FRAMES``."""
     if len(moved_px) < FEWEST_FRAMES:
         return None
-    chosen = spread(len(moved_px), MOST_FRAMES)
+    chosen = spread_indices(len(moved_px), MOST_FRAMES)
     moved = moved_px[chosen].reshape(len(chosen), -1)
     mean = moved.mean(axis=0)
     _, turned = np.linalg.eigh((moved - mean).T @ (moved - mean))
@@ -127,7 +127,7 @@ def learn_displacements(moved_px: np.ndarray) -> Displacements | None:
     weights = np.linalg.solve(terms.T @ terms + RIDGE * len(terms) * np.eye(terms.shape[1]), terms.T @ at[:, LEADING:])
     rest = at[:, LEADING:] - terms @ weights
     beside = moved - mean - at @ modes
-    return Displacements(mean, modes, scale, weights, np.atleast_2d(np.cov(rest.T)), float(np.sqrt(np.mean(beside**2))))
+    return DisplacementModel(mean, modes, scale, weights, np.atleast_2d(np.cov(rest.T)), float(np.sqrt(np.mean(beside**2))))
 
 
 def _terms(a: np.ndarray) -> np.ndarray:
@@ -136,7 +136,7 @@ def _terms(a: np.ndarray) -> np.ndarray:
     return np.column_stack([np.ones(len(a)), *(np.prod(a[:, term], axis=1) for term in chosen)])
 
 
-def rest_from_contacts(known: Displacements, start: Reference, pins_px: np.ndarray) -> RestFound:
+def rest_from_contacts(known: DisplacementModel, start: Reference, pins_px: np.ndarray) -> RestFound:
     """Rest places of a unit, estimated from its pins (M, N, 2) in contacts of any kind that the model describes.
 
     Parameters
@@ -168,7 +168,7 @@ def rest_from_contacts(known: Displacements, start: Reference, pins_px: np.ndarr
     return RestFound(start.pins_px + off.reshape(-1, 2), float(np.sqrt(np.mean(left**2))))
 
 
-def other_rest(known: Displacements | None, start: Reference, pins_px: np.ndarray) -> np.ndarray | None:
+def other_rest(known: DisplacementModel | None, start: Reference, pins_px: np.ndarray) -> np.ndarray | None:
     """The rest places (N, 2) estimated from contacts (M, N, 2), NaN where not found, if they differ from the assumed ones.
 
     Returns
@@ -179,14 +179,14 @@ def other_rest(known: Displacements | None, start: Reference, pins_px: np.ndarra
     whole = pins_px[np.isfinite(pins_px).all(axis=(1, 2))]
     if known is None or len(whole) < FEWEST_CONTACTS:
         return None
-    chosen = spread(len(whole), MOST_CONTACTS)
+    chosen = spread_indices(len(whole), MOST_CONTACTS)
     found = rest_from_contacts(known, start, whole[chosen]).pins_px
     away = float(np.sqrt(np.mean(np.sum((found - start.pins_px) ** 2, axis=1))))
     return found if away > SAME_UNIT * float(np.median(start.spacing_px)) else None
 
 
 def _round(
-    known: Displacements, whiten: np.ndarray, seen: np.ndarray, a: np.ndarray
+    known: DisplacementModel, whiten: np.ndarray, seen: np.ndarray, a: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Whitened slopes (M, 2N, D) and distances (M, 2N) at the coordinates (M, D), and each frame's inverse Hessian and gradient."""
     slopes = whiten @ known.slopes(a)
@@ -206,13 +206,13 @@ def _deviation(rest_px: np.ndarray, spacing_px: float) -> np.ndarray:
     return np.kron(alike, np.eye(2)) + (ALONE * spacing_px) ** 2 * np.eye(2 * len(x))
 
 
-def write_displacements(path: Path, known: Displacements) -> None:
+def write_displacements(path: Path, known: DisplacementModel) -> None:
     """Write the model in the form that ``read_displacements`` reads; modes in half precision."""
     arrays = {name: getattr(known, name).astype(np.float32) for name in ("mean", "scale", "weights", "left")}
     FILE.write(path, arrays | {"modes": known.modes.astype(np.float16)}, {"noise": known.noise})
 
 
-def read_displacements(path: Path, pins: int) -> Displacements:
+def read_displacements(path: Path, pins: int) -> DisplacementModel:
     """Read the model that ``write_displacements`` wrote, for a sensor with ``pins`` pins.
 
     Raises
@@ -220,8 +220,8 @@ def read_displacements(path: Path, pins: int) -> Displacements:
     TrainingError
         The file can't be read, is damaged, or belongs to another sensor.
     """
-    with FILE.opened(path) as (about, arrays):
-        known = Displacements(**{name: array.astype(float) for name, array in arrays.items()}, noise=float(about["noise"]))
+    with FILE.open_arrays(path) as (about, arrays):
+        known = DisplacementModel(**{name: array.astype(float) for name, array in arrays.items()}, noise=float(about["noise"]))
         if known.mean.shape != (2 * pins,) or not np.isfinite(known.at(np.zeros((1, len(known.scale))))).all():
             raise ValueError("of other pins")
         return known

@@ -32,7 +32,7 @@ from training.data.label_code import HALF_CIRCLE_DEG, label_error
 from training.errors import TrainingError
 from training.models.vgnn.registration import align
 from training.runs.run_files import AGAIN
-from twin.frames import spread
+from twin.frames import spread_indices
 from twin.pins import Reference
 from twin.store import ArrayFile
 from twin.types import BoolArray, FloatArray
@@ -142,7 +142,7 @@ class Strangeness:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class DomainVerdict:
     """What follows for an estimate from how strange its frame is.
 
     Attributes
@@ -245,11 +245,11 @@ class Domain:
         """The strangeness of one frame, from its pins' displacements (N, 2) in mean rest spacings; ``lost`` (N,) pins are not used."""
         if lost is None or not lost.any():
             return self._measure(moved.ravel())
-        filled, unsure = self.filled(moved, lost)
+        filled, unsure = self.fill_lost(moved, lost)
         found = self._measure(filled.ravel())
         return replace(found, unknown=found.unknown + max(unsure - self.blind, 0.0))
 
-    def judge(self, moved: FloatArray, lost: BoolArray, reference: Reference, *, corrects: bool = True) -> Verdict:
+    def assess(self, moved: FloatArray, lost: BoolArray, reference: Reference, *, corrects: bool = True) -> DomainVerdict:
         """Whether a frame can be estimated, from its pins' displacements (N, 2) in mean rest spacings.
 
         Parameters
@@ -266,7 +266,7 @@ class Domain:
         strange = max(others)
         removable = share < 1 or (corrects and bool((np.abs(found.camera) <= CORRECTED).all()))
         if not removable or (found.parts[:4] > REFUSED - share * (REFUSED - IN_PLACE)).any():
-            return Verdict(self._why(found, moved, lost, reference))
+            return DomainVerdict(self._why(found, moved, lost, reference))
         notes = []
         if strange > 1:
             notes.append(f"the pins' pattern is {strange:.1f} times as far from the training frames as they are from each other")
@@ -278,7 +278,7 @@ class Domain:
             notes.append("no training frame of known label is near")
         factor = (1 + GROWS * max(strange - 1, 0)) * (1 + (OFF_PLACE - 1) * share)
         wider = tuple(f"{note}: intervals are wider" for note in notes)
-        return Verdict("", factor, self.rate * unknown, wider, share * found.camera)
+        return DomainVerdict("", factor, self.rate * unknown, wider, share * found.camera)
 
     def common_camera(self, moved: FloatArray) -> tuple[FloatArray, float]:
         """What contacts (M, N, 2), in mean rest spacings, say about the camera that took all of them.
@@ -315,7 +315,7 @@ class Domain:
 
     def _why(self, found: Strangeness, moved: FloatArray, lost: BoolArray, reference: Reference) -> str:
         """The most probable cause of a strange frame, in words."""
-        straight = self(_aligned(moved, reference), lost)  # exactly, because the motions are those of small turns
+        straight = self(_remove_similarity(moved, reference), lost)  # exactly, because the motions are those of small turns
         again = "take a new frame without contact with the present view (init_0.png beside the frames, --no-contact, --at-rest)"
         if any((each.parts[:4] <= REFUSED).all() for each in (found, straight)):
             scale, turn, *shift = align(reference.pins_px[None] + moved * reference.spacing_px.mean(), reference.pins_px)[1][0]
@@ -323,7 +323,7 @@ class Domain:
                 f"displaced camera: the view is shifted by ({shift[0]:.1f}, {shift[1]:.1f}) px, turned by {np.degrees(turn):.1f} deg "
                 f"and {np.exp(scale):.3f} times as large as at rest, more than a contact does; {again}"
             )
-        share, place, axis, step = self._torn(moved, lost, reference)
+        share, place, axis, step = self._find_tear(moved, lost, reference)
         smooth, stretch = self._smooth(moved, lost, reference)
         if share > EXPLAINS and share > smooth + TORN_MORE * (1 - smooth):
             side = ("right of x" if axis == 0 else "below y") + f" = {place:.0f} px"
@@ -341,7 +341,7 @@ class Domain:
             "mirrored picture, or pins with wrong names"
         )
 
-    def _explained(self, moved: FloatArray, lost: BoolArray, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _explain_misfit(self, moved: FloatArray, lost: BoolArray, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Share of a frame's improbability that each of S sets of further motions explains, and their amplitudes.
 
         The improbability is u' P u, with the inverse covariance P of displacements: components of their deviations, any motion of the
@@ -356,7 +356,7 @@ class Domain:
         (S,) float, (S, k) float
         """
         known = np.repeat(~lost, 2)
-        modes, inner = self._seen_modes(known)
+        modes, inner = self._known_modes(known)
         away = (moved.ravel() - self.mean)[known]
 
         def probable(x: FloatArray) -> FloatArray:
@@ -371,7 +371,7 @@ class Domain:
         whole = float(away @ probable(away[None])[0])
         return (force * step).sum(axis=1) / max(whole, 1e-12), step
 
-    def _torn(self, moved: FloatArray, lost: BoolArray, reference: Reference) -> tuple[float, float, int, FloatArray]:
+    def _find_tear(self, moved: FloatArray, lost: BoolArray, reference: Reference) -> tuple[float, float, int, FloatArray]:
         """The tear that explains most: its share, its place (px), the axis across it, and the displacement (2,) beyond it in spacings."""
         sets, places = [], []
         for axis in (1, 0):
@@ -380,7 +380,7 @@ class Domain:
                 beyond = (at > place).astype(float)
                 sets.append([np.column_stack([beyond, 0 * beyond]).ravel(), np.column_stack([0 * beyond, beyond]).ravel()])
                 places.append((float(place), axis))
-        share, step = self._explained(moved, lost, np.array(sets))
+        share, step = self._explain_misfit(moved, lost, np.array(sets))
         best = int(np.argmax(share))
         return float(share[best]), *places[best], step[best]
 
@@ -390,7 +390,7 @@ class Domain:
         size = float(np.abs(_places(reference)).max())
         fields_xy = [(x, -y), (y, x), (x * x / size, x * y / size), (x * y / size, y * y / size)]
         fields_xy.append((x * (x * x + y * y) / size**2, y * (x * x + y * y) / size**2))
-        share, step = self._explained(moved, lost, np.array([[np.column_stack(each).ravel() for each in fields_xy]]))
+        share, step = self._explain_misfit(moved, lost, np.array([[np.column_stack(each).ravel() for each in fields_xy]]))
         return float(share[0]), step[0, :2]
 
     def _measure(self, flat: FloatArray) -> Strangeness:
@@ -417,16 +417,16 @@ class Domain:
         unknown = self._near[1](first * self.deviation[:lead]) / len(flat) ** 0.5 - self.near
         return Strangeness(parts, camera, max(unknown, 0.0), uneven, ample)
 
-    def filled(self, moved: FloatArray, lost: BoolArray) -> tuple[FloatArray, float]:
+    def fill_lost(self, moved: FloatArray, lost: BoolArray) -> tuple[FloatArray, float]:
         """Displacements (N, 2) in which ``lost`` pins are the most probable ones, and the rms of what is not known of all coordinates."""
         known = np.repeat(~lost, 2)
-        part, inner = self._seen_modes(known)
+        part, inner = self._known_modes(known)
         found = np.linalg.solve(inner, part @ (moved.ravel() - self.mean)[known])
         spread_out = np.linalg.cholesky(np.linalg.inv(inner) * NOISE**2).T @ self._modes[:, ~known]
         whole = np.where(known, moved.ravel(), self.mean + found @ self._modes).reshape(moved.shape)
         return whole, float(np.sqrt((spread_out**2).sum() / len(known)))
 
-    def _seen_modes(self, known: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def _known_modes(self, known: BoolArray) -> tuple[FloatArray, FloatArray]:
         """The modes in the ``known`` coordinates (2N,), and NOISE^2 times the precision of their amplitudes given these coordinates.
 
         Modes are the camera's motions, then the components in standard deviations.
@@ -507,16 +507,16 @@ def learn_domain(
     measures = np.full((len(flat), 12), np.nan)
     for fold in range(FOLDS):
         here = part == fold
-        one = _fit(flat[~here], labelled[~here], motions, rng)
+        one = _fit_changes(flat[~here], labelled[~here], motions, rng)
         measures[here] = [[*found.parts[:3], *found.uneven, *found.usual_camera, found.unknown] for found in map(one, moved[here])]
-    fitted = _fit(flat, labelled, motions, rng)
+    fitted = _fit_changes(flat, labelled, motions, rng)
     limits = np.quantile(measures[:, :-1], 1 - ALLOWED, axis=0)
     limits[3:7] *= np.clip(limits[3:7] / EVEN, 1.0, 1.3)
     floors = np.array([OUTSIDE, *[1.0] * 6, SHIFT, SHIFT, np.radians(TURN_DEG), SCALE])
     blind = [0.0]
     if lost is not None:
-        rows = spread(len(moved), LOST_FRAMES)
-        blind = [fitted.filled(moved[k], lost[k])[1] if lost[k].any() else 0.0 for k in rows]
+        rows = spread_indices(len(moved), LOST_FRAMES)
+        blind = [fitted.fill_lost(moved[k], lost[k])[1] if lost[k].any() else 0.0 for k in rows]
     low, high = np.quantile(labels[labelled], (1 - IN_RANGE, IN_RANGE), axis=0)
     return replace(
         fitted,
@@ -531,9 +531,9 @@ def learn_domain(
     )
 
 
-def _fit(flat: np.ndarray, labelled: np.ndarray, motions: np.ndarray, rng: np.random.Generator) -> Domain:
+def _fit_changes(flat: np.ndarray, labelled: np.ndarray, motions: np.ndarray, rng: np.random.Generator) -> Domain:
     """A domain with limits of 1, for displacements (M, 2N); rows that are not ``labelled`` (M,) have no known label."""
-    chosen = spread(len(flat), MOST_FRAMES)
+    chosen = spread_indices(len(flat), MOST_FRAMES)
     flat, labelled = flat[chosen], labelled[chosen]
     reduced = rng.choice(len(flat), int(LIGHTER * len(flat)), replace=False)
     light = flat[reduced] * rng.uniform(0, 1, (len(reduced), 1))
@@ -608,7 +608,7 @@ def _whitening(left: np.ndarray) -> np.ndarray:
     return white
 
 
-def _aligned(moved: FloatArray, reference: Reference) -> FloatArray:
+def _remove_similarity(moved: FloatArray, reference: Reference) -> FloatArray:
     """Displacements (N, 2) in spacings without the similarity of a displaced camera."""
     spacing_px = reference.spacing_px.mean()
     aligned: FloatArray = align(reference.pins_px[None] + moved * spacing_px, reference.pins_px)[0][0] / spacing_px
@@ -667,5 +667,5 @@ def read_domain(path: Path, pins: int, labels: int) -> Domain:
     TrainingError
         The file can't be read, is damaged, or belongs to another sensor or model.
     """
-    with FILE.opened(path) as (about, arrays):
+    with FILE.open_arrays(path) as (about, arrays):
         return domain_of(arrays, about, pins, labels)

@@ -15,8 +15,8 @@ from training.data.dataset import Dataset
 from training.data.pins import PinTable
 from training.data.targets import limits_of
 from training.errors import TrainingError
-from training.estimate.displacements import Displacements, read_displacements
-from training.estimate.domain import Domain, Verdict, read_domain
+from training.estimate.displacements import DisplacementModel, read_displacements
+from training.estimate.domain import Domain, DomainVerdict, read_domain
 from training.estimate.rest import RestPlaces
 from training.estimate.rest_seeking import RestSeeker
 from training.estimate.widening import Widening
@@ -32,15 +32,15 @@ from training.runs.run_files import (
     MAPS,
     SLIP,
     TENSORS,
-    damaged,
+    damage_error,
     read_config,
     read_tensors,
     require_together,
 )
 from training.touch.contact_maps import MapModel, read_maps
+from training.touch.contact_probability import TouchAnswer
 from training.touch.slip import NAMES as SLIP_NAMES
 from training.touch.slip import SLIP_UNITS, Slip, SlipModel, SlipTracker, read_slip
-from training.touch.touched import TouchAnswer
 from twin.errors import FrameError
 from twin.estimate import SensorModel
 from twin.frames.forms import blob_spec, form_named
@@ -48,7 +48,7 @@ from twin.mechanics.skin_map import ContactMaps
 from twin.pins import Pipeline, Reference, make_reference
 from twin.types import Form, Frame, Observation
 
-USUAL_FRAME = Verdict("")
+USUAL_FRAME = DomainVerdict("")
 """Verdict on a frame about which nothing strange is known."""
 
 
@@ -133,14 +133,14 @@ class PoseEstimator:
         reference = make_reference(content["reference_px"].numpy(), self.sensor.pins)
         self.pipeline = Pipeline(self.sensor, self.form, reference, graph=config["pipeline"]["graph"])
         self.ensemble = Ensemble(self.part, reference, content, config["size"])
-        known = config.get("known_rest_px")  # pins at rest, measured on the unit from which the weights were learnt
+        known = config.get("known_rest_px")  # pins at rest, measured on the unit from which the weights were trained
         self._known_rest_px = None if known is None else np.array(known, float)
         learnt = {group: {key: value.numpy() for key, value in arrays.items()} for group, arrays in content["aside"].items()}
         self.learnt_from: np.ndarray | None = content["learnt_from"].numpy() if "learnt_from" in content else None
         self._trained = Trained(self.sensor, self.pipeline, reference, learnt, self.ensemble)
         self.maps: MapModel | None = None
         self.slip: SlipModel | None = None
-        self.displacements: Displacements | None = None
+        self.displacements: DisplacementModel | None = None
         self.domain: Domain | None = None
         self._tracker: SlipTracker | None = None
         self._undecided = ""
@@ -172,7 +172,7 @@ class PoseEstimator:
                 raise TrainingError(f"{run}: corrected by a regression, which this version does not know; train again")
             found = cls(config, content)
         except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, IndexError) as error:
-            raise damaged(run / (WEIGHTS if packed else TENSORS), f"its weights do not fit {CONFIG}") from error
+            raise damage_error(run / (WEIGHTS if packed else TENSORS), f"its weights do not fit {CONFIG}") from error
         if (run / MAPS).is_file():
             found.maps = read_maps(run / MAPS, found.sensor.geometry)
         if (run / SLIP).is_file():
@@ -213,12 +213,12 @@ class PoseEstimator:
 
     @cached_property
     def _known_rest(self) -> Reference:
-        """The pins at rest of the unit from which the weights were learnt."""
+        """The pins at rest of the unit from which the weights were trained."""
         known = self._known_rest_px
         return self._trained.reference if known is None else make_reference(known, self.sensor.pins)
 
-    def remembering(self) -> "PoseEstimator":
-        """The model for consecutive frames, which remembers earlier frames; the model itself if the run did not learn slip.
+    def with_history(self) -> "PoseEstimator":
+        """The model for consecutive frames, which uses earlier frames; the model itself if the run did not learn slip.
 
         Its estimates also have the labels ``training.touch.slip.NAMES``: the probabilities that the contact has begun to slide and that
         all of it slides, the sliding share, the remaining drag until all of it slides (mm), and the direction in which the object moves
@@ -235,7 +235,7 @@ class PoseEstimator:
 
     @property
     def recorded_sensor(self) -> SensorSpec:
-        """The sensor with the pins at rest of the unit from which the weights were learnt, if they were measured.
+        """The sensor with the pins at rest of the unit from which the weights were trained, if they were measured.
 
         Displacements in a recording without a no-contact frame are computed from these.
         """
@@ -245,7 +245,7 @@ class PoseEstimator:
         return self.sensor.model_copy(update={"pipeline": self.sensor.pipeline.model_copy(update={str(self.form): blob})})
 
     def at_known_rest(self) -> "PoseEstimator":
-        """The same model for frames without a no-contact frame, taken by the unit from which its weights were learnt."""
+        """The same model for frames without a no-contact frame, taken by the unit from which its weights were trained."""
         return self if self._known_rest_px is None else self.counted_from(self._known_rest, measured=True)
 
     def at_rest_of(self, frames: Iterable[Frame]) -> tuple["PoseEstimator", bool]:
@@ -258,9 +258,9 @@ class PoseEstimator:
         FrameError
             The camera's picture is displaced so far that estimates would be wrong.
         """
-        return self.told_rest(self.at_known_rest().nodes_in(frames), "these contacts")
+        return self.rest_from_contacts(self.at_known_rest().nodes_in(frames), "these contacts")
 
-    def told_rest(self, nodes_px: np.ndarray, name: str) -> tuple["PoseEstimator", bool]:
+    def rest_from_contacts(self, nodes_px: np.ndarray, name: str) -> tuple["PoseEstimator", bool]:
         """As ``at_rest_of``, from the pins (M, N, 2), px, of contacts; errors call them ``name``."""
         rest, undecided = self.rest.of_contacts(nodes_px, name)
         return self.counted_from_told(rest).noting(undecided), rest is not None
@@ -300,7 +300,7 @@ class PoseEstimator:
         found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
         touched = TouchAnswer(reference) if measured else self._trained.touched
         found._trained = replace(self._trained, pipeline=found.pipeline, touched=touched)
-        return found if self._tracker is None else found.remembering()
+        return found if self._tracker is None else found.with_history()
 
     def noting(self, undecided: str) -> "PoseEstimator":
         """The same model; its ``caveats`` say what is ``undecided`` about the camera's view."""
@@ -334,7 +334,7 @@ class PoseEstimator:
         if not isinstance(self.part, PinModel):
             return self._as_estimate(self.part.estimate_frame(self._trained, frame), started, verdict=self._verdict_of(frame))
         seen = self.pins_in(frame)
-        return self.unseen(seen, started) if isinstance(seen, Unseen) else self.estimate_one(seen, started, "")
+        return self.estimate_without_pose(seen, started) if isinstance(seen, Unseen) else self.estimate_one(seen, started, "")
 
     @property
     def caveats(self) -> list[str]:
@@ -364,7 +364,7 @@ class PoseEstimator:
         """
         started, seen = perf_counter(), self.pins_in(frame)
         if isinstance(seen, Unseen):
-            return self.unseen(seen, started), None
+            return self.estimate_without_pose(seen, started), None
         made = self.estimate_one(seen, started, "")
         return made, self.maps_of(seen.pins, made.value[None])[0] if made.valid else None
 
@@ -400,7 +400,7 @@ class PoseEstimator:
         contact: str = "",
         slip: Slip | None = None,
         lost: float = 0.0,
-        verdict: Verdict = USUAL_FRAME,
+        verdict: DomainVerdict = USUAL_FRAME,
     ) -> PoseEstimate:
         excess: np.ndarray = np.zeros(len(self._bounds[0]))
         if isinstance(made, Prediction) and self.domain is not None:
@@ -439,10 +439,10 @@ class PoseEstimator:
             Kind of the frame's contact.
         """
         known = self._trained.reference
-        seen = replace(seen, pins=seen.pins.seen_from(known)) if seen.pins.measured else seen
+        seen = replace(seen, pins=seen.pins.relative_to(known)) if seen.pins.measured else seen
         verdict = self._verdict(seen.pins.nodes_px[0], seen.pins.lost[0])
         if verdict.reason:
-            return self.unseen(Unseen(verdict.reason, seen.touched, seen.seen), started)
+            return self.estimate_without_pose(Unseen(verdict.reason, seen.touched, seen.seen), started)
         if self.domain is not None and verdict.camera.any():
             pins = seen.pins
             places = self.domain.without_camera(pins.nodes_px[0], pins.area_px2[0], verdict.camera, known.spacing_px.mean())
@@ -457,27 +457,27 @@ class PoseEstimator:
 
     def knows(self, pins: PinTable) -> np.ndarray:
         """(M,) bool: whether the pins of each row of a table are a pattern that the model was trained on."""
-        seen = pins.seen_from(self._trained.reference)
+        seen = pins.relative_to(self._trained.reference)
         return np.array([not self._verdict(*each).reason for each in zip(seen.nodes_px, seen.lost, strict=True)], bool)
 
-    def _verdict(self, nodes_px: np.ndarray, lost: np.ndarray) -> Verdict:
+    def _verdict(self, nodes_px: np.ndarray, lost: np.ndarray) -> DomainVerdict:
         """Whether pins (N, 2), as seen by the camera of the training, some of them ``lost`` (N,), are a pattern that was trained on."""
         if self.domain is None:
             return USUAL_FRAME
         reference = self._trained.reference
         moved = (nodes_px - reference.pins_px) / reference.spacing_px.mean()
-        return self.domain.judge(moved, lost, reference, corrects=isinstance(self.part, PinModel))
+        return self.domain.assess(moved, lost, reference, corrects=isinstance(self.part, PinModel))
 
-    def _verdict_of(self, frame: Frame) -> Verdict:
+    def _verdict_of(self, frame: Frame) -> DomainVerdict:
         """The verdict on a frame for a model that does not look for pins itself."""
         if self.domain is None:
             return USUAL_FRAME
         seen = self.pipeline(frame)
         if not seen.valid or seen.graph is None:
-            return Verdict(seen.reason)
+            return DomainVerdict(seen.reason)
         return self._verdict(seen.graph.nodes_px, np.isnan(seen.pins_px[:, 0]))
 
-    def unseen(self, seen: Unseen, started: float) -> PoseEstimate:
+    def estimate_without_pose(self, seen: Unseen, started: float) -> PoseEstimate:
         """The estimate of a frame that shows no known pose."""
         return self._as_estimate(seen, started)
 

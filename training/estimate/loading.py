@@ -52,7 +52,7 @@ def digest_of(run: str | Path) -> str:
     return digest.hexdigest()
 
 
-def load_remembering(run: str | Path) -> PoseEstimator:
+def load_with_history(run: str | Path) -> PoseEstimator:
     """A trained model for consecutive frames: ``PoseEstimator.load`` and ``PoseEstimator.remembering``.
 
     Raises
@@ -60,7 +60,7 @@ def load_remembering(run: str | Path) -> PoseEstimator:
     TrainingError
         The folder holds no run.
     """
-    return PoseEstimator.load(run).remembering()
+    return PoseEstimator.load(run).with_history()
 
 
 def load_by_name(runs: Sequence[Path]) -> dict[str, PoseEstimator]:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from training.estimate.displacements import MOST_CONTACTS, Displacements, other_rest
+from training.estimate.displacements import MOST_CONTACTS, DisplacementModel, other_rest
 from training.estimate.domain import Domain
 from twin.errors import FrameError
-from twin.frames import spread
-from twin.pins import Reference, View, make_reference, measure_reference, view_of
+from twin.frames import spread_indices
+from twin.pins import PinView, Reference, make_reference, measure_reference, view_of
 from twin.pins.view import camera_modes
 from twin.types import Form, Frame
 
@@ -30,7 +30,7 @@ class RestPlaces:
     ----------
     sensor, form : SensorSpec, Form
     known : Reference
-        The pins at rest of the unit from which the weights were learnt.
+        The pins at rest of the unit from which the weights were trained.
     displacements : Displacements or None
         Model of the pins' possible displacements.
     domain : Domain or None
@@ -42,7 +42,7 @@ class RestPlaces:
     sensor: SensorSpec
     form: Form
     known: Reference
-    displacements: Displacements | None
+    displacements: DisplacementModel | None
     domain: Domain | None
     used: bool
 
@@ -56,7 +56,7 @@ class RestPlaces:
             (``twin.pins.view``).
         """
         reference = measure_reference(self.sensor, self.form, frame, known=self.known)
-        return reference, self.require_view(reference.pins_px, frame.name or "frame").undecided()
+        return reference, self.require_view(reference.pins_px, frame.name or "frame").describe_ambiguity()
 
     def of_contacts(self, nodes_px: np.ndarray, name: str) -> tuple[Reference | None, str]:
         """The pins at rest estimated from contacts with pins (M, N, 2), if they are not the known ones, and what is undecided; raises as
@@ -84,7 +84,7 @@ class RestPlaces:
         whole = nodes_px[np.isfinite(nodes_px).all(axis=(1, 2))]
         if self.domain is None or len(whole) < FEWEST_VIEWED:
             return np.zeros(4), 1.0
-        whole = whole[spread(len(whole), MOST_CONTACTS)]
+        whole = whole[spread_indices(len(whole), MOST_CONTACTS)]
         return self.domain.common_camera((whole - start.pins_px) / start.spacing_px.mean())
 
     def usual_share(self, nodes_px: np.ndarray) -> float:
@@ -113,9 +113,9 @@ class RestPlaces:
                 f"{name}: no pins at rest of {self.sensor.name} explain them: the camera's picture may be turned or mirrored, or they are "
                 f"of a kind that the weights do not know; {GIVE_REST}"
             )
-        return "" if view is None else view.undecided()
+        return "" if view is None else view.describe_ambiguity()
 
-    def require_view(self, pins_px: np.ndarray, name: str, *, contacts: bool = False) -> View:
+    def require_view(self, pins_px: np.ndarray, name: str, *, contacts: bool = False) -> PinView:
         """The camera's view of pins at rest (N, 2), or of the median of ``contacts``, against the unit of the weights.
 
         Raises

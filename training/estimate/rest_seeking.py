@@ -27,9 +27,9 @@ class RestingModel(SensorModel, Protocol):
 
     def at_known_rest(self) -> "RestingModel": ...
 
-    def told_rest(self, nodes_px: np.ndarray, name: str) -> tuple["RestingModel", bool]: ...
+    def rest_from_contacts(self, nodes_px: np.ndarray, name: str) -> tuple["RestingModel", bool]: ...
 
-    def unseen(self, seen: Unseen, started: float) -> Estimate: ...
+    def estimate_without_pose(self, seen: Unseen, started: float) -> Estimate: ...
 
 
 class RestSeeker:
@@ -79,22 +79,22 @@ class RestSeeker:
     def __call__(self, frame: Frame) -> Estimate:
         """The estimate of one frame, with the rest places that are known by then; raises as the model does."""
         if self._refused:
-            return self._model.unseen(Unseen(self._refused), perf_counter())
+            return self._model.estimate_without_pose(Unseen(self._refused), perf_counter())
         made = self._model(frame)
-        if self._gathered(made.seen) and len(self._contacts_px) in (FEWEST_CONTACTS, MOST_CONTACTS):
+        if self._collect_contact(made.seen) and len(self._contacts_px) in (FEWEST_CONTACTS, MOST_CONTACTS):
             try:
-                told, other = self._given.told_rest(np.array(self._contacts_px), "the contacts so far")
+                told, other = self._given.rest_from_contacts(np.array(self._contacts_px), "the contacts so far")
             except FrameError as error:
                 self._refused = str(error)
                 LOG.warning("%s", error)
-                return self._model.unseen(Unseen(self._refused), perf_counter())
-            if other or self.other:  # otherwise the present model continues, because it remembers the frames so far
+                return self._model.estimate_without_pose(Unseen(self._refused), perf_counter())
+            if other or self.other:  # otherwise the present model continues, because it keeps the frames so far
                 self._model, self.other, self.pipeline = told, other, told.pipeline
                 made = self._model(frame)
                 LOG.warning("%s, after %d contacts", OTHER_UNIT if other else SAME_UNIT, len(self._contacts_px))
         return made
 
-    def _gathered(self, seen: Observation | None) -> bool:
+    def _collect_contact(self, seen: Observation | None) -> bool:
         """Whether a frame's pins show a contact that differs from all collected ones. It is then collected."""
         if seen is None or seen.graph is None or len(self._contacts_px) >= MOST_CONTACTS:
             return False

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from training.estimate.domain import FEWEST, Domain, Verdict
+from training.estimate.domain import FEWEST, Domain, DomainVerdict
 
 LOST_USUAL = 0.02
 """Share of lost pins in usual frames."""
@@ -72,7 +72,7 @@ class Widening:
         return found
 
     def __call__(
-        self, value: np.ndarray, half: np.ndarray, lost_share: float, verdict: Verdict, excess: np.ndarray
+        self, value: np.ndarray, half: np.ndarray, lost_share: float, verdict: DomainVerdict, excess: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
         """Low and high ends (K,) of the intervals with all unknown effects, and notes on this frame."""
         lost = 1.0 + LOST_WIDENS * lost_share if lost_share > LOST_USUAL else 1.0

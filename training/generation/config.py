@@ -76,17 +76,17 @@ class GenerationConfig(Section):
 
 @dataclass(frozen=True)
 class Draw:
-    """One randomly drawn contact.
+    """One randomly sampled contact.
 
     Attributes
     ----------
     label : ArmLabel
     sensor : SensorSpec
-        The sensor with the values drawn for this contact.
+        The sensor with the values sampled for this contact.
     friction : float
         Coefficient of friction.
     values : dict of str to float
-        The drawn values, by key of the randomisation.
+        The sampled values, by key of the randomisation.
     image_seed : int
         Seed of the picture's noise.
     noise : numpy.random.Generator
@@ -114,7 +114,7 @@ def draw_contact(config: GenerationConfig, index: int, attempt: int) -> Draw:
     Raises
     ------
     ContactError
-        The drawn values do not make a valid sensor.
+        The sampled values do not make a valid sensor.
     """
     streams = [np.random.default_rng([config.seed, index, attempt, part]) for part in range(5)]
     how = config.randomisation
@@ -133,7 +133,7 @@ def draw_friction(spread: FrictionSpread, rng: np.random.Generator) -> float:
 
 
 def draw_sensor(nominal: SensorSpec, how: RandomisationSpec, rng: np.random.Generator) -> tuple[SensorSpec, dict]:
-    """A copy of a sensor with randomly drawn values, and these values by key. They are drawn in the alphabetical order of the keys."""
+    """A copy of a sensor with randomly sampled values, and these values by key. They are drawn in the alphabetical order of the keys."""
     plain = nominal.model_dump(mode="json") | {"rig": rig_of(nominal).model_dump(mode="json")}
     values = {}
     for key, spread in sorted(how.sensor.items()):
@@ -151,4 +151,4 @@ def draw_sensor(nominal: SensorSpec, how: RandomisationSpec, rng: np.random.Gene
     except ValidationError as error:
         problem = error.errors()[0]
         where = ".".join(map(str, problem["loc"])) or "sensor"
-        raise ContactError(f"the drawn numbers make no sensor: {where}: {problem['msg']}; narrow the randomisation") from error
+        raise ContactError(f"the sampled numbers make no sensor: {where}: {problem['msg']}; narrow the randomisation") from error

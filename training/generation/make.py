@@ -71,7 +71,7 @@ def make_contact(text: str, index: int) -> Outcome:
     for attempt in range(MOST_ATTEMPTS):
         try:
             draw = draw_contact(config, index, attempt)
-            return _simulated(config, text, draw, index, failures)
+            return _simulate(config, text, draw, index, failures)
         except (ContactError, MeshError) as error:
             failures.append(str(error))
     raise DatasetError(
@@ -79,10 +79,10 @@ def make_contact(text: str, index: int) -> Outcome:
     )
 
 
-def _simulated(config: GenerationConfig, text: str, draw: Draw, index: int, failures: list) -> Outcome:
+def _simulate(config: GenerationConfig, text: str, draw: Draw, index: int, failures: list) -> Outcome:
     simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor, _shading(config, text, draw.sensor))
     contact = RigContact(simulator.solver, config.experiment, config.object)
-    way = contact.way(draw.label)
+    way = contact.commanded_path(draw.label)
     found = list(contact.along(way, friction=draw.friction))
     labels = [way.label(fraction) for fraction, _ in found[:-1]] + [draw.label]
     kept = range(len(found)) if config.states == "all" else [len(found) - 1]

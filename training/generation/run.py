@@ -15,7 +15,7 @@ from twin.records import KeptAlso
 from twin.rig.contact import friction_between
 from twin.store import output
 from twin.store.resume import MADE_BY
-from twin.types import FINE, Quality, Readable
+from twin.types import FINE, Quality, ReadableResult
 from twin.workers import outcomes, require_scheduler
 
 
@@ -71,7 +71,7 @@ def generate(
     refuse_foreign(folder)
     with output(folder, *FILES, gone_on=(CONFIG, MADE_BY)):
         store = Store(folder, config)
-        done = store.finished()
+        done = store.list_finished()
         before = len(done - {REST})
         store.check_count(count)
         todo = [index for index in range(REST, count) if index not in done]
@@ -88,7 +88,7 @@ def generate(
 
 
 @dataclass(frozen=True, repr=False)
-class Simulated(Readable):
+class Simulated(ReadableResult):
     """A data set that was made, and its folder."""
 
     folder: Path
@@ -103,7 +103,7 @@ class Simulated(Readable):
         """The result as lines of text."""
         lines = [f"{self.made.before} contacts were there before"] if self.made.before else []
         if self.made.failed:
-            lines.append(f"{self.made.failed} draws failed and were drawn anew: see {self.folder / 'failures.csv'}")
+            lines.append(f"{self.made.failed} draws failed and were sampled again: see {self.folder / 'failures.csv'}")
         return [*lines, f"{self.made.frames} frames of {self.made.contacts} contacts"]
 
 
@@ -111,7 +111,7 @@ def config_for(
     sensor: SensorSpec,
     experiment: ExperimentSpec,
     *,
-    touched: ObjectSpec | None = None,
+    obj: ObjectSpec | None = None,
     images: Images = "raw",
     states: States = "end",
     randomisation: RandomisationSpec | None = None,
@@ -123,7 +123,7 @@ def config_for(
 
     Parameters
     ----------
-    touched : ObjectSpec, optional
+    obj : ObjectSpec, optional
         The object; the experiment's own by default. For its friction on this sensor see ``friction_between``.
     seed : int, optional
         Seed of all random numbers; the experiment's own by default.
@@ -135,13 +135,13 @@ def config_for(
     FrameError
         The sensor has no frames of the requested form.
     """
-    thing = touched or load_object(experiment.object)
+    thing = obj or load_object(experiment.object)
     config = GenerationConfig(
         sensor=sensor,
         object=thing,
         experiment=experiment,
         randomisation=randomisation,
-        friction=friction_between(sensor.rig and sensor.rig.before(thing.name), thing).static,
+        friction=friction_between(sensor.rig and sensor.rig.for_object(thing.name), thing).static,
         seed=experiment.seed if seed is None else seed,
         images=images,
         states=states,

@@ -41,7 +41,7 @@ LARGEST_RECORD = 100_000_000
 CONFIG = "generation.json"
 # Folder that holds a record of each contact that is done.
 RECORDS = "records"
-# Table of the values that were drawn for each contact.
+# Table of the values that were sampled for each contact.
 DRAWS = "draws.csv"
 # Columns of the table of draws that failed.
 FAILURE_COLUMNS = ("path_id", "attempt", "reason")
@@ -106,7 +106,7 @@ class Store:
         except OSError as error:
             raise DatasetError(f"{folder}: can't be written to ({error.strerror}); give another folder with `out`") from error
 
-    def finished(self) -> set[int]:
+    def list_finished(self) -> set[int]:
         """Indices of the contacts that are done. They include ``REST`` if the frame without contact is done or no pictures are wanted."""
         done = {int(path.stem) for path in (self.folder / RECORDS).glob("*.npz")}
         if self.config.images != "none":
@@ -117,7 +117,7 @@ class Store:
 
     def check_count(self, count: int) -> None:
         """Raise DatasetError if the folder holds more contacts than the ``count`` that are wanted."""
-        highest = max(self.finished(), default=REST)
+        highest = max(self.list_finished(), default=REST)
         if highest >= count:
             raise DatasetError(f"{self.folder}: holds contacts up to {highest}; give `count` {highest + 1} or more, or another `out`")
 
@@ -132,7 +132,7 @@ class Store:
         try:
             self._keep(outcome)
         except StoreError as error:
-            raise self._unfinished(error) from error
+            raise self._unfinished_error(error) from error
 
     def _keep(self, outcome: Outcome) -> None:
         if outcome.index == REST:
@@ -160,9 +160,9 @@ class Store:
                 write_text(self.folder / name, _csv(rows, FAILURE_COLUMNS if name == "failures.csv" else None))
             replace_folder(truth.path, self.folder / TRUTH)
         except StoreError as error:
-            raise self._unfinished(error) from error
+            raise self._unfinished_error(error) from error
         except OSError as error:
-            raise self._unfinished(unwritten(self.folder / TRUTH, error)) from error
+            raise self._unfinished_error(unwritten(self.folder / TRUTH, error)) from error
         return len(tables["targets.csv"])
 
     def _add_rows(self, tables: dict, index: int, arrays: dict, notes: dict) -> None:
@@ -208,9 +208,9 @@ class Store:
         require_same_code(self.folder, make_contact, begun=False)
         write_text(path, text)  # written last, so that a folder with a configuration also states what code made it
 
-    def _unfinished(self, error: StoreError) -> DatasetError:
-        done = len(self.finished() - {REST})
-        return DatasetError(f"{error}; {done} contacts are kept, and the same command goes on from there")
+    def _unfinished_error(self, error: StoreError) -> DatasetError:
+        done = len(self.list_finished() - {REST})
+        return DatasetError(f"{error}; {done} contacts are kept, and the same command resumes from there")
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -228,7 +228,7 @@ def read_record(path: Path) -> dict[str, Any]:
         how = "it holds no record"
     except (OSError, ValueError, RecursionError) as error:
         how = getattr(error, "strerror", None) or "no readable JSON"
-    raise DatasetError(f"{path}: damaged ({how}); copy the data set anew, or make it anew in another `out`")
+    raise DatasetError(f"{path}: damaged ({how}); copy the data set again, or make it again in another `out`")
 
 
 def refuse_foreign(folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, fields
 
-from scenes.files import shown
+from scenes.files import quote
 from scenes.plugins import others
 from training.errors import TrainingError
 from training.models.cnn.model import CNN_V1, CNN_V2
@@ -53,7 +53,7 @@ def model_named(name: str) -> Model:
         given = others("models", MODELS, is_one=lambda part: isinstance(part, Model))
         MODELS.update({model.name: model for model in given.values()})
     if name not in MODELS:
-        raise TrainingError(f"no model '{shown(name)}'; choose one of {', '.join(MODELS)}")
+        raise TrainingError(f"no model '{quote(name)}'; choose one of {', '.join(MODELS)}")
     return MODELS[name]
 
 
@@ -71,7 +71,7 @@ def variant_named(name: str) -> tuple[Model, Variant]:
         return model, Variant()
     if part not in model.variants:
         can_be = f"can be trained without {', '.join(model.variants)}" if model.variants else "has no part that can be left out"
-        raise TrainingError(f"no model '{shown(name)}'; {model.name} {can_be}")
+        raise TrainingError(f"no model '{quote(name)}'; {model.name} {can_be}")
     return model, model.variants[part]
 
 

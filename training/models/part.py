@@ -100,7 +100,7 @@ class OneFrame:
 
 @dataclass(frozen=True)
 class Unseen:
-    """A frame that shows too little for an estimate, with the reason; ``touched`` and ``seen`` as in ``Prediction``."""
+    """A frame that shows too little for an estimate, with the reason; ``touched`` and ``inputs_seen`` as in ``Prediction``."""
 
     reason: str
     touched: float = float("nan")
@@ -138,8 +138,8 @@ class Trained:
     ensemble : callable
         ``ensemble(inputs, rows)`` gives the labels of rows (B,) of inputs.
     touched : callable, optional
-        ``touched(nodes_px, lost)`` gives the probability that a frame's pins (N, 2) show a contact (``training.touch.touched``). It is None
-        unless the pins at rest were measured in a frame without contact.
+        ``touched(nodes_px, lost)`` gives the probability that a frame's pins (N, 2) show a contact
+        (``training.touch.contact_probability``). It is None unless the pins at rest were measured in a frame without contact.
     """
 
     sensor: SensorSpec
@@ -149,7 +149,7 @@ class Trained:
     ensemble: Callable[[Inputs, torch.Tensor], Prediction]
     touched: Callable[[np.ndarray, np.ndarray], float] | None = None
 
-    def likely_touched(self, nodes_px: np.ndarray, lost: np.ndarray) -> float:
+    def contact_probability(self, nodes_px: np.ndarray, lost: np.ndarray) -> float:
         """Probability that pins (N, 2), of which some are ``lost`` (N,), show a contact; NaN if it is unknown."""
         return float("nan") if self.touched is None else self.touched(nodes_px, lost)
 
@@ -212,7 +212,7 @@ class Model(ABC):
         """Make the inputs of all M frames of a data set, and learn from its training rows (m,) what the networks need."""
 
     @abstractmethod
-    def seen(self, data: Dataset) -> object:
+    def inputs_seen(self, data: Dataset) -> object:
         """All that the model uses of a data set's frames, as input of ``inputs_digest``. Frames with equal values are equal for it."""
 
     @abstractmethod
@@ -335,7 +335,7 @@ class PinModel(Model):
         """See ``Model``."""
         return self.prepare_pins(data.pins, train)
 
-    def seen(self, data: Dataset) -> object:
+    def inputs_seen(self, data: Dataset) -> object:
         """See ``Model``: the pins, and their places at rest."""
         pins = data.pins
         places = [np.round(px, SEEN_DECIMALS) + 0.0 for px in (pins.nodes_px, pins.area_px2, pins.reference.pins_px)]
@@ -352,7 +352,7 @@ class PinModel(Model):
         if not seen.valid or seen.graph is None:
             return Unseen(seen.reason, seen=seen)
         lost = np.isnan(seen.pins_px[:, 0])
-        touched = trained.likely_touched(seen.graph.nodes_px, lost)
+        touched = trained.contact_probability(seen.graph.nodes_px, lost)
         if touched < LIKELY:
             return Unseen(f"nothing is touched (probability of a contact {touched:.0%})", touched, seen)
         reference = trained.pipeline.reference
@@ -372,7 +372,7 @@ class PinModel(Model):
 
     def estimate_one(self, trained: Trained, seen: OneFrame) -> Prediction:
         """Estimate the labels of one frame."""
-        return replace(self._estimated(trained, seen.pins, together=False), touched=seen.touched, seen=seen.seen)
+        return replace(self._estimate_table(trained, seen.pins, together=False), touched=seen.touched, seen=seen.seen)
 
     def estimate_rows(self, trained: Trained, data: Dataset, rows: np.ndarray) -> Prediction:
         """See ``Model``."""
@@ -384,9 +384,9 @@ class PinModel(Model):
         If the camera sits at another place than in training, its displacement is measured in the table's own frame without contact. Without
         such a frame it is the median over the frames.
         """
-        return self._estimated(trained, pins, together=not pins.measured)
+        return self._estimate_table(trained, pins, together=not pins.measured)
 
-    def _estimated(self, trained: Trained, pins: PinTable, *, together: bool) -> Prediction:
+    def _estimate_table(self, trained: Trained, pins: PinTable, *, together: bool) -> Prediction:
         inputs = self.inputs(pins, trained.learnt, trained.reference, together=together)
         return trained.ensemble(inputs, torch.arange(len(pins)))
 

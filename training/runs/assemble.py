@@ -18,7 +18,7 @@ from training.data.dataset import Dataset
 from training.data.label_code import LabelCode, label_error
 from training.models import model_named
 from training.models.part import Inputs, Model, Modes, Prediction, Prepared
-from training.runs.config import RunConfig, labels_learnt
+from training.runs.config import RunConfig, training_labels
 from training.runs.gaussian_process import SMOOTH_AND_LINEAR, TWO_FIDELITIES, Points, Processes, fit_processes, fit_smooth_processes
 from training.runs.networks import predict_rows
 from twin.errors import warn_once
@@ -97,15 +97,15 @@ class Ensemble:
             modes = self.modes(inputs, rows)
             share = PROCESS_SHARE * (1 - modes.share[:, None])  # 0 in view 1, because the process has not seen a displaced camera
             mean = (1 - share) * mean + share * self.beside(Points.of(modes.inputs, second=True))
-        labels, scale = self.labelled(mean, scale)
+        labels, scale = self.destandardise(mean, scale)
         raw = self.raw_quantile[undone(executed)]
         return Prediction(labels, self.quantile * scale, raw * scale, executed)
 
-    def labelled(self, mean: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def destandardise(self, mean: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Labels and their expected errors (B, K), mm and deg, from standardised numbers and theirs (B, E)."""
         return self.code.decode(self.shift + self.scale * mean, self.scale * scale)
 
-    def standardised(self, labels: np.ndarray) -> np.ndarray:
+    def standardise(self, labels: np.ndarray) -> np.ndarray:
         """Standardised numbers (M, E) of labels (M, K) in mm and deg."""
         return (self.code.encode(labels) - self.shift) / self.scale
 
@@ -150,7 +150,7 @@ def calibrate(
         ``Ensemble``.
     """
     (shift, scale), model, kernel = scaling, model_named(config.model), config.recipe.kernel
-    learnt = labels_learnt(data, config)
+    learnt = training_labels(data, config)
     y = (code.encode(learnt) - shift) / scale
     k, e, owner = learnt.shape[1], y.shape[1], code.label_of
     helps = [name in config.helpers for name in data.targets.names]
@@ -186,7 +186,7 @@ def calibrate(
         errors = [np.abs(b * said + (1 - b) * mean - truth).mean(axis=0) for b in BLENDS]
         content["blend"][main] = BLENDS[np.argmin(errors, axis=0)][main]
         mean = np.where(content["blend"] > 0, content["blend"] * said + (1 - content["blend"]) * mean, mean)
-    return content | intervals(*single[0].labelled(mean, spread), known, published, executed, data.targets.units)
+    return content | intervals(*single[0].destandardise(mean, spread), known, published, executed, data.targets.units)
 
 
 def intervals(

@@ -59,6 +59,6 @@ def training_rows(config: RunConfig, data: Dataset) -> np.ndarray:
     return np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
 
 
-def labels_learnt(data: Dataset, config: RunConfig) -> np.ndarray:
+def training_labels(data: Dataset, config: RunConfig) -> np.ndarray:
     """Labels (M, K) of the kind that a run learns, mm and deg."""
     return data.targets.corrected if config.labels == "corrected" else data.targets.raw

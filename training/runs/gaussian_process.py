@@ -135,10 +135,10 @@ class Kernel:
 
     def __call__(self, a: Points, b: Points) -> np.ndarray:
         """(A, B) the covariance between rows, without noise."""
-        found: np.ndarray = self.between(self.placed(a), self.placed(b))
+        found: np.ndarray = self.between(self.divide_by_lengths(a), self.divide_by_lengths(b))
         return found
 
-    def placed(self, points: Points) -> Placed:
+    def divide_by_lengths(self, points: Points) -> Placed:
         """Rows divided by the lengths."""
         rows = self._library.asarray(points.inputs) / self.lengths
         return Placed(rows, (rows**2).sum(1), self._library.asarray(points.second))
@@ -159,7 +159,7 @@ class Kernel:
     def noisy(self, points: Points) -> Any:
         """(M, M) the covariance of the rows' labels, including noise and ``JITTER``."""
         noises = self.noises[points.second.astype(int) if len(self.noises) > 1 else np.zeros(len(points), int)]
-        placed = self.placed(points)
+        placed = self.divide_by_lengths(points)
         return self.between(placed, placed) + self._library.diag(noises**2 + JITTER)
 
     def logs(self) -> np.ndarray:
@@ -195,7 +195,7 @@ class Kernel:
         return any(term.reaches for term in self.terms)
 
 
-def climbed(start: Kernel, points: Points, label: np.ndarray) -> Kernel:
+def climb_likelihood(start: Kernel, points: Points, label: np.ndarray) -> Kernel:
     """The kernel after ``CLIMB_STEPS`` steps of Adam that increase the likelihood of a label (M,).
 
     The search stops before the maximum, because with many lengths and few rows the maximum is overfitted: it explains these rows
@@ -259,18 +259,18 @@ class Posterior:
                 part = columns[:, rows].T @ columns[:, rows]
                 self.left_out[rows] = label[rows] - np.linalg.solve(part, self.weight[rows])
 
-    def mean(self, asked: Points) -> np.ndarray:
+    def mean(self, wanted: Points) -> np.ndarray:
         """(B,) the expected label of other rows."""
-        return self.kernel(asked, self.points) @ self.weight
+        return self.kernel(wanted, self.points) @ self.weight
 
-    def covariance(self, asked: Points) -> np.ndarray:
+    def covariance(self, wanted: Points) -> np.ndarray:
         """(B, B) covariance of the labels of other rows, without their noise."""
-        half = solve_triangular(self._factor, self.kernel(self.points, asked), lower=True)
-        return self.kernel(asked, asked) - half.T @ half
+        half = solve_triangular(self._factor, self.kernel(self.points, wanted), lower=True)
+        return self.kernel(wanted, wanted) - half.T @ half
 
-    def draw(self, asked: Points, rng: np.random.Generator) -> np.ndarray:
-        """(B,) labels of other rows, without noise: one function drawn from the posterior, evaluated at all of them."""
-        return rng.multivariate_normal(self.mean(asked), self.covariance(asked), method="eigh")
+    def draw(self, wanted: Points, rng: np.random.Generator) -> np.ndarray:
+        """(B,) labels of other rows, without noise: one function sampled from the posterior, evaluated at all of them."""
+        return rng.multivariate_normal(self.mean(wanted), self.covariance(wanted), method="eigh")
 
 
 class Processes:
@@ -288,12 +288,12 @@ class Processes:
 
     def __init__(self, kernels: list[Kernel], points: Points, weight: np.ndarray) -> None:
         self.kernels, self.points, self.weight = kernels, points, weight
-        self._placed = [kernel.placed(points) for kernel in kernels]  # computed once, because it is the same for every frame
+        self._placed = [kernel.divide_by_lengths(points) for kernel in kernels]  # computed once, because it is the same for every frame
 
-    def __call__(self, asked: Points) -> np.ndarray:
+    def __call__(self, wanted: Points) -> np.ndarray:
         """(B, K) expected labels of other rows."""
         found = [
-            kernel.between(kernel.placed(asked), placed) @ weight
+            kernel.between(kernel.divide_by_lengths(wanted), placed) @ weight
             for kernel, placed, weight in zip(self.kernels, self._placed, self.weight.T, strict=True)
         ]
         return np.stack(found, axis=1)
@@ -339,8 +339,8 @@ def fit_processes(
         Prediction of each row from all rows of other groups. The row itself was used to find lengths, sizes and noises.
     """
     points = Points.of(inputs)
-    start = Kernel(SMOOTH_AND_LINEAR, 5.0 * _spread(inputs), np.array([1.0, 0.3]), np.array([0.05]))
-    return _fitted(start, points, labels, drawn_rows(len(points), seed), group, progress)
+    start = Kernel(SMOOTH_AND_LINEAR, 5.0 * _standard_deviations(inputs), np.array([1.0, 0.3]), np.array([0.05]))
+    return _fit_processes(start, points, labels, sample_rows(len(points), seed), group, progress)
 
 
 def fit_smooth_processes(inputs: np.ndarray, labels: np.ndarray, *, group: np.ndarray | None = None) -> tuple[Processes, np.ndarray]:
@@ -349,7 +349,7 @@ def fit_smooth_processes(inputs: np.ndarray, labels: np.ndarray, *, group: np.nd
     It is meant for inputs whose scales already show their importance. It takes seconds, and does not overfit with many inputs and few rows.
     """
     points = Points.of(inputs)
-    chosen = inputs[drawn_rows(len(inputs), 0)]
+    chosen = inputs[sample_rows(len(inputs), 0)]
     squares = (chosen**2).sum(axis=1)
     middle = np.median(np.maximum(squares[:, None] + squares - 2 * chosen @ chosen.T, 0.0))
     lengths = np.full(inputs.shape[1], max(SMOOTH_LENGTHS * np.sqrt(middle), LEAST_SPREAD))
@@ -387,15 +387,15 @@ def fit_two_fidelities(
     left_out : (n, K) float
         Prediction of each real frame from all other rows. The frame itself was used to find lengths, sizes and noises.
     """
-    chosen = drawn_rows(len(simulated), seed)
+    chosen = sample_rows(len(simulated), seed)
     inputs, labels = np.concatenate([simulated[chosen], real]), np.concatenate([simulated_labels[chosen], real_labels])
     points = Points(inputs, np.repeat([0.0, 1.0], [len(chosen), len(real)]))
-    start = Kernel(TWO_FIDELITIES, 5.0 * _spread(inputs), np.array([1.0, 0.3, 0.1, 0.1, 0.1]), np.array([0.05, 0.05]), 2.0)
-    processes, left_out = _fitted(start, points, labels, np.arange(len(points)), None, None)
+    start = Kernel(TWO_FIDELITIES, 5.0 * _standard_deviations(inputs), np.array([1.0, 0.3, 0.1, 0.1, 0.1]), np.array([0.05, 0.05]), 2.0)
+    processes, left_out = _fit_processes(start, points, labels, np.arange(len(points)), None, None)
     return processes, left_out[len(chosen) :]
 
 
-def drawn_rows(count: int, seed: int) -> np.ndarray:
+def sample_rows(count: int, seed: int) -> np.ndarray:
     """Indices of at most ``FIT_ROWS`` of ``count`` rows, in random order.
 
     They are drawn by PyTorch's generator. Another generator would draw other rows, so that the same seed would give another model.
@@ -403,12 +403,12 @@ def drawn_rows(count: int, seed: int) -> np.ndarray:
     return torch.randperm(count, generator=torch.Generator().manual_seed(seed))[:FIT_ROWS].numpy()
 
 
-def _fitted(
+def _fit_processes(
     start: Kernel, points: Points, labels: np.ndarray, rows: np.ndarray, group: np.ndarray | None, progress: Callable | None
 ) -> tuple[Processes, np.ndarray]:
     kernels, weights, left_out = [], [], []
     for k, label in enumerate(labels.T):
-        posterior = Posterior(climbed(start, points.rows(rows), label[rows]), points, label, group)
+        posterior = Posterior(climb_likelihood(start, points.rows(rows), label[rows]), points, label, group)
         kernels.append(posterior.kernel)
         weights.append(posterior.weight)
         left_out.append(posterior.left_out)
@@ -417,5 +417,5 @@ def _fitted(
     return Processes(kernels, points, np.stack(weights, axis=1)), np.stack(left_out, axis=1)
 
 
-def _spread(inputs: np.ndarray) -> np.ndarray:
+def _standard_deviations(inputs: np.ndarray) -> np.ndarray:
     return np.maximum(inputs.std(axis=0, ddof=1), LEAST_SPREAD)

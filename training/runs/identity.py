@@ -1,4 +1,4 @@
-"""Identity of the data that a run learnt from: digests and marks of its frames, independent of the table's order."""
+"""Identity of the data that a run was trained on: digests and marks of its frames, independent of the table's order."""
 
 import hashlib
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ def identity_of(data: Dataset, model: Model) -> dict[str, str]:
     return {
         "names": inputs_digest(ordered.pins.image_name.tolist(), ordered.group),
         "labels": inputs_digest(targets.names, *(np.round(getattr(targets, key), EXACT) + 0.0 for key in TARGET_COLUMNS)),
-        "frames": inputs_digest(model.seen(ordered)),
+        "frames": inputs_digest(model.inputs_seen(ordered)),
     }
 
 
@@ -66,29 +66,30 @@ def frame_marks(data: Dataset) -> np.ndarray:
     return np.array([[int.from_bytes(digest, "little", signed=True) for digest in kind] for kind in digests], np.int64).reshape(2, -1).T
 
 
-def learnt_before(learnt: np.ndarray | None, data: Dataset) -> list[str]:
-    """A line if a run learnt from frames of a data set, found by the run's marks (m, 2), or if the run does not hold its frames' marks."""
+def trained_before(learnt: np.ndarray | None, data: Dataset) -> list[str]:
+    """A line if a run was trained on frames of a data set, found by the run's marks (m, 2), or if the run does not hold its frames'
+    marks."""
     if learnt is None:
-        return ["the run does not tell from which frames it learnt: whether these are among them is not known; train again to know"]
+        return ["the run does not state from which frames it learnt: whether these are among them is not known; train again to know"]
     known = np.isin(frame_marks(data), learnt).any(axis=1)
     if not known.any():
         return []
     return [
-        f"{int(known.sum())} of these {len(data)} frames are frames that the run learnt from (first {data.pins.image_name[known][0]}): "
+        f"{int(known.sum())} of these {len(data)} frames are frames that the run was trained on (first {data.pins.image_name[known][0]}): "
         "errors on them are smaller than on new ones; give a recording it has not seen, or `rows` validation"
     ]
 
 
 def changed_since(config: Mapping, data: Dataset, model: Model) -> list[str]:
-    """Differences between a data set and the one that a run learnt from, one line each. Runs of earlier versions do not hold them."""
+    """Differences between a data set and the one that a run was trained on, one line each. Runs of earlier versions do not hold them."""
     rows = config["rows"]
     if "frames" not in rows:
         return [
             "the run is of an earlier version and does not name its frames: whether these are the ones that it kept out of its training "
-            "can't be told, if the table was sorted anew, or frames or labels have changed since; train again to know"
+            "can't be found out, if the table was sorted again, or frames or labels have changed since; train again to know"
         ]
     now = identity_of(data, model)
-    return [f"the run learnt from {DIGESTS[key]}: something has changed since" for key in DIGESTS if now[key] != rows.get(key)]
+    return [f"the run was trained on {DIGESTS[key]}: something has changed since" for key in DIGESTS if now[key] != rows.get(key)]
 
 
 def difference(wanted: Mapping, found: Mapping) -> str:

@@ -24,7 +24,7 @@ EXECUTED_LOSS = 0.05
 
 
 @dataclass(frozen=True)
-class Rows:
+class TrainingRows:
     """The rows with which a network is trained and monitored.
 
     Attributes
@@ -69,7 +69,7 @@ class Loop:
 
     network: nn.Module
     recipe: Recipe
-    rows: Rows
+    rows: TrainingRows
     seed: int
     penalty: Callable[[nn.Module], torch.Tensor | None] = no_penalty
     epochs_done: int = 0
@@ -204,7 +204,7 @@ def row_loss(out: dict, labels: torch.Tensor, executed: torch.Tensor, weight: to
 def epoch_step(step: Step) -> Callable[[int, int, Mapping[str, float]], None]:
     """The callback of ``train_run`` that reports epochs as a ``twin.progress`` step, with the error on held-out rows as the note."""
 
-    def told(done: int, total: int, point: Mapping[str, float]) -> None:
+    def report_epoch(done: int, total: int, point: Mapping[str, float]) -> None:
         step(done, total, f"{point['held_out_error']:.4f}")
 
-    return told
+    return report_epoch

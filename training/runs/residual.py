@@ -1,11 +1,11 @@
-"""Teaches the small network that adds to rendered frames what models leave out (`twin.camera.residual`), and judges it apart.
+"""Teaches the small network that adds to rendered frames what models leave out (`twin.camera.residual`), and evaluates it apart.
 
-The network is taught against judges, networks that learn at the same time to tell real patches from rendered ones (Goodfellow et al. 2014).
-Two judges are built like the two-sample test's network and begin anew in turn, so that no weakness of a single one is learnt; a third one
-sees finer texture. Squared errors hold the network near the render: of the luma against the real frame, and of averages over 5 x 5 px
-against the render's own, so that levels and the pins' centroids stay.
+The network is taught against classifiers, networks that learn at the same time to distinguish real patches from rendered ones (Goodfellow
+et al. 2014). Two classifiers are built like the two-sample test's network and begin again in turn, so that no weakness of a single one is
+learnt; a third one sees finer texture. Squared errors hold the network near the render: of the luma against the real frame, and of averages
+over 5 x 5 px against the render's own, so that levels and the pins' centroids stay.
 
-Frames to which the light was fitted are left out: their renders are more like them than those of other frames. Each judged frame is
+Frames to which the light was fitted are left out: their renders are more like them than those of other frames. Each evaluated frame is
 rendered with a network that was taught on the other half of the frames. The network that is written was taught on all of them.
 """
 
@@ -19,16 +19,16 @@ from torch import nn
 from torch.nn import functional
 
 from scenes.sensor import ResidualSpec, SensorSpec
-from training.data.two_sample import LEVEL_SCALE, PATCH_PX, TwoSample, judged, judged_halves, patch_corners, patch_network
+from training.data.two_sample import LEVEL_SCALE, PATCH_PX, TwoSample, evaluate_classifiers, evaluate_halves, patch_corners, patch_network
+from twin.calibration.sensor_file import write_sensor
 from twin.camera.capture import CHROMA_RANGE, LUMA_RANGE, before_stream, expose, luma_weights
 from twin.camera.projection import Disc, lens_disc
 from twin.camera.residual import LEAK, LEVELS, MIDDLE, MOST_LEVELS, STEEPNESS, differences, with_residual
 from twin.errors import FrameError
-from twin.fit.sensor_file import write_sensor
+from twin.evaluation.pictures.aligned import with_changes
+from twin.evaluation.pictures.frames import read_real
+from twin.evaluation.pictures.images import compare_images
 from twin.frames.recording import BadFrame
-from twin.judge.pictures.aligned import revised
-from twin.judge.pictures.frames import read_real
-from twin.judge.pictures.images import compare_images
 from twin.mechanics.skin_fit import SkinFit
 from twin.optics.render import Renderer
 from twin.pins.pipeline import Pipeline
@@ -39,15 +39,15 @@ from twin.types import FloatArray, Form, Frame, ImageArray
 CHANNELS, NOISES = 16, 2
 """Size of the network: channels within, random numbers at each pixel."""
 STEPS, ALONE = 700, 30
-"""Steps of teaching, and how many of them the judges learn alone first."""
+"""Steps of teaching, and how many of them the classifiers learn alone first."""
 BATCH, TURNED = 24, 6
-"""Patches of each kind in a step, and how many of them are turned alike for the judges."""
+"""Patches of each kind in a step, and how many of them are turned alike for the classifiers."""
 RATE, LAST_SHARE = 1e-3, 0.4
 """Learning rate of Adam, and the share of it that the last step has."""
 MOMENTS, WEIGHT_DECAY = (0.5, 0.99), 1e-2
-"""Decay of Adam's moments, and the weight decay of the judges."""
+"""Decay of Adam's moments, and the weight decay of the classifiers."""
 ANEW, NOISE_ANEW = 150, 100
-"""Steps after which a judge begins anew, and after which the camera's noise is drawn anew."""
+"""Steps after which a classifier begins again, and after which the camera's noise is sampled again."""
 LOW_WEIGHT, LUMA_WEIGHT = 0.05, 0.002
 """Weights of the squared errors (gray levels): of averages over 5 x 5 px, and of the luma."""
 AVERAGED_PX, AVERAGED_STRIDE = 5, 3
@@ -61,23 +61,23 @@ NUMBERS = (LUMA_RANGE / 255, CHROMA_RANGE / 255, CHROMA_RANGE / 255)
 DIGITS = 5
 """Significant digits of a written weight."""
 LEAST_TAUGHT = 4
-"""Fewest frames that the network is taught on and judged by."""
+"""Fewest frames that the network is taught on and evaluated by."""
 
 
 @dataclass(frozen=True)
 class TaughtResidual:
-    """A sensor with a residual network, and how its frames are judged without it and with it.
+    """A sensor with a residual network, and how its frames are evaluated without it and with it.
 
     Attributes
     ----------
     spec : SensorSpec
         With ``response.residual``, not switched on.
     frames : int
-        Number of frames that were judged.
+        Number of frames that were evaluated.
     before, after : dict of str to TwoSample
-        What each judge of the two-sample test (`JUDGES`) tells of real frames and renders.
+        What each classifier of the two-sample test (`JUDGES`) result for real frames and renders.
     real : dict of str to TwoSample
-        What it tells of two halves of the real frames, where there is nothing to tell.
+        Its result for two halves of the real frames, where there is no difference.
     psnr_db : (float, float)
         Over the disc, before and after.
     shift_px : (float, float)
@@ -100,7 +100,7 @@ class TaughtResidual:
         """The result as lines of text."""
         lines = [f"refused {each['image_name']}: {each['reason']}" for each in self.refused]
         told = [
-            f"two-sample accuracy, {name} judge: {self.before[name].text()} -> {self.after[name].text()}; "
+            f"two-sample accuracy, {name} evaluate: {self.before[name].text()} -> {self.after[name].text()}; "
             f"of two halves of the real frames {self.real[name].text()}"
             for name in self.before
         ]
@@ -118,7 +118,7 @@ class TaughtResidual:
 def calibrate_residual(
     frames: Path, sensor: SensorSpec, out: Path, *, fitted: int = 6, steps: int = STEPS, progress: Progress = silent
 ) -> TaughtResidual:
-    """Teach a residual network to a folder of raw colour frames, judge it on frames that it did not see, and write the specification.
+    """Teach a residual network to a folder of raw colour frames, evaluate it on frames that it did not see, and write the specification.
 
     Parameters
     ----------
@@ -132,16 +132,16 @@ def calibrate_residual(
     Raises
     ------
     FrameError
-        The camera is mono, or fewer than ``LEAST_TAUGHT`` frames can be used.
+        The camera is mono, or fewer than ``LEAST_TAUGHT`` frames are valid.
     """
     if sensor.camera.channels == "mono":
         raise FrameError(f"sensor {sensor.name}: a residual network needs colour frames, this camera is mono")
-    sensor = revised(sensor, response={"residual": None})
+    sensor = with_changes(sensor, response={"residual": None})
     disc = lens_disc(sensor.view, sensor.housing)
     with stage(progress, "read the frames, find their pins") as step:
         read = read_real(frames, sensor, disc, fitted=fitted, progress=step)
     if len(read.frames) < LEAST_TAUGHT:
-        raise FrameError(f"{frames}: {len(read.frames)} frames can be used beside the {fitted} fitted ones; give {LEAST_TAUGHT} or more")
+        raise FrameError(f"{frames}: {len(read.frames)} frames are valid beside the {fitted} fitted ones; give {LEAST_TAUGHT} or more")
     fit, renderer, light = SkinFit(sensor), Renderer(sensor), []
     with stage(progress, "fit the skin to the pins, render") as step:
         for done, each in enumerate(read.frames):
@@ -154,19 +154,19 @@ def calibrate_residual(
     for taught, unseen in (halves, halves[::-1]):
         with stage(progress, "teach a network on half of the frames") as step:
             residual = teach([real[k] for k in taught], [light[k] for k in taught], sensor, disc, steps=steps, progress=step)
-        own = with_residual(revised(sensor, response={"residual": residual.model_dump()}))
+        own = with_residual(with_changes(sensor, response={"residual": residual.model_dump()}))
         for k in unseen:
             found[k] = expose(light[k], own.capture, np.random.default_rng(k))
     with stage(progress, "teach the network on all frames") as step:
         residual = teach(real, light, sensor, disc, steps=steps, progress=step)
     with stage(progress, "train the two-sample test") as step:
-        before, after = (judged(real, shown, disc.inside, progress=step) for shown in (plain, found))
+        before, after = (evaluate_classifiers(real, shown, disc.inside, progress=step) for shown in (plain, found))
     with stage(progress, "the same for halves of the real frames") as step:
-        real_told = judged_halves(real, disc.inside, progress=step)
+        real_told = evaluate_halves(real, disc.inside, progress=step)
     psnr = [
         float(np.mean([compare_images(a, b, disc.inside).psnr_db for a, b in zip(real, shown, strict=True)])) for shown in (plain, found)
     ]
-    spec = revised(sensor, response={"residual": residual.model_dump()})
+    spec = with_changes(sensor, response={"residual": residual.model_dump()})
     write_sensor(out, spec, f"With a residual network that was taught on {len(real)} frames of {frames.name}.")
     return TaughtResidual(
         spec, len(real), before, after, real_told, (psnr[0], psnr[1]), _shift_px(sensor, plain, found), read.refused, [out]
@@ -235,7 +235,7 @@ def teach(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = ResidualNetwork()
-        judges = [patch_network(), patch_network(), _fine_judge()]
+        judges = [patch_network(), patch_network(), _fine_classifier()]
         their = [_optimizer(judge) for judge in judges]
         mine = torch.optim.Adam(network.parameters(), RATE, betas=MOMENTS)
         kept = [weights.detach().clone() for weights in network.parameters()]
@@ -250,12 +250,12 @@ def teach(
                 their[turn] = _optimizer(judges[turn])
             mine.param_groups[0]["lr"] = RATE * (1 - (1 - LAST_SHARE) * done / steps)
             given, wanted = _pairs(signal, shown, corners, rng)
-            made = _added(network, given, sensor.response.chroma_columns)
+            made = _add_noise(network, given, sensor.response.chroma_columns)
             frames = _through_stream(made, matrix, sensor.response.stream)
             for judge, optimizer in zip(judges, their, strict=True):
-                _teach_judge(judge, optimizer, wanted, frames.detach(), rng)
+                _train_classifier(judge, optimizer, wanted, frames.detach(), rng)
             if done >= ALONE:
-                fooled = torch.stack([_fooled(judge, wanted, frames) for judge in judges]).mean()
+                fooled = torch.stack([_deception_loss(judge, wanted, frames) for judge in judges]).mean()
                 low = (_averages(made) - _averages(given)).square().mean()
                 luma = (made[:, 0] - _colours(wanted, matrix)[:, 0]).square().mean()
                 mine.zero_grad()
@@ -287,7 +287,7 @@ def _pairs(signal: torch.Tensor, shown: torch.Tensor, corners: np.ndarray, rng: 
     return torch.stack([signal[c] for c in cut]), torch.stack([shown[c] for c in cut])
 
 
-def _added(network: ResidualNetwork, signal: torch.Tensor, columns: int) -> torch.Tensor:
+def _add_noise(network: ResidualNetwork, signal: torch.Tensor, columns: int) -> torch.Tensor:
     """Luma and colour differences after the network; ``columns`` neighbouring columns have their mean colour differences."""
     noise = torch.randn(len(signal), network.noises, *signal.shape[2:])
     made = signal + network(signal, noise)
@@ -308,8 +308,8 @@ def _averages(signal: torch.Tensor) -> torch.Tensor:
     return functional.avg_pool2d(signal, AVERAGED_PX, AVERAGED_STRIDE)
 
 
-def _fine_judge() -> nn.Module:
-    """A judge whose first convolution sees every pixel, with bounded slopes (Miyato et al. 2018)."""
+def _fine_classifier() -> nn.Module:
+    """A classifier whose first convolution sees every pixel, with bounded slopes (Miyato et al. 2018)."""
     layers: list[nn.Module] = []
     for given, made, stride in ((3, 24, 1), (24, 48, 2), (48, 64, 2)):
         layers += [nn.utils.parametrizations.spectral_norm(nn.Conv2d(given, made, 3, stride=stride, padding=1)), nn.LeakyReLU(LEAK)]
@@ -320,24 +320,24 @@ def _optimizer(judge: nn.Module) -> torch.optim.Optimizer:
     return torch.optim.AdamW(judge.parameters(), RATE, betas=MOMENTS, weight_decay=WEIGHT_DECAY)
 
 
-def _teach_judge(
+def _train_classifier(
     judge: nn.Module, optimizer: torch.optim.Optimizer, real: torch.Tensor, made: torch.Tensor, rng: np.random.Generator
 ) -> None:
-    """One step of a judge on real (n, 3, p, p) and made patches, turned and mirrored."""
-    seen = torch.cat([_turned(part, rng) for patches in (real, made) for part in patches.split(TURNED)])
+    """One step of a classifier on real (n, 3, p, p) and made patches, turned and mirrored."""
+    seen = torch.cat([_turn_patches(part, rng) for patches in (real, made) for part in patches.split(TURNED)])
     truth = torch.cat([torch.ones(len(real)), torch.zeros(len(made))])
     optimizer.zero_grad()
     functional.binary_cross_entropy_with_logits(judge(seen / LEVEL_SCALE - 1), truth).backward()
     optimizer.step()
 
 
-def _turned(patches: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+def _turn_patches(patches: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
     turned = torch.rot90(patches, int(rng.integers(4)), (2, 3))
     return turned.flip(3) if rng.random() < 0.5 else turned
 
 
-def _fooled(judge: nn.Module, real: torch.Tensor, made: torch.Tensor) -> torch.Tensor:
-    """Loss of made patches that a judge, which sees them among real ones, takes for made."""
+def _deception_loss(judge: nn.Module, real: torch.Tensor, made: torch.Tensor) -> torch.Tensor:
+    """Loss of made patches that a classifier, which sees them among real ones, takes for made."""
     judge.requires_grad_(False)
     loss = functional.softplus(-judge(torch.cat([real, made]) / LEVEL_SCALE - 1)[len(real) :]).mean()
     judge.requires_grad_(True)

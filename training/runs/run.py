@@ -27,11 +27,11 @@ from training.models import model_named
 from training.models.part import Prepared
 from training.models.recipes import as_dict
 from training.runs.assemble import calibrate
-from training.runs.config import RunConfig, labels_learnt, training_rows
+from training.runs.config import RunConfig, training_labels, training_rows
 from training.runs.identity import ASIDE, difference, frame_marks, identity_of
-from training.runs.loop import Loop, Rows
+from training.runs.loop import Loop, TrainingRows
 from training.runs.networks import parameter_count
-from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, write_tensors
+from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damage_error, read_config, read_tensors, write_tensors
 from twin.frames.forms import blob_spec
 from twin.store import fingerprint, write_text, writes
 
@@ -39,7 +39,7 @@ RUN_FILES = (CONFIG, "curves.csv", TENSORS)
 FOLDS = 10  # parts of the training rows; each network of an ensemble holds out another part
 KEEP_EVERY_S = 20.0  # s between two checkpoints
 FEWEST_PARTS = 3  # least number of rows, or groups of rows: with fewer, almost no rows are left beside the held-out part
-BEGIN_ANEW = "remove it to begin anew, or give another `out`"  # remedy for a damaged checkpoint
+BEGIN_ANEW = "remove it to begin again, or give another `out`"  # remedy for a damaged checkpoint
 EXTRA_WEIGHT = 0.3  # weight of a helper label in the loss; requested labels have the weight 1
 
 
@@ -71,7 +71,11 @@ class _Lesson:
         learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # held-out frames are used in view 0 only
         rows = [torch.from_numpy(each) for each in (learnt, held)]
         return Loop(
-            network, config.recipe, Rows(self.prepared.inputs, self.scaled.repeat(views, 1), weight, executed, *rows), seed, model.penalty
+            network,
+            config.recipe,
+            TrainingRows(self.prepared.inputs, self.scaled.repeat(views, 1), weight, executed, *rows),
+            seed,
+            model.penalty,
         )
 
     def keep(self, done: list, loop: Loop | None) -> None:
@@ -138,9 +142,9 @@ def train_run(
             f"{FEWEST_PARTS} {what} to learn from are needed{said}"
         )
     resolved = resolve(config, data, train)
-    state = _opened(out, resolved)
+    state = _open_checkpoint(out, resolved)
     prepared = model_named(config.model).prepare(data, train)
-    code = LabelCode(goes_round(data.targets.units, labels_learnt(data, config)[train]))
+    code = LabelCode(goes_round(data.targets.units, training_labels(data, config)[train]))
     scaled, *scaling = scaled_labels(data, config, train, code)
     lesson = _Lesson(out, resolved, config, data, train, prepared, code, scaled, (scaling[0], scaling[1]))
     done: list = state["done"] if state else []
@@ -160,9 +164,9 @@ def train_run(
                 lesson.keep(done, loop)
                 kept = monotonic()
             if out_of_time and not loop.finished:
-                lesson.assemble([*done, _finished(loop)])
+                lesson.assemble([*done, _collect_weights(loop)])
                 return False
-        done.append(_finished(loop))
+        done.append(_collect_weights(loop))
         lesson.keep(done, None)
         if out_of_time and len(done) < config.recipe.members:
             lesson.assemble(done)
@@ -220,7 +224,7 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
 
 def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: LabelCode) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
     """Labels (M, E) as the network learns them, float32, and shift and scale (E,) for the code's numbers: ``number = shift + scale x``."""
-    labels = code.encode(labels_learnt(data, config))
+    labels = code.encode(training_labels(data, config))
     known, k = labels[train], labels.shape[1]
     if config.recipe.scaling == "standard":
         shift, scale = known.mean(axis=0), known.std(axis=0)
@@ -243,7 +247,7 @@ def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | Non
     return np.sort(held), np.setdiff1d(train, held)
 
 
-def _finished(loop: Loop) -> dict:
+def _collect_weights(loop: Loop) -> dict:
     network = loop.result()
     return {
         "weights": {key: value.cpu().clone() for key, value in network.state_dict().items()},
@@ -252,7 +256,7 @@ def _finished(loop: Loop) -> dict:
     }
 
 
-def _opened(out: Path, resolved: dict) -> dict | None:
+def _open_checkpoint(out: Path, resolved: dict) -> dict | None:
     """The checkpoint of an interrupted run with the same configuration; None if there is nothing to continue."""
     path = out / CHECKPOINT
     if not path.is_file():
@@ -264,7 +268,7 @@ def _opened(out: Path, resolved: dict) -> dict | None:
     try:
         before = dict(json.loads(state["identity"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise damaged(path, "it does not say of which run it is", BEGIN_ANEW) from error
+        raise damage_error(path, "it does not say of which run it is", BEGIN_ANEW) from error
     _require_same(out, resolved, before, "begun and not finished")
     return state
 

@@ -12,7 +12,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from scenes.files import read_regular
-from scenes.load import explained
+from scenes.load import explain_problems
 from scenes.sensor import SensorSpec
 from training.errors import TrainingError
 from training.models import model_named
@@ -28,7 +28,7 @@ DISPLACEMENTS = "displacements.safetensors"  # the model of the pins' possible d
 DOMAIN = "domain.safetensors"  # the patterns of pins that the run was trained on
 BESIDE_FILES = (MAPS, SLIP, DISPLACEMENTS, DOMAIN)  # files that a run has beside its networks, if it learnt these models
 LARGEST_CONFIG = 100_000_000  # bytes; a configuration names the frames kept out of training, and a million names take 20 MB
-AGAIN = "train again, or copy the run's folder anew"
+AGAIN = "train again, or copy the run's folder again"
 
 
 class _Pipeline(BaseModel):
@@ -64,15 +64,15 @@ def read_config(run: Path) -> dict[str, Any]:
     try:
         config = json.loads(read_regular(path, LARGEST_CONFIG).decode())
     except (OSError, ValueError, RecursionError) as error:
-        raise damaged(path, getattr(error, "strerror", None) or "no readable JSON") from error
+        raise damage_error(path, getattr(error, "strerror", None) or "no readable JSON") from error
     try:
         _Config.model_validate(config)
     except ValidationError as error:
-        raise damaged(path, explained(error, _Config)) from error
+        raise damage_error(path, explain_problems(error, _Config)) from error
     try:
         model_named(config["model"])
     except TrainingError as error:
-        raise damaged(path, str(error)) from error
+        raise damage_error(path, str(error)) from error
     return config
 
 
@@ -87,9 +87,9 @@ def require_together(run: Path, config: Mapping[str, Any], content: Mapping[str,
     sensor = SensorSpec.model_validate(config["sensor"])
     pins, labels = len(content["reference_px"]), len(content.get("circular", content["shift"]))
     if pins != sensor.pins.count:
-        raise damaged(run / CONFIG, f"a sensor of {sensor.pins.count} pins, the weights are of {pins}")
+        raise damage_error(run / CONFIG, f"a sensor of {sensor.pins.count} pins, the weights are of {pins}")
     if not labels == len(config["columns"]) == len(config["units"]):
-        raise damaged(run / CONFIG, f"{len(config['columns'])} columns and {len(config['units'])} units, the weights are of {labels}")
+        raise damage_error(run / CONFIG, f"{len(config['columns'])} columns and {len(config['units'])} units, the weights are of {labels}")
 
 
 def read_tensors(path: Path, remedy: str = AGAIN) -> dict[str, Any]:
@@ -116,17 +116,17 @@ def read_tensors(path: Path, remedy: str = AGAIN) -> dict[str, Any]:
     except OSError as error:
         raise TrainingError(f"{path}: can't be read ({error.strerror or error}); {remedy}") from error
     except zipfile.BadZipFile as error:
-        raise damaged(path, "cut, changed, or no file of weights", remedy) from error
+        raise damage_error(path, "cut, changed, or no file of weights", remedy) from error
     except UnpicklingError as error:
-        raise damaged(path, "holds more than numbers, and is not loaded for that reason", remedy) from error
+        raise damage_error(path, "holds more than numbers, and is not loaded for that reason", remedy) from error
     except (RuntimeError, ValueError, KeyError, EOFError, TypeError, AttributeError, IndexError) as error:
-        raise damaged(path, "no file of weights", remedy) from error
+        raise damage_error(path, "no file of weights", remedy) from error
     if not isinstance(content, dict):
-        raise damaged(path, "no file of weights", remedy)
+        raise damage_error(path, "no file of weights", remedy)
     return content
 
 
-def damaged(path: Path, how: str, remedy: str = AGAIN) -> TrainingError:
+def damage_error(path: Path, how: str, remedy: str = AGAIN) -> TrainingError:
     """The error for a file of a run that can't be used: it names the file, the damage, and the remedy."""
     return TrainingError(f"{path}: not of a run of this version, or damaged ({how}); {remedy}")
 

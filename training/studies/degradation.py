@@ -9,28 +9,28 @@ from typing import TYPE_CHECKING, Any
 from scenes import SensorSpec
 from scenes.sensor import RecordingSpec
 from twin.camera.capture import in_form
-from twin.judge.degradation.envelope import Envelope
-from twin.judge.degradation.plan import SweepPlan
-from twin.judge.degradation.report import REPORT_FILES
-from twin.judge.degradation.shots import RealSource, RenderedSource
-from twin.judge.degradation.study import check_pipelines, real_study, rendered_study
-from twin.judge.degradation.sweep import Answer
+from twin.evaluation.degradation.envelope import Envelope
+from twin.evaluation.degradation.plan import SweepPlan
+from twin.evaluation.degradation.report import REPORT_FILES
+from twin.evaluation.degradation.shots import RealSource, RenderedSource
+from twin.evaluation.degradation.study import check_pipelines, real_study, rendered_study
+from twin.evaluation.degradation.sweep import ModelAnswer
 from twin.progress import Progress, silent
 from twin.store import writes
-from twin.types import Frame, Readable
+from twin.types import Frame, ReadableResult
 
 if TYPE_CHECKING:
     from training.estimate.estimator import PoseEstimator  # loads torch, which pipelines alone do not need
 
-# Pipelines that are judged if none are named.
+# Pipelines that are evaluated if none are named.
 PIPELINES = ("twin", "legacy")
-# Most real frames that are judged if no other number is given.
+# Most real frames that are evaluated if no other number is given.
 LIMIT = 12
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is degraded, and which pipelines and models are judged.
+class DegradationPlan:
+    """What is degraded, and which pipelines and models are evaluated.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Plan:
 
 
 @dataclass(frozen=True, repr=False)
-class Result(Readable):
+class DegradationResult(ReadableResult):
     """The severities at which each pipeline and model fails under each condition, and the files, the page first."""
 
     envelopes: list[Envelope]
@@ -75,8 +75,8 @@ class Result(Readable):
 
 
 @writes(*REPORT_FILES, "cells", "pictures", "pipelines", "rendered")
-def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
-    """Sweep every condition from severity 0 to 1, judge pipelines and models on every frame, and write the result.
+def run(plan: DegradationPlan, out: Path, *, progress: Progress = silent) -> DegradationResult:
+    """Sweep every condition from severity 0 to 1, evaluate pipelines and models on every frame, and write the result.
 
     The folder ``out`` must exist. Results of an earlier call there are used again if their inputs have not changed.
 
@@ -96,21 +96,23 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
         options["model_digests"] = {each.name: digest_of(each) for each in runs}
     cases, severities = plan.sweep.cases(), plan.sweep.severities()
     if plan.frames is None:
-        return Result(*rendered_study(plan.sensor, pipelines, cases, severities, out, **options))
-    return Result(*real_study(plan.sensor, plan.frames, plan.limit, pipelines, cases, severities, out, beside=plan.rendered, **options))
+        return DegradationResult(*rendered_study(plan.sensor, pipelines, cases, severities, out, **options))
+    return DegradationResult(
+        *real_study(plan.sensor, plan.frames, plan.limit, pipelines, cases, severities, out, beside=plan.rendered, **options)
+    )
 
 
 def load_models(
     runs: tuple[Path, ...], sensor: SensorSpec, source: RenderedSource | RealSource | None = None
-) -> dict[str, Callable[[Frame], Answer]]:
+) -> dict[str, Callable[[Frame], ModelAnswer]]:
     """Models by name, as a sweep calls them. If a model was trained on recordings, raw frames are converted to that form first.
 
-    Models that use a frame without contact take that of the ``source``; without one, its contacts tell the pins at rest.
+    Models that use a frame without contact take that of the ``source``; without one, its contacts determine the pins at rest.
     """
-    return {each.name: partial(_estimates, _at_rest(_checked(each, sensor), source), sensor.recording) for each in runs}
+    return {each.name: partial(_estimates, _at_rest(_load_estimator(each, sensor), source), sensor.recording) for each in runs}
 
 
-def _checked(run: Path, sensor: SensorSpec) -> "PoseEstimator":
+def _load_estimator(run: Path, sensor: SensorSpec) -> "PoseEstimator":
     from training.estimate.estimator import PoseEstimator
 
     estimator = PoseEstimator.load(run)
@@ -128,6 +130,6 @@ def _at_rest(estimator: "PoseEstimator", source: RenderedSource | RealSource | N
     return estimator.at_rest_of(in_form(frame, estimator.form, recording) for frame in source.frames)[0]
 
 
-def _estimates(estimator: "PoseEstimator", recording: RecordingSpec | None, frame: Frame) -> Answer:
+def _estimates(estimator: "PoseEstimator", recording: RecordingSpec | None, frame: Frame) -> ModelAnswer:
     found = estimator(in_form(frame, estimator.form, recording))
-    return Answer(found.value, found.low, found.high, found.units, estimator.label_range, found.valid)
+    return ModelAnswer(found.value, found.low, found.high, found.units, estimator.label_range, found.valid)

@@ -7,24 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from training.data.dataset import Dataset, joined, load_dataset, told_apart
+from training.data.dataset import Dataset, join_datasets, load_dataset, shortest_distinct_ends
 from training.data.simulated import is_simulated
 from training.errors import TrainingError
 from training.estimate.contact_estimator import ContactEstimator, contacts_folder
 from training.estimate.displacements import OTHER_UNIT
 from training.estimate.estimator import PoseEstimator
-from training.runs.identity import changed_since, learnt_before
+from training.runs.identity import changed_since, trained_before
 from training.runs.packed import folder_of
-from training.studies.judging import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
-from training.touch.contact_maps import judge_maps
-from training.touch.slip import Eyes, drags_of, gone_through, judge_slip, random_places
+from training.studies.judging import measure_changes, measure_errors, rows_to_evaluate, time_frames, write_evaluation
+from training.touch.contact_maps import compare_maps
+from training.touch.slip import CapView, compare_slip, drags_of, random_places, resample_path
 from twin.frames import open_recording
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
-from twin.types import Readable
+from twin.types import ReadableResult
 
-# Choices of the rows to judge.
+# Choices of the rows to evaluate.
 ROWS = ("validation", "all")
 # Choices of the labels that count as truth.
 LABELS = ("corrected", "raw")
@@ -52,14 +52,14 @@ def _slip_errors(estimator: PoseEstimator, parts: Sequence[Dataset], chosen: set
     """Errors of slip on the drags whose frames are all ``chosen``, each traversed once at a random speed; None if there is none."""
     assert estimator.slip is not None
     rng, ways = np.random.default_rng(0), []
-    called = told_apart([part.folder.resolve() for part in parts]) if len(parts) > 1 else [""]
+    called = shortest_distinct_ends([part.folder.resolve() for part in parts]) if len(parts) > 1 else [""]
     for part, prefix in zip(parts, called, strict=True):
-        eyes = Eyes(estimator.modes_of, part.pins)
+        eyes = CapView(estimator.modes_of, part.pins)
         for rows, drag in drags_of(part):
             names = {f"{prefix}/{name}" if prefix else name for name in part.pins.image_name[rows].tolist()}
             if names <= chosen:
-                ways.append(gone_through(drag, random_places(len(rows), rng), eyes, rng))
-    return asdict(judge_slip(estimator.slip, ways)) if ways else None
+                ways.append(resample_path(drag, random_places(len(rows), rng), eyes, rng))
+    return asdict(compare_slip(estimator.slip, ways)) if ways else None
 
 
 def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
@@ -82,7 +82,7 @@ def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
 
 
 @dataclass(frozen=True, repr=False)
-class Evaluation(Readable):
+class Evaluation(ReadableResult):
     """Evaluation of a model.
 
     Attributes
@@ -96,7 +96,7 @@ class Evaluation(Readable):
     units : dict of str to str
         Unit of each label.
     frames : int
-        Number of judged frames.
+        Number of evaluated frames.
     problems : list of str
         Irregularities of the recordings.
     written : list of Path
@@ -157,7 +157,7 @@ def evaluate_run(
     robustness: bool = False,
     progress: Progress = silent,
 ) -> Evaluation:
-    """Judge a trained model, and write the result to a folder.
+    """Evaluate a trained model, and write the result to a folder.
 
     Parameters
     ----------
@@ -166,11 +166,11 @@ def evaluate_run(
     recordings : sequence of Path
         Labelled recordings; for ``rows="validation"`` exactly those that the run was trained on.
     rows : {"validation", "all"}
-        Judge the rows that were kept out of the run's training, or all rows.
+        Evaluate the rows that were kept out of the run's training, or all rows.
     labels : {"corrected", "raw"}
         Labels that count as truth in ``predictions.csv`` and ``errors.png``.
     robustness : bool
-        Also judge changed images.
+        Also evaluate changed images.
 
     Raises
     ------
@@ -182,10 +182,10 @@ def evaluate_run(
 
     Notes
     -----
-    With models of several kinds of contact (``ContactEstimator``), each frame is judged by the most probable of those kinds whose labels
+    With models of several kinds of contact (``ContactEstimator``), each frame is evaluated by the most probable of those kinds whose labels
     the recording varies. ``taken_for`` of the metrics shows the classification among all kinds.
     """
-    for value, allowed, option in ((rows, ROWS, "`rows`"), (labels, LABELS, "`labels`")):
+    for value, allowed, option in ((rows, ROWS, "`rows`"), (labels, LABELS, "`label_kind`")):
         if value not in allowed:
             raise TrainingError(f"{option} must be {' or '.join(allowed)}, got {value!r}")
     several, parts, kinds = models_of_kinds(run, recordings[0]), [], []
@@ -202,26 +202,26 @@ def evaluate_run(
             if estimator.counts_from_rest and part.pins.measured:
                 estimator.rest.require_view(part.pins.reference.pins_px, folder.name)
             parts.append(at_own_rest(estimator, part))
-    found = joined(parts)
-    chosen = rows_to_judge(estimator, found, rows)
+    found = join_datasets(parts)
+    chosen = rows_to_evaluate(estimator, found, rows)
     if rows == "validation":
         found.problems.extend(changed_since(estimator.config, found, estimator.part))
     else:
-        found.problems.extend(learnt_before(estimator.learnt_from, found))
+        found.problems.extend(trained_before(estimator.learnt_from, found))
     made = several.predict_rows(found, chosen, kinds) if several else estimator.predict_rows(found, chosen)
-    metrics = {"model": estimator.model, "rows": rows, **judge(made, found, chosen)}
+    metrics = {"model": estimator.model, "rows": rows, **measure_errors(made, found, chosen)}
     metrics["ms_per_frame"] = time_frames(several or estimator, found)
     if several is not None:
         metrics["taken_for"] = several.taken_for(found.pins.rows(chosen))
     if estimator.maps is not None and several is None and all(is_simulated(folder) for folder in found.folders):
-        rated = judge_maps(estimator.maps_of(found.pins.rows(chosen), made.mean), found, chosen)
+        rated = compare_maps(estimator.maps_of(found.pins.rows(chosen), made.mean), found, chosen)
         metrics["maps"] = None if rated is None else asdict(rated)
     if estimator.slip is not None and several is None and all(is_simulated(folder) for folder in found.folders):
         metrics["slip"] = _slip_errors(estimator, parts, set(found.pins.image_name[chosen].tolist()))
     written, changes = write_evaluation(out, made, found, chosen, metrics, labels), []
     if robustness:
         with stage(progress, "changed frames") as step:
-            changes = judge_changes(estimator, found, chosen, progress=step)
+            changes = measure_changes(estimator, found, chosen, progress=step)
         written.append(write_table(out / "robustness.csv", changes))
     units = dict(zip(estimator.names, estimator.units, strict=True))
     return Evaluation(metrics, changes, units, len(chosen), found.problems, written)

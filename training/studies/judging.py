@@ -35,7 +35,7 @@ from twin.types import Form, Frame
 DEPTH_EDGES_MM = (-4.0, -3.0, -2.0, -1.0, 0.0)
 ANGLE_EDGES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 SHEAR_EDGES_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-# Least move, mm or deg, of frames on which the probability of an executed move is judged. A smaller move hardly changes the frame.
+# Least move, mm or deg, of frames on which the probability of an executed move is evaluated. A smaller move hardly changes the frame.
 LARGE_MOVE = 1.0
 # Number of frames, spread evenly over the recording, whose time to a pose is measured.
 TIMED_FRAMES = 100
@@ -53,7 +53,7 @@ ERASED_PINS = 5
 ERASED_MARGIN = 1.25
 
 
-def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndarray:
+def rows_to_evaluate(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndarray:
     """Rows of a data set: with ``validation`` those that the run kept out of its training, found by their names; with ``all`` every row.
 
     Raises
@@ -76,7 +76,7 @@ def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndar
     return data.natural_order()[split_rows(len(data), split, data.in_order().group)[1]]
 
 
-def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
+def measure_errors(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
     """Errors against raw and corrected labels, overall and binned, the intervals' coverage and the leak check."""
     targets = data.targets.rows(rows)
     found: dict = {"frames": len(rows), "without_prediction": int((~np.isfinite(made.mean)).any(axis=1).sum())}
@@ -139,7 +139,9 @@ def leak_check(mean: np.ndarray, targets: Targets) -> Leak:
     if ANGLE not in targets.names:
         return Leak(None, f"it needs the angle label {ANGLE} and its {TURN}; the labels are {', '.join(targets.names)}")
     if not np.isfinite(targets.executed).any():
-        return Leak(None, f"no file beside the table tells which moves were executed ({', '.join(EXECUTED_FILES)}; 'twin audit' makes one)")
+        return Leak(
+            None, f"no file beside the table states which moves were executed ({', '.join(EXECUTED_FILES)}; 'twin audit' makes one)"
+        )
     k = targets.names.index(ANGLE)
     turn, error = targets.move[:, 1], label_error(mean, targets.corrected, targets.units)[:, k]
     usable = (targets.executed < 0.5) & np.isfinite(turn) & np.isfinite(error)
@@ -244,24 +246,24 @@ def _similar(image: np.ndarray, *, scale: float = 1.0, turn_deg: float = 0.0, sh
     return cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_LINEAR)
 
 
-def scaled(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
+def scale_image(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
     """The image one per cent larger or smaller, at random."""
     return _similar(image, scale=1 + SCALE_CHANGE * rng.choice([-1, 1]))
 
 
-def shifted(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
+def shift_image(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
     """The image shifted by two px in a random direction."""
     angle = rng.uniform(0, 2 * np.pi)
     return _similar(image, shift_px=(SHIFT_CHANGE_PX * np.cos(angle), SHIFT_CHANGE_PX * np.sin(angle)))
 
 
-def turned(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
+def turn_image(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
     """The image turned by one degree, at random to the left or to the right."""
     return _similar(image, turn_deg=TURN_CHANGE_DEG * rng.choice([-1.0, 1.0]))
 
 
-def erased(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
-    """The image with five pins erased, drawn at random from those that the pipeline finds."""
+def erase_pins(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
+    """The image with five pins erased, sampled at random from those that the pipeline finds."""
     seen = estimator.pipeline(Frame(image, estimator.form))
     found = np.flatnonzero(np.isfinite(seen.pins_px[:, 0]))
     half = ERASED_MARGIN * float(estimator.pipeline.reference.spacing_px.mean()) / 2
@@ -273,10 +275,10 @@ def erased(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator
     return image
 
 
-CHANGES: dict[str, Change] = {"1 % scale": scaled, "2 px shift": shifted, "1 deg turn": turned, "5 pins erased": erased}
+CHANGES: dict[str, Change] = {"1 % scale": scale_image, "2 px shift": shift_image, "1 deg turn": turn_image, "5 pins erased": erase_pins}
 
 
-def judge_changes(
+def measure_changes(
     estimator: PoseEstimator, data: Dataset, rows: np.ndarray, *, seed: int = 0, progress: Step | None = None
 ) -> list[dict[str, Any]]:
     """Errors against corrected labels of single frames, unchanged and under every change.
@@ -293,7 +295,7 @@ def judge_changes(
         The data set has no pictures.
     """
     if is_pins_only(data.folder):
-        raise TrainingError(f"{data.folder}: a data set of pins has no pictures to change; render it, or judge without `robustness`")
+        raise TrainingError(f"{data.folder}: a data set of pins has no pictures to change; render it, or evaluate without `robustness`")
     recording = open_recording(data.folder, data.pins.sensor, data.pins.form)
     place = {name: k for k, name in enumerate(recording.names)}
     changes: dict[str, Change] = {"none": lambda image, rng, estimator: image} | CHANGES

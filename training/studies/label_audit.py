@@ -10,18 +10,18 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from scenes import SensorSpec
-from training.data.audit import STORIES, Audit, audit_labels
+from training.data.audit import HYPOTHESES, Audit, audit_labels
 from training.data.dataset import Dataset, load_dataset
 from training.data.targets import CONTACT, UNITS, unit_of
 from twin.errors import FrameError
 from twin.progress import Progress, silent, stage
-from twin.report.charts import muted, new_figure, write_chart
+from twin.report.charts import muted_colour, new_figure, write_chart
 from twin.report.numbers import number
-from twin.report.page import Page, Picture
+from twin.report.page import Page, PagePicture
 from twin.report.table import Column
 from twin.rig.labels import as_executed
 from twin.store import made_by, write_json, write_text, writes
-from twin.types import Form, Readable
+from twin.types import Form, ReadableResult
 
 # Columns of a table that an audit reads.
 NAMES = tuple(f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, len(UNITS) + 1))
@@ -36,7 +36,7 @@ LARGE_MOVE = 1.0
 
 
 @dataclass(frozen=True, repr=False)
-class LabelAudit(Readable):
+class LabelAudit(ReadableResult):
     """The result of an audit, and its files.
 
     Attributes
@@ -55,8 +55,8 @@ class LabelAudit(Readable):
 
     def lines(self) -> list[str]:
         """The result as lines of text."""
-        if self.audit.untold:
-            lines = [f"{self.frames} frames: {self.audit.untold}", "no labels_corrected.csv: whether the labels are right is not known"]
+        if self.audit.not_assessed:
+            lines = [f"{self.frames} frames: {self.audit.not_assessed}", "no labels_corrected.csv: the labels are not assessed"]
         else:
             undone, undecided = self.summary["moves_not_executed"], self.summary["undecided"]
             lines = [f"{self.frames} frames; in {undone['frames']} the move was not executed; {undecided} undecided"]
@@ -64,13 +64,13 @@ class LabelAudit(Readable):
             if names := self.summary[key]:
                 more = ", ..." if len(names) > SAID else ""
                 lines.append(f"{key.replace('_', ' ')}: {len(names)} ({', '.join(names[:SAID])}{more})")
-        if self.audit.untold:
+        if self.audit.not_assessed:
             return lines
         drift = self.audit.drift["r2_of_row_number_beyond_labels"]
         return [
             *lines,
             f"depth beyond the label where not executed: {self.audit.depth_per_move:+.4f} mm for each mm of move_1",
-            f"row number told by the outmost pins beyond the labels: R^2 {drift:.2f}",
+            f"row number given by the outmost pins beyond the labels: R^2 {drift:.2f}",
         ]
 
 
@@ -78,7 +78,7 @@ class LabelAudit(Readable):
 def audit_recording(data: Path, sensor: SensorSpec, out: Path, *, form: Form | None = None, progress: Progress = silent) -> LabelAudit:
     """Audit the labels of a recording of one object, and write the result to a folder.
 
-    A recording with too few frames is not judged. The result states this (``Audit.untold``), and no corrected labels are written.
+    A recording with too few frames is not evaluated. The result states this (``Audit.untold``), and no corrected labels are written.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def _pose_and_move(data: Dataset) -> np.ndarray:
     return np.array([columns.get(name, none) for name in NAMES]).reshape(2, len(UNITS), len(data)).swapaxes(1, 2)
 
 
-def _corrected(data: Dataset, executed: np.ndarray, depth_per_move: float) -> dict[str, np.ndarray]:
+def _correct_moves(data: Dataset, executed: np.ndarray, depth_per_move: float) -> dict[str, np.ndarray]:
     """The varying labels without moves that were not executed (M,), by their names."""
     pose, move = _pose_and_move(data)
     before, made = as_executed(pose, move, executed)
@@ -118,13 +118,13 @@ def summary_of(audit: Audit, data: Dataset) -> dict:
     lost = data.pins.lost.any(axis=1)
     return {
         "frames": len(data),
-        **({"not_told": audit.untold} if audit.untold else _moves(audit, data)),
+        **({"not_told": audit.not_assessed} if audit.not_assessed else _moves(audit, data)),
         "no_contact": names[audit.no_contact].tolist(),
         "wrong_sign": names[audit.wrong_sign].tolist(),
         "fit_no_story": names[audit.odd].tolist(),
-        "same_pins_as_an_earlier_frame": names[audit.twins != np.arange(len(names))].tolist(),
+        "same_pins_as_an_earlier_frame": names[audit.duplicates != np.arange(len(names))].tolist(),
         "frames_with_lost_pins": int(lost.sum()),
-        **({} if audit.untold else {"depth_mm_per_mm_of_move_not_executed": audit.depth_per_move, "drift": audit.drift}),
+        **({} if audit.not_assessed else {"depth_mm_per_mm_of_move_not_executed": audit.depth_per_move, "drift": audit.drift}),
         "reader": data.problems,
     }
 
@@ -157,9 +157,9 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
         "before it; labels_corrected.csv holds the answer. Laid beside the recording's targets.csv, it is what training with corrected "
         "labels uses.",
     )
-    page.notice("Not told, and no corrected labels written", [audit.untold] if audit.untold else [], tone="bad")
+    page.notice("Not assessed, and no corrected labels written", [audit.not_assessed] if audit.not_assessed else [], tone="bad")
     page.notice("The reader says", summary["reader"])
-    evidence = [] if audit.untold else _write_evidence(out, audit, data, page)
+    evidence = [] if audit.not_assessed else _write_evidence(out, audit, data, page)
     page.section("Findings")
     page.table(_findings(summary), [Column("finding", "finding"), Column("value", "value", align="right")])
     page.section("Frames that stand out")
@@ -175,10 +175,12 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
 
 def _write_evidence(out: Path, audit: Audit, data: Dataset, page: Page) -> list[Path]:
     """Write the corrected labels and the picture, and show the picture on the page."""
-    labels = _corrected(data, audit.executed.round(), audit.depth_per_move)
+    labels = _correct_moves(data, audit.executed.round(), audit.depth_per_move)
     chart = write_chart(out / "audit.png", lambda: _evidence_figure(audit, data, labels))
     page.figures(
-        Picture(chart, "Evidence for the findings: which story fits each frame, corrections of the angle, moves along the table, drift")
+        PagePicture(
+            chart, "Evidence for the findings: which hypothesis fits each frame, corrections of the angle, moves along the table, drift"
+        )
     )
     return [write_text(out / "labels_corrected.csv", _labels_csv(audit, data, labels)), chart]
 
@@ -211,12 +213,12 @@ def _some(names: list[str]) -> str:
 def _labels_csv(audit: Audit, data: Dataset, labels: dict[str, np.ndarray]) -> str:
     text = io.StringIO(newline="")
     writer = csv.writer(text)
-    writer.writerow(["image_name", "executed", *labels, *(f"chi2_{story.replace(' ', '_')}" for story in STORIES), "findings"])
+    writer.writerow(["image_name", "executed", *labels, *(f"chi2_{story.replace(' ', '_')}" for story in HYPOTHESES), "findings"])
     for k, name in enumerate(data.pins.image_name):
-        flags = {"no contact": audit.no_contact, "wrong sign": audit.wrong_sign, "fits no story": audit.odd}
+        flags = {"no contact": audit.no_contact, "wrong sign": audit.wrong_sign, "fits no hypothesis": audit.odd}
         said = [flag for flag, rows in flags.items() if rows[k]]
-        if audit.twins[k] != k:
-            said.append(f"same pins as {data.pins.image_name[audit.twins[k]]}")
+        if audit.duplicates[k] != k:
+            said.append(f"same pins as {data.pins.image_name[audit.duplicates[k]]}")
         numbers = [f"{v:.6g}" for v in (*(column[k] for column in labels.values()), *audit.chi2[k])]
         writer.writerow([name, f"{audit.executed[k]:.4g}", *numbers, "; ".join(said)])
     return text.getvalue()
@@ -229,8 +231,8 @@ def _evidence_figure(audit: Audit, data: Dataset, labels: dict[str, np.ndarray])
     difference = audit.chi2[:, 1] - audit.chi2[:, 0]
     size = np.linalg.norm(_pose_and_move(data)[1], axis=1)
     axes[0].plot(size, np.sign(difference) * np.log10(1 + np.abs(difference)), ".", markersize=2)
-    axes[0].axhline(0, color=muted(), linewidth=0.8)
-    axes[0].set(title="which story fits better", xlabel="size of the move, mm and deg", ylabel="log10 chi² for (+) executed")
+    axes[0].axhline(0, color=muted_colour(), linewidth=0.8)
+    axes[0].set(title="which hypothesis fits better", xlabel="size of the move, mm and deg", ylabel="log10 chi² for (+) executed")
     axes[1].plot(raw[shown], raw[shown] - labels[shown], ".", markersize=2)
     axes[1].set(title=f"{shown} less what the pins say", xlabel=f"{shown}, {unit_of(shown)}", ylabel=unit_of(shown))
     undone = audit.executed < 0.5

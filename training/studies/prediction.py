@@ -50,7 +50,7 @@ class Predictions:
             for frame in self.recording:
                 if not warm:
                     # loads or compiles code, which must not count in a frame's time; a copy is used, so that no memory changes
-                    self.estimator.remembering()(frame)
+                    self.estimator.with_history()(frame)
                     warm = True
                 if self.maps is None or not isinstance(self.estimator, PoseEstimator):
                     yield frame.name, self.estimator(frame)
@@ -71,7 +71,7 @@ class Predictions:
         told, poses, reasons = len(self.recording.problems), 0, []
         yield from (f"note: {problem}" for problem in [*self.recording.problems, *self.estimator.caveats])
         for name, made in self:
-            yield f"{name}: {_said(made)}"
+            yield f"{name}: {_describe_estimate(made)}"
             poses += made.valid
             if not made.valid:
                 reasons.append(f"{name}: {made.reason}")
@@ -133,7 +133,7 @@ def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = N
     recording = open_recording(frames, estimator.sensor, estimator.form)
     if estimator.counts_from_rest:
         if recording.reference is None and Path(frames).is_file():
-            _look_beside(recording, Path(frames))
+            _find_rest_frame(recording, Path(frames))
         if recording.reference is not None:
             estimator = estimator.at_rest(recording.reference)
         else:
@@ -147,14 +147,14 @@ def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = N
     if sequence:
         if not isinstance(estimator, PoseEstimator) or estimator.slip is None:
             raise TrainingError(
-                f"{run}: does not tell slip; train touch on simulated drags ('twin dataset --experiment drag --randomise drag "
+                f"{run}: does not estimate slip; train touch on simulated drags ('twin dataset --experiment drag --randomise drag "
                 "--states all'), or leave `sequence` out"
             )
-        estimator = estimator.remembering()
+        estimator = estimator.with_history()
     return Predictions(estimator, recording, maps)
 
 
-def _look_beside(recording: Recording, picture: Path) -> None:
+def _find_rest_frame(recording: Recording, picture: Path) -> None:
     """Use a frame without contact that lies where that of a recording would, if there is one."""
     homes = [picture.parent, *([picture.parent.parent] if picture.parent.name in IMAGE_FOLDERS else [])]
     recording.take_reference([file for home in homes for file in references_in(home) if file.name != picture.name])
@@ -162,7 +162,7 @@ def _look_beside(recording: Recording, picture: Path) -> None:
         recording.problems.append(f"pins are counted from {recording.reference.name}, which lies beside the picture")
 
 
-def _said(made: PoseEstimate) -> str:
+def _describe_estimate(made: PoseEstimate) -> str:
     if not made.valid:
         return f"not valid: {made.reason}"
     rows = zip(made.names, made.units, made.value, made.low, made.high, strict=True)

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 from scenes import SensorSpec
-from training.data.two_sample import SMALL, TwoSample, accuracy_text, judged, judged_halves
+from training.data.two_sample import SMALL, TwoSample, accuracy_text, evaluate_classifiers, evaluate_halves
 from twin.errors import OptionError
-from twin.judge.pictures.realism import run_realism
+from twin.evaluation.pictures.realism import run_realism
 from twin.progress import Progress, Step, silent
 from twin.store import writes
-from twin.types import Quality, Readable
+from twin.types import Quality, ReadableResult
 
 IMAGES = ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip", "psnr_whole_db")
 
 
 @dataclass(frozen=True, repr=False)
-class Realism(Readable):
+class Realism(ReadableResult):
     """The result: all figures, as ``metrics.json`` holds them, and the files, the page first."""
 
     metrics: dict[str, Any]
@@ -93,7 +93,7 @@ def compare_with_renders(
     test : bool
         Train the two-sample test (minutes).
     thorough : bool
-        Also train a stronger network, and both on two halves of the real frames, where there is nothing to tell (ten minutes).
+        Also train a stronger network, and both on two halves of the real frames, where there is no difference (ten minutes).
 
     Raises
     ------
@@ -123,12 +123,12 @@ def compare_with_renders(
 
 
 def _quick(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> dict[str, TwoSample]:
-    return judged(real, rendered, inside, judges={"small": SMALL}, progress=step)
+    return evaluate_classifiers(real, rendered, inside, judges={"small": SMALL}, progress=step)
 
 
 def _thorough(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> dict[str, TwoSample]:
-    halves = judged_halves(real, inside, progress=step)
-    return judged(real, rendered, inside, progress=step) | {f"{name}, real halves": told for name, told in halves.items()}
+    halves = evaluate_halves(real, inside, progress=step)
+    return evaluate_classifiers(real, rendered, inside, progress=step) | {f"{name}, real halves": told for name, told in halves.items()}
 
 
 def _image_line(title: str, count: int, images: dict[str, Any]) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from scenes import SensorSpec
-from training.data.dataset import Dataset, joined, load_dataset, told_apart, with_common_labels
+from training.data.dataset import Dataset, join_datasets, load_dataset, shortest_distinct_ends, with_common_labels
 from training.data.simulated import is_simulated
 from training.data.targets import CONTACT, PRESETS, SHEAR, TURN
 from training.estimate.displacements import learn_displacements, write_displacements
@@ -17,25 +17,25 @@ from training.estimate.estimator import PoseEstimator
 from training.models import model_named, recipe_of
 from training.models.part import LIKELY
 from training.models.touch.model import TOUCH
-from training.runs.config import RunConfig, labels_learnt, training_rows
+from training.runs.config import RunConfig, training_labels, training_rows
 from training.runs.loop import epoch_step
 from training.runs.networks import choose_device
 from training.runs.run import RUN_FILES, train_run
 from training.runs.run_files import BESIDE_FILES, CHECKPOINT, DISPLACEMENTS, DOMAIN, MAPS, SLIP
 from training.touch.contact_maps import FEWEST_STATES, learn_maps, write_maps
-from training.touch.slip import FEWEST_DRAGS, Eyes, drags_of, learn_slip, write_slip
-from training.touch.touched import TouchAnswer
+from training.touch.contact_probability import TouchAnswer
+from training.touch.slip import FEWEST_DRAGS, CapView, drags_of, learn_slip, write_slip
 from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.store import writes
-from twin.types import Form, Readable
+from twin.types import Form, ReadableResult
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helper labels
 FILES = (*RUN_FILES, *BESIDE_FILES)  # files of a finished run
 
 
 @dataclass(frozen=True, repr=False)
-class Trained(Readable):
+class TrainedRun(ReadableResult):
     """A training run and its recordings.
 
     Attributes
@@ -71,7 +71,7 @@ class Trained(Readable):
         lines = [f"note: {problem}" for problem in self.problems]
         lines.append(f"{self.frames} usable frames; labels {', '.join(self.names)} ({self.labels})")
         if not self.finished:
-            lines.append(f"time is up: the weights so far are in {self.out}; the same command goes on from here")
+            lines.append(f"time is up: the weights so far are in {self.out}; the same command resumes from here")
         return lines
 
 
@@ -95,7 +95,7 @@ def train_model(
     device: str = "auto",
     form: Form | None = None,
     progress: Progress = silent,
-) -> Trained:
+) -> TrainedRun:
     """Train a model on labelled recordings, or continue the run in ``out``.
 
     Parameters
@@ -131,7 +131,7 @@ def train_model(
         The recordings have no such labels, or can't be joined.
     """
     if labels not in ("corrected", "raw"):
-        raise OptionError(f"`labels` must be corrected or raw, got {labels!r}")
+        raise OptionError(f"`label_kind` must be corrected or raw, got {labels!r}")
     recipe = recipe_of(model, epochs=epochs, batch=batch, members=members, kernel=kernel)
     if threads:
         torch.set_num_threads(threads)
@@ -139,7 +139,7 @@ def train_model(
     for folder in recordings:
         with stage(progress, f"frames of {folder.name}") as step:
             parts.append(load_dataset(folder, sensor, columns_of(target), form=form, progress=step))
-    found = joined(with_common_labels(parts) if target == CONTACT else parts)
+    found = join_datasets(with_common_labels(parts) if target == CONTACT else parts)
     config = RunConfig(model, recipe, labels, seed, split, (SHEAR, TURN) if target == SHEAR_PRESET else ())
     with stage(progress, model) as step:
         finished = train_run(config, found, out, max_minutes=max_minutes, device=chosen, progress=epoch_step(step))
@@ -151,11 +151,11 @@ def train_model(
     if finished:
         add_displacements(out, config, found)
         add_domain(out, config, found)
-    return Trained(out, finished, len(found), found.targets.names, labels, found.problems)
+    return TrainedRun(out, finished, len(found), found.targets.names, labels, found.problems)
 
 
 def add_maps(run: Path, config: RunConfig, data: Dataset) -> list[str]:
-    """Learn contact maps from the simulated contacts that a finished run learnt from, and write them beside its weights.
+    """Learn contact maps from the simulated contacts that a finished run was trained on, and write them beside its weights.
 
     Returns
     -------
@@ -171,7 +171,7 @@ def add_maps(run: Path, config: RunConfig, data: Dataset) -> list[str]:
 
 
 def add_displacements(run: Path, config: RunConfig, data: Dataset) -> None:
-    """Learn how contacts displace the pins from the frames that a finished run learnt from, and write the model beside its weights.
+    """Learn how contacts displace the pins from the frames that a finished run was trained on, and write the model beside its weights.
 
     Nothing is written if the model does not use displacements from rest, the pins at rest were not measured, or there are too few frames.
     """
@@ -183,7 +183,7 @@ def add_displacements(run: Path, config: RunConfig, data: Dataset) -> None:
 
 
 def add_domain(run: Path, config: RunConfig, data: Dataset) -> None:
-    """Learn the domain from the frames that a finished run learnt from, and write it beside its weights.
+    """Learn the domain from the frames that a finished run was trained on, and write it beside its weights.
 
     Nothing is written if there are too few frames.
     """
@@ -195,7 +195,7 @@ def add_domain(run: Path, config: RunConfig, data: Dataset) -> None:
     touched = TouchAnswer(pins.reference)
     apart = np.array([touched(nodes_px, lost) < LIKELY for nodes_px, lost in zip(pins.nodes_px, pins.lost, strict=True)])
     labels = np.where(
-        apart[:, None], np.nan, labels_learnt(data, config)[rows]
+        apart[:, None], np.nan, training_labels(data, config)[rows]
     )  # a state before first touch has a label, but no pattern of its own
     group = None if data.group is None else data.group[rows]
     simulated = not config.labelled and all(is_simulated(folder) for folder in data.folders)
@@ -207,7 +207,7 @@ def add_domain(run: Path, config: RunConfig, data: Dataset) -> None:
 
 
 def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str]:
-    """Learn slip from the drags among the simulated contacts that a finished run learnt from, and write it beside the weights.
+    """Learn slip from the drags among the simulated contacts that a finished run was trained on, and write it beside the weights.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str
     """
     estimator, drags = PoseEstimator.load(run), []
     kept_out = set(estimator.config["rows"]["kept_out"])
-    called = told_apart([part.folder.resolve() for part in parts]) if len(parts) > 1 else [""]
+    called = shortest_distinct_ends([part.folder.resolve() for part in parts]) if len(parts) > 1 else [""]
     for part, prefix in zip(parts, called, strict=True):
         for rows, drag in drags_of(part):
             names = [f"{prefix}/{name}" if prefix else name for name in part.pins.image_name[rows].tolist()]
@@ -230,11 +230,12 @@ def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str
     slide = sum(np.isfinite(drag.whole_mm) for drag in drags)
     if slide < FEWEST_DRAGS:
         return [
-            f"{slide} contacts are dragged until they slide ({FEWEST_DRAGS} are needed to learn slip from): slip is not told over time; "
+            f"{slide} contacts are dragged until they slide ({FEWEST_DRAGS} are needed to learn slip from): slip is not "
+            f"estimated over time; "
             "'twin dataset --experiment drag --randomise drag --states all' makes such contacts"
         ]
     sensor = parts[0].pins.sensor
-    write_slip(run / SLIP, learn_slip(drags, Eyes(estimator.modes_of, parts[0].pins), sensor, seed=config.seed))
+    write_slip(run / SLIP, learn_slip(drags, CapView(estimator.modes_of, parts[0].pins), sensor, seed=config.seed))
     return []
 
 

@@ -5,19 +5,19 @@ from pathlib import Path
 from typing import Any
 
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_object
-from twin.judge.labelled import ContactModel, compare, measure_frames
-from twin.judge.labelled.compare import Comparison
-from twin.judge.labelled.report import summary_of, write_validation
+from twin.evaluation.labelled import ContactModel, compare, measure_frames
+from twin.evaluation.labelled.compare import Comparison
+from twin.evaluation.labelled.report import summary_of, write_validation
 from twin.progress import Progress, silent, stage
 from twin.store import writes
-from twin.types import FINE, Form, Readable
+from twin.types import FINE, Form, ReadableResult
 
 # Number of frames for which an individual friction is fitted.
 FRICTION_FRAMES = 5
 
 
 @dataclass(frozen=True, repr=False)
-class Validation(Readable):
+class Validation(ReadableResult):
     """The result of a validation.
 
     Attributes
@@ -56,7 +56,7 @@ def validate_contacts(
     experiment: ExperimentSpec,
     out: Path,
     *,
-    touched: ObjectSpec | None = None,
+    obj: ObjectSpec | None = None,
     limit: int | None = None,
     friction_frames: int = FRICTION_FRAMES,
     seed: int = 0,
@@ -72,7 +72,7 @@ def validate_contacts(
         A labelled recording.
     experiment : ExperimentSpec
         The experiment that the recording was made with.
-    touched : ObjectSpec, optional
+    obj : ObjectSpec, optional
         The experiment's own object by default.
     limit : int, optional
         Number of frames, chosen at random with ``seed``; all by default.
@@ -88,7 +88,7 @@ def validate_contacts(
     """
     with stage(progress, "pins") as step:
         measured = measure_frames(frames, sensor, limit, seed, experiment=experiment, form=form, progress=step)
-    model = ContactModel(sensor, experiment, touched or load_object(experiment.object), measured.form, across=across)
+    model = ContactModel(sensor, experiment, obj or load_object(experiment.object), measured.form, across=across)
     with stage(progress, "contacts") as step:
         found = compare(model, measured, friction_frames=friction_frames, progress=step)
     summary = summary_of(found, sensor.name)

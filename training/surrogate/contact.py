@@ -3,7 +3,7 @@
 Forces f at the nodes displace the skin by u = C f (see ``compliance``) plus the correction of ``bending``. At every pose of the object the
 solver looks for forces with which each node is in one of three states: it is clear of the object; it presses and sticks to its anchor; or
 it presses and slides at Coulomb's bound. It starts from the forces of the last pose, corrects one node at a time while it keeps the others
-fixed, and repeats this until no force changes (projected Gauss-Seidel: Jourdan, Alart & Jean 1998). Then it evaluates the bending anew.
+fixed, and repeats this until no force changes (projected Gauss-Seidel: Jourdan, Alart & Jean 1998). Then it evaluates the bending again.
 An anchor is a point of the object: where the node first touched it, or where the node stopped sliding. So the memory neither drifts nor
 fades, and it ends with the contact.
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from training.surrogate.bending import bend, unbent
 from twin.compiled import compiled
-from twin.objects.analytic import Solid
+from twin.objects.analytic import CompiledSolid
 from twin.objects.kernels import solid
 from twin.rig.contact import ArmTurning
 from twin.types import BoolArray, FloatArray, IntArray
@@ -149,7 +149,7 @@ class LinearContacts:
         return float(np.linalg.norm(self.node_mm[0]))
 
     def begin(
-        self, row: int, thing: Solid, friction: float, *, compliance_mm_per_n: float = 0.0, turning: ArmTurning | None = None
+        self, row: int, thing: CompiledSolid, friction: float, *, compliance_mm_per_n: float = 0.0, turning: ArmTurning | None = None
     ) -> None:
         """Set the object, friction and compliance of one sensor, and set it to rest."""
         sizes = thing.sizes
@@ -235,11 +235,11 @@ def _distances(
     still, origin = np.zeros_like(node), np.zeros((1, 3))
     for r in range(len(rows)):
         row, turn, place = rows[r], T[r, :3, :3], T[r, :3, 3]
-        _seen_from(node, still, turn, place, points)
+        _to_object_frame(node, still, turn, place, points)
         found, _, _ = solid(points, kind[row], sizes[row])
         for i in range(len(node)):
             gap[r, i] = found[i]
-        _seen_from(origin, origin, turn, place, middle)
+        _to_object_frame(origin, origin, turn, place, middle)
         distance, outward, _ = solid(middle, kind[row], sizes[row])
         centre[r, 0] = distance[0]
         centre[r, 1] = -(turn[2, 0] * outward[0, 0] + turn[2, 1] * outward[0, 1] + turn[2, 2] * outward[0, 2])
@@ -282,7 +282,7 @@ def _follow(
         mu, soft, last = friction[row], compliance[row], steps[r] - 1
         way = between(start[r], stop[r], steps[r])
         for step in range(steps[r] + MOST_SETTLING):
-            T = _given_way(way[min(step, last)], turning[row], force[row])
+            T = _deflect_arm(way[min(step, last)], turning[row], force[row])
             if step > last and _motion(taken[row], T, node[0, 2]) <= SETTLED_MM:
                 break
             for p in range(4):
@@ -297,7 +297,7 @@ def _follow(
                 change = bend(force[row], bent[row], moved[row], *bending)
                 if part > 1 and change < BENT_MM:
                     break
-                _seen_from(node, moved[row], turn, place, here)
+                _to_object_frame(node, moved[row], turn, place, here)
                 gap, normal, _ = solid(here, kind[row], sizes[row])
                 if part == 0:
                     for i in range(len(node)):
@@ -310,8 +310,8 @@ def _follow(
                     looked = near[:count]
                     _solve(answer, looked, turn, here, gap, normal, force[row], moved[row], bent[row], anchor[row], shift, mu, soft, part)
             if count:
-                _seen_from(node, moved[row], turn, place, here)
-                used[row] = _remember(near[:count], turn, here, normal, force[row], anchor[row], mu, held[row], slides[row])
+                _to_object_frame(node, moved[row], turn, place, here)
+                used[row] = _record_friction(near[:count], turn, here, normal, force[row], anchor[row], mu, held[row], slides[row])
             for i in range(len(node)):
                 before[row, i] = gap[i]
                 for p in range(3):
@@ -319,7 +319,7 @@ def _follow(
 
 
 @compiled()
-def _given_way(T: FloatArray, turning: FloatArray, force: FloatArray) -> FloatArray:
+def _deflect_arm(T: FloatArray, turning: FloatArray, force: FloatArray) -> FloatArray:
     """The object's pose (4, 4) after an arm has turned under the skin's forces (M, 3); see ``ArmTurning``."""
     if turning[9] == 0:
         return T
@@ -372,7 +372,7 @@ def _motion(start: FloatArray, stop: FloatArray, radius_mm: float) -> float:
 
 
 @compiled()
-def _seen_from(node: FloatArray, moved: FloatArray, turn: FloatArray, place: FloatArray, here: FloatArray) -> None:
+def _to_object_frame(node: FloatArray, moved: FloatArray, turn: FloatArray, place: FloatArray, here: FloatArray) -> None:
     """Write the nodes' positions in the object's frame to ``here`` (M, 3)."""
     for i in range(len(node)):
         x, y, z = node[i, 0] + moved[i, 0] - place[0], node[i, 1] + moved[i, 1] - place[1], node[i, 2] + moved[i, 2] - place[2]
@@ -490,7 +490,7 @@ def _solve(
 
 
 @compiled()
-def _remember(
+def _record_friction(
     near: IntArray,
     turn: FloatArray,
     here: FloatArray,

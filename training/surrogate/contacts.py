@@ -6,24 +6,24 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from training.surrogate.contact import LinearContacts, motion_mm
-from training.surrogate.felt import Contact, Felt
 from training.surrogate.model import Surrogate, by_row, features, outside, rest_of, unlike_parts
 from training.surrogate.paths import unlike_drawn
+from training.surrogate.reading import ContactReading, EpisodeContact
 from twin.geometry.pins import PinRest
 from twin.objects import build_field
-from twin.objects.analytic import Solid
+from twin.objects.analytic import CompiledSolid
 from twin.rig.contact import ArmTurning
 from twin.types import FloatArray, IntArray
 
 LARGEST_MOVE_MM = 30.0
-"""Largest motion between two poses. Beyond it the path between them is unknown, and the contact begins anew."""
+"""Largest motion between two poses. Beyond it the path between them is unknown, and the contact begins again."""
 CLEAR_MM = 0.5
 """Distance between dome and object at which a contact begins."""
 _field = lru_cache(maxsize=64)(build_field)
 
 
 class SurrogateContacts:
-    """A ``Backend`` (see ``training.surrogate.felt``) on a surrogate.
+    """A ``Backend`` (see ``training.surrogate.reading``) on a surrogate.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class SurrogateContacts:
     count : int
         Number of sensors.
     friction_memory : bool
-        False: at every pose the contact begins anew.
+        False: at every pose the contact begins again.
     """
 
     def __init__(self, surrogate: Surrogate, sensor: SensorSpec, count: int, *, friction_memory: bool = True) -> None:
@@ -56,11 +56,11 @@ class SurrogateContacts:
         self._gap = np.full((count, len(surrogate.node_mm)), np.inf)
         self._parts = np.zeros((count, len(modes)), np.float32)
         self._domain = surrogate.domain
-        self.felt = Felt.at_rest(count, self._caps_rest)
+        self.felt = ContactReading.at_rest(count, self._caps_rest)
 
-    def require(self, contact: Contact) -> None:
-        """See ``Backend``: it takes objects of the drawn family, with one coefficient of friction."""
-        touched, friction = contact.touched, contact.law.friction
+    def require(self, contact: EpisodeContact) -> None:
+        """See ``Backend``: it takes objects of the sampled family, with one coefficient of friction."""
+        touched, friction = contact.obj, contact.law.friction
         unlike = unlike_drawn(touched)
         if unlike:
             raise outside(unlike)
@@ -71,13 +71,15 @@ class SurrogateContacts:
         if friction.static > self._domain["friction"]:
             raise outside(f"a friction of {friction.static:g}, at most {self._domain['friction']:g} was trained")
         if contact.sensor is not self._sensor and unlike_parts(self._surrogate.about["mechanics"], contact.sensor):
-            raise outside("the skin, gel, lens or pins of the sensor are drawn anew; randomise friction, camera and noise only ('moves')")
+            raise outside(
+                "the skin, gel, lens or pins of the sensor are sampled again; randomise friction, camera and noise only ('moves')"
+            )
 
-    def begin(self, row: int, contact: Contact) -> None:
+    def begin(self, row: int, contact: EpisodeContact) -> None:
         """See ``Backend``."""
         self.require(contact)
-        law, thing = contact.law, _field(contact.touched)
-        assert isinstance(thing, Solid)  # required
+        law, thing = contact.law, _field(contact.obj)
+        assert isinstance(thing, CompiledSolid)  # required
         assert law.given_way is None or isinstance(law.given_way, ArmTurning)
         friction, soft = law.friction.static, law.compliance_mm_per_n
         self._linear.begin(row, thing, friction, compliance_mm_per_n=soft, turning=law.given_way)
@@ -95,7 +97,7 @@ class SurrogateContacts:
         for place, row in enumerate(rows.tolist()):
             self.felt.lost[row] = "" if inside[place] else self._outside(depth[place], polar[place])
         if not inside.all():
-            self._forget(rows[~inside])
+            self._clear_history(rows[~inside])
             rows, T_sensor_object, gap = rows[inside], T_sensor_object[inside], gap[inside]
         rows = self._bring(rows, T_sensor_object, gap)
         if len(rows):
@@ -118,7 +120,7 @@ class SurrogateContacts:
         """Depths (B,) of the objects inside the undeformed domes."""
         return np.maximum(-self._gap.min(axis=1), 0.0)
 
-    def _forget(self, rows: IntArray) -> None:
+    def _clear_history(self, rows: IntArray) -> None:
         self._linear.free(rows)
         self._known[rows] = False
 

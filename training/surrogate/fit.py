@@ -14,10 +14,10 @@ from training.surrogate.bending import Bending, ample
 from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of
 from training.surrogate.contact import LinearContacts
 from training.surrogate.contacts import SurrogateContacts
-from training.surrogate.felt import Contact
 from training.surrogate.model import SHIPPED, SUFFIX, VIEWS, Surrogate, features, gate, load_surrogate, mechanics_of, within
-from training.surrogate.nodes import interpolated
+from training.surrogate.nodes import interpolation_matrix
 from training.surrogate.paths import DEEPEST_MM, STICKING
+from training.surrogate.reading import EpisodeContact
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
 from training.surrogate.symmetry import Symmetry, ring_directions, symmetries
 from twin.camera.projection import project
@@ -27,17 +27,17 @@ from twin.geometry.pins import rest_pins
 from twin.mechanics import Friction
 from twin.mechanics.law import ContactLaw
 from twin.objects import build_field
-from twin.objects.analytic import Solid
+from twin.objects.analytic import CompiledSolid
 from twin.progress import Progress, silent, stage
 from twin.store import Layers, writes_file
-from twin.types import FloatArray, Form, Readable
+from twin.types import FloatArray, Form, ReadableResult
 
 FAMILY = "mg400-331"
 """Sensor of the shipped surrogate whose networks are the start of the training for every other sensor."""
 PATHS = 120
 """Default number of solved paths to train a surrogate on: about 5000 states."""
 RADII_MM = (15.0, 25.0)
-"""Smallest and largest radius of a dome. In this range the drawn indentations, of up to 5 mm, are usual ones."""
+"""Smallest and largest radius of a dome. In this range the sampled indentations, of up to 5 mm, are usual ones."""
 LEAST_PATHS = 10
 """Smallest number of paths to train on."""
 JUDGED = 5
@@ -87,7 +87,7 @@ BINS = {"depth_mm": (0.0, 1.5, 3.0, 6.0), "shear_mm": (0.0, 0.5, 1.5, 20.0)}
 
 
 @dataclass(frozen=True, repr=False)
-class Distilled(Readable):
+class Distilled(ReadableResult):
     """A fitted surrogate with its errors on paths that it was not trained on, and the files that were written."""
 
     surrogate: Surrogate
@@ -134,11 +134,11 @@ class _Truths:
     force: FloatArray
     pins: FloatArray
 
-    def turned(self, g: Symmetry) -> "_Truths":
+    def turn(self, g: Symmetry) -> "_Truths":
         """The same states, turned or mirrored."""
         pins = self.pins.reshape(len(self.pins), 2, -1, 3)
-        pins = np.stack([g.moved(pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
-        return _Truths(g.moved(self.moved, NODE_RINGS), g.moved(self.force, NODE_RINGS), pins.reshape(len(pins), -1))
+        pins = np.stack([g.move_vectors(pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
+        return _Truths(g.move_vectors(self.moved, NODE_RINGS), g.move_vectors(self.force, NODE_RINGS), pins.reshape(len(pins), -1))
 
     def some(self, first: int, every: int) -> "_Truths":
         """Every ``every``-th state, from ``first`` on."""
@@ -185,7 +185,7 @@ def require_dome(sensor: SensorSpec) -> None:
         )
     for part in ("skin", "gel"):
         if getattr(sensor, part).relaxation:
-            raise OptionError(f"{sensor.name}: its {part} relaxes, and a surrogate remembers no time; use backend='fem'")
+            raise OptionError(f"{sensor.name}: its {part} relaxes, and a surrogate has no history in time; use backend='fem'")
     if sensor.gel.sealed:
         raise OptionError(f"{sensor.name}: its gel is sealed, which a surrogate does not know; use backend='fem'")
 
@@ -210,7 +210,7 @@ def fit(
     seen = [path for number, path in enumerate(solved) if number % JUDGED] + list(extra)
     kept = [path for number, path in enumerate(solved) if not number % JUDGED]
     skin = compliance_of(lattice_sensor(sensor))
-    answer = averaged(skin.nodes, sensor.pins.phase_deg)
+    answer = average_compliance(skin.nodes, sensor.pins.phase_deg)
     weights = np.array([1.0, AXIS_MM], np.float32)[:, None, None]
     linear_pins = np.stack([skin.base, skin.axis]).astype(np.float32) * weights[..., None, None]  # (2, P, 3, M, 3)
     flat = linear_pins.reshape(linear_pins.shape[0] * linear_pins.shape[1] * 3, -1)
@@ -219,26 +219,28 @@ def fit(
     moves = truths.force.reshape(len(truths.force), -1) @ answer.transpose(0, 3, 1, 2).reshape(3 * len(answer), -1)
     softness = float((moves * truths.moved.reshape(moves.shape)).sum() / (moves**2).sum())
     answer, flat = softness * answer, softness * flat
-    turned = [truths.turned(g) for g in group]
+    turned = [truths.turn(g) for g in group]
     if start is None:
         some = [part.some(number, max(len(truths.force) * len(group) // MODE_STATES, 1)) for number, part in enumerate(turned)]
         pins = np.concatenate([part.pins for part in some])
         forces = np.concatenate([part.force.reshape(len(part.force), -1) for part in some])
         modes = _main(np.concatenate([pins, 3 * (pins - forces @ flat.T)]), MODES)
     else:
-        modes = _carried(start, sensor, weights)
+        modes = _carry_modes(start, sensor, weights)
     read = modes @ flat
     bending = _bending(turned, answer, read, start, progress)
     kernel = bending.kernel(read)
     rng = np.random.default_rng(0)
     turns = rng.uniform(0.0, np.pi / 3, (len(seen), TURNS))
     turns[:, 0] = 0.0
-    rows = _joined([sampled(sensor, skin, answer, path, turn, kernel) for path, angles in zip(seen, turns, strict=True) for turn in angles])
+    rows = _join_samples(
+        [sample_states(sensor, skin, answer, path, turn, kernel) for path, angles in zip(seen, turns, strict=True) for turn in angles]
+    )
     rows = replace(rows, pins=rows.pins * weights)
-    view = start.view if start else _main(np.concatenate([_turned(rows, g).within[:: 4 * len(group)] for g in group]), VIEWS)
+    view = start.view if start else _main(np.concatenate([_turn_states(rows, g).within[:: 4 * len(group)] for g in group]), VIEWS)
     inputs, outputs = [], []
     for g in group:
-        part = _turned(rows, g)
+        part = _turn_states(rows, g)
         seen_by = [part.force.reshape(len(part.force), -1) @ read.T, part.beside, part.within @ view.T]
         inputs.append(np.concatenate(seen_by, axis=1).astype(np.float32))
         lacks = _pins_and_rest(part, flat)[1] @ modes.T
@@ -256,7 +258,7 @@ def fit(
     counts = np.tile(1.0 / (LEAST_MOVED_MM**2 + largest**2), len(group))
     gates = np.tile(gate(rows.depth), len(group))
     given = (x - mean) / scale, y / out_scale, gates.astype(np.float32), (counts / counts.mean()).astype(np.float32)
-    layers = _trained(*given, start.layers if start else (), WIDTH, progress)
+    layers = _train_network(*given, start.layers if start else (), WIDTH, progress)
     onto = _interpolation(sensor)
     on_pins = np.einsum("np,kcpi->knci", onto, modes.reshape(MODES, 2, -1, 3) / weights[None], optimize=True)
     about = {
@@ -279,16 +281,16 @@ def fit(
         layers,
         out_scale,
     ).as_kept()  # so that the errors are those of the file, which rounds the arrays
-    about["errors"] = judge(made, sensor, kept)
+    about["errors"] = measure_errors(made, sensor, kept)
     return made
 
 
 def cut(path: SolvedPath, radius_mm: float) -> SolvedPath:
     """A path up to where it leaves the domain on a dome of this radius: later states, which may be very large, are not trained on."""
-    thing = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
+    obj = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
     inside = len(path.T)
     for number, T in enumerate(path.T):
-        distance, outward, _ = thing.probe(-T[:3, 3][None] @ T[:3, :3])
+        distance, outward, _ = obj.probe(-T[:3, 3][None] @ T[:3, :3])
         depth = radius_mm - float(distance[0])
         if depth > DEEPEST_TAKEN_MM or (depth > 0 and -T[2, :3] @ outward[0] < np.cos(np.radians(POLAR_DEG))):
             inside = number
@@ -298,7 +300,7 @@ def cut(path: SolvedPath, radius_mm: float) -> SolvedPath:
     return replace(path, **states)
 
 
-def averaged(nodes: FloatArray, phase_deg: float) -> FloatArray:
+def average_compliance(nodes: FloatArray, phase_deg: float) -> FloatArray:
     """Compliance (M, M, 3, 3), force node first, averaged over the symmetries: the mesh of squares breaks them slightly."""
     answer = nodes.transpose(2, 0, 1, 3)
     total = np.zeros_like(answer)
@@ -309,7 +311,7 @@ def averaged(nodes: FloatArray, phase_deg: float) -> FloatArray:
     return np.ascontiguousarray(total / len(group))
 
 
-def sampled(
+def sample_states(
     sensor: SensorSpec,
     skin: Compliance,
     answer: FloatArray,
@@ -324,10 +326,10 @@ def sampled(
     about = np.eye(4)
     about[:3, :3] = turn = _about_z(turn_rad)
     poses = about @ path.T
-    thing = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
-    assert isinstance(thing, Solid)
+    obj = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
+    assert isinstance(obj, CompiledSolid)
     linear, row = LinearContacts.at_rest(skin.node_mm, answer.astype(np.float32), 1, bending=bending), np.zeros(1, int)
-    linear.begin(0, thing, path.friction)
+    linear.begin(0, obj, path.friction)
     rest = rest_pins(lattice_sensor(sensor).geometry)
     states = []
     for before, T in zip(poses[[0, *range(len(poses) - 1)]], poses, strict=True):
@@ -341,7 +343,7 @@ def sampled(
     beside = features(deep, np.full(len(deep), path.friction), holding, slips, used, wrench)
     pins = np.stack([path.base_mm - rest.base_mm, path.axis - rest.axis], axis=1)
     if turn_rad:
-        pins = interpolated(-rest.axis @ turn.T, -rest.axis) @ (pins @ turn.T)
+        pins = interpolation_matrix(-rest.axis @ turn.T, -rest.axis) @ (pins @ turn.T)
     truth = np.concatenate([path.force_n @ turn.T, path.torque_nmm @ turn.T], axis=1)
     return _Samples(forces, beside, deep, near, wrench, pins.astype(np.float32), truth, path.area_mm2, path.slip - slips)
 
@@ -353,7 +355,7 @@ def _main(rows: FloatArray, count: int) -> FloatArray:
     return found
 
 
-def _carried(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> FloatArray:
+def _carry_modes(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> FloatArray:
     """The modes (MODES, 6 P) of ``start``, a surrogate of another sensor of the family, on this sensor's lattice."""
     turn = _about_z(np.radians(sensor.pins.phase_deg - start.phase_deg)).astype(np.float32)
     modes = (start.modes @ turn.T).transpose(0, 2, 1, 3) * weights
@@ -388,7 +390,7 @@ def _truths(sensor: SensorSpec, solved: Sequence[SolvedPath], weights: FloatArra
 
 
 def _bending(turned: Sequence[_Truths], answer: FloatArray, read: FloatArray, start: Surrogate | None, progress: Any) -> Bending:
-    """Fit the bending: the true displacements minus those of the linear skin under the same forces. ``turned`` has all symmetries."""
+    """Fit the bending: the true displacements minus those of the linear skin under the same forces. ``turn`` has all symmetries."""
     compliance = answer.transpose(0, 3, 1, 2).reshape(3 * len(answer), -1).astype(np.float32)
     forces = [part.force.reshape(len(part.force), -1) for part in turned]
     lacks = [part.moved.reshape(len(part.moved), -1) - force @ compliance for part, force in zip(turned, forces, strict=True)]
@@ -401,12 +403,12 @@ def _bending(turned: Sequence[_Truths], answer: FloatArray, read: FloatArray, st
     straight = np.linalg.solve((x * light).T @ x + STEADY * len(x) * np.eye(x.shape[1]), (x * light).T @ y).T
     rest, size = y - x @ straight.T, 1.0 if start else float(y.std(axis=0).max())
     given = x, rest / size, ample(x), (counts / counts.mean()).astype(np.float32)
-    layers = _trained(*given, start.bending.layers if start else (), BENT_WIDTH, progress)
+    layers = _train_network(*given, start.bending.layers if start else (), BENT_WIDTH, progress)
     layers = (*layers[:-1], (size * layers[-1][0], size * layers[-1][1]))
     return Bending(scale, straight.astype(np.float32), layers, modes.reshape(len(modes), -1, 3))
 
 
-def judge(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]) -> dict[str, Any]:
+def measure_errors(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]) -> dict[str, Any]:
     """Errors on solved paths: pins in px of the sensor's frames, force, sliding share; for all states and by kind of contact."""
     lattice, form = lattice_sensor(sensor), Form.PROCESSED if sensor.recording else Form.RAW
     onto, cap_mm = _interpolation(sensor), sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
@@ -420,9 +422,9 @@ def judge(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]
     }
     rest_px = px(rest.caps_mm)
     for path in solved:
-        thing = ObjectSpec(name="drawn", description="", shape=path.shape)
+        obj = ObjectSpec(name="drawn", description="", shape=path.shape)
         contacts = SurrogateContacts(surrogate, sensor, 1)
-        contacts.begin(0, Contact(sensor, thing, ContactLaw(Friction(path.friction, path.friction))))
+        contacts.begin(0, EpisodeContact(sensor, obj, ContactLaw(Friction(path.friction, path.friction))))
         for number, T in enumerate(path.T):
             contacts.move(np.zeros(1, int), T[None], np.zeros(1))
             depth = float(contacts.depth_mm[0])
@@ -445,7 +447,7 @@ def judge(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]
 
     large = values["largest"] >= LARGE_PX
 
-    def told(rows: Any) -> dict[str, float]:
+    def summarise(rows: Any) -> dict[str, float]:
         return {
             "states": int(np.sum(rows)),
             "pins_px": round(float(values["error"][rows].mean()), 4),
@@ -454,28 +456,28 @@ def judge(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]
             "slip": round(float(values["slip"][rows].mean()), 4),
         }
 
-    by: dict[str, dict[str, Any]] = {"object": {kind: told(values["object"] == kind) for kind in sorted(set(columns["object"]))}}
+    by: dict[str, dict[str, Any]] = {"object": {kind: summarise(values["object"] == kind) for kind in sorted(set(columns["object"]))}}
     for key, ends in BINS.items():
         rows = [
             (f"{low:g} to {high:g}", (values[key] >= low) & (values[key] < high)) for low, high in zip(ends[:-1], ends[1:], strict=True)
         ]
-        by[key] = {name: told(inside) for name, inside in rows if inside.any()}
-    return {"paths": len(solved), "all": told(np.ones(len(values["force"]), bool)), "by": by}
+        by[key] = {name: summarise(inside) for name, inside in rows if inside.any()}
+    return {"paths": len(solved), "all": summarise(np.ones(len(values["force"]), bool)), "by": by}
 
 
-def _joined(parts: Sequence[_Samples]) -> _Samples:
+def _join_samples(parts: Sequence[_Samples]) -> _Samples:
     every = _Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in _Samples.__dataclass_fields__))
     rows = every.depth > TOUCHES_MM
     return _Samples(*(getattr(every, name)[rows] for name in _Samples.__dataclass_fields__))
 
 
-def _turned(rows: _Samples, g: Symmetry) -> _Samples:
+def _turn_states(rows: _Samples, g: Symmetry) -> _Samples:
     """The same states, turned or mirrored."""
     wrench, linear, beside = (_turned_wrench(values, g) for values in (rows.wrench, rows.linear, rows.beside))
-    pins = np.stack([g.moved(rows.pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
+    pins = np.stack([g.move_vectors(rows.pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
     near = np.empty_like(rows.within)
     near[:, g.places(NODE_RINGS)] = rows.within
-    return replace(rows, force=g.moved(rows.force, NODE_RINGS), beside=beside, within=near, linear=linear, pins=pins, wrench=wrench)
+    return replace(rows, force=g.move_vectors(rows.force, NODE_RINGS), beside=beside, within=near, linear=linear, pins=pins, wrench=wrench)
 
 
 def _turned_wrench(values: FloatArray, g: Symmetry) -> FloatArray:
@@ -486,7 +488,7 @@ def _turned_wrench(values: FloatArray, g: Symmetry) -> FloatArray:
     return out
 
 
-def _trained(x: FloatArray, y: FloatArray, gates: FloatArray, counts: FloatArray, start: Layers, width: int, progress: Any) -> Layers:
+def _train_network(x: FloatArray, y: FloatArray, gates: FloatArray, counts: FloatArray, start: Layers, width: int, progress: Any) -> Layers:
     """Train a network whose output, times the gates (S,), estimates y (S, o) from x (S, i); return its weights and offsets.
 
     ``counts`` (S,) are the states' weights in the loss. Training starts from the weights and offsets of ``start``, if there are any.
@@ -527,4 +529,4 @@ def _interpolation(sensor: SensorSpec) -> FloatArray:
     places = -rest_pins(sensor.geometry).axis
     if places.shape == lattice.shape and np.allclose(places, lattice, atol=1e-9):
         return np.eye(len(lattice))
-    return interpolated(lattice, places)
+    return interpolation_matrix(lattice, places)

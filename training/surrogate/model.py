@@ -186,7 +186,7 @@ def representatives(phase_deg: float) -> list[int]:
     return sorted(set(np.min([g.places(NODE_RINGS) for g in symmetries(phase_deg)], axis=0).tolist()))
 
 
-def unfolded(kept: FloatArray, phase_deg: float) -> FloatArray:
+def unfold_compliance(kept: FloatArray, phase_deg: float) -> FloatArray:
     """The compliance (M, M, 3, 3) of all nodes from that of the representatives."""
     count = kept.shape[1]
     out = np.zeros((count, count, 3, 3), np.float32)
@@ -206,7 +206,7 @@ def load_surrogate(path: Path) -> Surrogate:
     SurrogateError
         There is no such file, or it is not a surrogate of this version.
     """
-    with FILE.opened(path) as (about, arrays):
+    with FILE.open_arrays(path) as (about, arrays):
         return _of_arrays(about, arrays)
 
 
@@ -217,7 +217,7 @@ def _of_arrays(about: dict[str, Any], arrays: Mapping[str, FloatArray]) -> Surro
     return Surrogate(
         about,
         radius * ring_directions(NODE_RINGS, POLAR_DEG, phase),
-        unfolded(arrays["answer"], phase),
+        unfold_compliance(arrays["answer"], phase),
         arrays["modes"],
         arrays["read"],
         arrays["view"],

@@ -50,7 +50,7 @@ class AtNodes:
         phase, beyond = solver.spec.pins.phase_deg, NODE_RINGS + 1
         nodes = ring_directions(NODE_RINGS, POLAR_DEG, phase)
         around = ring_directions(beyond, POLAR_DEG * beyond / NODE_RINGS, phase)
-        return cls(outer, rest[outer], interpolated(rest[outer], nodes), solver.shape, Delaunay(laid_flat(around)))
+        return cls(outer, rest[outer], interpolation_matrix(rest[outer], nodes), solver.shape, Delaunay(laid_flat(around)))
 
     def moved_mm(self, state: ContactState) -> FloatArray:
         """Displacements (M, 3) float32 of the surrogate's nodes."""
@@ -72,7 +72,7 @@ class AtNodes:
         return out[: len(self.shares)].astype(np.float32)
 
 
-def interpolated(start: FloatArray, places: FloatArray) -> FloatArray:
+def interpolation_matrix(start: FloatArray, places: FloatArray) -> FloatArray:
     """Matrix (N, P) that interpolates values known in directions (P, 3) to other directions (N, 3)."""
     shares = RBFInterpolator(laid_flat(start), np.eye(len(start)), neighbors=NEIGHBOURS, kernel="thin_plate_spline")
     found: FloatArray = shares(laid_flat(places))

@@ -15,9 +15,9 @@ from twin.types import FloatArray
 LEGS = 7
 """Number of straight motions of a path after its first indentation."""
 DEEPEST_MM = 5.0
-"""Largest drawn indentation of the undeformed dome."""
+"""Largest sampled indentation of the undeformed dome."""
 SHALLOWEST_MM = 0.3
-"""Smallest drawn indentation of a contact."""
+"""Smallest sampled indentation of a contact."""
 POLAR_DEG = 35.0
 """Largest angle of the first touched place from the dome's apex."""
 BESIDE_MM = 9.0
@@ -40,9 +40,10 @@ BACK_SHARE = 0.2
 CLEAR_MM = 0.5
 """Distance between skin and object on a leg that leaves."""
 LEAST_MM = {"sphere": 4.0, "cylinder": 5.0, "prism": 5.0}
-"""Smallest drawn radii of balls and cylinders, and smallest drawn inradius of prisms. Smaller objects fit between two surrogate nodes."""
+"""Smallest sampled radii of balls and cylinders, and smallest sampled inradius of prisms. Smaller objects fit between two surrogate
+nodes."""
 LEAST_FILLET_MM = 0.45
-"""Smallest drawn fillet of edges. Prisms have a fillet of at least 1 mm."""
+"""Smallest sampled fillet of edges. Prisms have a fillet of at least 1 mm."""
 _DIRECTIONS = 2000
 """Number of directions, over the whole sphere, at which the dome is sampled."""
 
@@ -59,41 +60,41 @@ class DrawnPath:
 def draw_shape(rng: np.random.Generator) -> Shape:
     """A solid of random kind and size, in the range of the shipped objects and somewhat beyond."""
 
-    def sized(low: float, high: float) -> float:
+    def draw_size(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
     kind = rng.choice(["plane", "sphere", "cylinder", "edge", "prism"], p=[0.2, 0.2, 0.2, 0.25, 0.15])
     if kind == "plane":
         return PlaneShape(kind="plane")
     if kind == "sphere":
-        return SphereShape(kind="sphere", radius_mm=sized(LEAST_MM["sphere"], 45.0))
+        return SphereShape(kind="sphere", radius_mm=draw_size(LEAST_MM["sphere"], 45.0))
     if kind == "cylinder":
-        return CylinderShape(kind="cylinder", radius_mm=sized(LEAST_MM["cylinder"], 45.0))
+        return CylinderShape(kind="cylinder", radius_mm=draw_size(LEAST_MM["cylinder"], 45.0))
     if kind == "edge":
-        return EdgeShape(kind="edge", fillet_mm=sized(LEAST_FILLET_MM, 3.0))
-    fillet = sized(1.0, 8.0)
+        return EdgeShape(kind="edge", fillet_mm=draw_size(LEAST_FILLET_MM, 3.0))
+    fillet = draw_size(1.0, 8.0)
     return PrismShape(
-        kind="prism", sides=int(rng.integers(3, 7)), inradius_mm=max(fillet, sized(LEAST_MM["prism"], 45.0)), fillet_mm=fillet
+        kind="prism", sides=int(rng.integers(3, 7)), inradius_mm=max(fillet, draw_size(LEAST_MM["prism"], 45.0)), fillet_mm=fillet
     )
 
 
-def unlike_drawn(touched: ObjectSpec) -> str:
-    """The reason why an object does not belong to the drawn family; "" for one that does.
+def unlike_drawn(obj: ObjectSpec) -> str:
+    """The reason why an object does not belong to the sampled family; "" for one that does.
 
     Objects larger than the drawn ones are flatter, so they count as members of the family.
     """
-    shape = touched.shape
-    if touched.texture is not None:
-        return f"{touched.name} has a texture, which lies between the surrogate's nodes"
+    shape = obj.shape
+    if obj.texture is not None:
+        return f"{obj.name} has a texture, which lies between the surrogate's nodes"
     match shape:
         case MeshShape():
-            return f"{touched.name} is a mesh, and no mesh was trained"
+            return f"{obj.name} is a mesh, and no mesh was trained"
         case SphereShape() | CylinderShape() if shape.radius_mm < LEAST_MM[shape.kind]:
-            return f"{touched.name} has a radius of {shape.radius_mm:g} mm, at least {LEAST_MM[shape.kind]:g} was trained"
+            return f"{obj.name} has a radius of {shape.radius_mm:g} mm, at least {LEAST_MM[shape.kind]:g} was trained"
         case PrismShape() if shape.inradius_mm < LEAST_MM[shape.kind]:
-            return f"{touched.name} has an inradius of {shape.inradius_mm:g} mm, at least {LEAST_MM[shape.kind]:g} was trained"
+            return f"{obj.name} has an inradius of {shape.inradius_mm:g} mm, at least {LEAST_MM[shape.kind]:g} was trained"
         case EdgeShape() | PrismShape() if shape.fillet_mm < LEAST_FILLET_MM:
-            return f"{touched.name} is rounded by {shape.fillet_mm:g} mm, at least {LEAST_FILLET_MM:g} was trained"
+            return f"{obj.name} is rounded by {shape.fillet_mm:g} mm, at least {LEAST_FILLET_MM:g} was trained"
     return ""
 
 
@@ -107,20 +108,20 @@ def draw_path(sensor: SensorSpec, rng: np.random.Generator) -> DrawnPath:
     place, normal = _place_on(field, rng)
     toward = _direction(np.radians(rng.uniform(0, POLAR_DEG)), rng.uniform(0, 2 * np.pi))
     T = np.eye(4)
-    T[:3, :3] = _aligned(normal, -toward) @ Rotation.from_rotvec(rng.uniform(0, 2 * np.pi) * normal).as_matrix()
+    T[:3, :3] = _turn_between(normal, -toward) @ Rotation.from_rotvec(rng.uniform(0, 2 * np.pi) * normal).as_matrix()
     T[:3, 3] = radius * toward - T[:3, :3] @ place
     poses = [at_depth(field, dome, T, 0.0)]
     poses.append(at_depth(field, dome, poses[0], _depth(rng)))
     for _ in range(LEGS):
         if rng.random() < LEAVE_SHARE:
             free = at_depth(field, dome, poses[-1], -CLEAR_MM)
-            beside = at_depth(field, dome, _moved(field, dome, free, rng), -CLEAR_MM)
+            beside = at_depth(field, dome, _move_object(field, dome, free, rng), -CLEAR_MM)
             poses += [free, beside, at_depth(field, dome, beside, _depth(rng))]
         elif rng.random() < BACK_SHARE:
             poses.append(ContactPath(np.stack(poses[-2:])).at(1.0 - rng.uniform(0.3, 1.0)))
         else:
             depth = _depth(rng) if rng.random() < 0.5 else _deep(field, dome, poses[-1])[0]
-            poses.append(at_depth(field, dome, _moved(field, dome, poses[-1], rng), float(np.clip(depth, SHALLOWEST_MM, DEEPEST_MM))))
+            poses.append(at_depth(field, dome, _move_object(field, dome, poses[-1], rng), float(np.clip(depth, SHALLOWEST_MM, DEEPEST_MM))))
     return DrawnPath(shape, ContactPath(np.stack(poses)), _friction(rng))
 
 
@@ -152,7 +153,7 @@ def _depth(rng: np.random.Generator) -> float:
     return float(rng.uniform(SHALLOWEST_MM, DEEPEST_MM))
 
 
-def _moved(field: ObjectField, dome_mm: FloatArray, T: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _move_object(field: ObjectField, dome_mm: FloatArray, T: FloatArray, rng: np.random.Generator) -> FloatArray:
     """The object after one leg's sideways motion, twist, tilt or roll; several at once in a third of the legs."""
     _, toward = _deep(field, dome_mm, T)
     beside = np.cross(toward, rng.normal(size=3))
@@ -185,7 +186,7 @@ def _direction(polar: float, azimuth: float) -> FloatArray:
     return np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
 
 
-def _aligned(start: FloatArray, stop: FloatArray) -> FloatArray:
+def _turn_between(start: FloatArray, stop: FloatArray) -> FloatArray:
     """The shortest turn (3, 3) from one unit vector to another."""
     axis, cosine = np.cross(start, stop), float(start @ stop)
     sine = float(np.linalg.norm(axis))

@@ -52,7 +52,7 @@ class Symmetry:
             start += 6 * ring
         return np.concatenate(out)
 
-    def moved(self, vectors: FloatArray, rings: int) -> FloatArray:
+    def move_vectors(self, vectors: FloatArray, rings: int) -> FloatArray:
         """Vectors (S, M, 3) at a lattice's points, turned and mirrored together with the points."""
         out = np.empty_like(vectors)
         out[:, self.places(rings)] = vectors @ self.matrix.T.astype(vectors.dtype)

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from scenes.sensor import GeometrySpec
-from training.data.dataset import Dataset, told_apart
+from training.data.dataset import Dataset, shortest_distinct_ends
 from training.errors import TrainingError
 from training.runs.run_files import AGAIN
 from twin.frames.truth import arrays_of, open_truth, row_of
@@ -39,7 +39,7 @@ GAIN = 3.0
 HEADROOM = 1.2
 """Largest size of a mode, relative to its largest size in training. Larger values are clipped, because the network does not extrapolate."""
 PLAIN_N = 0.3
-"""Least normal force, N, of states on which maps are judged. Lighter contacts move the pins by less than their noise."""
+"""Least normal force, N, of states on which maps are evaluated. Lighter contacts move the pins by less than their noise."""
 FORCES = ("force_x", "force_y", "force_z")
 """Labels of the whole force."""
 TORQUE = "torque_z"
@@ -127,7 +127,7 @@ class _Truth:
 def _truth(data: Dataset, rows: np.ndarray, geometry: GeometrySpec) -> _Truth:
     """Known forces and places of rows (m,) of a data set. In joined data sets the folder stands before a frame's name."""
     grid = skin_grid(geometry)
-    called = told_apart([folder.resolve() for folder in data.folders]) if len(data.folders) > 1 else [""]
+    called = shortest_distinct_ends([folder.resolve() for folder in data.folders]) if len(data.folders) > 1 else [""]
     names = data.pins.image_name[rows]
     force = np.zeros((len(rows), 3, SIDE * SIDE), np.float32)
     skin: np.ndarray | None = None
@@ -144,7 +144,7 @@ def _truth(data: Dataset, rows: np.ndarray, geometry: GeometrySpec) -> _Truth:
             skin = np.zeros((len(rows), arrays["skin_mm"][0].size), np.float32)
         skin[mine] = arrays["skin_mm"][found].reshape(len(mine), -1)
     assert skin is not None  # every row is of one of the folders
-    smooth = grid.averaged(force.reshape(-1, SIDE * SIDE), DETAIL_MM).reshape(len(rows), 3, SIDE * SIDE)
+    smooth = grid.smooth_values(force.reshape(-1, SIDE * SIDE), DETAIL_MM).reshape(len(rows), 3, SIDE * SIDE)
     return _Truth((smooth / np.sqrt(grid.area_mm2)).transpose(0, 2, 1).reshape(len(rows), -1), skin)
 
 
@@ -201,7 +201,7 @@ def read_maps(path: Path, geometry: GeometrySpec) -> MapModel:
     TrainingError
         The file can't be read, or is damaged.
     """
-    with FILE.opened(path) as (_, found):
+    with FILE.open_arrays(path) as (_, found):
         layers = layers_from(found)
         force, skin = (Directions(found[f"{name}.mean"], found[f"{name}.rows"]) for name in ("force", "skin"))
         fits = len(force.mean) == 3 * SIDE * SIDE and len(layers[-1][1]) == len(force.rows) + len(skin.rows)
@@ -235,7 +235,7 @@ class MapErrors:
     skin_mm: float
 
 
-def judge_maps(made: list[ContactMaps], data: Dataset, rows: np.ndarray) -> MapErrors | None:
+def compare_maps(made: list[ContactMaps], data: Dataset, rows: np.ndarray) -> MapErrors | None:
     """Compare maps with the known forces and places of rows (m,) of a simulated data set; None if all contacts are too light."""
     geometry = data.pins.sensor.geometry
     grid, truth = skin_grid(geometry), _truth(data, rows, geometry)

@@ -35,7 +35,7 @@ from twin.camera.projection import project
 from twin.frames.forms import from_raw
 from twin.frames.truth import arrays_of, open_truth
 from twin.geometry.pins import rest_pins
-from twin.mechanics.path import carried
+from twin.mechanics.path import carry_points
 from twin.mechanics.skin_map import skin_grid
 from twin.store import ArrayFile
 
@@ -72,7 +72,7 @@ SEEN_DRAG_MM = 0.3
 FALSE_ALARMS = 0.01
 """Share of the held-out frames without slip that may raise the alarm. It determines the alarm's threshold."""
 NAMES = ("slip_begins", "slip_whole", "slip_sliding", "slip_left", "slip_direction")
-"""Additional labels of an estimate that remembers: probabilities of slip's beginning and of slip of the whole contact, sliding share,
+"""Additional labels of an estimate with history: probabilities of slip's beginning and of slip of the whole contact, sliding share,
 remaining drag, direction."""
 SLIP_UNITS = ("", "", "", "mm", "deg")
 
@@ -101,12 +101,12 @@ class Drag:
     drag_mm: np.ndarray
     direction: np.ndarray
 
-    def turned(self, symmetry: Symmetry, rings: int) -> "Drag":
+    def turn(self, symmetry: Symmetry, rings: int) -> "Drag":
         """The same drag with the object turned or mirrored over a sensor whose pins form rings."""
         lost = np.empty_like(self.lost)
         lost[:, symmetry.places(rings)] = self.lost
         direction = symmetry.matrix[:2, :2] @ self.direction
-        return replace(self, caps_mm=symmetry.moved(self.caps_mm, rings), lost=lost, direction=direction)
+        return replace(self, caps_mm=symmetry.move_vectors(self.caps_mm, rings), lost=lost, direction=direction)
 
     @property
     def whole_mm(self) -> float:
@@ -121,7 +121,7 @@ class Drag:
 
 
 @dataclass(frozen=True)
-class Way:
+class DragPath:
     """A drag as a sequence of T frames.
 
     Attributes
@@ -233,7 +233,7 @@ class SlipModel:
         now, last = (self.gain * np.clip(each, -self.limit, self.limit) for each in (modes, before))
         return np.concatenate([now, CHANGE * (now - last)], axis=-1).astype(np.float32)
 
-    def told(self, out: np.ndarray) -> Slip:
+    def estimate_from(self, out: np.ndarray) -> Slip:
         """The estimate from the network's numbers (8,)."""
         begins, whole, share = (1 / (1 + np.exp(-np.clip(out[[0, 1, 6]].astype(float), -50, 50)))).tolist()
         middle, wide = float(out[2]), self.left_factor * float(np.exp(np.clip(out[3], *LEFT_SCALES)))
@@ -267,7 +267,7 @@ class SlipTracker:
         with torch.no_grad():
             out, self._memory = self._model.network(x, self._memory)
         self._before = modes
-        return self._model.told(out[0, 0].numpy())
+        return self._model.estimate_from(out[0, 0].numpy())
 
 
 def drags_of(data: Dataset) -> list[tuple[np.ndarray, Drag]]:
@@ -301,7 +301,7 @@ def _drag(arrays: dict[str, np.ndarray], nodes_mm: np.ndarray) -> Drag:
     steps = np.zeros((len(T), 3))
     for k in range(1, len(T)):
         if dragged[k]:
-            steps[k] = carried(middle[k - 1 : k], T[k - 1], T[k])[0]
+            steps[k] = carry_points(middle[k - 1 : k], T[k - 1], T[k])[0]
     whole = steps.sum(axis=0)[:2]
     size = float(np.linalg.norm(whole))
     slides = arrays["map_slipping_mm2"].sum(axis=1) / np.maximum(arrays["map_touched_mm2"].sum(axis=1), 1e-6)
@@ -314,7 +314,7 @@ def _drag(arrays: dict[str, np.ndarray], nodes_mm: np.ndarray) -> Drag:
     )
 
 
-class Eyes:
+class CapView:
     """The model's view of its sensor's caps: their projections in the frame with noise, and from these the model's modes.
 
     Parameters
@@ -348,7 +348,7 @@ class Eyes:
         return self._modes_of(self._pins.with_columns(columns))
 
 
-def gone_through(drag: Drag, at: np.ndarray, eyes: Eyes, rng: np.random.Generator) -> Way:
+def resample_path(drag: Drag, at: np.ndarray, eyes: CapView, rng: np.random.Generator) -> DragPath:
     """A drag in frames at positions ``at`` (T,) in its sequence of states, 0 to S - 1, with linear interpolation between two states."""
     low = np.minimum(at.astype(int), len(drag.share) - 2)
     part = at - low
@@ -360,7 +360,7 @@ def gone_through(drag: Drag, at: np.ndarray, eyes: Eyes, rng: np.random.Generato
     drag_mm, share, limit = between(drag.drag_mm), between(drag.share), drag.whole_mm
     whole = drag_mm >= limit if np.isfinite(limit) else np.zeros(len(at), bool)
     modes = eyes(between(drag.caps_mm), drag.lost[low], rng)
-    return Way(modes, (share >= BEGINS) | whole, whole, share, np.maximum(limit - drag_mm, 0.0), drag_mm, drag.direction)
+    return DragPath(modes, (share >= BEGINS) | whole, whole, share, np.maximum(limit - drag_mm, 0.0), drag_mm, drag.direction)
 
 
 def random_places(states: int, rng: np.random.Generator) -> np.ndarray:
@@ -373,31 +373,31 @@ def random_places(states: int, rng: np.random.Generator) -> np.ndarray:
     return np.array(found)
 
 
-def learn_slip(drags: Sequence[Drag], eyes: Eyes, sensor: SensorSpec, *, seed: int = 0) -> SlipModel:
+def learn_slip(drags: Sequence[Drag], eyes: CapView, sensor: SensorSpec, *, seed: int = 0) -> SlipModel:
     """Learn slip from drags. At least ``FEWEST_DRAGS`` must slide in the end. If pins form rings, each drag is also turned and mirrored."""
     rings = sensor.pins.shape.rings if isinstance(sensor.pins.shape, Rings) else None
     turns = [] if rings is None else symmetries(sensor.pins.phase_deg)
     rng = np.random.default_rng([seed, 5])
     held = set(rng.permutation(len(drags))[::HELD_OUT].tolist())
-    ways: tuple[list[Way], list[Way]] = ([], [])
+    ways: tuple[list[DragPath], list[DragPath]] = ([], [])
     versions = max(1, round(WAYS / len(drags)))
     for k, drag in enumerate(drags):
         for _ in range(1 if k in held else versions):
-            seen = drag if rings is None else drag.turned(turns[rng.integers(len(turns))], rings)
-            ways[k in held].append(gone_through(seen, random_places(len(drag.share), rng), eyes, rng))
+            seen = drag if rings is None else drag.turn(turns[rng.integers(len(turns))], rings)
+            ways[k in held].append(resample_path(seen, random_places(len(drag.share), rng), eyes, rng))
     known = np.concatenate([way.modes for way in ways[0]])
     gain = GAIN / max(float(known.std(axis=0).max()), 1e-12)
     torch.manual_seed(seed)
     model = SlipModel(SlipNetwork(2 * known.shape[1]), gain, HEADROOM * np.abs(known).max(axis=0), 0.5, 1.0, 1.0)
-    _fit(model, ways[0], seed)
-    return _calibrated(model, ways[1])
+    _fit_filter(model, ways[0], seed)
+    return _calibrate(model, ways[1])
 
 
-def _fit(model: SlipModel, ways: list[Way], seed: int) -> None:
+def _fit_filter(model: SlipModel, ways: list[DragPath], seed: int) -> None:
     """Train the network of a model. Each step uses sequences of similar lengths."""
     generator = torch.Generator().manual_seed(seed)
     ways = sorted(ways, key=lambda way: len(way.modes))
-    groups = [_padded(model, ways[k : k + BATCH]) for k in range(0, len(ways), BATCH)]
+    groups = [_pad_sequences(model, ways[k : k + BATCH]) for k in range(0, len(ways), BATCH)]
     optimiser = torch.optim.AdamW(model.network.parameters(), lr=RATE, weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=EPOCHS * len(groups))
     for _ in range(EPOCHS):
@@ -413,7 +413,7 @@ def _fit(model: SlipModel, ways: list[Way], seed: int) -> None:
     model.network.eval()
 
 
-def _padded(model: SlipModel, ways: list[Way]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _pad_sequences(model: SlipModel, ways: list[DragPath]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Inputs (B, T, 2 D), a mask of the existing frames (B, T), and targets (B, T, 8) of ways, padded to the longest one's T frames."""
     longest = max(len(way.modes) for way in ways)
     x = np.zeros((len(ways), longest, 2 * ways[0].modes.shape[1]), np.float32)
@@ -449,9 +449,9 @@ def _likelihood(off: torch.Tensor, log_error: torch.Tensor) -> torch.Tensor:
     return (off / log_error.exp()) ** 2 / 2 + log_error
 
 
-def _calibrated(model: SlipModel, ways: list[Way]) -> SlipModel:
+def _calibrate(model: SlipModel, ways: list[DragPath]) -> SlipModel:
     """The model with threshold and intervals from ways from which it did not learn."""
-    x, there, wanted = _padded(model, ways)
+    x, there, wanted = _pad_sequences(model, ways)
     with torch.no_grad():
         out, _ = model.network(x)
     said, true = out[there].numpy(), wanted[there].numpy()
@@ -487,7 +487,7 @@ def read_slip(path: Path) -> SlipModel:
     TrainingError
         The file can't be read, or is damaged.
     """
-    with FILE.opened(path) as (about, found):
+    with FILE.open_arrays(path) as (about, found):
         limit = found.pop("limit").astype(float)
         network = SlipNetwork(2 * len(limit))
         try:
@@ -534,7 +534,7 @@ class SlipErrors:
     direction_deg: float
 
 
-def judge_slip(model: SlipModel, ways: Sequence[Way]) -> SlipErrors:
+def compare_slip(model: SlipModel, ways: Sequence[DragPath]) -> SlipErrors:
     """Compare the estimates for ways with the true values."""
     right: list[bool] = []
     alarms: list[bool] = []

@@ -13,7 +13,7 @@ import numpy as np
 
 from scenes.body import GelSpec
 from scenes.sensor import CameraSpec, CaptureSpec, RecordingSpec, ResponseSpec
-from twin.camera.residual import refined
+from twin.camera.residual import refine
 from twin.errors import FrameError
 from twin.types import BoolArray, FloatArray, Form, Frame, ImageArray, IntArray
 
@@ -72,7 +72,7 @@ def expose(
     response = capture.response
     if response.residual is not None and response.residual.used and np.ndim(linear) == 3:
         gray = before_stream(linear, capture, rng, origin_px=origin_px)
-        gray = refined(gray, response.residual, luma_weights(response.stream), response.chroma_columns, rng, origin_px)
+        gray = refine(gray, response.residual, luma_weights(response.stream), response.chroma_columns, rng, origin_px)
     else:
         gray = _developed_light(linear, capture, response, rng, origin_px)
     frame = through_stream(gray, response.stream) if gray.ndim == 3 else np.clip(np.rint(gray), 0, 255).astype(np.uint8)

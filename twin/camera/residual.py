@@ -2,8 +2,8 @@
 noise.
 
 The change of each pixel depends on the pixels around it and on random numbers of its own. The network has four convolutions; the middle two
-add to their input. It was trained against judges that distinguish real frames from rendered ones (`training.runs.residual`). It works on
-luma and colour differences before the stream rounds them, within the lens disc, and only if ``response.residual.used`` is set.
+add to their input. It was trained against classifiers that distinguish real frames from rendered ones (`training.runs.residual`). It works
+on luma and colour differences before the stream rounds them, within the lens disc, and only if ``response.residual.used`` is set.
 """
 
 import numpy as np
@@ -37,7 +37,7 @@ def with_residual(spec: SensorSpec) -> SensorSpec:
     return spec.model_copy(update={"response": response})
 
 
-def refined(
+def refine(
     gray: FloatArray,
     residual: ResidualSpec,
     luma: FloatArray,
@@ -71,7 +71,7 @@ def refined(
         size = (*part.shape[:2], residual.noises)
         noise: FloatArray = np.zeros(size, np.float32) if rng is None else rng.standard_normal(size, dtype=np.float32)
         signal[rows, across] = part + inside[rows, across, None] * change(part, noise, residual)
-    signal[..., 1:] = averaged(signal[..., 1:], columns, origin_px[0])
+    signal[..., 1:] = average_colours(signal[..., 1:], columns, origin_px[0])
     return np.asarray(signal @ np.linalg.inv(matrix).T, np.float32)
 
 
@@ -85,10 +85,10 @@ def change(signal: FloatArray, noise: FloatArray, residual: ResidualSpec) -> Flo
     """The change (H, W, 3), gray levels, that the network adds to luma and colour differences (H, W, 3), for noise (H, W, noises)."""
     first, second, third, last = layers(residual)
     seen = np.concatenate([signal / np.float32(LEVELS) - np.array(MIDDLE, np.float32), noise], axis=2)
-    hidden = rectified(convolved(seen, *first))
-    hidden = hidden + rectified(convolved(hidden, *second))
-    hidden = hidden + rectified(convolved(hidden, *third))
-    return np.float32(MOST_LEVELS) * np.tanh(np.float32(STEEPNESS) * convolved(hidden, *last))
+    hidden = rectify(convolve(seen, *first))
+    hidden = hidden + rectify(convolve(hidden, *second))
+    hidden = hidden + rectify(convolve(hidden, *third))
+    return np.float32(MOST_LEVELS) * np.tanh(np.float32(STEEPNESS) * convolve(hidden, *last))
 
 
 def layers(residual: ResidualSpec) -> list[tuple[FloatArray, FloatArray]]:
@@ -101,7 +101,7 @@ def layers(residual: ResidualSpec) -> list[tuple[FloatArray, FloatArray]]:
     return found
 
 
-def convolved(signal: FloatArray, kernel: FloatArray, bias: FloatArray) -> FloatArray:
+def convolve(signal: FloatArray, kernel: FloatArray, bias: FloatArray) -> FloatArray:
     """Cross-correlation of a signal (H, W, in) with a kernel (out, in, k, k). The signal is padded with zeros."""
     height, width, channels = signal.shape
     side = kernel.shape[2]
@@ -115,12 +115,12 @@ def convolved(signal: FloatArray, kernel: FloatArray, bias: FloatArray) -> Float
     return found.reshape(height, width, -1)
 
 
-def rectified(signal: FloatArray) -> FloatArray:
+def rectify(signal: FloatArray) -> FloatArray:
     """The signal, with its negative part multiplied by ``LEAK``."""
     return np.maximum(signal, np.float32(LEAK) * signal)
 
 
-def averaged(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:
+def average_colours(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:
     """Colour differences (H, W, 2), averaged over groups of columns of the full frame; ``left_px`` is the number of the first column."""
     if columns == 1:
         return chroma

@@ -36,10 +36,10 @@ def cap_truth(spec: SensorSpec, rest: PinState, state: PinState, form: Form) -> 
     caps_px = from_raw(spec.recording, form, project(spec.view, state.caps_mm))
     rest_px = from_raw(spec.recording, form, project(spec.view, rest.caps_mm))
     inside = np.all((caps_px >= -0.5) & (caps_px <= np.array(frame_size(spec, form)) - 0.5), axis=1)
-    return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~occluded(spec.view, 0.5 * spec.pins.cap_diameter_mm, state))
+    return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~find_occluded(spec.view, 0.5 * spec.pins.cap_diameter_mm, state))
 
 
-def occluded(view: ViewSpec, cap_radius_mm: float, state: PinState) -> BoolArray:
+def find_occluded(view: ViewSpec, cap_radius_mm: float, state: PinState) -> BoolArray:
     """(N,) bool: the ray in the gel from the window to the cap's centre passes through another pin.
 
     Each pin is approximated by a capsule of the cap's radius around the axis from foot to cap.

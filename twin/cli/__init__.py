@@ -44,7 +44,7 @@ FAILED, MISUSED = 1, 2
 class _Commands(TyperGroup):
     """All commands, listed by the kind of work. It also prints a line after Ctrl-C; typer alone ends the program without one."""
 
-    def titled(self, ctx: Any) -> dict[str, list[str]]:
+    def commands_by_title(self, ctx: Any) -> dict[str, list[str]]:
         """Names of the commands under each title of ``COMMANDS``."""
         found: dict[str, list[str]] = {title: [] for title in COMMANDS.values()}
         for name in self.list_commands(ctx):
@@ -56,7 +56,7 @@ class _Commands(TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         width = max(map(len, self.list_commands(ctx)))
-        for title, names in self.titled(ctx).items():
+        for title, names in self.commands_by_title(ctx).items():
             commands = [self.get_command(ctx, name) for name in names]
             rows = [
                 (f"{name:{width}}", command.get_short_help_str(formatter.width - width - 6))
@@ -90,7 +90,7 @@ class FewCommands(TyperGroup):
 app = App(name="twin", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
-def _tell_version(asked: bool) -> None:
+def _print_version(asked: bool) -> None:
     from twin.store.made import program_version
 
     if asked:
@@ -106,7 +106,7 @@ def _tell_version(asked: bool) -> None:
     "Exit codes: 0 done, 1 failed, 2 wrong command line, 3 a bad finding of 'twin check', 130 ended by Ctrl-C, 143 by SIGTERM.",
 )
 def _twin(
-    version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_tell_version, help="print the version and stop")] = False,
+    version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_print_version, help="print the version and stop")] = False,
 ) -> None:
     """What may stand before a command."""
 

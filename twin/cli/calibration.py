@@ -18,7 +18,8 @@ from twin.cli.command import App
 from twin.cli.options import (
     CORES,
     QUALITY,
-    Across,
+    Elements,
+    Formerly,
     FormOrAuto,
     NoContact,
     Out,
@@ -27,23 +28,23 @@ from twin.cli.options import (
     Table,
     Tuning,
     Workers,
-    if_given,
-    refined_if,
-    say,
+    load_if_named,
+    print_lines,
     sensor_with,
+    with_residual_if,
 )
 from twin.errors import OptionError
 from twin.progress import Progress
 from twin.types import FINE, Quality
 
 if TYPE_CHECKING:
-    from training.studies.degradation import Result
+    from training.studies.degradation import DegradationResult
     from training.studies.label_audit import LabelAudit
     from training.studies.realism import Realism
     from training.studies.validation import Validation
-    from twin.fit.contact.calibrate import ContactCalibration
-    from twin.fit.go_on import WholeSensor
-    from twin.fit.optics import OpticsCalibration
+    from twin.calibration.contact.calibrate import ContactCalibration
+    from twin.calibration.go_on import WholeSensor
+    from twin.calibration.optics import OpticsCalibration
 
 
 @app.command("new")
@@ -51,20 +52,24 @@ def new_sensor(
     out: Annotated[Path, typer.Option("--out", metavar="MY.toml", help="the specification to write")],
     frames: Annotated[Path | None, typer.Argument(help="folder of frames, video or recording")] = None,
     camera: Annotated[str, typer.Option("--camera", metavar="C", help="a live camera instead: 0, /dev/videoN, http://...")] = "",
-    labels: Annotated[Path | None, typer.Option("--labels", metavar="TABLE", help="table of labels: also fit the contact")] = None,
+    label_table: Annotated[
+        Path | None, typer.Option("--label-table", metavar="TABLE", help="table of labels: also fit the contact"), Formerly("labels")
+    ] = None,
     experiment: Annotated[
-        str | None, typer.Option("--experiment", metavar="E", help="how the labelled contacts were made; told by the table if not given")
+        str | None, typer.Option("--experiment", metavar="E", help="how the labelled contacts were made; taken from the table if not given")
     ] = None,
     contacts: Annotated[int, typer.Option("--contacts", min=4, metavar="N", help="labelled frames to which the contact is fitted")] = 20,
     optics: Annotated[bool, typer.Option("--optics", help="also fit light and colours")] = False,
     workers: Workers = CORES,
-    across: Across = FINE,
+    elements: Elements = FINE,
     layout: Annotated[str | None, typer.Option("--layout", metavar="L", help="the layout, if it is known")] = None,
     radius_mm: Annotated[float | None, typer.Option("--radius-mm", metavar="R", help="radius of the tip's dome (20 if not given)")] = None,
     no_contact: NoContact = None,
     table: Table = None,
     form: FormOrAuto = None,
-    limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = 40,
+    max_frames: Annotated[
+        int, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")
+    ] = 40,
     *,
     progress: Progress,
 ) -> "WholeSensor":
@@ -75,16 +80,17 @@ def new_sensor(
     init_0.png or --no-contact, in a frame that shows no contact, or made from many contacts, and it says which), and mask, threshold and
     camera fitted. Where the layout is unsure, the two likeliest are named with what would decide; then give --layout.
 
-    With --labels TABLE it goes on to the contact, as 'twin calibrate contact' does; with --optics to light and colours, as 'twin calibrate
-    optics' does (raw frames). --table TABLE only names the frames and their order, and fits nothing. With --camera a live camera takes the
-    place of the folder: it says when to press.
+    With --label-table TABLE it continues with the contact, as 'twin calibrate contact' does; with --optics to light and colours, as 'twin
+    calibrate optics' does (raw frames). --table TABLE only names the frames and their order, and fits nothing. With --camera a live camera
+    takes the place of the folder: it says when to press.
 
     \b
     Writes:
       MY.toml             a short, commented specification: --sensor MY.toml
       MY-new/index.html   what is known, what is assumed, what to do to know more;
                           pictures of frames with their pins beside it
-      MY-contact/, MY-calibration/, MY-frames/   with --labels, --optics, --camera
+      MY-contact/, MY-calibration/, MY-frames/  by --label-table,
+                                             --optics, --camera
 
     \b
     --layout rings:10         331 pins in 10 rings
@@ -96,7 +102,7 @@ def new_sensor(
     \b
     Example:
       twin new recordings/mine --out mine.toml
-      twin new recordings/mine --labels recordings/mine/targets.csv \\
+      twin new recordings/mine --label-table recordings/mine/targets.csv \\
           --out mine.toml
       twin new --camera /dev/video0 --out mine.toml
     """
@@ -104,7 +110,7 @@ def new_sensor(
     from hardware.collect.gather import gather_frames
     from scenes import load_experiment
     from scenes.pins import layout_from
-    from twin.fit.go_on import whole_sensor
+    from twin.calibration.go_on import whole_sensor
 
     if (frames is None) == (not camera):
         raise OptionError("give either a folder of frames or `camera`")
@@ -113,18 +119,18 @@ def new_sensor(
     return whole_sensor(
         frames,
         out,
-        labels=labels,
+        labels=label_table,
         optics=optics,
-        experiment=if_given(load_experiment, experiment),
+        experiment=load_if_named(load_experiment, experiment),
         contacts=contacts,
         workers=workers,
-        across=across,
-        layout=if_given(layout_from, layout),
+        across=elements,
+        layout=load_if_named(layout_from, layout),
         radius_mm=radius_mm,
         no_contact=no_contact,
         table=table,
         form=form,
-        limit=limit,
+        limit=max_frames,
         progress=progress,
     )
 
@@ -143,7 +149,9 @@ def calibrate_optics(
     no_contact: Annotated[
         Path | None, typer.Option("--no-contact", metavar="FRAME", help="a raw frame without contact: fits the camera")
     ] = None,
-    limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="fit at most N frames, evenly spread")] = 6,
+    max_frames: Annotated[
+        int, typer.Option("--max-frames", min=1, metavar="N", help="fit at most N frames, evenly spread"), Formerly("limit")
+    ] = 6,
     pipeline: Tuning = None,
     *,
     progress: Progress,
@@ -162,9 +170,9 @@ def calibrate_optics(
     tables and pictures (SPEC.*.csv, SPEC.*.uri), and SPEC-calibration/ with
     index.html (before, after, what is left, changes) and the stages' results.
 
-    An interrupted run continues where it ended.
+    An interrupted run resumes.
 
-    What frames cannot tell is kept at the starting values, and named: the response curve (gamma) and the product of LED power and
+    What frames do not determine is kept at the starting values, and named: the response curve (gamma) and the product of LED power and
     exposure in any case; distance and focal length if all frames are without contact.
 
     \b
@@ -172,9 +180,9 @@ def calibrate_optics(
       twin calibrate optics --sensor ur5-331 --frames recordings/my-tactip \\
           --out my-tactip.toml
     """
-    from twin.fit.optics import calibrate_optics
+    from twin.calibration.optics import calibrate_optics
 
-    return calibrate_optics(frames, sensor_with(sensor, pipeline), out, limit=limit, no_contact=no_contact, progress=progress)
+    return calibrate_optics(frames, sensor_with(sensor, pipeline), out, limit=max_frames, no_contact=no_contact, progress=progress)
 
 
 @calibrate_app.command("contact", goes_on=True)
@@ -182,7 +190,9 @@ def calibrate_contact(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording with its no-contact frame")],
     out: Annotated[Path, typer.Option("--out", metavar="SPEC.toml", help="the specification to write")],
-    labels: Annotated[int, typer.Option("--labels", min=4, metavar="N", help="frames to fit to, chosen at random")] = 20,
+    num_labelled: Annotated[
+        int, typer.Option("--num-labelled", min=4, metavar="N", help="frames to fit to, chosen at random"), Formerly("labels")
+    ] = 20,
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the choice of frames")] = 0,
     experiment: Annotated[
         str, typer.Option("--experiment", metavar="E", help="how they were recorded ('twin experiments')")
@@ -192,7 +202,7 @@ def calibrate_contact(
     ] = None,
     hold: Annotated[list[str] | None, typer.Option("--hold", metavar="KEY", help="leave this parameter as it is; may be repeated")] = None,
     workers: Workers = CORES,
-    across: Across = FINE,
+    elements: Elements = FINE,
     form: FormOrAuto = None,
     table: Table = None,
     no_contact: NoContact = None,
@@ -208,15 +218,15 @@ def calibrate_contact(
     when it was taken is found along with them. A frame that fits neither case gets a small weight. As many other frames, at most 20,
     are kept out of the fit, and the error is stated on them.
 
-    Pins do not tell newtons. Where the table has a column of forces along the approach (N; Fz, or the one that rig.force_sensor names)
+    Pins do not determine newtons. Where the table has a column of forces along the approach (N; Fz, or the one that rig.force_sensor names)
     with 3 presses or more, weighed with a kitchen scale for example, the stiffness of skin and gel is scaled to them; other rows may be
     empty. It says how far forces may still be off (skin.stiffness_factor), or which stiffness is assumed.
 
     \b
     Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/
-    with index.html (parameters with their uncertainty and what the frames tell of
+    with index.html (parameters with their uncertainty and what the frames determine of
     them, frames with their probabilities, before and after), calibration.json and
-    contacts/. An interrupted run continues where it ended.
+    contacts/. An interrupted run resumes.
 
     \b
     It simulates about 50 + 60 N contacts. Each takes 1 to 3 s on one core;
@@ -225,10 +235,10 @@ def calibrate_contact(
     \b
     Example:
       twin calibrate contact --sensor mg400-331 --frames recordings/my-surface \\
-          --labels 20 --out my-tactip.toml
+          --num-labelled 20 --out my-tactip.toml
     """
     from scenes import load_experiment, load_object
-    from twin.fit.contact.calibrate import calibrate_to_file
+    from twin.calibration.contact.calibrate import calibrate_to_file
     from twin.frames import frames_at
 
     return calibrate_to_file(
@@ -236,12 +246,12 @@ def calibrate_contact(
         sensor_with(sensor, pipeline),
         load_experiment(experiment),
         out,
-        touched=if_given(load_object, obj),
-        labels=labels,
+        obj=load_if_named(load_object, obj),
+        labels=num_labelled,
         seed=seed,
         hold=hold or (),
         workers=workers,
-        across=across,
+        across=elements,
         form=form,
         progress=progress,
     )
@@ -254,12 +264,14 @@ def validate(
     out: Out,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how it was recorded ('twin experiments')")] = "surface-2d",
     obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the touched object; the experiment's own if not given")] = None,
-    limit: Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help="N frames, chosen at random")] = None,
+    max_frames: Annotated[
+        int | None, typer.Option("--max-frames", min=1, metavar="N", help="N frames, chosen at random"), Formerly("limit")
+    ] = None,
     friction_frames: Annotated[
         int, typer.Option("--friction-frames", min=0, metavar="N", help="frames for which the best friction is searched, 9 contacts each")
     ] = 5,
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the choice of frames")] = 0,
-    across: Across = FINE,
+    elements: Elements = FINE,
     form: FormOrAuto = None,
     table: Table = None,
     no_contact: NoContact = None,
@@ -280,8 +292,8 @@ def validate(
 
     \b
     Example:
-      twin validate --sensor mg400-331 --frames recordings/surface --limit 40 \\
-          --out out/validate
+      twin validate --sensor mg400-331 --frames recordings/surface \\
+          --max-frames 40 --out out/validate
     """
     from scenes import load_experiment, load_object
     from training.studies.validation import validate_contacts
@@ -292,11 +304,11 @@ def validate(
         frames_at(frames, table, no_contact),
         load_experiment(experiment),
         out,
-        touched=if_given(load_object, obj),
-        limit=limit,
+        obj=load_if_named(load_object, obj),
+        limit=max_frames,
         friction_frames=friction_frames,
         seed=seed,
-        across=across,
+        across=elements,
         form=form,
         progress=progress,
     )
@@ -308,9 +320,11 @@ def realism(
     sensor: Sensor,
     out: Out,
     pose_aligned: Annotated[bool, typer.Option("--pose-aligned", help="also render from the labels alone")] = False,
-    limit: Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = None,
+    max_frames: Annotated[
+        int | None, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")
+    ] = None,
     fitted: Annotated[
-        int, typer.Option("--fitted", min=0, metavar="N", help="leave out the frames that 'calibrate optics --limit N' fits")
+        int, typer.Option("--fitted", min=0, metavar="N", help="leave out the frames that 'calibrate optics --max-frames N' fits")
     ] = 0,
     without: Annotated[
         list[str] | None, typer.Option("--without", metavar="DETAIL", help="relief, grain or background; may be repeated")
@@ -330,7 +344,7 @@ def realism(
 
     They are compared pair by pair, and as two sets. Each real frame's pins are found, the skin is fitted to them, and the sensor in
     that state is rendered and captured. Every cap stands where it stood in the real frame, so the differences come from camera and
-    light. With --pose-aligned the whole twin is judged as well: the labels in targets.csv (pose_3 depth in mm, pose_4 and pose_5
+    light. With --pose-aligned the whole twin is evaluated as well: the labels in targets.csv (pose_3 depth in mm, pose_4 and pose_5
     turns in deg, a tap on a flat plate) become contacts. The arm's kinematics is fitted to the pins of one half of the frames, and
     the error is stated on the other half.
 
@@ -353,17 +367,17 @@ def realism(
     \b
     How to read it: no render can do better than PSNR and SSIM of two real frames
     with the same contact. Two-sample accuracy is the share of patches of unseen
-    frames that a small network puts into the right set: at 100 % it always tells
-    real from rendered, at 50 % never. --thorough trains a stronger network, too,
+    frames that a small network puts into the right set: at 100 % it always
+    distinguishes real from rendered, at 50 % never. --thorough trains a stronger network, too,
     and both on two halves of the real frames, which should give 50 %. What is
     missed on the caps and fixed to each of them is what a better relief could
-    hold. --without shows what a measured detail is worth: the caps' relief, the
+    hold. --without removes a measured detail (ablation): the caps' relief, the
     skin's grain, the background. --residual adds the sensor's residual network;
-    judge it on frames that it was not taught on.
+    evaluate it on frames that it was not taught on.
 
     \b
     Example:
-      twin realism recordings/my-tactip --sensor ur5-331 --limit 10 \\
+      twin realism recordings/my-tactip --sensor ur5-331 --max-frames 10 \\
           --out out/realism
     """
     from training.studies.realism import compare_with_renders
@@ -371,10 +385,10 @@ def realism(
 
     return compare_with_renders(
         frames_at(path, table),
-        refined_if(residual, sensor_with(sensor, pipeline)),
+        with_residual_if(residual, sensor_with(sensor, pipeline)),
         out,
         pose_aligned=pose_aligned,
-        limit=limit,
+        limit=max_frames,
         fitted=fitted,
         without=without or (),
         quality=quality,
@@ -385,10 +399,10 @@ def realism(
 
 
 def _list_conditions(asked: bool) -> None:
-    from twin.judge.degradation.conditions import condition_lines
+    from twin.evaluation.degradation.conditions import condition_lines
 
     if asked:
-        say(condition_lines())
+        print_lines(condition_lines())
         raise typer.Exit
 
 
@@ -409,13 +423,15 @@ def robustness(
         Path | None, typer.Option("--conditions", metavar="FILE", help="TOML file: which conditions, ranges, steps, pairs")
     ] = None,
     frames: Annotated[Path | None, typer.Option("--frames", metavar="DIR", help="real frames instead of rendered ones")] = None,
-    limit: Annotated[int, typer.Option("--limit", min=2, metavar="N", help="at most N of the real frames, evenly spread")] = 12,
+    max_frames: Annotated[
+        int, typer.Option("--max-frames", min=2, metavar="N", help="at most N of the real frames, evenly spread"), Formerly("limit")
+    ] = 12,
     rendered: Annotated[bool, typer.Option("--rendered/--no-rendered", help="raw --frames beside rendered ones")] = True,
     jobs: Annotated[int, typer.Option("--jobs", min=1, metavar="N", help="processes")] = CORES,
     show: Annotated[bool, typer.Option("--list", is_eager=True, callback=_list_conditions, help="list the conditions and stop")] = False,
     *,
     progress: Progress,
-) -> "Result":
+) -> "DegradationResult":
     """How far may the sensor degrade before preprocessing fails?
 
     Sweeps each condition (dim or dead LEDs, room light, glare, defocus, motion, dirt, scratches, bubbles, haze, lost and faded
@@ -432,7 +448,7 @@ def robustness(
       frames.csv      every frame
       real-on-rendered.csv  with --frames: where real and rendered frames fail,
                             and their ratio
-      cells/          finished work: an interrupted run continues where it ended;
+      cells/          finished work: an interrupted run resumes;
                       work of another sensor, other weights or another version is
                       not used
 
@@ -440,11 +456,11 @@ def robustness(
     With --frames DIR real frames take the place of rendered ones. Then only
     conditions that act on a frame are swept, and the truth is the pins on which
     several detectors agree. Raw frames are compared with the envelope of rendered
-    ones, which tells how much of a sound sensor's margin this sensor has left.
+    ones, which shows how much of a sound sensor's margin this sensor has left.
     Rendered frames are swept for that, too; --no-rendered leaves this out.
 
     \b
-    Code of your own that finds pins is judged, too: --pipeline mine.py:my_pins
+    Code of your own that finds pins is evaluated, too: --pipeline mine.py:my_pins
     takes the function my_pins of the file. It is given the picture of a frame
     (uint8, gray or RGB) and returns the places (n, 2) of the pins it finds, x and
     y in px, in any order.
@@ -466,15 +482,15 @@ def robustness(
     """
     from scenes import load_sensor
     from training.studies import degradation
-    from twin.judge.degradation.plan import SweepPlan, load_plan
+    from twin.evaluation.degradation.plan import SweepPlan, load_plan
 
-    plan = degradation.Plan(
+    plan = degradation.DegradationPlan(
         load_sensor(sensor),
         pipelines=tuple(pipeline or degradation.PIPELINES),
         models=tuple(model or ()),
-        sweep=if_given(load_plan, conditions) or SweepPlan(),
+        sweep=load_if_named(load_plan, conditions) or SweepPlan(),
         frames=frames,
-        limit=limit,
+        limit=max_frames,
         rendered=rendered,
         jobs=jobs,
     )

@@ -9,21 +9,22 @@ import inspect
 import math
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from copy import copy
 from enum import Enum
 from functools import wraps
 from inspect import Parameter
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import typer
 from typer.models import ArgumentInfo, ParameterInfo
 
-from twin.cli.options import Force, tell
-from twin.errors import OptionError, extras_named
+from twin.cli.options import Force, Formerly, print_result
+from twin.errors import OptionError, extras_named, warn_once
 from twin.progress import Progress, silent
 
 Made = TypeVar("Made")
@@ -52,16 +53,18 @@ class App(typer.Typer):
         def register(work: Callable[..., Made]) -> Callable[..., Made]:
             options = inspect.signature(work).parameters
             forced = [Parameter("force", Parameter.KEYWORD_ONLY, default=False, annotation=Force)] if writes(options) else []
+            former = former_names(options)
             known = [*(each for each in options.values() if each.name != "progress"), *forced]
+            known += [_hidden(old, options[name]) for old, name in former.items()]
 
             @wraps(work)
             def command(*, force: bool = False, **given: Any) -> None:
                 from twin.store import overwriting
 
                 with overwriting(force):
-                    made = _done(work, given, progress=True, goes_on=goes_on)
+                    made = _do_work(work, with_present_names(given, former), progress=True, goes_on=goes_on)
                     if made is not None:
-                        tell(made)
+                        print_result(made)
                 if code := exit_code(made):
                     raise SystemExit(code)
 
@@ -73,14 +76,14 @@ class App(typer.Typer):
         return register
 
 
-def _done(work: Callable[..., Made], given: dict[str, Any], *, progress: Progress | bool | None, goes_on: bool = False) -> Made:
+def _do_work(work: Callable[..., Made], given: dict[str, Any], *, progress: Progress | bool | None, goes_on: bool = False) -> Made:
     """Do the work, which reports to ``progress`` if it reports at all: True shows bars."""
     with extras_named(), ExitStack() as stack:
         if "progress" in inspect.signature(work).parameters:
             if progress is True:
-                from twin.cli.progress import shown
+                from twin.cli.progress import show_progress
 
-                progress = stack.enter_context(shown(goes_on=goes_on))
+                progress = stack.enter_context(show_progress(goes_on=goes_on))
             given = {**given, "progress": progress or silent}
         return work(**given)
 
@@ -114,23 +117,49 @@ def as_function(work: Callable[..., Made], help: str) -> Callable[..., Made]:
     added = {"force": (writes(options), False, bool), "progress": ("progress" in options, None, Progress | bool | None)}
     public += [Parameter(name, Parameter.KEYWORD_ONLY, default=d, annotation=kind) for name, (has, d, kind) in added.items() if has]
     signature = inspect.Signature(public, return_annotation=inspect.signature(work).return_annotation)
+    former = former_names(options)
 
     @wraps(work)
     def function(*arguments: Any, **given: Any) -> Made:
         from twin.store import overwriting
 
-        bound = signature.bind(*arguments, **given).arguments
+        bound = signature.bind(*arguments, **with_present_names(given, former)).arguments
         force, progress = bound.pop("force", False), bound.pop("progress", None)
         try:
-            taken = {name: taken_as(name, _plain(options[name]), marks[name], value) for name, value in bound.items()}
+            taken = {name: parse_argument(name, _plain(options[name]), marks[name], value) for name, value in bound.items()}
             with overwriting(force):
-                return _done(work, taken, progress=progress)
+                return _do_work(work, taken, progress=progress)
         except typer.BadParameter as error:
             raise OptionError(f"{error.param_hint or ''} {error.message}".strip()) from error
 
     function.__signature__ = signature  # type: ignore[attr-defined]
     function.__doc__ = docstring(help, public, marks)
     return function
+
+
+def former_names(options: Mapping[str, Parameter]) -> dict[str, str]:
+    """The present names of options by those that they had before (``Formerly``)."""
+    marks = {name: getattr(each.annotation, "__metadata__", ()) for name, each in options.items()}
+    return {mark.name: name for name, those in marks.items() for mark in those if isinstance(mark, Formerly)}
+
+
+def with_present_names(given: dict[str, Any], former: Mapping[str, str]) -> dict[str, Any]:
+    """Options under their present names, with a warning for each that is given under its former one."""
+    for old in [name for name in given if name in former]:
+        value = given.pop(old)
+        if value is not None:
+            warn_once(f"`{old}` is now called `{former[old]}`; the old name still works")
+            given[former[old]] = value
+    return given
+
+
+def _hidden(old: str, option: Parameter) -> Parameter:
+    """The option under its former name, which no help shows."""
+    mark = copy(next(each for each in option.annotation.__metadata__ if isinstance(each, ParameterInfo)))
+    prefixes = ("", "no-") if _plain(option) is bool else ("",)
+    mark.param_decls = ("/".join(f"--{prefix}{old.replace('_', '-')}" for prefix in prefixes),)
+    mark.hidden = True
+    return Parameter(old, Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[_plain(option) | None, mark])
 
 
 def _plain(option: Parameter) -> Any:
@@ -148,7 +177,7 @@ def docstring(help: str, parameters: list[Parameter], marks: dict[str, Parameter
     return "\n".join([text.rstrip(), "", "Parameters", "----------", *rows, ""])
 
 
-def taken_as(name: str, kind: Any, mark: ParameterInfo, value: Any) -> Any:
+def parse_argument(name: str, kind: Any, mark: ParameterInfo, value: Any) -> Any:
     """The value of an argument as the command line would hand it on.
 
     Raises
@@ -156,7 +185,7 @@ def taken_as(name: str, kind: Any, mark: ParameterInfo, value: Any) -> Any:
     OptionError
         It has another type, or is out of the option's range.
     """
-    value = converted(name, kind, value)
+    value = convert_option(name, kind, value)
     if value is not None:
         if mark.min is not None and value < mark.min or mark.max is not None and value > mark.max:
             raise OptionError(f"`{name}={value}`: expected {' and '.join(_range(mark))}")
@@ -172,7 +201,7 @@ def _range(mark: ParameterInfo) -> list[str]:
     return [f"{words} {limit}" for words, limit in (("at least", mark.min), ("at most", mark.max)) if limit is not None]
 
 
-def converted(name: str, kind: Any, value: Any) -> Any:
+def convert_option(name: str, kind: Any, value: Any) -> Any:
     """The value as an instance of the type of an option.
 
     A path may be a text, a list may be one value or any sequence, names with commas between may be a list, and a specification may stand
@@ -185,14 +214,14 @@ def converted(name: str, kind: Any, value: Any) -> Any:
     """
     parts = [part for part in get_args(kind) if part is not NoneType]
     if NoneType in get_args(kind):
-        return None if value is None else converted(name, parts[0], value)
+        return None if value is None else convert_option(name, parts[0], value)
     if get_origin(kind) is list:
         many = isinstance(value, list | tuple | set | range)
-        return [converted(name, parts[0], each) for each in (value if many else [value])]
+        return [convert_option(name, parts[0], each) for each in (value if many else [value])]
     if get_origin(kind) is tuple:
         if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != len(parts):
             raise OptionError(f"`{name}`: expected {len(parts)} numbers, got {value!r}")
-        return tuple(converted(name, part, each) for part, each in zip(parts, value, strict=True))
+        return tuple(convert_option(name, part, each) for part, each in zip(parts, value, strict=True))
     if get_origin(kind) is Literal or isinstance(kind, type) and issubclass(kind, Enum):
         allowed = parts or list(kind)
         if value not in allowed:

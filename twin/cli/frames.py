@@ -3,7 +3,7 @@
 - ``twin preprocess``: find the pins in frames.
 - ``twin graph``: graphs of frames or of found pins, as arrays and pictures.
 - ``twin tune``: parameters of the pin detection, found from a user's own frames.
-- ``twin check``: whether the sensor is well.
+- ``twin check``: the health of the sensor.
 """
 
 from functools import partial
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from twin.cli import app
-from twin.cli.options import FormOrAuto, NoContact, Out, Sensor, Table, Tuning, if_given, sensor_with
+from twin.cli.options import Formerly, FormOrAuto, NoContact, Out, Sensor, Table, Tuning, load_if_named, sensor_with
 from twin.progress import Progress
 
 if TYPE_CHECKING:
@@ -124,7 +124,9 @@ def tune(
         Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"], typer.Option("--method", help="whose parameters")
     ] = "twin",
     form: FormOrAuto = None,
-    limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = 12,
+    max_frames: Annotated[
+        int, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")
+    ] = 12,
     table: Table = None,
     no_contact: NoContact = None,
     *,
@@ -150,7 +152,7 @@ def tune(
     from twin.pins.tune_files import tune_on_frames
 
     at = frames_at(frames, table, no_contact)
-    return tune_on_frames(at, load_sensor(sensor), out=out, method=method, form=form, limit=limit, progress=progress)
+    return tune_on_frames(at, load_sensor(sensor), out=out, method=method, form=form, limit=max_frames, progress=progress)
 
 
 # Exit code of 'twin check' if the sensor's condition is bad. It differs from those of a failure (1) and of a wrong command line (2).
@@ -165,7 +167,9 @@ def check(
     sensor: Sensor,
     form: FormOrAuto = None,
     pipeline: Annotated[Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="what 'twin tune' wrote")] = None,
-    limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="look at no more than N frames, evenly spread")] = 20,
+    max_frames: Annotated[
+        int, typer.Option("--max-frames", min=1, metavar="N", help="look at no more than N frames, evenly spread"), Formerly("limit")
+    ] = 20,
     no_contact: Annotated[Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, for --push")] = None,
     push: Annotated[
         list[str] | None,
@@ -183,7 +187,7 @@ def check(
     *,
     progress: Progress,
 ) -> "Examination":
-    """Check whether the sensor is well, and say what to do.
+    """Check the health of the sensor, and say what to do.
 
     It checks brightness, focus, missing pins, specks, glare, and drift from the calibration. It looks at a frame, a folder of frames, a
     video or a camera, with or without contact, and compares the frames with the one that the twin draws from the sensor's specification.
@@ -213,8 +217,8 @@ def check(
         source,
         load_sensor(sensor),
         form=form,
-        detector=if_given(load_detector, pipeline),
-        limit=limit,
+        detector=load_if_named(load_detector, pipeline),
+        limit=max_frames,
         no_contact=no_contact,
         pushes=push or (),
         twist=twist,

@@ -5,7 +5,7 @@
 - ``twin evaluate``: how good a trained model is.
 - ``twin predict``: the pose in each frame.
 - ``twin pack``: a small copy of a trained model.
-- ``twin surrogate``: a fast stand-in for a sensor's finite elements.
+- ``twin surrogate``: a fast surrogate model of a sensor's finite elements.
 - ``twin learn``: a policy of a task.
 """
 
@@ -19,9 +19,10 @@ from twin.cli.options import (
     CORES,
     MOST_SEED,
     QUALITY,
-    Across,
     Also,
     Device,
+    Elements,
+    Formerly,
     FormOrAuto,
     NoContact,
     Out,
@@ -35,12 +36,12 @@ from twin.cli.options import (
     Workers,
     each_once,
     finite,
-    if_given,
+    load_if_named,
     names_in,
-    one_recording,
-    refined_if,
-    say,
+    print_lines,
+    require_one_recording,
     sensor_with,
+    with_residual_if,
 )
 from twin.progress import Progress
 from twin.types import FINE, Quality
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
     from training.generation.run import Simulated
     from training.studies.evaluation import Evaluation
     from training.studies.prediction import Predictions
-    from training.studies.train import Trained
+    from training.studies.train import TrainedRun
     from training.surrogate.fit import Distilled
 
 
@@ -74,7 +75,7 @@ def make_dataset(
     scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
     quality: Annotated[Quality | None, typer.Option(help=QUALITY, show_default="drawn")] = None,
     residual: Residual = False,
-    across: Across = FINE,
+    elements: Elements = FINE,
     also: Also = None,
     *,
     progress: Progress,
@@ -96,7 +97,7 @@ def make_dataset(
                         move have gone. All states of a contact share a path_id,
                         and they all go either into the training or into the
                         validation part
-    --randomise R       what differs from contact to contact: a name ('twin
+    --randomise R       domain randomisation between contacts: a name ('twin
                         randomisations') or a file
 
     \b
@@ -105,7 +106,7 @@ def make_dataset(
       move_executed.csv   whether each frame's move had been made
       truth.zarr          caps (mm, px), pins with noise, forces, torque, areas in
                           contact and sliding, the object's pose: one row a frame
-      draws.csv           what was drawn for each contact; failures.csv: draws
+      draws.csv           what was sampled for each contact; failures.csv: draws
                           that failed
       generation.json     all resolved specifications and options
       made_by.json        the code that made it; a version whose code for contacts
@@ -128,15 +129,15 @@ def make_dataset(
     from training.generation.run import config_for, simulate_dataset
 
     config = config_for(
-        refined_if(residual, load_sensor(sensor)),
+        with_residual_if(residual, load_sensor(sensor)),
         load_experiment(experiment, wide=wide),
-        touched=if_given(load_object, obj),
+        obj=load_if_named(load_object, obj),
         images=images,
         states=states,
-        randomisation=if_given(load_randomisation, randomise),
+        randomisation=load_if_named(load_randomisation, randomise),
         seed=seed,
         quality=quality,
-        across=across,
+        across=elements,
     )
     return simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, also=tuple(also or ()), progress=progress)
 
@@ -148,7 +149,7 @@ def train(
     data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give it once for each of several")],
     out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
     target: Target = "surface-2d",
-    labels: Annotated[str, typer.Option("--labels", help="corrected or raw")] = "corrected",
+    label_kind: Annotated[str, typer.Option("--label-kind", help="corrected or raw"), Formerly("labels")] = "corrected",
     seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and order")] = 0,
     split: Split = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", help="epochs of training, instead of the model's own number")] = None,
@@ -169,8 +170,8 @@ def train(
     pipeline: Tuning = None,
     *,
     progress: Progress,
-) -> "Trained":
-    """Train a model that tells the pose from a frame.
+) -> "TrainedRun":
+    """Train a model that estimates the pose from a frame.
 
     \b
     vgnn              ours: Voronoi graph network on matched pins, ensemble,
@@ -189,12 +190,12 @@ def train(
 
     --target selects the labels, which are columns of the recording's table. It is a preset (surface-2d: pose_2 pose_6; surface-2d-shear:
     also move_1 move_6; surface-3d: pose_3 pose_4 pose_5; edge-2d; edge-3d; edge-circle; contact) or names with commas between. With
-    --labels corrected, a move that was not executed is taken out of the labels, if move_executed.csv or labels_corrected.csv beside the
+    --label-kind corrected, a move that was not executed is taken out of the labels, if move_executed.csv or labels_corrected.csv beside the
     table says so.
 
-    contact is everything that the table tells of a contact: poses and moves that vary, measured forces (Fx, Fy, Fz in N). Of simulated
-    contacts it is also force_x, force_y, force_z (N, of the skin on the object, sensor frame), torque_z (N mm, about the sensor's axis),
-    contact_area (mm2), slip_share (0 to 1) and contact (0 or 1).
+    contact is everything that the table contains about a contact: poses and moves that vary, measured forces (Fx, Fy, Fz in N). Of
+    simulated contacts it is also force_x, force_y, force_z (N, of the skin on the object, sensor frame), torque_z (N mm, about the sensor's
+    axis), contact_area (mm2), slip_share (0 to 1) and contact (0 or 1).
 
     Depth and angle of simulated contacts are relative to the touched surface, whatever its shape: the indentation along the normal at
     the nearest place, and the angle from this normal. So data sets of several objects can be joined: give --data once for each.
@@ -220,10 +221,10 @@ def train(
     return train_model(
         model,
         sensor_with(sensor, pipeline),
-        one_recording(data, table, no_contact),
+        require_one_recording(data, table, no_contact),
         out,
         target=target,
-        labels=labels,
+        labels=label_kind,
         seed=seed,
         split=None if split < 0 else split,
         epochs=epochs,
@@ -244,22 +245,24 @@ def evaluate(
     data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give all that the run was trained on")],
     out: Out,
     rows: Annotated[str, typer.Option("--rows", help="validation or all")] = "validation",
-    labels: Annotated[str, typer.Option("--labels", help="truth in predictions.csv and errors.png: corrected or raw")] = "corrected",
-    robustness: Annotated[bool, typer.Option("--robustness", help="also judge changed images (five times the frames)")] = False,
+    label_kind: Annotated[
+        str, typer.Option("--label-kind", help="truth in predictions.csv and errors.png: corrected or raw"), Formerly("labels")
+    ] = "corrected",
+    robustness: Annotated[bool, typer.Option("--robustness", help="also evaluate changed images (five times the frames)")] = False,
     table: Table = None,
     no_contact: NoContact = None,
     *,
     progress: Progress,
 ) -> "Evaluation":
-    """Judge a trained model on a labelled recording.
+    """Evaluate a trained model on a labelled recording.
 
     \b
     --rows validation  the fifth of the run's own recording that was kept out of
                        its training, by the frames' names
     --rows all         every row, for a recording that the model has not seen
 
-    Weights for several kinds of contact, such as those of ur5-331 for its binary pictures, are judged with --rows all by the labels that
-    the recording varies. The share of frames that they take for each kind is told.
+    Weights for several kinds of contact, such as those of ur5-331 for its binary pictures, are evaluated with --rows all by the labels that
+    the recording varies. The share of frames that they take for each kind is printed.
 
     \b
     Writes:
@@ -280,8 +283,8 @@ def evaluate(
     """
     from training.studies.evaluation import evaluate_run
 
-    recordings = one_recording(data, table, no_contact)
-    return evaluate_run(run, recordings, out, rows=rows, labels=labels, robustness=robustness, progress=progress)
+    recordings = require_one_recording(data, table, no_contact)
+    return evaluate_run(run, recordings, out, rows=rows, labels=label_kind, robustness=robustness, progress=progress)
 
 
 @app.command("predict")
@@ -289,7 +292,7 @@ def predict(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
     maps: Annotated[Path | None, typer.Option("--maps", metavar="DIR", help="folder for the contact maps of each frame")] = None,
-    sequence: Annotated[bool, typer.Option("--sequence", help="the frames follow each other in time: tell slip, too")] = False,
+    sequence: Annotated[bool, typer.Option("--sequence", help="the frames follow each other in time: estimate slip, too")] = False,
     table: Table = None,
     no_contact: NoContact = None,
 ) -> "Predictions":
@@ -301,10 +304,10 @@ def predict(
     With --maps DIR it also writes, for each frame, the pressure and the shear over the skin, the contact patch and the deformed skin:
     arrays (NAME.npz) and a picture (NAME.png). The model must be touch and have learnt from simulated contacts.
 
-    With --sequence the frames follow each other in time, as those of a video, and a model that learnt from simulated drags also tells slip:
-    slip_begins and slip_whole (probabilities that a tenth of the contact, and that all of it, slides), slip_sliding (share of the contact
-    that slides under the drag, 0 to 1), slip_left (drag in mm until all slides) and slip_direction (deg, sensor frame, of the object over
-    the skin).
+    With --sequence the frames follow each other in time, as those of a video, and a model that was trained on simulated drags also
+    estimates slip: slip_begins and slip_whole (probabilities that a tenth of the contact, and that all of it, slides), slip_sliding (share
+    of the contact that slides under the drag, 0 to 1), slip_left (drag in mm until all slides) and slip_direction (deg, sensor frame, of
+    the object over the skin).
 
     \b
     Examples:
@@ -336,7 +339,7 @@ def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, 
 
     PoseEstimator.load(run)  # says what is wrong with a folder that holds no run
     size = pack(run, out)
-    say([f"wrote {out / WEIGHTS} ({size / 1e3:.0f} kB), {out / 'config.json'}"])
+    print_lines([f"wrote {out / WEIGHTS} ({size / 1e3:.0f} kB), {out / 'config.json'}"])
 
 
 @app.command("surrogate")
@@ -349,12 +352,12 @@ def make_surrogate(
     *,
     progress: Progress,
 ) -> "Distilled":
-    """Make a fast stand-in for a sensor's finite elements.
+    """Make a fast surrogate model of a sensor's finite elements.
 
     Finite elements solve random contacts: plates, balls, cylinders, edges and prisms that press, shear, twist, roll, leave and return. The
     surrogate is the skin at small strain with exact contact and friction at 271 nodes, and a small network for what large deformations
     change. The network begins with that of mg400-331 and learns on. A surrogate takes about a sixtieth of the time, and less where
-    many contacts are computed together. Every fifth path is only judged with; the errors are printed and kept in the file.
+    many contacts are computed together. Every fifth path is only evaluated with; the errors are printed and kept in the file.
 
     Surrogates of the shipped sensors go with the package; the environments take others by surrogate=FILE.
 
@@ -374,14 +377,24 @@ def learn(
     sensor: Sensor,
     out: Out,
     observation: Annotated[str, typer.Option("--observation", help="pins, image, graph, pose or oracle")] = "pins",
-    randomise: Annotated[str | None, typer.Option("--randomise", metavar="R", help="what differs between episodes, e.g. moves")] = None,
+    randomise: Annotated[
+        str | None, typer.Option("--randomise", metavar="R", help="domain randomisation between episodes, e.g. moves")
+    ] = None,
     surrogate: Annotated[Path | None, typer.Option("--surrogate", metavar="FILE", help="for a sensor of one's own")] = None,
     objects: Annotated[str | None, typer.Option("--objects", callback=each_once, help="in place of the task's, commas between")] = None,
-    memory: Annotated[bool, typer.Option("--memory/--no-memory", help="whether friction remembers; to see what that is worth")] = True,
-    sight: Annotated[bool, typer.Option("--sight/--no-sight", help="whether it first learns to tell place and force")] = True,
+    friction_history: Annotated[
+        bool,
+        typer.Option("--friction-history/--no-friction-history", help="history-dependent friction; switch it off to measure its effect"),
+        Formerly("memory"),
+    ] = True,
+    state_estimator: Annotated[
+        bool,
+        typer.Option("--state-estimator/--no-state-estimator", help="first train a state estimator of place and force"),
+        Formerly("sight"),
+    ] = True,
     minutes: Annotated[float, typer.Option("--minutes", min=0, callback=finite, help="most time")] = 30.0,
     environments: Annotated[int, typer.Option("--environments", min=2, help="stepped together")] = 32,
-    fem: Annotated[int, typer.Option("--fem", min=0, metavar="N", help="episodes on finite elements in which the policy is judged")] = 0,
+    fem: Annotated[int, typer.Option("--fem", min=0, metavar="N", help="episodes on finite elements in which the policy is evaluated")] = 0,
     seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and episodes")] = 0,
     *,
     progress: Progress,
@@ -390,8 +403,8 @@ def learn(
 
     The task's environments run together on the surrogate of the sensor's finite elements, and proximal policy optimisation
     (stable-baselines3; pip install 'tactip-twin[rl]') learns from them until 97 % of the newest 100 episodes are solved, or the time is
-    over. The policy is then judged on 100 other episodes, and with --fem N on N episodes of finite elements, with drawn frames through
-    the real pipeline.
+    over. The policy is then evaluated on 100 other episodes, and with --fem N on N episodes of finite elements, with rasterised frames
+    through the real pipeline.
 
     \b
     Writes:
@@ -409,9 +422,11 @@ def learn(
         "sensor": sensor,
         "observation": observation,
         "randomise": randomise,
-        "friction_memory": memory,
+        "friction_memory": friction_history,
         "surrogate": surrogate,
         "objects": names_in(objects) if objects else None,
     }
-    plan = LearnPlan(task, Options.given(asked), minutes=minutes, environments=environments, fem_episodes=fem, seed=seed, sight=sight)
+    plan = LearnPlan(
+        task, Options.from_keywords(asked), minutes=minutes, environments=environments, fem_episodes=fem, seed=seed, sight=state_estimator
+    )
     return learn_policy(plan, out, progress=progress)

@@ -36,7 +36,7 @@ from twin.cli.options import (
     Sensor,
     ServoName,
     Steps,
-    say,
+    print_lines,
 )
 from twin.progress import Progress
 from twin.signals import signals_as_ctrl_c
@@ -44,7 +44,7 @@ from twin.types import FIRST, NONE
 
 if TYPE_CHECKING:
     from hardware.collect.collect import Collected
-    from hardware.live.live import Watched
+    from hardware.live.live import WatchResult
     from hardware.servo.following import Followed
     from twin.estimate import SensorModel
 
@@ -64,7 +64,7 @@ def live(
     at_rest: AtRest = NONE,
     also: Also = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="port of the page; if it is taken, the next free one")] = 8080,
-) -> "Watched":
+) -> "WatchResult":
     """Show a model's estimates on a camera's frames.
 
     It shows pins, graph, Voronoi map, the pose with its 90 % interval, and rates on a page for the browser, and prints the page's address.
@@ -74,10 +74,10 @@ def live(
     With --record DIR every frame is kept, lossless, with its estimate. The folder can be read even if the program was killed. --replay
     DIR runs the model on the same frames again, and says whether the estimates are the same. With --at-rest first there must be no
     contact at the start; the first frame is then kept with the session. Without it pins are counted from where the model knows them to be
-    at rest, or, once 40 contacts that differ have told other places, from there, as 'twin predict' does. --also keeps the session in
+    at rest, or, once 40 contacts that differ have determined other places, from there, as 'twin predict' does. --also keeps the session in
     further formats when it ends.
 
-    A model that learnt from simulated drags remembers the frames and tells slip: see 'twin predict --help', --sequence.
+    A model that was trained on simulated drags also uses earlier frames and estimates slip: see 'twin predict --help', --sequence.
 
     \b
     Example:
@@ -87,7 +87,7 @@ def live(
       twin live --replay out/session --model RUN --headless
     """
     from hardware.live.live import WatchPlan, watch
-    from training.estimate.loading import load_remembering
+    from training.estimate.loading import load_with_history
 
     plan = WatchPlan(
         camera=camera,
@@ -102,10 +102,10 @@ def live(
         also=tuple(also or ()),
     )
     with signals_as_ctrl_c():
-        return watch(plan, load_remembering(model), name=str(model), on_shown=tell_view)
+        return watch(plan, load_with_history(model), name=str(model), on_shown=print_view)
 
 
-def tell_view(url: str) -> None:
+def print_view(url: str) -> None:
     """Print where the frames are shown."""
     print(f"showing in {url}; Ctrl-C ends it", flush=True)
 
@@ -123,8 +123,10 @@ def collect(
     obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the experiment's own if not given")] = None,
     servo: ServoName = "surface",
     form: FormOrAuto = None,
-    limits: Limits = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of the drawn contacts; the experiment's own if not given")] = None,
+    safety: Limits = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, help="seed of the sampled contacts; the experiment's own if not given")
+    ] = None,
     design: Annotated[str, typer.Option("--design", help="random, or even (fill the ranges)")] = "random",
     plain_light: PlainLight = False,
     also: Also = None,
@@ -159,7 +161,7 @@ def collect(
     asked = load_experiment(experiment)
     plan = CollectPlan(
         sensor=load_sensor(sensor),
-        stimulus=load_object(obj or asked.object),
+        obj=load_object(obj or asked.object),
         experiment=asked,
         servo=load_servo(servo),
         camera=camera,
@@ -168,7 +170,7 @@ def collect(
         seed=seed,
         design=design,
         form=form,
-        limits=limits,
+        limits=safety,
         plain_light=plain_light,
         also=tuple(also or ()),
         dry_run=dry_run,
@@ -193,7 +195,7 @@ def servo(
     steps: Steps = None,
     stream: Annotated[bool, typer.Option("--stream", help="decide at a fixed rate on the newest frame, without waiting for moves")] = False,
     rate: Annotated[float, typer.Option("--rate", min=0.1, help="decisions a second with --stream")] = 10.0,
-    limits: Limits = None,
+    safety: Limits = None,
     record: Record = False,
     seed: NoiseSeed = 0,
     known_place: KnownPlace = False,
@@ -217,7 +219,7 @@ def servo(
     turn, and the sensor touches the same place again. The place is said before the arm moves.
 
     Before the arm touches anything, a frame is taken from which the model counts pins. With --at-rest none it counts them from where it
-    knows them to be at rest, or where the contacts tell that they are. Models on graphs count them from the specification's layout.
+    knows them to be at rest, or where the contacts show that they are. Models on graphs count them from the specification's layout.
 
     \b
     Example:
@@ -239,11 +241,11 @@ def servo(
     The exit code is 1 if it ended early.
     """
     from hardware.servo.following import follow
-    from training.estimate.loading import load_remembering
+    from training.estimate.loading import load_with_history
 
     return run_along(
         follow,
-        load_remembering,
+        load_with_history,
         model,
         out,
         kept_as="model",
@@ -254,7 +256,7 @@ def servo(
         arm=arm,
         steps=steps,
         stream_hz=rate if stream else None,
-        limits=limits,
+        limits=safety,
         record=record,
         seed=seed,
         plain_light=plain_light,
@@ -294,7 +296,7 @@ def run_along(
     from hardware.servo.following import FollowPlan
     from scenes import load_object, load_servo
 
-    plan = FollowPlan(stimulus=load_object(obj), servo=load_servo(servo), also=tuple(also or ()), **options)
+    plan = FollowPlan(obj=load_object(obj), servo=load_servo(servo), also=tuple(also or ()), **options)
     with signals_as_ctrl_c():
         return follow(plan, load(run), out, about={kept_as: str(run)}, progress=progress)
 
@@ -308,7 +310,7 @@ def run_policy(
     arm: ArmOption = "simulated",
     servo: ServoName = "surface",
     steps: Steps = None,
-    limits: Limits = None,
+    safety: Limits = None,
     record: Record = False,
     seed: NoiseSeed = 0,
     known_place: KnownPlace = False,
@@ -348,7 +350,7 @@ def run_policy(
         camera=camera,
         arm=arm,
         steps=steps,
-        limits=limits,
+        limits=safety,
         record=record,
         seed=seed,
         plain_light=plain_light,
@@ -371,14 +373,14 @@ FaultOption = Annotated[
 TimeScale = Annotated[float, typer.Option("--time-scale", help="how much faster than the real arm it moves", min=1e-3)]
 
 
-def faults_of(asked: list[str] | None, known: dict[str, tuple[float | None, str]]) -> tuple[str, ...]:
+def faults_of(wanted: list[str] | None, known: dict[str, tuple[float | None, str]]) -> tuple[str, ...]:
     """The faults that the user asks for. If the user asks for help, the known faults are printed and the command ends."""
     from hardware.emulators.running import fault_lines
 
-    if asked and "help" in asked:
-        say(fault_lines(known))
+    if wanted and "help" in wanted:
+        print_lines(fault_lines(known))
         raise typer.Exit
-    return tuple(asked or ())
+    return tuple(wanted or ())
 
 
 @emulate.command("mg400")

@@ -4,6 +4,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -20,6 +21,13 @@ Given = TypeVar("Given", str, Path)
 Spec = TypeVar("Spec")
 
 
+@dataclass(frozen=True)
+class Formerly:
+    """Mark of an option in ``Annotated``: the name that it had before, which still works, with one line of warning."""
+
+    name: str
+
+
 def usable_cores() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -31,7 +39,7 @@ MOST_SEED = 2**32 - 1
 # Largest number of CPU threads. More threads have never made a training faster, and many more can't be started.
 MOST_THREADS = 256
 
-QUALITY = "drawn without noise, or path-traced with more and more samples"
+QUALITY = "rasterised without noise, or path-traced with more and more samples"
 
 Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
 Object = Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]
@@ -91,26 +99,30 @@ Also = Annotated[
 PlainLight = Annotated[bool, typer.Option("--plain-light", help="draw the twin's frames with direct light alone, without path tracing")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, and move nothing")]
 ServoName = Annotated[str, typer.Option("--servo", help="gains, speeds and the object's place: a name, or a TOML file")]
-Limits = Annotated[str | None, typer.Option("--limits", help="safety limits: mg400, magician, or a TOML file")]
+Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, or a TOML file"), Formerly("limits")]
 AtRest = Annotated[
     str,
     typer.Option(
         "--at-rest",
         metavar="FRAME|first|none",
         help="frame without contact that pins are counted from: a file, the first frame (an error if the sensor is pressed in it), "
-        "or none (the places that the model knows, or that some forty contacts tell)",
+        "or none (the places that the model knows, or that are estimated from some forty contacts)",
     ),
 ]
 
 
 def _even(value: int) -> int:
     """The number, if it is even."""
-    if value % 2:
-        raise OptionError(f"`across` {value}: give an even number")
+    if value is not None and value % 2:
+        raise OptionError(f"`elements` {value}: give an even number")
     return value
 
 
-Across = Annotated[int, typer.Option("--across", min=6, max=64, callback=_even, help="elements along each side of the skin's grid; even")]
+Elements = Annotated[
+    int,
+    typer.Option("--elements", min=6, max=64, callback=_even, help="elements along each side of the skin's grid; even"),
+    Formerly("across"),
+]
 
 
 def names_in(text: str) -> list[str]:
@@ -129,7 +141,7 @@ def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
     return numbers
 
 
-def if_given(load: Callable[[Given], Spec], name: Given | None) -> Spec | None:
+def load_if_named(load: Callable[[Given], Spec], name: Given | None) -> Spec | None:
     """The specification of a name or file; None if none is given."""
     return load(name) if name else None
 
@@ -143,14 +155,14 @@ def sensor_with(name: str, tuning: Path | None) -> "SensorSpec":
     return spec if tuning is None else with_detector(spec, load_detector(tuning))
 
 
-def refined_if(wanted: bool, sensor: "SensorSpec") -> "SensorSpec":
+def with_residual_if(wanted: bool, sensor: "SensorSpec") -> "SensorSpec":
     """The sensor, with its residual network switched on if ``wanted``."""
     from twin.camera.residual import with_residual
 
     return with_residual(sensor) if wanted else sensor
 
 
-def one_recording(folders: list[Path], table: Path | None, no_contact: Path | None) -> list[Path]:
+def require_one_recording(folders: list[Path], table: Path | None, no_contact: Path | None) -> list[Path]:
     """The recordings. A table or a no-contact frame from elsewhere is allowed for a single recording only, and is attached to it."""
     from twin.frames import frames_at
 
@@ -175,13 +187,13 @@ def as_options(text: str) -> str:
     return re.sub(r"`([a-z][a-z0-9_]*)(?:=([^`]*))?`", option, text)
 
 
-def say(lines: Iterable[str]) -> None:
+def print_lines(lines: Iterable[str]) -> None:
     """Print each line as soon as it is known."""
     for line in lines:
         print(as_options(line), flush=True)
 
 
-def tell(result: Any) -> None:
+def print_result(result: Any) -> None:
     """Print the ``lines()`` of a result, and the files that it names as ``written``, if it does."""
-    say(result.lines())
-    say(f"wrote {path}" for path in getattr(result, "written", ()))
+    print_lines(result.lines())
+    print_lines(f"wrote {path}" for path in getattr(result, "written", ()))

@@ -127,12 +127,12 @@ class Lines:
         self._watcher.join()
 
 
-GOES_ON = "what is finished is kept; the same command goes on from there"
+GOES_ON = "what is finished is kept; the same command resumes from there"
 """Note of an interrupted command that does."""
 
 
 @contextmanager
-def shown(*, goes_on: bool = False) -> Iterator[Told]:
+def show_progress(*, goes_on: bool = False) -> Iterator[Told]:
     """The ``Progress`` of a command: bars where stderr is a terminal, else lines.
 
     ``goes_on``: the same command continues interrupted work, and Ctrl-C says so.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from twin.cli import app
-from twin.cli.options import Out, if_given
+from twin.cli.options import Out, load_if_named
 from twin.progress import Progress
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def convert_command(
     Every format holds the picture, the time, and as far as the source knows them pins, pose, move, wrench, estimate and action. Pins are
     found in the pictures if the source has none and its sensor is known. docs/records.md has names, units, frames and axes.
 
-    The same command goes on after any end, and adds what is new: several rounds become one data set. Episodes that are there already are
+    The same command resumes after any end, and adds what is new: several rounds become one data set. Episodes that are there already are
     not written again.
 
     \b
@@ -56,4 +56,4 @@ def convert_command(
     from scenes import load_sensor
     from twin.records import convert
 
-    return convert(sources, out, to, sensor=if_given(load_sensor, sensor), task=task, video=video, progress=progress)
+    return convert(sources, out, to, sensor=load_if_named(load_sensor, sensor), task=task, video=video, progress=progress)

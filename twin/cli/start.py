@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import QUALITY, Object, Out, Pair, Sensor, say
+from twin.cli.options import QUALITY, Object, Out, Pair, Sensor, print_lines
 from twin.progress import Progress
 from twin.types import Form, Quality
 
@@ -32,7 +32,7 @@ def sensors() -> None:
     """
     from scenes import catalog
 
-    say(catalog.sensors().lines())
+    print_lines(catalog.sensors().lines())
 
 
 @app.command("objects")
@@ -45,7 +45,7 @@ def objects() -> None:
     """
     from scenes import catalog
 
-    say([*catalog.objects().lines(), "Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl"])
+    print_lines([*catalog.objects().lines(), "Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl"])
 
 
 @app.command("experiments")
@@ -60,14 +60,14 @@ def experiments() -> None:
     """
     from scenes import catalog
 
-    say(catalog.experiments().lines())
+    print_lines(catalog.experiments().lines())
 
 
 @app.command("randomisations")
 def randomisations() -> None:
     """List the randomisations, and where to put one's own.
 
-    A randomisation says what differs from one simulated frame to the next.
+    A randomisation (domain randomisation) is the distribution of the quantities that vary between simulated frames.
 
     \b
     Example:
@@ -75,7 +75,7 @@ def randomisations() -> None:
     """
     from scenes import catalog
 
-    say(catalog.randomisations().lines())
+    print_lines(catalog.randomisations().lines())
 
 
 @app.command("doctor", exit_code=lambda machine: 0 if machine.can_render else 1)

@@ -1,8 +1,8 @@
 """Commands of ``twin study``: experiments that compare models.
 
 - ``twin study servo``: several models follow the outlines of several objects.
-- ``twin study objects``: how well a model estimates poses on objects that it never touched.
-- ``twin study sim-to-real``: what training in the twin is worth on real frames.
+- ``twin study objects``: how well a model estimates poses on unseen objects.
+- ``twin study sim-to-real``: how well models that are trained in the twin do on real frames.
 - ``twin study tac-vgnn``: the comparison of the Tac-VGNN paper.
 """
 
@@ -16,8 +16,9 @@ from twin.cli.command import App
 from twin.cli.options import (
     CORES,
     MOST_SEED,
-    Across,
     Device,
+    Elements,
+    Formerly,
     FormOrAuto,
     Out,
     PlainLight,
@@ -28,7 +29,7 @@ from twin.cli.options import (
     Workers,
     each_once,
     finite,
-    if_given,
+    load_if_named,
     names_in,
     numbers_in,
 )
@@ -94,17 +95,19 @@ def study_objects(
     train: Annotated[str, typer.Option("--train", help="objects to train on, with commas between; the first also alone")] = TRAIN,
     unseen: Annotated[str, typer.Option("--unseen", help="objects never trained on, with commas between")] = UNSEEN,
     count: Annotated[int, typer.Option("--count", min=2, metavar="N", help="contacts of each object to train on")] = 100,
-    tests: Annotated[int, typer.Option("--tests", min=1, metavar="N", help="other contacts of each object to judge on")] = 50,
-    experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="contacts to judge on ('twin experiments')")] = "objects-2d",
+    tests: Annotated[int, typer.Option("--tests", min=1, metavar="N", help="other contacts of each object to evaluate on")] = 50,
+    experiment: Annotated[
+        str, typer.Option("--experiment", metavar="E", help="contacts to evaluate on ('twin experiments')")
+    ] = "objects-2d",
     randomise: Annotated[str, typer.Option("--randomise", metavar="R", help="randomisation ('twin randomisations')")] = "moves",
     seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the contacts and the weights")] = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of both trainings, instead of the study's own")] = None,
     workers: Workers = CORES,
-    across: Across = FINE,
+    elements: Elements = FINE,
     *,
     progress: Progress,
-) -> "objects.Result":
-    """Train on several objects, and judge on others.
+) -> "objects.ObjectsResult":
+    """Train on several objects, and evaluate on others.
 
     \b
     Example:
@@ -112,12 +115,12 @@ def study_objects(
           --unseen cylinder,edge --out out/objects
 
     Two models learn from the same number of contacts that are simulated in the twin (pins alone, every state on their way). 'mixed' learns
-    from --count contacts of each object of --train, the other from the first of these objects alone. Both are judged on --tests other
+    from --count contacts of each object of --train, the other from the first of these objects alone. Both are evaluated on --tests other
     contacts of every object, including the objects of --unseen.
 
     Labels mean the same on every object. The depth is the indentation along the surface's normal at the place nearest to the dome's
     centre, and the angle is measured from this normal, as if a flat plate were touched there. --experiment gives the ranges in which the
-    models are judged; they are trained on its wider ranges.
+    models are evaluated; they are trained on its wider ranges.
 
     The same command continues an interrupted study. The run that learnt several objects can be given wherever a RUN is asked for:
 
@@ -133,7 +136,7 @@ def study_objects(
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.studies import objects
 
-    plan = objects.Plan(
+    plan = objects.ObjectsPlan(
         sensor=load_sensor(sensor),
         experiment=load_experiment(experiment),
         randomisation=load_randomisation(randomise),
@@ -142,7 +145,7 @@ def study_objects(
         count=count,
         tests=tests,
         seed=seed,
-        across=across,
+        across=elements,
         epochs=epochs,
         workers=workers,
     )
@@ -154,8 +157,12 @@ def study_sim_to_real(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled real recording")],
     out: Out,
-    labels: Annotated[int, typer.Option("--labels", min=8, metavar="N", help="labelled frames beside the simulated ones")] = 40,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the drawn frames, the contacts and the weights")] = 0,
+    num_labelled: Annotated[
+        int, typer.Option("--num-labelled", min=8, metavar="N", help="labelled frames beside the simulated ones"), Formerly("labels")
+    ] = 40,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the rasterised frames, the contacts and the weights")
+    ] = 0,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how the frames were recorded")] = "surface-2d",
     contacts: Annotated[
         str | None,
@@ -171,23 +178,23 @@ def study_sim_to_real(
     ablate: Annotated[bool, typer.Option("--ablate", help="also train without one ingredient at a time")] = False,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of every training, instead of the model's own")] = None,
     workers: Workers = CORES,
-    across: Across = FINE,
+    elements: Elements = FINE,
     *,
     progress: Progress,
-) -> "sim_to_real.Result":
+) -> "sim_to_real.SimToRealResult":
     """Train in the twin or on real frames, test on real ones.
 
     \b
     Example:
-      twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 \\
+      twin study sim-to-real --sensor mg400-331 --frames DIR --num-labelled 40 \\
           --seed 0 --out out/sim-to-real
 
     --experiment says how the arm moved in the recording and what is learnt; --contacts is the experiment that is simulated.
 
-    First, --labels real frames are drawn at random from four fifths of the recording. The friction of the simulated contacts is drawn
-    from the friction found on these frames. The difference between the twin's pins and the real pins on these frames is learnt as a
+    First, --num-labelled real frames are sampled at random from four fifths of the recording. The friction of the simulated contacts is
+    drawn from the friction found on these frames. The difference between the twin's pins and the real pins on these frames is learnt as a
     Gaussian process of the label, and drawn --draws times for every simulated contact. With --calibrate the specification is fitted to
-    these frames first ('twin calibrate contact'; about an hour). All models are judged on the remaining fifth:
+    these frames first ('twin calibrate contact'; about an hour). All models are evaluated on the remaining fifth:
 
     \b
       simulated            vgnn trained on simulated contacts alone (steered, if
@@ -198,7 +205,7 @@ def study_sim_to_real(
                            also the twin that is read, with 0 to 500 frames
       ..., N without labels
                            vgnn or steered, trained on the labelled frames and on
-                           N others, whose labels the twin that is read tells
+                           N others, whose labels model inversion estimates
       real                 vgnn or steered, and a quadratic regression, trained on
                            as many real frames, on 500 and on all
       ..., even            the same with frames that are nearest to an even
@@ -206,7 +213,7 @@ def study_sim_to_real(
       --ablate             also models trained on simulated contacts with one
                            change each: without the learnt difference of the pins,
                            with a fifth of the contacts, a coarse mesh, one
-                           friction, any friction, no moves, drawn tolerances of
+                           friction, any friction, no moves, sampled tolerances of
                            skin and gel, and without calibration; this simulates
                            six more sets of contacts
 
@@ -219,12 +226,12 @@ def study_sim_to_real(
     from scenes import load_experiment, load_sensor
     from training.studies import sim_to_real
 
-    plan = sim_to_real.Plan(
+    plan = sim_to_real.SimToRealPlan(
         sensor=load_sensor(sensor),
         frames=frames,
         experiment=load_experiment(experiment),
-        contacts=if_given(load_experiment, contacts),
-        labels=labels,
+        contacts=load_if_named(load_experiment, contacts),
+        labels=num_labelled,
         seed=seed,
         draws=draws,
         count=count,
@@ -233,7 +240,7 @@ def study_sim_to_real(
         ablate=ablate,
         epochs=epochs,
         workers=workers,
-        across=across,
+        across=elements,
     )
     return sim_to_real.run(plan, out, progress=progress)
 
@@ -248,7 +255,9 @@ def study_tac_vgnn(
     out: Out,
     models: Annotated[str, typer.Option("--models", help="names with commas between")] = MODELS,
     seeds: Annotated[str, typer.Option("--seeds", help="seeds of weights and order, with commas between")] = "0",
-    labels: Annotated[str, typer.Option("--labels", help="labels to learn: raw (as in the paper) or corrected")] = "raw",
+    label_kind: Annotated[
+        str, typer.Option("--label-kind", help="labels to train on: raw (as in the paper) or corrected"), Formerly("labels")
+    ] = "raw",
     target: Target = "surface-2d",
     split: Annotated[int, typer.Option("--split", min=0, max=MOST_SEED, help="seed of the fifth kept out of training")] = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of training, instead of each model's own number")] = None,
@@ -264,10 +273,10 @@ def study_tac_vgnn(
     form: FormOrAuto = None,
     *,
     progress: Progress,
-) -> "tac_vgnn.Result":
+) -> "tac_vgnn.TacVgnnResult":
     """Repeat the Tac-VGNN paper's comparison on a recording.
 
-    It compares graphs, models and training efficiency, and shows how the Voronoi areas tell the depth of a contact.
+    It compares graphs, models and training efficiency, and shows how the Voronoi areas depend on the depth of a contact.
 
     \b
     Example:
@@ -277,8 +286,8 @@ def study_tac_vgnn(
     The models (--models) are gnn, tac-vgnn, tac-vgnn-release, cnn-v1, cnn-v2, and this project's vgnn. vgnn-without-graph,
     vgnn-without-modes and vgnn-without-kernel show what each part of vgnn contributes.
 
-    All models are trained on the same rows and labels, and judged on the same fifth. Each run is a folder below --out/runs as 'twin train'
-    writes it. The same command continues an interrupted study, so a study may be spread over several days. --max-minutes is shared
+    All models are trained on the same rows and labels, and evaluated on the same fifth. Each run is a folder below --out/runs as 'twin
+    train' writes it. The same command continues an interrupted study, so a study may be spread over several days. --max-minutes is shared
     evenly among the runs that are still to do. A run that this time ended is reported as ended early.
 
     \b
@@ -289,12 +298,12 @@ def study_tac_vgnn(
     from training.studies import tac_vgnn
     from training.studies.train import columns_of
 
-    plan = tac_vgnn.Plan(
+    plan = tac_vgnn.TacVgnnPlan(
         data=data,
         sensor=load_sensor(sensor),
         models=tuple(names_in(models)),
         seeds=numbers_in(seeds, "--seeds", 0),
-        labels=labels,
+        labels=label_kind,
         target=columns_of(target),
         split=split,
         epochs=epochs,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import say
+from twin.cli.options import print_lines
 from twin.errors import extras_named
 from twin.signals import signals_as_ctrl_c
 
@@ -31,7 +31,7 @@ def studio(
     saves: Annotated[Path, typer.Option("--saves", metavar="DIR", help="folder for what the page saves")] = Path("out/studio"),
     host: Annotated[str, typer.Option("--host", help="address to listen on; another one than this machine's is warned of")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=1, max=65535, help="port of the page; the next free one if it is taken")] = 8090,
-    plain: Annotated[bool, typer.Option("--plain", help="no path tracing: pictures stay drawn")] = False,
+    plain: Annotated[bool, typer.Option("--plain", help="no path tracing: pictures stay rasterised")] = False,
     seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="end after this time")] = None,
 ) -> None:
     """Move an object over the skin, on a page in the browser.
@@ -40,11 +40,11 @@ def studio(
     with ctrl they turn it; 'ctrl + K' lists all). At once the page shows the skin with its pins, the camera's picture, the pins found and
     their Voronoi cells, force and torque, and the model's estimate with its 90 % interval beside the truth.
 
-    While the object moves, contacts are solved on the usual mesh and pictures are drawn. When it stands still, the picture is path-traced
-    and the contact is solved again on a fine mesh. The page says which of them it shows. Where the object may not go, it stops, and the
-    page says why.
+    While the object moves, contacts are solved on the usual mesh and pictures are rasterised. When it stands still, the picture is
+    path-traced and the contact is solved again on a fine mesh. The page says which of them it shows. Where the object may not go, it stops,
+    and the page says why.
 
-    Other modes: Degrade (what the pipeline and the model bear on this contact), Recording (labels against estimates), Live (camera and
+    Other modes: Degrade (what the pipeline and the model tolerate on this contact), Recording (labels against estimates), Live (camera and
     arm), Your own sensor (a specification from a folder of frames, as 'twin new' makes it, with the layout drawn over them and corrected).
 
     The page's folder 'Save' shows a link that opens the whole state again, in a browser while the studio runs, or with --state.
@@ -67,17 +67,17 @@ def studio(
     shown = load_sensor(first.sensor)
     require_feed(camera, arm, recording, shown)
     plan = StudioPlan(first, saves, host=host, port=port, traces=not plain, recording=recording, camera=camera, arm=arm, seconds=seconds)
-    say(plan.warnings)
+    print_lines(plan.warnings)
     with signals_as_ctrl_c():
-        run_studio(plan, models_when_asked(model, shown.name), CameraFeed, on_open=tell_page)
+        run_studio(plan, lazy_models_by_sensor(model, shown.name), CameraFeed, on_open=print_address)
 
 
-def tell_page(url: str) -> None:
+def print_address(url: str) -> None:
     """Print the page's address."""
     print(f"open {url} in a browser; Ctrl-C ends it", flush=True)
 
 
-def models_when_asked(run: Path | None, sensor: str) -> Callable[[str], "PoseEstimator | None"]:
+def lazy_models_by_sensor(run: Path | None, sensor: str) -> Callable[[str], "PoseEstimator | None"]:
     """``models_by_sensor``. If no run is given, it loads when the first model is requested, so that the page does not wait for PyTorch."""
 
     def model_of(name: str) -> "PoseEstimator | None":

@@ -20,11 +20,11 @@ from twin.report.charts import write_chart
 from twin.report.skin3d import draw_contact_skin
 from twin.simulator import Simulator
 from twin.store import writes
-from twin.types import Form, Readable
+from twin.types import Form, ReadableResult
 
 
 @dataclass(frozen=True, repr=False)
-class Demo(Readable):
+class Demo(ReadableResult):
     """The result of the demo.
 
     Attributes

@@ -11,9 +11,9 @@ from twin.demo.stages import ContactResult, DepthRow
 from twin.frames.images import write_image
 from twin.report.charts import new_figure, write_chart
 from twin.report.numbers import number
-from twin.report.page import Page, Picture, code, sentence
+from twin.report.page import Page, PagePicture, code, sentence
 from twin.report.plots import (
-    Look,
+    ObservedFrame,
     area_change_at,
     area_surface_figure,
     draw_area_change,
@@ -72,7 +72,7 @@ def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
     return written
 
 
-def motion_figure(motions: list[tuple[str, Look]]) -> Figure:
+def motion_figure(motions: list[tuple[str, ObservedFrame]]) -> Figure:
     """Displacement (top) and area change (bottom) for each motion, as in the paper's figure 1(d)."""
     figure, axes = new_figure(len(motions), 2, panel_inch=4.2)
     for column, (title, look) in enumerate(motions):
@@ -146,26 +146,28 @@ def _contact_section(page: Page, contact: ContactContent) -> None:
     at, title = contact.pictures, contact.title
     page.section(title, contact.description)
     shown = [
-        Picture(
+        PagePicture(
             at["skin"], f"{title}: deformed skin in 3D", "The skin, cut open, coloured by its displacement, with pins and object.", "photo"
         ),
-        Picture(at["raw"], f"{title}: rendered camera frame", f"What the camera inside sees ({contact.raw_size}).", "frame"),
+        PagePicture(at["raw"], f"{title}: rendered camera frame", f"What the camera inside sees ({contact.raw_size}).", "frame"),
     ]
     if "recorded" in at:
         said = "The same frame in the form of this sensor's recordings: cropped, adaptively thresholded, resized."
-        shown.append(Picture(at["recorded"], f"{title}: frame in the form of a recording", said, "frame"))
+        shown.append(PagePicture(at["recorded"], f"{title}: frame in the form of a recording", said, "frame"))
     page.figures(*shown, layout="row")
     page.figures(
-        Picture(
+        PagePicture(
             at["pins"],
             f"{title}: pins and Voronoi graph",
             "Pins found (green), graph edges (blue) and Voronoi cells (white); yellow crosses are spots that are not pins.",
         ),
-        Picture(at["areas"], f"{title}: Voronoi area change", "Voronoi cell areas against no contact: cells grow where the dome flattens."),
+        PagePicture(
+            at["areas"], f"{title}: Voronoi area change", "Voronoi cell areas against no contact: cells grow where the dome flattens."
+        ),
         layout="row",
     )
     page.figures(
-        Picture(
+        PagePicture(
             at["surfaces"],
             f"{title}: interpolated area surfaces",
             "Cell area interpolated over the image: no contact, contact, difference.",
@@ -180,7 +182,7 @@ def _motions_section(page: Page, motions: Path, sensor: str) -> None:
         "Pressing (Z) spreads the pins outwards. Dragging along x or y carries them with the object until they slip.",
     )
     page.figures(
-        Picture(
+        PagePicture(
             motions,
             "Displacement of the pins and change of the Voronoi areas for motions along Z, X and Y",
             f"Pin displacement (top) and Voronoi area change (bottom) for motions along Z, X and Y, on {sensor}.",
@@ -214,7 +216,7 @@ def _time_section(page: Page, seconds: Mapping[str, float]) -> None:
     page.table([*stages, total], [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
 
 
-def _graph_figure(look: Look) -> Figure:
+def _graph_figure(look: ObservedFrame) -> Figure:
     figure, (ax,) = new_figure(1, panel_inch=6)
     graph, rest = look.graphs()
     draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
@@ -223,7 +225,7 @@ def _graph_figure(look: Look) -> Figure:
     return figure
 
 
-def _areas_figure(look: Look) -> Figure:
+def _areas_figure(look: ObservedFrame) -> Figure:
     figure, (ax,) = new_figure(1, panel_inch=6)
     graph, rest = look.graphs()
     draw_area_change(ax, graph, rest.area_px2, "")

@@ -15,7 +15,7 @@ from twin.one_contact import look_at
 from twin.pins.graph import make_graph
 from twin.pins.reference import nominal_reference
 from twin.progress import Step
-from twin.report.plots import Look
+from twin.report.plots import ObservedFrame
 from twin.simulator import RenderedFrame, Simulator
 from twin.types import ContactState, Form
 
@@ -63,7 +63,7 @@ class ContactResult:
     pose: ContactPose
     state: ContactState
     raw: RenderedFrame
-    look: Look
+    look: ObservedFrame
     seconds: dict[str, float]
 
 

@@ -49,7 +49,7 @@ def raw_to_recording(recording: RecordingSpec | None, raw_px: np.ndarray) -> np.
     Raises
     ------
     FrameError
-        The sensor has no recording form.
+        The sensor has no processed form.
     """
     corner, scale = _corner_and_scale(recording)
     return (np.asarray(raw_px, float) - corner + 0.5) * scale - 0.5
@@ -86,11 +86,11 @@ def frame_size(spec: SensorSpec, form: Form) -> tuple[int, int]:
     Raises
     ------
     FrameError
-        The sensor has no recording form, or there is no such form.
+        The sensor has no processed form, or there is no such form.
     """
     known, form = known_frames(spec), form_named(form)
     if form not in known.size_px:
-        raise FrameError(f"sensor '{spec.name}' has no recording form: its recordings are raw frames; use the raw form")
+        raise FrameError(f"sensor '{spec.name}' has no processed form: its recordings are raw frames; use the raw form")
     return known.size_px[form]
 
 
@@ -100,11 +100,11 @@ def blob_spec(pipeline: PipelineSpec, form: Form) -> BlobSpec:
     Raises
     ------
     FrameError
-        The sensor has no recording form, or there is no such form.
+        The sensor has no processed form, or there is no such form.
     """
     found = pipeline.raw if form_named(form) == Form.RAW else pipeline.recording
     if found is None:
-        raise FrameError("the sensor has no recording form ([pipeline.recording]): its recordings are raw frames; use the raw form")
+        raise FrameError("the sensor has no processed form ([pipeline.recording]): its recordings are raw frames; use the raw form")
     return found
 
 
@@ -190,7 +190,7 @@ def is_two_level(image: np.ndarray) -> bool:
     return away < FEW_AWAY or 1 - away / float(np.mean(gray)) > AT_EDGES
 
 
-def tell_form(known: KnownFrames, image: np.ndarray) -> Form:
+def recognise_form(known: KnownFrames, image: np.ndarray) -> Form:
     """Recognise the form of a sensor's frame by its size. If both forms have this size, the content decides.
 
     Raises
@@ -221,7 +221,7 @@ def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form 
     if known is None:
         return form or (Form.PROCESSED if is_two_level(image) else Form.RAW)
     try:
-        told = tell_form(known, image)
+        told = recognise_form(known, image)
     except FrameError as error:
         raise FrameError(f"{name}: {error}") from None
     if form is None:
@@ -266,7 +266,7 @@ def common_kind(files: list[Path], known: KnownFrames | None, form: Form | None)
 def _corner_and_scale(recording: RecordingSpec | None) -> tuple[np.ndarray, np.ndarray]:
     """First pixel (x, y) of the crop in the camera's frame, and number of recorded pixels for one pixel of the camera, in x and y."""
     if recording is None:
-        raise FrameError("the sensor has no recording form ([recording]): its recordings are raw frames; use the raw form")
+        raise FrameError("the sensor has no processed form ([recording]): its recordings are raw frames; use the raw form")
     x0, y0, x1, y1 = recording.crop_px
     return np.array([x0, y0], float), np.array([recording.width_px / (x1 - x0), recording.height_px / (y1 - y0)])
 

@@ -71,7 +71,7 @@ def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
     FrameError
         The file cannot be read: it is missing, empty, truncated, damaged or no picture.
     """
-    return _as_levels(*_stored(path), bits)
+    return _as_levels(*_read_levels(path), bits)
 
 
 def picture_of(data: bytes) -> tuple[np.ndarray, str]:
@@ -82,7 +82,7 @@ def picture_of(data: bytes) -> tuple[np.ndarray, str]:
     FrameError
         The bytes are truncated, damaged or no picture; the message names no file.
     """
-    return _as_levels(*_decoded(data), 0)
+    return _as_levels(*_decode_picture(data), 0)
 
 
 def _as_levels(stored: np.ndarray, odd: str, bits: int) -> tuple[np.ndarray, str]:
@@ -112,10 +112,10 @@ def decode(path: Path) -> np.ndarray:
     FrameError
         The file cannot be read: it is missing, empty, truncated, damaged or no picture.
     """
-    return _stored(path)[0]
+    return _read_levels(path)[0]
 
 
-def _stored(path: Path) -> tuple[np.ndarray, str]:
+def _read_levels(path: Path) -> tuple[np.ndarray, str]:
     """Levels as of ``decode``, and a note on irregularities of the file ("" if there are none)."""
     try:
         data = read_regular(path, LARGEST_BYTES)
@@ -124,14 +124,14 @@ def _stored(path: Path) -> tuple[np.ndarray, str]:
     if not data:
         raise FrameError(f"{path.name}: the file is empty; copy it again")
     try:
-        image, odd = _decoded(data)
+        image, odd = _decode_picture(data)
     except FrameError as error:
         raise FrameError(f"{path.name}: {error}") from None
     several = "holds several pictures; only the first is read" if _holds_several(path, data) else ""
     return image, "; ".join(filter(None, [several, odd]))
 
 
-def _decoded(data: bytes) -> tuple[np.ndarray, str]:
+def _decode_picture(data: bytes) -> tuple[np.ndarray, str]:
     """Levels as of ``decode`` from a picture's bytes, and a note on irregularities that its decoder reported ("" if there are none)."""
     if data.startswith(PNG_START) and (torn := _png_fault(data)):
         raise FrameError(f"{torn}; copy it again")
@@ -218,7 +218,7 @@ def to_eight_bits(image: np.ndarray, bits: int = 0) -> tuple[np.ndarray, str]:
     return np.round(image * (255.0 / ((1 << bits) - 1))).astype(np.uint8), f"16-bit levels taken as {bits}-bit data and scaled to 8 bits"
 
 
-def _turn_away() -> None:
+def _silence_stderr() -> None:
     """Redirect stderr to the null device, unless another call has already done so."""
     global _inside, _kept
     with _lock:
@@ -248,7 +248,7 @@ def _turn_back() -> None:
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
     """Context that drops what any thread prints to stderr. Use it for one decoder call only."""
-    _turn_away()
+    _silence_stderr()
     try:
         yield
     finally:

@@ -71,7 +71,7 @@ class LeRobotFrames:
             return
         for index in wanted:
             try:
-                image, note = picture_of(self._stored(*self._places[index]))
+                image, note = picture_of(self._read_encoded(*self._places[index]))
                 said = f"{self.path.name}: pictures of {self._feature}: {note}"
                 self.problems += [said] if note and said not in self.problems else []
                 yield index, self._as_first(image)
@@ -91,11 +91,13 @@ class LeRobotFrames:
             for index in number.values():
                 yield index, f"{path.name} ends before it"
 
-    def _stored(self, path: Path, group: int, row: int) -> bytes:
+    def _read_encoded(self, path: Path, group: int, row: int) -> bytes:
         """The encoded bytes of a picture that a table holds or names."""
         if self._group != (path, group):
             columns = [self._feature]
-            table = _read(path, lambda parquet: parquet.ParquetFile(path, page_checksum_verification=True).read_row_group(group, columns))
+            table = _read_table(
+                path, lambda parquet: parquet.ParquetFile(path, page_checksum_verification=True).read_row_group(group, columns)
+            )
             if self._feature not in table.column_names:
                 raise FrameError(f"{path}: has no column {self._feature}, though {INFO} names it; {DAMAGED}")
             self._group, self._cells = (path, group), table.column(self._feature).to_pylist()
@@ -182,9 +184,9 @@ def _rows(path: Path, info: dict[str, Any], numbered: list[str]) -> tuple[dict[s
     places: list[tuple[Path, int, int]] = []
     total = info.get("total_episodes")
     for file in sorted(path.glob(DATA)):
-        groups = _read(file, lambda parquet, file=file: parquet.ParquetFile(file).num_row_groups)
+        groups = _read_table(file, lambda parquet, file=file: parquet.ParquetFile(file).num_row_groups)
         for group in range(groups):
-            table = _read(
+            table = _read_table(
                 file,
                 lambda parquet, file=file, group=group: parquet.ParquetFile(file, page_checksum_verification=True).read_row_group(
                     group, columns=columns
@@ -208,7 +210,7 @@ def _in_videos(path: Path, info: dict[str, Any], feature: str, rows: dict[str, l
     at = f"videos/{feature}"
     keys = [f"{at}/chunk_index", f"{at}/file_index", f"{at}/from_timestamp"]
     for file in sorted(path.glob(EPISODES)):
-        table = _read(
+        table = _read_table(
             file, lambda parquet, file=file: parquet.read_table(file, columns=["episode_index", *keys], page_checksum_verification=True)
         )
         episodes |= {row["episode_index"]: row for row in table.to_pylist()}
@@ -246,7 +248,7 @@ def _columns(feature: str, names: object, cells: list[Any]) -> dict[str, np.ndar
     return {f"{feature}.{names[k] if named else k}": values[:, k] for k in range(values.shape[1])}  # type: ignore[index]
 
 
-def _read(file: Path, how: Any) -> Any:
+def _read_table(file: Path, how: Any) -> Any:
     """The result of ``how``, applied to pyarrow's module for tables; a damaged file raises ``FrameError``."""
     parquet, arrow = _library("pyarrow.parquet"), _library("pyarrow")
     try:

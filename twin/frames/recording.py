@@ -8,14 +8,14 @@ from typing import TypedDict
 
 import numpy as np
 
-from scenes.files import LONGEST_PATH, shown
+from scenes.files import LONGEST_PATH, quote
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, odd_entries, references_in, the_video_in
 from twin.frames.forms import FrameKind, KnownFrames, common_kind, form_named, form_of, known_frames, times
 from twin.frames.images import read_image
 from twin.frames.lerobot import INFO, RESTS, LeRobotFrames, is_lerobot, open_lerobot
-from twin.frames.tables import TABLES, counted, order_by_table, read_metadata, unlikely_units
+from twin.frames.tables import TABLES, describe_count, order_by_table, read_metadata, unlikely_units
 from twin.frames.videos import Video, open_video
 from twin.types import Form, Frame
 
@@ -105,7 +105,7 @@ class Recording:
     def some(self, chosen: Collection[int]) -> Iterator[Frame]:
         """The readable frames of some indices of ``names``, in order; unreadable ones are added to ``failed``."""
         self.failed.clear()
-        for index, frame in self._chosen(chosen):
+        for index, frame in self._read_chosen(chosen):
             if isinstance(frame, str):
                 self.failed.append({"image_name": self.names[index], "reason": frame.removeprefix(f"{self.names[index]}: ")})
             else:
@@ -120,7 +120,7 @@ class Recording:
             The frame can't be read, or its size differs from the recording's.
         """
         if not self._files:
-            for _, frame in self._chosen({index}):
+            for _, frame in self._read_chosen({index}):
                 if isinstance(frame, str):
                     raise FrameError(f"{self.names[index]}: {frame}")
                 return frame
@@ -132,7 +132,7 @@ class Recording:
         alike: dict[str, list[str]] = {}
         for bad in self.failed:
             alike.setdefault(bad["reason"], []).append(bad["image_name"])
-        skipped = {said: names[0] if len(names) == 1 else counted(len(names), "frames", names) for said, names in alike.items()}
+        skipped = {said: names[0] if len(names) == 1 else describe_count(len(names), "frames", names) for said, names in alike.items()}
         return [*self.problems, *(f"skipped {named}: {said}" for said, named in skipped.items())]
 
     def labels_found(self) -> str:
@@ -156,7 +156,7 @@ class Recording:
             raise FrameError(f"{name}: expected {expected} as the recording's other frames, got {got}; leave it out or record it again")
         return Frame(image, self.form, name, time_s, index)
 
-    def _chosen(self, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
+    def _read_chosen(self, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
         """Index and frame, or the reason why it can't be read, of chosen frames of any source."""
         if self._dataset is not None:
             return self._dataset_frames(self._dataset, chosen)
@@ -316,19 +316,19 @@ def open_recording(
     table, no_contact = (path.table, path.no_contact) if isinstance(path, FramesAt) else (None, None)
     path = Path(path)
     if table is not None and not table.is_file() and not is_lerobot(table):
-        raise FrameError(f"{shown(table, LONGEST_PATH)}: no such table; give the path of a CSV file (`table` or `labels`)")
-    recording = _opened(path, None if spec is None else known_frames(spec), form, table)
+        raise FrameError(f"{quote(table, LONGEST_PATH)}: no such table; give the path of a CSV file (`table` or `label_table`)")
+    recording = _open_with_table(path, None if spec is None else known_frames(spec), form, table)
     if no_contact is not None:
         recording.must_take_reference(no_contact)
     recording.problems += unlikely_units(recording.labels)
     return recording
 
 
-def _opened(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
+def _open_with_table(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
     """The recording at ``path``, with the table and the other files that lie beside its frames."""
     if not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
         link = "a link to nothing" if os.path.islink(path) else "no such file or folder"
-        raise FrameError(f"{shown(path, LONGEST_PATH)}: {link}; give a picture, a folder of frames, a recording or a video")
+        raise FrameError(f"{quote(path, LONGEST_PATH)}: {link}; give a picture, a folder of frames, a recording or a video")
     if path.is_dir() and is_lerobot(path):
         return _open_dataset(path, known, form, table)
     if path.is_dir():
@@ -343,7 +343,7 @@ def _opened(path: Path, known: KnownFrames | None, form: Form | None, table: Pat
     return Recording(path, kind.form, [path.name], kind.size_px, _files=[path], _bits=kind.bits)
 
 
-def spread(count: int, wanted: int) -> list[int]:
+def spread_indices(count: int, wanted: int) -> list[int]:
     """At most ``wanted`` of ``count`` indices, evenly spread from the first to the last."""
     return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int)).tolist()
 
@@ -358,7 +358,7 @@ def evenly_read(recording: Recording, limit: int) -> list[Frame]:
     FrameError
         None of them can be read.
     """
-    frames = list(recording.some(set(spread(len(recording), limit))))
+    frames = list(recording.some(set(spread_indices(len(recording), limit))))
     if not frames:
         raise FrameError(f"{recording.failed[0]['image_name']}: {recording.failed[0]['reason']}")
     return frames

@@ -64,7 +64,7 @@ def _text(path: Path) -> str:
 
 
 @dataclass
-class Table:
+class LabelTable:
     """A table: its file's name, its cells by column, and the columns that name pictures. Pictures are named by their base names."""
 
     name: str
@@ -114,7 +114,7 @@ def _distinct(header: list[str]) -> list[str]:
     return distinct
 
 
-def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are taken in natural order") -> Table | None:
+def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are taken in natural order") -> LabelTable | None:
     """A table; None if it names no pictures.
 
     The reason, with its consequence ``otherwise``, is then added to ``problems``.
@@ -136,24 +136,24 @@ def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are 
     ragged = sum(len(row) != len(header) for row in rows[1:])
     if ragged:
         problems.append(f"{path.name}: {ragged} rows don't have the header's {len(header)} cells and are left out")
-    if _cut(text, rows[1:]):
-        problems.append(f"{path.name}: it ends within its last row, before the last number; copy it anew")
+    if _is_truncated(text, rows[1:]):
+        problems.append(f"{path.name}: it ends within its last row, before the last number; copy it again")
     distinct = _distinct(header)
     if renamed := [new for new, old in zip(distinct, header, strict=True) if new != old]:
-        problems.append(f"{path.name}: {counted(len(renamed), 'columns have the name of another', renamed)}")
+        problems.append(f"{path.name}: {describe_count(len(renamed), 'columns have the name of another', renamed)}")
     rows = [row for row in rows[1:] if len(row) == len(header)]
     columns = {column: [row[k] for row in rows] for k, column in enumerate(distinct) if column}
-    return Table(path.name, columns, [[base_name(row[k]) for row in rows] for k in name_columns])
+    return LabelTable(path.name, columns, [[base_name(row[k]) for row in rows] for k in name_columns])
 
 
-def _cut(text: str, rows: list[list[str]]) -> bool:
+def _is_truncated(text: str, rows: list[list[str]]) -> bool:
     """Whether the text was cut within the last row: its last cell is no number, but the cells above it are."""
     ended = text.splitlines(keepends=True)[-1] != text.splitlines()[-1]
     *above, last = (np.isnan(_number(row[-1])) for row in rows or [["0"]])
     return not ended and last and not all(above or [False])
 
 
-def counted(count: int, things: str, names: list[str]) -> str:
+def describe_count(count: int, things: str, names: list[str]) -> str:
     """Number and kind of things, with the names of the first three."""
     return f"{count} {things} ({', '.join(names[:3])}{', ...' if count > 3 else ''})"
 
@@ -222,10 +222,10 @@ def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -
         "rows for a picture that has one before, left out": pairing.doubled,
         "rows without a picture": pairing.missing,
     }
-    problems += [f"{table.name}: {counted(len(rows), what, [names[k] for k in rows])}" for what, rows in odd.items() if rows]
+    problems += [f"{table.name}: {describe_count(len(rows), what, [names[k] for k in rows])}" for what, rows in odd.items() if rows]
     if unlisted:
         what = "pictures without a row, placed after the others"
-        problems.append(f"{table.name}: {counted(len(unlisted), what, [p.name for p in unlisted])}")
+        problems.append(f"{table.name}: {describe_count(len(unlisted), what, [p.name for p in unlisted])}")
     rows = sorted(pairing.files)
     labels = {c: _as_array([cells[k] for k in rows] + [""] * len(unlisted)) for c, cells in table.columns.items()}
     return [pairing.files[k] for k in rows] + unlisted, called_here(labels)
@@ -239,8 +239,8 @@ def called_here(labels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def unlikely_units(labels: dict[str, np.ndarray]) -> list[str]:
     """Doubts about the unit of a table's poses and moves, one line each. Lengths are in mm, angles in deg.
 
-    A table has one unit for all lengths, and one for all angles, so the widest column of each decides. A column that is constant tells
-    nothing.
+    A table has one unit for all lengths, and one for all angles, so the widest column of each decides. A column that is constant carries no
+    information.
     """
     ranges = {"mm": [(0.0, "")], "deg": [(0.0, "")]}
     for name, cells in labels.items():
@@ -301,7 +301,7 @@ def read_metadata(path: Path, problems: list[str]) -> object | None:
         return float(name)
 
     try:
-        content = _parsed_or_mended(path.name, text, constant, problems)
+        content = _parse_json(path.name, text, constant, problems)
     except ValueError as error:
         problems.append(f"{path.name}: invalid JSON ({error}); ignored")
         return None
@@ -313,7 +313,7 @@ def read_metadata(path: Path, problems: list[str]) -> object | None:
     return content
 
 
-def _parsed_or_mended(name: str, text: str, constant: Callable[[str], float], problems: list[str]) -> object:
+def _parse_json(name: str, text: str, constant: Callable[[str], float], problems: list[str]) -> object:
     """Content of JSON text. If necessary, single backslashes are doubled first. ``constant`` converts NaN and Infinity."""
     try:
         return json.loads(text, parse_constant=constant)

@@ -11,7 +11,7 @@ from twin.types import Form
 
 # Zarr group with the exact values of the frames.
 TRUTH = "truth.zarr"
-AGAIN = "copy the data set anew, or make it again"
+AGAIN = "copy the data set again, or make it again"
 NEVER_ZERO = (
     "pins_px",
     "rest_px",

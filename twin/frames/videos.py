@@ -1,4 +1,4 @@
-"""Reads videos frame by frame, counts their frames, and finds out which frames can be used.
+"""Reads videos frame by frame, counts their frames, and finds out which frames are valid.
 
 Motion JPEG is read picture by picture, so that a damaged frame is noticed and left out. Of other codecs those frames are left out of which
 the decoder reports damage, with those that are predicted from them, and those that the decoder would scale to the first frame's size.
@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scenes.files import require_regular, shown
+from scenes.files import quote, require_regular
 from twin.errors import FrameError
 from twin.frames.av1 import decode_av1
 from twin.frames.forms import times
@@ -72,7 +72,7 @@ class Video:
 
     def frames(self) -> Iterator[tuple[int, float, np.ndarray | str]]:
         """Index, time (s) and picture of each frame, in order. A frame that can't be used gives the reason, a text, instead."""
-        for index, time_s, image, said in _read(self.path):
+        for index, time_s, image, said in _read_frames(self.path):
             if index >= self.count:
                 return
             yield index, time_s, self.faults.get(index) or (said if image is None else image)
@@ -90,13 +90,13 @@ def open_video(path: Path) -> Video:
         require_regular(path)
     except OSError as error:
         raise FrameError(f"{path}: can't be read ({error.strerror}); give a video") from error
-    stored = _stored(path)
+    stored = _read_properties(path)
     times_s: list[float] = []
     said: dict[int, str] = {}
     sizes: dict[int, tuple[int, ...]] = {}
     firsts: dict[tuple[int, ...], np.ndarray] = {}
     repeated, before = 0, None
-    for index, time_s, image, note in _read(path):
+    for index, time_s, image, note in _read_frames(path):
         times_s.append(time_s)
         said |= {index: note} if note else {}
         if image is not None:
@@ -214,7 +214,7 @@ def _remedy(path: Path, codec: bytes, said: str) -> str:
             codec = named[named.lastindex or 0] if named else b""
     if not codec:
         return "; check that it is a video, or record it again"
-    why = f"{shown(codec.decode('ascii', 'replace'))}{f' ({said})' if said else ''}"
+    why = f"{quote(codec.decode('ascii', 'replace'))}{f' ({said})' if said else ''}"
     return f": its codec is {why}; convert it without loss, for example with 'ffmpeg -i VIDEO -c:v libx264 -qp 0 OTHER.mp4'"
 
 
@@ -231,7 +231,7 @@ def _capture(path: Path) -> Iterator[tuple[cv2.VideoCapture, bytes]]:
         capture.release()
 
 
-def _stored(path: Path) -> _Stored:
+def _read_properties(path: Path) -> _Stored:
     with _capture(path) as (capture, codec):
         if not capture.isOpened():
             return _Stored()
@@ -268,7 +268,7 @@ def _size_in(packet: bytes, codec: bytes) -> tuple[int, ...]:
     return ()
 
 
-def _read(path: Path) -> Iterator[tuple[int, float, np.ndarray | None, str]]:
+def _read_frames(path: Path) -> Iterator[tuple[int, float, np.ndarray | None, str]]:
     """Index, time (s), picture (RGB) and irregularities of each frame; None and the reason for a frame that can't be used."""
     with _capture(path) as (capture, codec):
         if codec == AV1:

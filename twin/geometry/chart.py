@@ -79,7 +79,7 @@ class Chart:
         """Square points (k, 2) of complex disc points (k,)."""
         a = self._shift
         w = (disc - a) / (1 - a.conjugate() * disc) * np.exp(-1j * self.focus.turn_rad)
-        r = _spread(np.minimum(np.abs(w), 1.0), self._centre_slope)
+        r = _ungather(np.minimum(np.abs(w), 1.0), self._centre_slope)
         return square_of_disc(w / np.maximum(np.abs(w), 1e-300) * r)
 
 
@@ -106,13 +106,15 @@ class RectangleChart:
 
     def disc(self, square: FloatArray) -> ComplexArray:
         """Places (k,) of square points (k, 2)."""
-        x, y = ((s + a) / (1 + a * s) for s, a in ((_gathered(t, c), a) for t, (a, c) in zip(square.T, self._axes, strict=True)))
+        x, y = ((s + a) / (1 + a * s) for s, a in ((_gather(t, c), a) for t, (a, c) in zip(square.T, self._axes, strict=True)))
         return x + 1j * y
 
     def square(self, disc: ComplexArray) -> FloatArray:
         """Square points (k, 2) of places (k,)."""
         shifted = ((p - a) / (1 - a * p) for p, (a, _) in zip((disc.real, disc.imag), self._axes, strict=True))
-        return np.column_stack([np.sign(s) * _spread(np.minimum(np.abs(s), 1.0), c) for s, (_, c) in zip(shifted, self._axes, strict=True)])
+        return np.column_stack(
+            [np.sign(s) * _ungather(np.minimum(np.abs(s), 1.0), c) for s, (_, c) in zip(shifted, self._axes, strict=True)]
+        )
 
 
 def disc_of_square(square: FloatArray) -> ComplexArray:
@@ -138,13 +140,13 @@ def _slope(share: float) -> float:
     return float(np.clip((share - _FINE**_POWER) / (_FINE - _FINE**_POWER), _LEAST_SLOPE, 1.0))
 
 
-def _gathered(r: FloatArray, c: float) -> FloatArray:
+def _gather(r: FloatArray, c: float) -> FloatArray:
     """s(r) = c r + (1 - c) r^5."""
     return r * (c + (1 - c) * r ** (_POWER - 1))
 
 
-def _spread(wanted: FloatArray, c: float) -> FloatArray:
-    """Inverse of ``_gathered`` for values from 0 to 1, by Newton's method inside a shrinking bracket."""
+def _ungather(wanted: FloatArray, c: float) -> FloatArray:
+    """Inverse of ``_gather`` for values from 0 to 1, by Newton's method inside a shrinking bracket."""
     r = np.sqrt(wanted)
     low, high = np.zeros_like(r), np.ones_like(r)
     for _ in range(60):

@@ -216,7 +216,7 @@ class Pad(SkinShape):
         sine = np.clip((size - flat_mm) / self._inner_edge_mm, 0, 1)
         return np.sign(at_mm) * (np.minimum(size, flat_mm) + self.edge_mm * np.arcsin(sine)) / (flat_mm + self.edge_mm * np.pi / 2)
 
-    def _checked(self, feet_mm: FloatArray, on_flat: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def _check_flat(self, feet_mm: FloatArray, on_flat: BoolArray) -> tuple[FloatArray, FloatArray]:
         if not on_flat.all():
             raise SpecError(
                 f"{np.count_nonzero(~on_flat)} pins stand beyond the flat part of the pad; make pins.reach_mm smaller, or turn the layout"
@@ -285,7 +285,7 @@ class RoundPad(Pad):
 
     def pins(self, layout: FloatArray, pins: PinsSpec) -> tuple[FloatArray, FloatArray]:
         feet = self._feet(layout, pins)
-        return self._checked(feet, np.hypot(*feet.T) <= self.skin.outer_radius_mm - self.edge_mm + _PIN_ROUNDING_MM)
+        return self._check_flat(feet, np.hypot(*feet.T) <= self.skin.outer_radius_mm - self.edge_mm + _PIN_ROUNDING_MM)
 
 
 @dataclass(frozen=True)
@@ -344,7 +344,7 @@ class RectangularPad(Pad):
     def pins(self, layout: FloatArray, pins: PinsSpec) -> tuple[FloatArray, FloatArray]:
         feet = self._feet(layout, pins)
         flat_mm = np.array(self.skin.half_size_mm) - self.edge_mm + _PIN_ROUNDING_MM
-        return self._checked(feet, np.abs(feet / flat_mm).max(axis=1) <= 1)
+        return self._check_flat(feet, np.abs(feet / flat_mm).max(axis=1) <= 1)
 
 
 def _complex(x: FloatArray, y: FloatArray) -> ComplexArray:

@@ -229,7 +229,7 @@ class Problem:
         self.slid_mm = state.slid_mm[looked]
         self.friction = friction.after(self.slid_mm)
 
-    def moved(self, T: FloatArray, anchor_mm: FloatArray, slid_mm: FloatArray) -> "Problem":
+    def move_object(self, T: FloatArray, anchor_mm: FloatArray, slid_mm: FloatArray) -> "Problem":
         """The same equations with the object at ``T`` (4, 4), and with anchors (q, 3) and slip (q,) of the candidate points."""
         other = copy(self)
         other.T, other.anchor_mm, other.slid_mm, other.friction = T, anchor_mm, slid_mm, self._law.after(slid_mm)
@@ -272,10 +272,10 @@ class Problem:
         residual = elastic - pushed[self.body.free].ravel()
         return Balance(elastic, residual, border_residual, contact, force, scale, elastic_nmm, self.volume_force_n_per_mm3)
 
-    def stiffness(self, control: FloatArray, border: FloatArray, kept: list[KeptStiffness], *, anew: bool) -> None:
-        """Update the elements' tangents to a state; ``anew`` recomputes all of them."""
+    def stiffness(self, control: FloatArray, border: FloatArray, kept: list[KeptStiffness], *, fresh: bool) -> None:
+        """Update the elements' tangents to a state; ``fresh`` recomputes all of them."""
         for number, (kind, given, blocks) in enumerate(zip(self.body.kinds, self._given, kept, strict=True)):
-            blocks.update(kind, control, given, border[1] if number else 0.0, anew=anew)
+            blocks.update(kind, control, given, border[1] if number else 0.0, anew=fresh)
 
     def volume(self, control: FloatArray, out: FloatArray) -> float:
         """Increase of the gel's volume, mm^3; adds its gradient to ``out``."""

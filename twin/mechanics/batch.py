@@ -19,7 +19,7 @@ from twin.workers import in_processes
 class ContactJob:
     """One contact to solve (see ``SkinSolver.path``); ``every_state`` keeps the states of all load steps, not only the last one."""
 
-    touched: ObjectSpec
+    obj: ObjectSpec
     pose: ContactPose | ContactPath
     friction: float | Friction | None = None
     every_state: bool = False
@@ -75,7 +75,7 @@ def _begin(spec: SensorSpec, resolution: Resolution | None) -> Callable[[tuple[i
 def _solve(solver: SkinSolver, task: tuple[int, ContactJob]) -> ContactOutcome:
     number, job = task
     try:
-        states = [state for _, state in solver.path(job.touched, job.pose, friction=job.friction)]
+        states = [state for _, state in solver.path(job.obj, job.pose, friction=job.friction)]
     except (ContactError, MeshError) as error:
         return ContactOutcome(number, [], str(error))
     return ContactOutcome(number, states if job.every_state else states[-1:])

@@ -7,9 +7,9 @@ from scipy.linalg import blas, lapack
 
 from twin.compiled import compiled
 from twin.mechanics.balance import FORCE_FLOOR_N, Balance, Problem
-from twin.mechanics.body.linear import Eliminated, split
+from twin.mechanics.body.linear import Eliminated, split_matrix
 from twin.mechanics.contact import ContactForces, positions, spread_forces, spread_stiffness
-from twin.mechanics.turns import turned, turned_back, turned_matrix
+from twin.mechanics.turns import turn_vectors, turned_back, turned_matrix
 from twin.types import FloatArray, IntArray
 
 _ITERATIONS = 60
@@ -102,7 +102,7 @@ class Near:
         stays = np.repeat(stays[:-1], 3)
         far = np.flatnonzero(~stays)
         near = np.flatnonzero(stays)
-        within, across, rest = split(matrix, far, near)
+        within, across, rest = split_matrix(matrix, far, near)
         factor, info = lapack.spotrf(within.T, lower=1, clean=0, overwrite_a=1) if len(far) else (np.zeros((0, 0)), 0)
         if info > 0:  # without contact some far controls have no stiffness: eliminate none
             near, far, factor, rest = np.arange(count), far[:0], np.zeros((0, 0)), matrix
@@ -119,10 +119,10 @@ class Near:
             column = column - coupling.T @ far_column
         return cls(near, far, renumber[local], rest, column, factor, coupling, far_column)
 
-    def turned(self, turns: FloatArray) -> "Near":
+    def turn(self, turns: FloatArray) -> "Near":
         """The same for a body whose kept controls have rotated by ``turns`` (k / 3, 3, 3) since the tangent was computed."""
         turns = turns[self.near[::3] // 3]
-        return replace(self, matrix=turned_matrix(turns, self.matrix), column=turned(turns, self.column), turns=turns)
+        return replace(self, matrix=turned_matrix(turns, self.matrix), column=turn_vectors(turns, self.column), turns=turns)
 
 
 class SmallContact:
@@ -153,7 +153,7 @@ class SmallContact:
         self._far_residual = lapack.strtrs(near.factor, residual[near.far], lower=1)[0] if len(near.far) else residual[near.far]
         self._r = residual[near.near] - near.coupling.T @ self._far_residual
         if near.turns is not None:
-            self._r = turned(near.turns, self._r)
+            self._r = turn_vectors(near.turns, self._r)
         self._v = near.column
         self._g = volume_residual - near.far_column @ self._far_residual
         self._q = pivot - near.far_column @ near.far_column
@@ -192,7 +192,7 @@ class SmallContact:
 
     def places(self, y: FloatArray) -> FloatArray:
         """Candidate points (q, 3) after displacements ``y`` (n + 2,), in the object's frame."""
-        return _moved(self._near.local, self._problem.weights, self._at, y, self._problem.T, self._border[0] + y[-2])
+        return _move_points(self._near.local, self._problem.weights, self._at, y, self._problem.T, self._border[0] + y[-2])
 
     def _newton(self, y: FloatArray, soften: float, wanted: float, most: int) -> tuple[FloatArray, bool]:
         residual, contact = self._equations(y, soften)
@@ -203,14 +203,14 @@ class SmallContact:
             self.iterations += 1
             # the earlier factors are nearly right as long as the same points touch and stick
             if self._near.solved and self._near.solved[0] == soften:
-                trial_y = y - self._solved(residual)
+                trial_y = y - self._solve(residual)
                 trial, trial_contact = self._equations(trial_y, soften)
                 trial_norm = float(np.linalg.norm(trial))
                 if trial_norm < max(_KEEP_FACTORS * norm, wanted):
                     y, residual, contact, norm = trial_y, trial, trial_contact, trial_norm
                     continue
             self._factorise(contact, soften)
-            move = -self._solved(residual)
+            move = -self._solve(residual)
             size = min(1.0, LARGEST_MOVE_MM / max(np.abs(move[:-2]).max(initial=0.0), 1e-300))
             trial, trial_contact = self._equations(y + size * move, soften)
             best = latest = float(np.linalg.norm(trial)), size, trial, trial_contact
@@ -229,7 +229,7 @@ class SmallContact:
     def _equations(self, y: FloatArray, soften: float) -> tuple[FloatArray, ContactForces]:
         problem, near = self._problem, self._near
         border = self._border + y[-2:]
-        at = _moved(near.local, problem.weights, self._at, y, problem.T, border[0])
+        at = _move_points(near.local, problem.weights, self._at, y, problem.T, border[0])
         contact = problem.contact(at, soften)
         out = np.zeros(len(y))
         force_z = _residual(near.matrix, y, self._r, self._v, near.local, problem.weights, contact.force_n, problem.T, out)
@@ -261,7 +261,7 @@ class SmallContact:
         factors, pivots, _ = lapack.sgetrf(matrix, overwrite_a=1)
         self._near.solved = soften, factors, pivots
 
-    def _solved(self, right_side: FloatArray) -> FloatArray:
+    def _solve(self, right_side: FloatArray) -> FloatArray:
         """Solution for a right side with the latest factors."""
         assert self._near.solved is not None, "factorise first"
         _, factors, pivots = self._near.solved
@@ -269,7 +269,7 @@ class SmallContact:
 
 
 @compiled()
-def _moved(local: IntArray, weights: FloatArray, at: FloatArray, y: FloatArray, T: FloatArray, yielded: float) -> FloatArray:
+def _move_points(local: IntArray, weights: FloatArray, at: FloatArray, y: FloatArray, T: FloatArray, yielded: float) -> FloatArray:
     """Points (q, 3) in the object's frame after displacements ``y`` of their controls."""
     controls = (len(y) - 2) // 3
     out = np.empty_like(at)

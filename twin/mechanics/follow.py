@@ -8,7 +8,7 @@ from scenes.object import ObjectSpec
 from twin.errors import ContactError
 from twin.mechanics.law import ContactLaw
 from twin.mechanics.ongoing import OngoingContact
-from twin.mechanics.path import ContactPath, carried, deepest_mm
+from twin.mechanics.path import ContactPath, carry_points, deepest_mm
 from twin.mechanics.solver import SkinSolver
 from twin.objects import build_field
 from twin.types import ContactState
@@ -42,9 +42,9 @@ class Follower:
         Largest motion of the object at the pressed skin in one load step. The default is ``STEP_MM``, or less for an object with wires.
     """
 
-    def __init__(self, solver: SkinSolver, touched: ObjectSpec, law: ContactLaw, *, step_mm: float | None = None) -> None:
-        self._solver, self._law, self._step_mm = solver, law, step_mm or _step_of(touched)
-        self._field = build_field(touched)
+    def __init__(self, solver: SkinSolver, obj: ObjectSpec, law: ContactLaw, *, step_mm: float | None = None) -> None:
+        self._solver, self._law, self._step_mm = solver, law, step_mm or _step_of(obj)
+        self._field = build_field(obj)
         self._skin_mm = solver.shape.outside(solver.shape.even(_PLACES))
         self._rest = solver.rest()
         self._contact: OngoingContact | None = None
@@ -104,14 +104,14 @@ class Follower:
 
     def _free(self, T: np.ndarray) -> ContactState:
         rest = self._rest
-        return ContactState.untouched(rest.nodes_mm, rest.base_mm, rest.axis, rest.caps_mm, T_sensor_object=T)
+        return ContactState.undeformed(rest.nodes_mm, rest.base_mm, rest.axis, rest.caps_mm, T_sensor_object=T)
 
     def _press(self, T: np.ndarray, time_s: float) -> None:
         limit = deepest_mm(self._solver.spec.geometry)
         if (deep := -self.gap_mm(T)) > limit:
             raise ContactError(f"the object is {deep:.1f} mm inside the skin, more than {limit:.1f} (half the gel's depth); move away")
         last = self._T
-        near = last is not None and np.linalg.norm(carried(self._skin_mm, last, T), axis=1).max() < LARGEST_MOVE_MM
+        near = last is not None and np.linalg.norm(carry_points(self._skin_mm, last, T), axis=1).max() < LARGEST_MOVE_MM
         if last is not None and near and (self._contact is not None or self.gap_mm(last) >= 0):
             try:
                 self._go(last, T, self._time_s, time_s)
@@ -135,7 +135,7 @@ class Follower:
         pressed = self._gaps(stop) < 0
         if self._contact is None:
             self._contact = self._solver.begin(self._field, self._law, start, focus=self._solver.focus(self._field, way))
-        moved = np.linalg.norm(carried(self._skin_mm[pressed], start, stop), axis=1).max()
+        moved = np.linalg.norm(carry_points(self._skin_mm[pressed], start, stop), axis=1).max()
         count = max(1, int(np.ceil(moved / self._step_mm)))
 
         def pose_at(progress: float) -> np.ndarray:
@@ -150,7 +150,7 @@ class Follower:
         """Move the object to the pose under the last contact force, until this pose converges; ``T`` (4, 4) is the commanded pose."""
         for _ in range(_MOST_SETTLING):
             there = self._law.pose(T, self._state.force_n)
-            if np.linalg.norm(carried(self._skin_mm, contact.load.T, there), axis=1).max() <= SETTLED_MM:
+            if np.linalg.norm(carry_points(self._skin_mm, contact.load.T, there), axis=1).max() <= SETTLED_MM:
                 return
             way = ContactPath(np.stack([contact.load.T, there]))
             for _, state in contact.advance(way.at, 0.0, 1.0, lambda progress: 0.0, _WHERE):
@@ -158,6 +158,6 @@ class Follower:
         raise ContactError("the arm gives way without an end under the contact's force; use less turn_compliance_deg_per_n or indentation")
 
 
-def _step_of(touched: ObjectSpec) -> float:
+def _step_of(obj: ObjectSpec) -> float:
     """Largest motion in one load step, mm. With wires, a longer step would move skin past the middle of a wire, where it would catch."""
-    return STEP_MM * min(1.0, touched.texture.wire_diameter_mm) if touched.texture is not None else STEP_MM
+    return STEP_MM * min(1.0, obj.texture.wire_diameter_mm) if obj.texture is not None else STEP_MM

@@ -33,9 +33,9 @@ class ContactLaw:
     given_way: GivenWay | None = None
 
     @classmethod
-    def of_object(cls, touched: ObjectSpec) -> "ContactLaw":
+    def of_object(cls, obj: ObjectSpec) -> "ContactLaw":
         """The law with the object's own friction and compliance, for a contact without an arm."""
-        return cls(friction_of(touched), touched.compliance_mm_per_n)
+        return cls(friction_of(obj), obj.compliance_mm_per_n)
 
     def override(self, *, friction: float | Friction | None = None, compliance_mm_per_n: float | None = None) -> "ContactLaw":
         """The same law with the given values in place of its own. A number for ``friction`` sets the static and the kinetic coefficient."""
@@ -54,7 +54,7 @@ class ContactLaw:
         return T if self.given_way is None else self.given_way(T, force_n)
 
 
-def friction_of(touched: ObjectSpec) -> Friction:
+def friction_of(obj: ObjectSpec) -> Friction:
     """The friction that an object's specification states."""
-    kinetic = touched.friction if touched.kinetic_friction is None else touched.kinetic_friction
-    return Friction(touched.friction, kinetic, touched.slip_weakening_mm, touched.shear_strength_mpa or np.inf)
+    kinetic = obj.friction if obj.kinetic_friction is None else obj.kinetic_friction
+    return Friction(obj.friction, kinetic, obj.slip_weakening_mm, obj.shear_strength_mpa or np.inf)

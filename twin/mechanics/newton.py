@@ -16,9 +16,9 @@ from twin.mechanics.body.elements import KeptStiffness
 from twin.mechanics.body.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
 from twin.mechanics.contact import touching_mm2
-from twin.mechanics.path import carried
-from twin.mechanics.rubbing import met, rub, rubbed, substeps
-from twin.mechanics.turns import Turns, turned, turned_back
+from twin.mechanics.friction_history import first_touch, friction_substeps, substeps, update_friction
+from twin.mechanics.path import carry_points
+from twin.mechanics.turns import Turns, turn_vectors, turned_back
 from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -89,7 +89,7 @@ class _Secants:
         self._offset = residual
         self._seen = [(residual, residual)]
 
-    def mend(self, residual: FloatArray) -> FloatArray:
+    def correction(self, residual: FloatArray) -> FloatArray:
         """Correction (unknowns,) to add to the elastic force at the present state, from the residual (unknowns,) there."""
         offset = self._offset + residual
         errors = np.column_stack([residual - old for _, old in self._seen])
@@ -147,11 +147,11 @@ class LoadStepper:
         """
         control, border = self._extrapolate(state, T)
         before, gap_before = self._gaps(state)
-        after = self._seen(control, border, T)
+        after = self._points_in_object_frame(control, border, T)
         gap = self._field.distance(after)
         looked = np.flatnonzero((gap < _REACH_MM) | state.held)
         self._provide(looked, gap)
-        anchors = met(state.held, state.anchor_mm, before, after, gap_before, gap)
+        anchors = first_touch(state.held, state.anchor_mm, before, after, gap_before, gap)
         memory = replace(state, dissipated_nmm=0.0)
         penalty = state.penalty_mpa_mm
 
@@ -177,18 +177,18 @@ class LoadStepper:
             problem = problem_now()
             control, border, balance = self._solve(problem, control, border, known, tolerance=_ROUGH_TOLERANCE)
             known = True
-            gap_now = self._field.distance(self._seen(control, border, T))
+            gap_now = self._field.distance(self._points_in_object_frame(control, border, T))
             looked = np.flatnonzero((gap_now < _SOLVED_REACH_MM) | state.held)
             self._provide(looked, gap_now)
             problem = problem_now()
             balance = problem.again(balance, control, border)
-            found = self._rubbed(problem, state, anchors, control, border, balance, count)
+            found = self._update_friction(problem, state, anchors, control, border, balance, count)
             if found is not None:
                 memory, anchors = found, found.anchor_mm
         for _ in range(_PENALTY_RAISES):
             problem = problem_now()
             control, border, balance = self._solve(problem, control, border, known, before=balance)
-            seen = self._seen(control, border, T)
+            seen = self._points_in_object_frame(control, border, T)
             gap_seen = self._field.distance(seen)
             missed = gap_seen < 0
             missed[looked] = False
@@ -199,7 +199,7 @@ class LoadStepper:
                 penalty *= _PENALTY_GROWTH
             else:
                 self._last, self._touch = state, (control, seen, gap_seen)
-                return self._accepted(memory, problem, control, border, balance, gap_seen), balance, looked
+                return self._accept_step(memory, problem, control, border, balance, gap_seen), balance, looked
         raise NoConvergence(balance.relative if balance else np.inf)
 
     def touching_mm2(self, state: LoadState) -> float:
@@ -210,7 +210,7 @@ class LoadStepper:
         """All contact points in the object's frame, (p, 3), and their distances from the object, (p,). The last result is stored."""
         if self._touch is not None and self._touch[0] is state.control_mm:
             return self._touch[1:]
-        seen = self._seen(state.control_mm, state.border, state.T)
+        seen = self._points_in_object_frame(state.control_mm, state.border, state.T)
         return seen, self._field.distance(seen)
 
     def _provide(self, looked: IntArray, gap: FloatArray) -> None:
@@ -239,13 +239,13 @@ class LoadStepper:
         if not len(at):
             return state.control_mm, state.border
 
-        before, now = carried(at, old.T, state.T).ravel(), carried(at, state.T, T).ravel()
+        before, now = carry_points(at, old.T, state.T).ravel(), carry_points(at, state.T, T).ravel()
         ratio = (before @ now) / max(float(before @ before), 1e-300)
         if before @ now < 0.95 * np.linalg.norm(before) * np.linalg.norm(now) or ratio > 2:
             return state.control_mm, state.border
         return state.control_mm + ratio * (state.control_mm - old.control_mm), state.border
 
-    def _accepted(
+    def _accept_step(
         self, state: LoadState, problem: Problem, control: FloatArray, border: FloatArray, balance: Balance, gap: FloatArray
     ) -> LoadState:
         """The state at the end of a converged step.
@@ -256,7 +256,7 @@ class LoadStepper:
         held, anchor, slid, limit = np.zeros(count, bool), np.zeros((count, 3)), np.zeros(count), np.zeros(count)
         held[looked] = contact.penetration_mm > 0
         before = state.gap_mm[looked]
-        anchor[looked], slid[looked], limit[looked], lost = rub(problem, contact, state.limit_n[looked], before, gap[looked])
+        anchor[looked], slid[looked], limit[looked], lost = update_friction(problem, contact, state.limit_n[looked], before, gap[looked])
         return LoadState(
             control, border, anchor, held, slid, limit, gap, problem.penalty, problem.T, balance.elastic_nmm, state.dissipated_nmm + lost
         )
@@ -264,9 +264,9 @@ class LoadStepper:
     def _moved_mm(self, state: LoadState, T: FloatArray, which: BoolArray) -> float:
         """Largest displacement, mm, of the object at the selected contact points (``which``, (p,) bool) in a step to ``T`` (4, 4)."""
         at = self._body.points.positions(state.control_mm)[which]
-        return float(np.linalg.norm(carried(at, state.T, T), axis=1).max(initial=0.0))
+        return float(np.linalg.norm(carry_points(at, state.T, T), axis=1).max(initial=0.0))
 
-    def _rubbed(
+    def _update_friction(
         self,
         problem: Problem,
         state: LoadState,
@@ -281,8 +281,8 @@ class LoadStepper:
             self._tangent = self._linearise(problem, control, border, 0.0)
         self._turn(self._tangent, control)
         near, local = self._nearest(problem, self._tangent), self._local[problem.looked]
-        forward = self._eliminated(self._tangent, balance.elastic)
-        return rubbed(
+        forward = self._eliminate(self._tangent, balance.elastic)
+        return friction_substeps(
             problem, state, anchors, self._field, near, self._tangent, self._turned, forward, local, control, border, balance, count=count
         )
 
@@ -295,7 +295,7 @@ class LoadStepper:
             return self._near[2]
         if self._near_turned is None or self._near_turned[0] is not self._turned:
             last = self._near_turned[1] if self._near_turned else self._near[2]
-            near = self._near[2].turned(self._turned[tangent.eliminated.kept[::3] // 3])
+            near = self._near[2].turn(self._turned[tangent.eliminated.kept[::3] // 3])
             near.solved = last.solved
             self._near_turned = self._turned, near
         return self._near_turned[1]
@@ -308,7 +308,7 @@ class LoadStepper:
         self._turned = turns
         return True
 
-    def _seen(self, control: FloatArray, border: FloatArray, T: FloatArray) -> FloatArray:
+    def _points_in_object_frame(self, control: FloatArray, border: FloatArray, T: FloatArray) -> FloatArray:
         """All contact points in the object's frame, (p, 3)."""
         return in_object(self._body.points.positions(control), T, border)
 
@@ -342,7 +342,7 @@ class LoadStepper:
                 fresh = False
                 if balance.relative > _ROUGH_TOLERANCE and self._turn(tangent, control):
                     secants = None
-            elastic = balance.elastic + secants.mend(balance.residual) if secants else balance.elastic
+            elastic = balance.elastic + secants.correction(balance.residual) if secants else balance.elastic
             secants = secants or _Secants(balance.residual)
             soften = astray or not (accepted or extrapolated)
             move, border_move = self._contact_move(problem, tangent, control, border, balance, elastic, soften)
@@ -372,7 +372,7 @@ class LoadStepper:
         assert self._frontal is not None, "provide first"
         self.eliminations += 1
         self._tangent = self._turned = None  # the elimination below overwrites their memory
-        problem.stiffness(control, border, self._stiffness, anew=shift > 0)
+        problem.stiffness(control, border, self._stiffness, fresh=shift > 0)
         blocks = [kept.blocks for kept in self._stiffness]
         while True:
             try:
@@ -391,7 +391,7 @@ class LoadStepper:
         inner = eliminated.inner(column)
         return Tangent(eliminated, matrix, column, -float(inner @ inner), strains)
 
-    def _eliminated(self, tangent: Tangent, elastic: FloatArray) -> FloatArray:
+    def _eliminate(self, tangent: Tangent, elastic: FloatArray) -> FloatArray:
         """Elastic force (unknowns,), rotated back to the state of the tangent, after forward elimination. The last result is stored."""
         kept, turns = self._forward, self._turned
         if kept is None or kept[0] is not elastic or kept[1] is not tangent or kept[2] is not turns:
@@ -412,7 +412,7 @@ class LoadStepper:
         """The move of the controls (unknowns,) and of the border (2,) that balances the linearised body with the exact contact."""
         eliminated = tangent.eliminated
         kept = eliminated.kept
-        forward, turns = self._eliminated(tangent, elastic), self._turned
+        forward, turns = self._eliminate(tangent, elastic), self._turned
         volume_residual, near = balance.border_residual[1], self._nearest(problem, tangent)
         if tangent.volume_column is not None:
             volume_residual = volume_residual - eliminated.inner(tangent.volume_column) @ eliminated.inner(forward)
@@ -422,4 +422,4 @@ class LoadStepper:
         if tangent.volume_column is not None:
             forward = forward + border_move[1] * tangent.volume_column
         move = eliminated.backward(-forward, kept_move)
-        return move if turns is None else turned(turns, move), border_move
+        return move if turns is None else turn_vectors(turns, move), border_move

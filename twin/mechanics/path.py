@@ -145,7 +145,7 @@ class ContactPath:
         return ContactPath(np.concatenate([self.poses, self.poses[-2::-1]]), np.concatenate([clock, clock[-1] + span[1:]]))
 
 
-def carried(points_mm: FloatArray, start: FloatArray, stop: FloatArray) -> FloatArray:
+def carry_points(points_mm: FloatArray, start: FloatArray, stop: FloatArray) -> FloatArray:
     """Displacements (k, 3) of points (k, 3) that move with an object from the pose ``start`` (4, 4) to the pose ``stop`` (4, 4)."""
     return (points_mm - start[:3, 3]) @ start[:3, :3] @ stop[:3, :3].T + stop[:3, 3] - points_mm
 

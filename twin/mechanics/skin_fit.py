@@ -156,7 +156,7 @@ class SkinFit:
                 target_px = pins_px - self._offset_px(control) * centroids
                 move, traction = self._step(control, target_px, seen, traction, even=step < EVEN_STEPS)
                 largest = np.abs(move).max()
-                control = self._body.moved(control, move * min(1.0, LARGEST_MOVE_MM / largest))
+                control = self._body.move_controls(control, move * min(1.0, LARGEST_MOVE_MM / largest))
                 if step >= EVEN_STEPS and largest < SETTLED_MM:
                     break
             pins = self._on_rays(control, pins_px - self._offset_px(control) * centroids, seen)
@@ -272,7 +272,7 @@ class SoftBody:
                 shift = 4 * shift or SHIFT_SHARE * float(np.mean(np.diag(matrix)))
                 matrix[np.diag_indices(size)] += shift
 
-    def moved(self, control_mm: FloatArray, move_mm: FloatArray) -> FloatArray:
+    def move_controls(self, control_mm: FloatArray, move_mm: FloatArray) -> FloatArray:
         """The shape (n, 3) after a move (f, 3) of the free controls. The move is halved until no element is inside out."""
         while True:
             moved = control_mm.copy()

@@ -43,7 +43,7 @@ class SkinGrid:
     nodes_mm: FloatArray
     area_mm2: FloatArray
 
-    def spread(self, place: ComplexArray, values: FloatArray) -> FloatArray:
+    def distribute_values(self, place: ComplexArray, values: FloatArray) -> FloatArray:
         """Values (c, k) at places (c,) of the skin (see ``twin.geometry.shapes``), distributed over the nodes and summed there: (G, k)."""
         at = (outer_chart(self.geometry).square(place) + 1) / 2 * (SIDE - 1)
         low = np.clip(np.floor(at).astype(int), 0, SIDE - 2)
@@ -55,7 +55,7 @@ class SkinGrid:
                 np.add.at(found, (low[:, 1] + down) * SIDE + low[:, 0] + right, weight[:, None] * values)
         return found
 
-    def averaged(self, values: FloatArray, sigma_mm: float) -> FloatArray:
+    def smooth_values(self, values: FloatArray, sigma_mm: float) -> FloatArray:
         """Values (M, G) of the nodes, smoothed with a Gaussian of standard deviation ``sigma_mm``; their sum does not change."""
         apart_mm2 = ((self.nodes_mm[:, None] - self.nodes_mm[None]) ** 2).sum(axis=-1)
         weights = np.exp(-apart_mm2 / (2 * sigma_mm**2)).astype(np.float32)
@@ -179,7 +179,7 @@ def skin_map(geometry: GeometrySpec, state: ContactState) -> SkinMap:
     """Forces and areas of a contact on the sensor's grid."""
     force_n = state.tangential_n - state.normal_n[:, None] * state.normal
     values = np.column_stack([force_n, state.normal_n, state.point_area_mm2, state.point_area_mm2 * state.slipping])
-    found = skin_grid(geometry).spread(state.contact_place, values)
+    found = skin_grid(geometry).distribute_values(state.contact_place, values)
     return SkinMap(found[:, :3], found[:, 3], found[:, 4], found[:, 5])
 
 

@@ -22,7 +22,7 @@ from twin.mechanics.contact import contact_points
 from twin.mechanics.law import ContactLaw
 from twin.mechanics.newton import LoadStepper
 from twin.mechanics.ongoing import OngoingContact, Setting
-from twin.mechanics.path import ContactPath, ContactPose, carried, deepest_mm, plan_path
+from twin.mechanics.path import ContactPath, ContactPose, carry_points, deepest_mm, plan_path
 from twin.objects import ObjectField, build_field
 from twin.types import ContactState, FloatArray
 
@@ -83,7 +83,7 @@ class SkinSolver:
         self._setting = lru_cache(maxsize=_KEPT_SOLIDS)(self._set_up)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled as its specification: a copy computes the rest anew."""
+        """Pickled as its specification: a copy computes the rest again."""
         return partial(SkinSolver, resolution=self.resolution), (self.spec,)
 
     def rest(self, *, T_sensor_object: FloatArray | None = None) -> ContactState:
@@ -91,11 +91,11 @@ class SkinSolver:
         with self._one_thread():
             setting = self._setting(Focus())
         base, axis, caps = pin_pose(setting.solid, setting.solid.control_mm)
-        return ContactState.untouched(self.mesh.nodes_mm, base, axis, caps, T_sensor_object=T_sensor_object)
+        return ContactState.undeformed(self.mesh.nodes_mm, base, axis, caps, T_sensor_object=T_sensor_object)
 
     def press(
         self,
-        touched: ObjectField | ObjectSpec,
+        obj: ObjectField | ObjectSpec,
         pose: ContactPose | ContactPath,
         *,
         law: ContactLaw | None = None,
@@ -104,14 +104,14 @@ class SkinSolver:
         progress: Callable[[float, ContactState], object] | None = None,
     ) -> ContactState:
         """The state at the end of a contact; arguments and errors as ``path``."""
-        for at, state in self.path(touched, pose, law=law, friction=friction, compliance_mm_per_n=compliance_mm_per_n):
+        for at, state in self.path(obj, pose, law=law, friction=friction, compliance_mm_per_n=compliance_mm_per_n):
             if progress is not None:
                 progress(at, state)
         return state
 
     def path(
         self,
-        touched: ObjectField | ObjectSpec,
+        obj: ObjectField | ObjectSpec,
         pose: ContactPose | ContactPath,
         *,
         law: ContactLaw | None = None,
@@ -124,7 +124,7 @@ class SkinSolver:
 
         Parameters
         ----------
-        touched : ObjectField or ObjectSpec
+        obj : ObjectField or ObjectSpec
         law : ContactLaw, optional
             Default: the object's own friction and compliance (``ContactLaw.of_object``); for an ``ObjectField`` no friction and no
             compliance. For a sensor on an arm, ``twin.rig.contact`` makes the law. ``law.given_way`` receives the contact force of the
@@ -148,7 +148,7 @@ class SkinSolver:
             If a pose is out of range, if the object does not reach the skin or starts inside it, or if a load step does not converge; the
             message then states the step and the residual.
         """
-        spec, field = (touched, build_field(touched)) if isinstance(touched, ObjectSpec) else (None, touched)
+        spec, field = (obj, build_field(obj)) if isinstance(obj, ObjectSpec) else (None, obj)
         if law is None:
             law = ContactLaw.of_object(spec) if spec else ContactLaw()
         law = law.override(friction=friction, compliance_mm_per_n=compliance_mm_per_n)
@@ -158,7 +158,7 @@ class SkinSolver:
         if isinstance(pose, ContactPose) and pose.indent_mm <= 0:
             yield 1.0, self.rest(T_sensor_object=plan.at(1.0))
             return
-        reached = self._reached(field, plan)
+        reached = self._find_reached_points(field, plan)
         contact = self.begin(field, law, plan.at(0.0), focus=self.focus(field, plan))
         stops = _stops(plan, reached, step_mm)
         force_n: FloatArray = np.zeros(3)
@@ -193,7 +193,7 @@ class SkinSolver:
         relaxation = spec.skin.relaxation, spec.gel.relaxation, spec.gel.relaxation
         return Setting(solid, body, NodeView.of(self.mesh, solid), relaxation)
 
-    def _reached(self, field: ObjectField, plan: ContactPath) -> FloatArray:
+    def _find_reached_points(self, field: ObjectField, plan: ContactPath) -> FloatArray:
         """Points (k, 3) of the undeformed skin inside the object at some pose of the path, or else the nearest point.
 
         Raises ContactError if the path goes too deep or starts inside the skin.
@@ -291,7 +291,7 @@ def _stops(plan: ContactPath, points_mm: FloatArray, step_mm: float) -> FloatArr
     out = [np.zeros(1)]
     for leg in range(len(plan.poses) - 1):
         start, stop = plan.poses[leg], plan.poses[leg + 1]
-        moved = carried(points_mm, start, stop)
+        moved = carry_points(points_mm, start, stop)
         count = max(1, int(np.ceil(np.linalg.norm(moved, axis=1).max() / step_mm)))
         out.append(leg + np.arange(1, count + 1) / count)
     return np.concatenate(out)

@@ -75,7 +75,7 @@ def _add_to_controls(elements: IntArray, values: FloatArray, out: FloatArray) ->
 
 
 @compiled(fastmath=True)
-def turned(turns: FloatArray, vectors: FloatArray) -> FloatArray:
+def turn_vectors(turns: FloatArray, vectors: FloatArray) -> FloatArray:
     """Vectors (3 n,) of n controls, rotated by one rotation for each control (n, 3, 3)."""
     out = np.empty_like(vectors)
     for n in range(len(turns)):
@@ -87,8 +87,8 @@ def turned(turns: FloatArray, vectors: FloatArray) -> FloatArray:
 
 
 def turned_back(turns: FloatArray, vectors: FloatArray) -> FloatArray:
-    """The inverse of ``turned``."""
-    return turned(turns.transpose(0, 2, 1), vectors)
+    """The inverse of ``turn_vectors``."""
+    return turn_vectors(turns.transpose(0, 2, 1), vectors)
 
 
 def turned_matrix(turns: FloatArray, matrix: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from twin.objects.level_set import Probe, Wrapped, rows
 from twin.types import FloatArray
 
 
-class Solid(Wrapped):
+class CompiledSolid(Wrapped):
     """A solid for which there is compiled code.
 
     Attributes
@@ -38,7 +38,7 @@ class Solid(Wrapped):
 
 
 @dataclass(frozen=True)
-class Plane(Solid):
+class Plane(CompiledSolid):
     """Half space z >= 0."""
 
     kind, kernel = kernels.PLANE, staticmethod(kernels.plane)
@@ -49,7 +49,7 @@ class Plane(Solid):
 
 
 @dataclass(frozen=True)
-class Sphere(Solid):
+class Sphere(CompiledSolid):
     """Ball behind its pole at the origin. A texture is projected along z."""
 
     radius_mm: float
@@ -62,7 +62,7 @@ class Sphere(Solid):
 
 
 @dataclass(frozen=True)
-class Cylinder(Solid):
+class Cylinder(CompiledSolid):
     """Cylinder along y that touches the origin from z > 0."""
 
     radius_mm: float
@@ -78,7 +78,7 @@ class Cylinder(Solid):
 
 
 @dataclass(frozen=True)
-class Edge(Solid):
+class Edge(CompiledSolid):
     """Quarter space x >= 0, z >= 0 with an edge rounded by a fillet. The rounded edge lies a little behind the origin."""
 
     fillet_mm: float
@@ -91,7 +91,7 @@ class Edge(Solid):
 
 
 @dataclass(frozen=True)
-class Prism(Solid):
+class Prism(CompiledSolid):
     """Regular polygon in x-z extruded along y, with rounded edges, and faces tilted by a taper about x.
 
     Face 0 passes through the origin and faces -z. With a positive taper its normal tilts towards +y (the prism narrows towards +y). The

@@ -89,13 +89,13 @@ def load_mesh_field(shape: MeshShape) -> MeshField:
         raise MeshError(f"{path}: not readable ({error.strerror}); give a file that may be read") from error
     if shape.sha256 not in ("", digest):
         raise MeshError(
-            f"{path}: has changed since it was loaded or simulated; put the former file back, or give the object and `out` anew"
+            f"{path}: has changed since it was loaded or simulated; put the former file back, or give the object and `out` again"
         )
-    return _sampled(str(path), digest, shape.unit, shape.rotation_deg)
+    return _sample_field(str(path), digest, shape.unit, shape.rotation_deg)
 
 
 @lru_cache(maxsize=8)
-def _sampled(file: str, digest: str, unit: str, rotation_deg: tuple[float, float, float]) -> MeshField:
+def _sample_field(file: str, digest: str, unit: str, rotation_deg: tuple[float, float, float]) -> MeshField:
     key = {
         "file": [digest, Path(file).suffix.lower()],
         "placement": [unit, list(rotation_deg)],

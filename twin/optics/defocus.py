@@ -53,7 +53,7 @@ def defocused(image: FloatArray, circles: FloatArray) -> FloatArray:
     if last == 0:
         return image
     blurred = [cv2.filter2D(image, -1, disc(LEAST_VARIANCE * 2.0 ** (k - 1))) if k else image for k in range(first, last + 1)]
-    return np.asarray(_interpolated(np.stack([each.reshape(image.shape) for each in blurred]), circles, first))
+    return np.asarray(_interpolate_blur(np.stack([each.reshape(image.shape) for each in blurred]), circles, first))
 
 
 @compiled()
@@ -67,7 +67,7 @@ def _level(diameter_px: float) -> float:
 
 
 @compiled()
-def _interpolated(blurred: FloatArray, circles: FloatArray, first: int) -> FloatArray:
+def _interpolate_blur(blurred: FloatArray, circles: FloatArray, first: int) -> FloatArray:
     """Picture (H, W, C) whose pixels have the given circles (H, W), from blurred pictures (K, H, W, C) with levels from ``first`` on."""
     levels, height, width, channels = blurred.shape
     found = np.empty((height, width, channels), np.float32)

@@ -65,7 +65,7 @@ class DirectLight:
         each = normals.reshape(len(points_mm), -1, 3)
         return _irradiance(points_mm, each, bump, self._places, self._powers, self._window, self._absorption).reshape(normals.shape)
 
-    def ways(self, points_mm: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def refracted_rays(self, points_mm: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Refracted rays from points (n, 3) to a place (3,) in the air: unit directions (n, 3) and lengths (n,) in the gel."""
         return _ways(points_mm, np.asarray(place_mm, float), self._window)
 
@@ -78,7 +78,7 @@ def _irradiance(
     absorbs = np.any(absorption > 0)
     for i in range(len(points)):
         for k in range(len(places)):
-            x, y, z, length, factor = _way(points[i], places[k], window)
+            x, y, z, length, factor = _refracted_ray(points[i], places[k], window)
             arriving = factor * (powers[k] * np.exp(-absorption * length) if absorbs else powers[k])
             for j in range(normals.shape[1]):
                 cosine = x * normals[i, j, 0] + y * normals[i, j, 1] + z * normals[i, j, 2]
@@ -92,12 +92,12 @@ def _irradiance(
 def _ways(points: FloatArray, place: FloatArray, window: FloatArray) -> tuple[FloatArray, FloatArray]:
     toward, lengths = np.empty((len(points), 3)), np.empty(len(points))
     for i in range(len(points)):
-        toward[i, 0], toward[i, 1], toward[i, 2], lengths[i], _ = _way(points[i], place, window)
+        toward[i, 0], toward[i, 1], toward[i, 2], lengths[i], _ = _refracted_ray(points[i], place, window)
     return toward, lengths
 
 
 @compiled(error_model="numpy")
-def _way(point: FloatArray, place: FloatArray, window: FloatArray) -> tuple[float, float, float, float, float]:
+def _refracted_ray(point: FloatArray, place: FloatArray, window: FloatArray) -> tuple[float, float, float, float, float]:
     """The refracted ray from a point in the gel to a place in the air: direction and length in the gel, and a factor of the light.
 
     The factor is the solid angle at the point (``d omega = sin d(theta) d(phi)``) per area at the place, whose normal is +z, times

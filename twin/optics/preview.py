@@ -1,4 +1,4 @@
-"""A fast picture of the sensor for interaction and control loops. It is drawn instead of path-traced.
+"""A fast picture of the sensor for interaction and control loops. It is rasterised instead of path-traced.
 
 Skin, stems and caps are projected through the window, shaded with the lamps' direct light (without shadows), and drawn from far to near.
 Pins are drawn with exact coverage of pixels. Shadows, and light that other surfaces reflect, are approximated by a gain and an offset
@@ -45,7 +45,7 @@ DARK = 1e-3
 TRUST = 3e-3
 """Weight of the prior "direct light alone" in a fit, relative to the most visible material. For hardly visible materials it dominates."""
 NEAR_PX = 4.0
-"""Standard deviation, px, of the Gaussian neighbourhood in which traced and drawn light of the skin are compared."""
+"""Standard deviation, px, of the Gaussian neighbourhood in which traced and rasterised light of the skin are compared."""
 MOST_SKIN_GAIN = 4.0
 """Largest gain of one corner of the skin."""
 
@@ -176,7 +176,7 @@ class Preview:
             The state has another number of pins.
         """
         state = self._rest if state is None else state
-        film = self._known(state) + self._through * self._gel(self._drawing(state), self.shading)
+        film = self._measured_light(state) + self._through * self._gel(self._drawing(state), self.shading)
         np.maximum(film, 0, out=film)
         return film if self._color else film[..., 0]
 
@@ -199,20 +199,20 @@ class Preview:
             raise RenderError(f"the renderer's window_px is {renderer.window_px}, the preview's {self.window_px}: build both alike")
         traced = renderer.render().reshape(self._shine.shape)
         drawing = self._drawing(self._rest)
-        known = self._known(self._rest)
+        known = self._measured_light(self._rest)
         gel = traced - known
-        # the weights depend on the drawn light: with the noisy traced light, samples that are too dark would get too much weight;
+        # the weights depend on the rasterised light: with the noisy traced light, samples that are too dark would get too much weight;
         # traced light below 0 was set to 0, so it has no weight
         drawn = known + self._through * self._gel(drawing, Shading())
         weight = np.where(traced > 0, (np.maximum(drawn, 0) + DARK) ** -0.5, 0)
         alone = np.eye(8).reshape(8, 2, 4, 1)  # shadings in which one gain, or one offset, is 1 and all others are 0
         parts = np.stack([weight * self._through * self._gel(drawing, Shading(*only)) for only in alone], axis=-1)
-        fitted = [_fit(parts[..., c, :].reshape(-1, 8), (weight * gel)[..., c].ravel()) for c in range(gel.shape[2])]
+        fitted = [_fit_gains(parts[..., c, :].reshape(-1, 8), (weight * gel)[..., c].ravel()) for c in range(gel.shape[2])]
         fit = Shading(*np.stack(fitted, axis=-1).reshape(2, 4, -1))
         self.shading = replace(fit, skin=self._skin_gain(drawing, fit, np.where(traced > 0, gel, np.nan)))
         return self.shading
 
-    def _known(self, state: PinState) -> FloatArray:
+    def _measured_light(self, state: PinState) -> FloatArray:
         """Light (H, W, C) of the static layer and the measured relief."""
         if self._relief is None:
             return self._shine
@@ -249,14 +249,14 @@ class Preview:
         if base.shape != self._rest.base_mm.shape:
             raise RenderError(f"the state has {len(base)} pins, {self.spec.name} has {len(self._rest.base_mm)}")
         pupil = np.array([0.0, 0.0, -self.spec.camera.distance_mm])
-        toward, _ = self._direct.ways(caps, pupil)
+        toward, _ = self._direct.refracted_rays(caps, pupil)
         half = 0.5 * self.spec.pins.cap_height_mm
         places = [base, 0.5 * (base + caps), caps, caps + half * axis]
         side = toward - np.sum(toward * axis, axis=1, keepdims=True) * axis
         lit = [self._light(place, normal) for place, normal in zip(places[:2], (axis, unit(side)), strict=True)]
         lit += [self._cap_light(place, normal) for place, normal in zip(places[2:], (side_normals(axis), axis), strict=True)]
         skin = np.concatenate([base, self._belt_mm])
-        kept = [self._kept(place, pupil) for place in (skin, *places[1:])]
+        kept = [self._gel_transmittance(place, pupil) for place in (skin, *places[1:])]
         kept[SIDE] = kept[SIDE][:, None]
         direct = [light * share for light, share in zip([np.concatenate([lit[0], self._belt_light]), *lit[1:]], kept, strict=True)]
         feet_px, outlines_px = self._outlines(base, axis, caps)
@@ -284,19 +284,19 @@ class Preview:
         draw_triangles(circles, drawing.corners_px, drawing.circles, self._faces)
         return defocused(image, circles[..., 0])
 
-    def _kept(self, points_mm: FloatArray, pupil_mm: FloatArray) -> FloatArray:
+    def _gel_transmittance(self, points_mm: FloatArray, pupil_mm: FloatArray) -> FloatArray:
         """Transmittance (n, 3) of the gel from points (n, 3) to the camera."""
         absorption = np.array(self.spec.gel.absorption_per_mm)
         if not absorption.any():
             return np.ones_like(points_mm)
-        return np.exp(-absorption * self._direct.ways(points_mm, pupil_mm)[1][:, None])
+        return np.exp(-absorption * self._direct.refracted_rays(points_mm, pupil_mm)[1][:, None])
 
     def _on_film(self, rgb: FloatArray) -> FloatArray:
         """RGB (..., 3) as the film's channels (..., C)."""
         return np.asarray(rgb if self._color else luminance(rgb)[..., None], np.float32)
 
 
-def _fit(parts: FloatArray, target: FloatArray) -> FloatArray:
+def _fit_gains(parts: FloatArray, target: FloatArray) -> FloatArray:
     """Non-negative gains and offsets (8,) with which parts (m, 8) sum best to a target (m,). Those of hardly visible parts are 1 and 0."""
     trust = TRUST * np.linalg.norm(parts, axis=0).max()
     plain = np.repeat([1.0, 0.0], 4)

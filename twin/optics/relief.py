@@ -113,7 +113,7 @@ class Relief:
         """Numbers (n,) of pixels of the window, and the linear light (n, 3) that is added there."""
         relief = self._relief
         places = cap_places(self._spec.view, self._spec.pins, state, self._window_px, relief.reach)
-        used = _used(relief, places.place)
+        used = _relief_mask(relief, places.place)
         places = CapPlaces(places.pixels[used], places.cap[used], places.place[used])
         weights = places.weights(relief.cells, relief.reach, self._spec.pins.count)
         return places.pixels, (weights @ self._values) * self._lamp(state)[places.cap].astype(np.float32)
@@ -130,7 +130,7 @@ class CapLamp:
         return self._lamp(state.caps_mm, state.axis, self._bump) * self._albedo / np.pi
 
 
-def _used(relief: ReliefSpec, place: FloatArray) -> BoolArray:
+def _relief_mask(relief: ReliefSpec, place: FloatArray) -> BoolArray:
     skin = np.linalg.norm(place, axis=-1) > SKIN_FROM
     return np.where(skin, relief.skin, relief.caps)
 

@@ -19,7 +19,7 @@ from twin.optics.sampling import SKIN_SAVING, PixelSamples, near_pins
 from twin.optics.scalar import ScalarView
 from twin.optics.scene import build_scene, move_meshes
 from twin.optics.static_layer import static_layer
-from twin.optics.surfaces import SkinSurface, Surface, caps, stems
+from twin.optics.surfaces import PaintedSurface, SkinSurface, caps, stems
 from twin.optics.tracer import GelTracer, luminance
 from twin.optics.variants.arrays import with_room
 from twin.optics.variants.variant import DrJit, VariantChoice, choose_variant, use_variant
@@ -51,7 +51,7 @@ class Renderer:
     variant : str or VariantChoice, optional
         Variant for `twin.optics.variants.variant.choose_variant`. Default: the fastest variant that works.
     quality : {"drawn", "preview", "standard", "high"}
-        A drawn picture costs a small part of a traced one. Its light is the lamps' direct light, with the shading of a traced frame.
+        A rasterised picture costs a small part of a traced one. Its light is the lamps' direct light, with the shading of a traced frame.
     mesh : SensorMesh, optional
         The mechanics' mesh (``nodes_mm``, ``inner_quads``). With a mesh the skin follows the nodes on its inside, without one it follows
         the feet of the pins.
@@ -63,12 +63,12 @@ class Renderer:
     bounces : int, optional
         Number of scatterings of a light path after the first. Default: 2, or 6 if the skin is brighter than the caps.
     shading : Shading, optional
-        Shading of drawn pictures. Default: the shading of the frame at rest (`traced_shading`).
+        Shading of rasterised pictures. Default: the shading of the frame at rest (`traced_shading`).
 
     Raises
     ------
     RenderError
-        There is no such quality, the window is not within the frame, or ``spp`` is given for a drawn picture.
+        There is no such quality, the window is not within the frame, or ``spp`` is given for a rasterised picture.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Renderer:
         self.window_px = window
         self.drawn = quality == "drawn"
         if self.drawn and spp:
-            raise RenderError(f"spp={spp}: a drawn picture has no samples; use another quality, or leave spp out")
+            raise RenderError(f"spp={spp}: a rasterised picture has no samples; use another quality, or leave spp out")
         self._variant, self._shading = variant, shading
         self.spp = 0 if self.drawn else spp or (SCALAR_SAMPLES if self.choice.backend == "scalar" else SAMPLES)[quality]
         self._rest = rest_pins(spec.geometry)
@@ -198,7 +198,7 @@ class Renderer:
             image.reshape(through.size, -1)[pixels] += (through.ravel()[pixels, None] * (total / count)).astype(np.float32)
             yield np.maximum(image, 0)
 
-    def surfaces(self, state: PinState) -> dict[str, Surface]:
+    def surfaces(self, state: PinState) -> dict[str, PaintedSurface]:
         """Skin, stems and caps of a state, by the names of the scene's meshes.
 
         Raises
@@ -211,7 +211,7 @@ class Renderer:
         nodes = getattr(state, "nodes_mm", None)
         control = state.base_mm if self._inner is None else (self._skin.control_mm if nodes is None else nodes[self._inner])
         return {
-            "skin": Surface(self._skin.vertices(control), self._skin.faces),
+            "skin": PaintedSurface(self._skin.vertices(control), self._skin.faces),
             "stems": stems(self.spec.pins, state.base_mm, state.axis),
             "caps": caps(self.spec.pins, self.spec.appearance, state.caps_mm, state.axis),
         }
@@ -249,7 +249,7 @@ class GelView:
     """
 
     def __init__(
-        self, mi: ModuleType, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, Surface], bounces: int
+        self, mi: ModuleType, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, PaintedSurface], bounces: int
     ) -> None:
         import drjit as dr
 
@@ -259,7 +259,7 @@ class GelView:
         self.tracer = GelTracer.of(mi, spec, scene, bounces)
         self.rays = CameraRays(mi, dr, spec.camera, Window.of(spec.view), window_px)
 
-    def move(self, surfaces: dict[str, Surface]) -> None:
+    def move(self, surfaces: dict[str, PaintedSurface]) -> None:
         """Move the meshes' vertices."""
         move_meshes(self.params, surfaces)
 

@@ -17,7 +17,7 @@ from twin.camera.projection import pixel_rays, project, window_tangent
 from twin.geometry.pins import rest_pins
 from twin.optics.lights import Patch, lights
 from twin.optics.scene import build_pinhole_camera, build_scene, mesh, move_meshes
-from twin.optics.surfaces import Surface
+from twin.optics.surfaces import PaintedSurface
 from twin.optics.variants.variant import DrJit
 from twin.types import FloatArray, IntArray, PinState
 
@@ -33,7 +33,7 @@ class ScalarView:
     """The counterpart of ``GelView`` for scalar variants."""
 
     def __init__(
-        self, mi: ModuleType, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, Surface], bounces: int
+        self, mi: ModuleType, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, PaintedSurface], bounces: int
     ) -> None:
         self._mi, self._view, self._window_px = mi, spec.view, window_px
         rest_mm = rest_pins(spec.geometry).caps_mm
@@ -49,7 +49,7 @@ class ScalarView:
         pitch_px = np.ptp(rest_px, axis=0).max()
         self._size = int(OVERSAMPLING * 1.25 * pitch_px)
 
-    def move(self, surfaces: dict[str, Surface]) -> None:
+    def move(self, surfaces: dict[str, PaintedSurface]) -> None:
         """Move the meshes' vertices."""
         move_meshes(self._params, surfaces)
 
@@ -74,7 +74,7 @@ class ScalarView:
         place, direction = pixel_rays(self._view, grid.astype(float))
         seen = place + direction * ((z - place[..., 2]) / direction[..., 2])[..., None] - self._eye_mm
         ideal = (seen[..., :2] / np.maximum(seen[..., 2:], 1e-3) / self._half_field + 1) * 0.5 * self._size - 0.5
-        fine = np.stack([_refined(channel, (y1 - y0, x1 - x0)) for channel in np.moveaxis(ideal, 2, 0)], axis=-1)
+        fine = np.stack([_interpolate_grid(channel, (y1 - y0, x1 - x0)) for channel in np.moveaxis(ideal, 2, 0)], axis=-1)
         return fine.reshape(-1, 2)
 
 
@@ -84,7 +84,7 @@ def nearest_point(place: FloatArray, direction: FloatArray) -> FloatArray:
     return np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, place))
 
 
-def _refined(values: FloatArray, shape: tuple[int, int]) -> FloatArray:
+def _interpolate_grid(values: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Values at every pixel from those on a grid with a spacing of COARSE px."""
     rows, columns = (np.arange(n) / COARSE for n in shape)
     return map_coordinates(values, np.meshgrid(rows, columns, indexing="ij"), order=3, mode="nearest")
@@ -94,7 +94,7 @@ def _apparent_lights(mi: ModuleType, view: ViewSpec, patches: Sequence[Patch], c
     """An emitter for every LED, at the apparent position of the LED in the gel, with its apparent brightness."""
     made, unseen = {}, mi.load_dict({"type": "null"})
     for k, patch in enumerate(p for p in patches if p.half_mm.any()):
-        place, direction, gain = _seen_from(view, patch, caps_mm)
+        place, direction, gain = _refracted_rays(view, patch, caps_mm)
         middle = nearest_point(place, direction)
         square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ patch.half_mm
         corners = middle + np.column_stack([square, np.zeros(4)])
@@ -103,11 +103,13 @@ def _apparent_lights(mi: ModuleType, view: ViewSpec, patches: Sequence[Patch], c
         flat = away[:, 2] / np.sqrt(dist2) / dist2  # solid angle per area of the square in the gel
         radiance = patch.radiance * float(np.median(gain / np.maximum(flat, 1e-9)))
         emitter = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": [float(c) for c in radiance]}})
-        made[f"led{k}"] = mesh(mi, f"led{k}", Surface(corners, np.array([[0, 1, 2], [0, 2, 3]])), unseen, smooth=False, emitter=emitter)
+        made[f"led{k}"] = mesh(
+            mi, f"led{k}", PaintedSurface(corners, np.array([[0, 1, 2], [0, 2, 3]])), unseen, smooth=False, emitter=emitter
+        )
     return made
 
 
-def _seen_from(view: ViewSpec, patch: Patch, points_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _refracted_rays(view: ViewSpec, patch: Patch, points_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Refracted rays from points in the gel to a patch: places and unit directions (n, 3), and solid angle per area of the patch."""
     across = points_mm[:, :2] - patch.center_mm[:2]
     rho = np.linalg.norm(across, axis=1)

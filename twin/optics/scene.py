@@ -6,7 +6,7 @@ from types import ModuleType
 import numpy as np
 
 from scenes.sensor import AppearanceSpec
-from twin.optics.surfaces import Surface, vertex_normals
+from twin.optics.surfaces import PaintedSurface, vertex_normals
 from twin.optics.tracer import luminance
 from twin.optics.variants.arrays import with_room
 from twin.optics.variants.variant import DrJit
@@ -19,7 +19,7 @@ PAINT = {"type": "mesh_attribute", "name": "vertex_paint"}
 
 
 def build_scene(
-    mi: ModuleType, look: AppearanceSpec, gel_index: float, surfaces: Mapping[str, Surface], *, extra: dict[str, DrJit] | None = None
+    mi: ModuleType, look: AppearanceSpec, gel_index: float, surfaces: Mapping[str, PaintedSurface], *, extra: dict[str, DrJit] | None = None
 ) -> DrJit:
     """A Mitsuba scene of the surfaces in the gel, without camera or lights.
 
@@ -72,7 +72,7 @@ def build_pinhole_camera(mi: ModuleType, to_world: FloatArray, half_field: float
     )
 
 
-def mesh(mi: ModuleType, name: str, surface: Surface, bsdf: DrJit, *, smooth: bool, emitter: DrJit | None = None) -> DrJit:
+def mesh(mi: ModuleType, name: str, surface: PaintedSurface, bsdf: DrJit, *, smooth: bool, emitter: DrJit | None = None) -> DrJit:
     """A Mitsuba mesh with the id ``name``. The surface's paint becomes a vertex attribute."""
     props = mi.Properties()
     props["bsdf"] = bsdf
@@ -92,7 +92,7 @@ def mesh(mi: ModuleType, name: str, surface: Surface, bsdf: DrJit, *, smooth: bo
     return made
 
 
-def move_meshes(params: DrJit, surfaces: dict[str, Surface]) -> None:
+def move_meshes(params: DrJit, surfaces: dict[str, PaintedSurface]) -> None:
     """Move the vertices of a scene's meshes; ``params`` are the scene's traversed parameters, ``surfaces`` has the meshes' ids as keys."""
     for name, surface in surfaces.items():
         params[f"{name}.vertex_positions"] = with_room(surface.vertices_mm.ravel(), np.float32)
@@ -100,7 +100,7 @@ def move_meshes(params: DrJit, surfaces: dict[str, Surface]) -> None:
     _set_normals(params, {f"{name}.": surface for name, surface in surfaces.items()})
 
 
-def _set_normals(params: DrJit, surfaces: Mapping[str, Surface]) -> None:
+def _set_normals(params: DrJit, surfaces: Mapping[str, PaintedSurface]) -> None:
     """Set the vertex normals of smooth meshes, by the prefix of their parameters.
 
     Mitsuba computes them, too, but its threads add to the same numbers in any order: last digits, and so pictures, would differ from run

@@ -47,17 +47,17 @@ def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tupl
     """
     view = spec.view.model_copy(update={"camera": spec.camera.model_copy(update={"vignetting": 0.0})})
     ring = spec.housing.model_copy(update={"background": None})
-    light, cover = _computed(view, spec.leds, ring, spec.appearance.specks, tuple(window_px))
+    light, cover = _compute_light(view, spec.leds, ring, spec.appearance.specks, tuple(window_px))
     return light + background_light(spec, window_px), cover
 
 
 @lru_cache(maxsize=KEPT)
-def _computed(
+def _compute_light(
     view: ViewSpec, leds: LedRingSpec, ring: HousingSpec, specks: tuple[SpeckSpec, ...], window_px: tuple[int, int, int, int]
 ) -> tuple[FloatArray, FloatArray]:
     """Light (H, W, 3), without the measured background, and cover (H, W)."""
     table = ray_table(view.camera, window_px) @ sensor_to_camera(view.camera)[:3, :3]
-    seen = partial(_seen, view, leds, ring, specks)
+    seen = partial(_look_along, view, leds, ring, specks)
     at_corners = np.concatenate([part.reshape(*part.shape[:2], -1) for part in seen(table)], axis=2)
     around = np.stack([at_corners[:-1, :-1], at_corners[:-1, 1:], at_corners[1:, :-1], at_corners[1:, 1:]])
     both = around.mean(axis=0)
@@ -90,7 +90,7 @@ def background_light(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> 
     return values[y0:y1, x0:x1]
 
 
-def _seen(
+def _look_along(
     view: ViewSpec, leds: LedRingSpec, ring: HousingSpec, specks: Sequence[SpeckSpec], rays: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Light (..., 3) and cover (...) along rays from the pupil, whose directions (..., 3) are in the sensor frame and of any length."""
@@ -134,7 +134,7 @@ def beyond_aperture(ring: HousingSpec, at_mm: FloatArray) -> FloatArray:
     """Distance (...) of places (..., 2) of the housing's plane from its opening, mm; negative within it."""
     place = at_mm - ring.center_mm
     if ring.aperture_mm is None:
-        return np.sqrt(_squared(place)) - ring.aperture_radius_mm
+        return np.sqrt(_squared_length(place)) - ring.aperture_radius_mm
     over = np.abs(place) - np.array(ring.aperture_mm) / 2
     return np.linalg.norm(np.maximum(over, 0), axis=-1) + np.minimum(over.max(axis=-1), 0)
 
@@ -153,7 +153,7 @@ def housing_light(leds: LedRingSpec, ring: HousingSpec, at_mm: FloatArray) -> Fl
     light = ring.ambient * np.mean(shares) * np.exp(-np.maximum(out, 0) / ring.ambient_falloff_mm)
     for patch, share in zip(patches, shares, strict=True):
         led = patch.center_mm[:2] / np.linalg.norm(patch.center_mm[:2])
-        away2 = _squared(place - ring.glow_radius_mm * led) / ring.glow_height_mm**2
+        away2 = _squared_length(place - ring.glow_radius_mm * led) / ring.glow_height_mm**2
         light = light + ring.glow * share * (1 + away2) ** -ring.glow_exponent
     light = leds.power * light * np.where(out < ring.lip_width_mm, 1.0, ring.wall_fraction)
     return light[..., None] * np.array(ring.albedo)
@@ -162,7 +162,7 @@ def housing_light(leds: LedRingSpec, ring: HousingSpec, at_mm: FloatArray) -> Fl
 def reflections(view: ViewSpec, leds: LedRingSpec, ring: HousingSpec, tangents: FloatArray) -> FloatArray:
     """Radiance (..., 3) of the lights that both faces of the window reflect, for tangents (..., 2) of rays in air."""
     lens, distance = view.lens, view.camera.distance_mm
-    u2 = _squared(tangents)
+    u2 = _squared_length(tangents)
     cos_air = 1 / np.sqrt(1 + u2)
     sine2 = 1 - cos_air**2
     cos_window = np.sqrt(1 - sine2 / lens.refractive_index**2)
@@ -185,23 +185,23 @@ def _profile(leds: LedRingSpec, patch: Patch, at_mm: FloatArray) -> FloatArray:
     """A light's radiance at places (..., 2) about its centre, relative to its mean."""
     inner, outer = patch.radii_mm
     if outer > 0:
-        rho = np.sqrt(_squared(at_mm))
+        rho = np.sqrt(_squared_length(at_mm))
         return ((rho >= inner) & (rho <= outer)).astype(float)
     along, across = np.moveaxis(np.abs(at_mm @ np.linalg.inv(patch.half_mm)), -1, 0)
     within = (along <= 1) & (across <= 1)
     share, sd = leds.core_share, leds.core_mm
-    core = patch.area_mm2 / (2 * np.pi * sd**2) * np.exp(-_squared(at_mm) / (2 * sd**2)) if share else 0.0
+    core = patch.area_mm2 / (2 * np.pi * sd**2) * np.exp(-_squared_length(at_mm) / (2 * sd**2)) if share else 0.0
     return leds.mirror_share * ((1 - share) * within + share * core)
 
 
 def _specks(view: ViewSpec, specks: Sequence[SpeckSpec], tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cover (...) and light (..., 3) of the specks on the window's gel side."""
     hidden, shine = np.zeros(tangents.shape[:-1]), np.zeros((*tangents.shape[:-1], 3))
-    lens, u2 = view.lens, _squared(tangents)[..., None]
+    lens, u2 = view.lens, _squared_length(tangents)[..., None]
     within = 1 / np.sqrt(lens.refractive_index**2 + (lens.refractive_index**2 - 1) * u2)
     at = tangents * (lens.back_mm + view.camera.distance_mm + lens.thickness_mm * within)
     for speck in specks:
-        squared = _squared(at - [speck.x_mm, speck.y_mm]) / speck.radius_mm**2
+        squared = _squared_length(at - [speck.x_mm, speck.y_mm]) / speck.radius_mm**2
         on = squared < 1
         disc = np.minimum(2 - 2 * np.sqrt(squared[on]), 1)  # 1 up to half the radius
         hidden[on] = 1 - (1 - hidden[on]) * (1 - speck.opacity * disc)
@@ -209,6 +209,6 @@ def _specks(view: ViewSpec, specks: Sequence[SpeckSpec], tangents: FloatArray) -
     return hidden, shine
 
 
-def _squared(vectors: FloatArray) -> FloatArray:
+def _squared_length(vectors: FloatArray) -> FloatArray:
     """Squared lengths (...) of vectors (..., 2); a sum over an axis of two is several times slower."""
     return np.asarray(vectors[..., 0] ** 2 + vectors[..., 1] ** 2)

@@ -33,7 +33,7 @@ MOST_CONTROL_POINTS = 1200
 
 
 @dataclass(frozen=True)
-class Surface:
+class PaintedSurface:
     """Triangles ``faces (m, 3)`` over ``vertices_mm (n, 3)``; ``paint (n, 3)``: reflectance of each vertex."""
 
     vertices_mm: FloatArray
@@ -77,27 +77,27 @@ class SkinSurface:
         return self.rest_mm + self._weights @ moved.astype(np.float32)
 
 
-def stems(pins: PinsSpec, base_mm: FloatArray, axis: FloatArray) -> Surface:
+def stems(pins: PinsSpec, base_mm: FloatArray, axis: FloatArray) -> PaintedSurface:
     """All pin stems as one surface: cylinders from the skin to the cap."""
     length = pins.length_mm
     profile = np.array([[0.5 * pins.diameter_mm, -STEM_ROOT_MM], [0.5 * pins.diameter_mm, length]])
     return _lathe(profile, base_mm, axis, STEM_SIDES)
 
 
-def caps(pins: PinsSpec, appearance: AppearanceSpec, caps_mm: FloatArray, axis: FloatArray) -> Surface:
+def caps(pins: PinsSpec, appearance: AppearanceSpec, caps_mm: FloatArray, axis: FloatArray) -> PaintedSurface:
     """All caps as one surface: bevelled discs, or shapes with measured outlines, about their centres. The invisible underside is open."""
     radius, half = 0.5 * pins.cap_diameter_mm, 0.5 * pins.cap_height_mm
     bevel = min(CAP_BEVEL * pins.cap_height_mm, 0.5 * radius)
     radius *= np.sqrt(2 * np.pi / CAP_SIDES / np.sin(2 * np.pi / CAP_SIDES))  # the polygon has the disc's area
     profile = np.array([[radius, -half], [radius, half - bevel], [radius - bevel, half], [0, half]])
     body = _lathe(profile, caps_mm, axis, CAP_SIDES, cap_outlines(appearance, CAP_SIDES))
-    return Surface(
+    return PaintedSurface(
         body.vertices_mm, body.faces, np.repeat(cap_albedo(appearance, pins.count), len(body.vertices_mm) // len(caps_mm), axis=0)
     )
 
 
 def cap_albedo(look: AppearanceSpec, count: int) -> FloatArray:
-    """Reflectance (N, 3) of each cap: the measured one, else one drawn at random."""
+    """Reflectance (N, 3) of each cap: the measured one, else one sampled at random."""
     drawn = 1 + look.cap_variation * np.random.default_rng(look.cap_pattern).standard_normal(count)
     each = np.array(look.cap_levels) if look.cap_levels else drawn
     return np.clip(each[:, None] * np.array(look.cap_albedo), 0, 1)
@@ -148,7 +148,7 @@ def _ring_grid(bands: int, around: int) -> IntArray:
     return np.concatenate([np.stack([a, a + around, b], axis=1), np.stack([b, a + around, b + around], axis=1)])
 
 
-def _lathe(profile: FloatArray, origin_mm: FloatArray, axis: FloatArray, sides: int, outlines: FloatArray | None = None) -> Surface:
+def _lathe(profile: FloatArray, origin_mm: FloatArray, axis: FloatArray, sides: int, outlines: FloatArray | None = None) -> PaintedSurface:
     """Copies of a body of revolution with the profile (k, 2) of (radius, height), at each origin along its axis; normals outwards.
 
     The azimuth starts at the projection of the sensor's x onto the body's plane and increases towards y. ``outlines`` (N, sides) scale
@@ -168,4 +168,4 @@ def _lathe(profile: FloatArray, origin_mm: FloatArray, axis: FloatArray, sides: 
     corners = profile[one // sides, 0] == 0
     one = one[corners.sum(axis=1) < 2]  # a quad with a radius of 0 at one end is one triangle; v is opposite to u x axis (clockwise)
     faces = (np.arange(len(origin_mm))[:, None, None] * each + one[None]).reshape(-1, 3)
-    return Surface(vertices.reshape(-1, 3), faces)
+    return PaintedSurface(vertices.reshape(-1, 3), faces)

@@ -89,7 +89,7 @@ class GelTracer:
         ray, weight = mi.Ray3f(place, direction), mi.Spectrum(1.0)
         hit = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
         active = hit.is_valid()
-        weight *= self._absorbed(mi, dr, hit.t, active)
+        weight *= self._transmittance(mi, dr, hit.t, active)
         result, sample = mi.Spectrum(0.0), None
         for bounce in range(self.bounces + 1):
             bsdf = hit.bsdf(ray)
@@ -127,7 +127,7 @@ class GelTracer:
         ray = mi.Ray3f(dr.select(up, place, ray.o), dr.select(up, back, ray.d))
         hit = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=up | first.is_valid())
         active = hit.is_valid()
-        weight *= dr.select(up, share, 1.0) * self._absorbed(mi, dr, far + hit.t, active)
+        weight *= dr.select(up, share, 1.0) * self._transmittance(mi, dr, far + hit.t, active)
         return ray, hit, weight, active
 
     def _direct(self, mi: ModuleType, dr: ModuleType, hit: DrJit, bsdf: DrJit, random: PixelSamples, active: DrJit) -> DrJit:
@@ -138,7 +138,7 @@ class GelTracer:
         for patch, radiance in zip(self.emitters.patches, self.emitters.radiance, strict=True):
             toward, length, factor = self.window.connect(dr, mi, hit.p, _point(mi, dr, patch, place))
             ways.append((toward, length, factor * patch.area_mm2 * radiance))
-            taken = _taken(dr, dr.dot(toward, hit.sh_frame.n), bump)
+            taken = _received_share(dr, dr.dot(toward, hit.sh_frame.n), bump)
             strength = dr.detach(dr.max(radiance)) * factor * patch.area_mm2 * taken
             total += dr.select(active, strength, 0.0)
             shares.append(mi.Float(total))
@@ -156,8 +156,8 @@ class GelTracer:
         shadow.maxt = length * (1 - 1e-4)
         lit &= ~self.scene.ray_test(shadow, coherent=False, active=lit)
         local = hit.to_local(toward)
-        reflected = bsdf.eval(mi.BSDFContext(), hit, local, lit) * (_taken(dr, local.z, bump) / dr.maximum(local.z, NEVER))
-        arriving *= self._absorbed(mi, dr, length, lit) * self._tint(mi, dr, hit)
+        reflected = bsdf.eval(mi.BSDFContext(), hit, local, lit) * (_received_share(dr, local.z, bump) / dr.maximum(local.z, NEVER))
+        arriving *= self._transmittance(mi, dr, length, lit) * self._tint(mi, dr, hit)
         return dr.select(lit, reflected * arriving * (total / dr.maximum(share, NEVER)), 0.0)
 
     def _tint(self, mi: ModuleType, dr: ModuleType, hit: DrJit) -> DrJit:
@@ -166,13 +166,13 @@ class GelTracer:
             factor = dr.select(hit.shape == shape, tint, factor)
         return factor
 
-    def _absorbed(self, mi: ModuleType, dr: ModuleType, length: DrJit, active: DrJit) -> DrJit:
+    def _transmittance(self, mi: ModuleType, dr: ModuleType, length: DrJit, active: DrJit) -> DrJit:
         if not any(self.absorption):
             return mi.Spectrum(1.0)
         return dr.exp(-spectrum(mi, np.array(self.absorption)) * dr.select(active, length, 0.0))
 
 
-def _taken(dr: ModuleType, cosine: DrJit, bump: DrJit) -> DrJit:
+def _received_share(dr: ModuleType, cosine: DrJit, bump: DrJit) -> DrJit:
     """Received share of light: by the cosine law of a flat place, mixed with that of a ball (one half, averaged over its visible side)."""
     return dr.select(cosine > 0, (1 - bump) * cosine + 0.5 * bump, 0.0)
 

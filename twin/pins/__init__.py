@@ -11,7 +11,7 @@ from twin.pins.graph import make_graph, node_features
 from twin.pins.pipeline import Pipeline, measure_reference
 from twin.pins.reference import Reference, make_reference, nominal_reference
 from twin.pins.tune import Tuned, tune
-from twin.pins.view import View, view_of
+from twin.pins.view import PinView, view_of
 
 __all__ = [
     "Detector",
@@ -23,7 +23,7 @@ __all__ = [
     "Pipeline",
     "Reference",
     "Tuned",
-    "View",
+    "PinView",
     "examine",
     "load_detector",
     "make_detector",

@@ -19,7 +19,7 @@ from twin.pins.pipeline import Pipeline, measure_reference
 from twin.pins.reference import Reference, nominal_reference
 from twin.pins.view import view_of
 from twin.store import made_by, write_json, write_npz, writes
-from twin.types import Form, Frame, Observation, Readable
+from twin.types import Form, Frame, Observation, ReadableResult
 
 EDGE_RGB = (90, 110, 160)
 """Colour of a graph's edges in a picture."""
@@ -62,7 +62,7 @@ UNMEASURED = "specification"
 
 
 @dataclass(frozen=True, repr=False)
-class Preprocessed(Readable):
+class Preprocessed(ReadableResult):
     """The pins of all frames of a recording.
 
     Attributes
@@ -137,7 +137,7 @@ def preprocess_recording(
     notes: list[str] = []
     reference, reference_name = recording_reference(spec, recording, notes)
     pipeline = Pipeline(spec, recording.form, reference)
-    names, observations, unfit = _observed(recording, pipeline, pictures_dir, progress)
+    names, observations, unfit = _observe_frames(recording, pipeline, pictures_dir, progress)
     arrays = _arrays(names, observations, spec.pins.count)
     all_found = np.array([o.complete for o in observations], bool)
     summary = {
@@ -162,11 +162,11 @@ def preprocess_recording(
     write_npz(out_dir / "pins.npz", arrays, compressed=True)
     write_json(out_dir / "summary.json", summary)
     if not arrays["valid"].any():
-        raise FrameError(_nothing_found(path, summary, out_dir / "summary.json"))
+        raise FrameError(_describe_no_result(path, summary, out_dir / "summary.json"))
     return Preprocessed(summary, arrays, [out_dir / name for name in ("pins.npz", "summary.json", "overlay")[: 3 if overlay else 2]])
 
 
-def _observed(
+def _observe_frames(
     recording: Recording, pipeline: Pipeline, pictures_dir: Path | None, progress: Callable[[int, int], None] | None
 ) -> tuple[list[str], list[Observation], list[BadFrame]]:
     """Names and observations of a recording's frames, and the frames that do not suit the pipeline. Pictures go to the given folder."""
@@ -194,7 +194,7 @@ def _observed(
 def recording_reference(spec: SensorSpec, recording: Recording, problems: list[str]) -> tuple[Reference, str]:
     """The layout in the recording's no-contact frame and this frame's name; without such a frame the specification's layout.
 
-    What is worth knowing about the reference is added to ``problems``.
+    Notes about the reference are added to ``problems``.
 
     Raises
     ------
@@ -294,7 +294,7 @@ def _arrays(names: list[str], observations: list[Observation], n: int) -> dict[s
     }
 
 
-def _nothing_found(path: str | Path, summary: dict, summary_path: Path) -> str:
+def _describe_no_result(path: str | Path, summary: dict, summary_path: Path) -> str:
     """The message for a recording without a valid frame."""
     bad = summary["invalid"] + summary["failed"]
     return (

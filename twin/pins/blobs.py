@@ -101,7 +101,7 @@ class Blobs:
         return np.stack([columns, rows], axis=1) + self.corner_px, self.gray[rows, columns]
 
 
-def despeckled(gray: np.ndarray) -> np.ndarray:
+def despeckle(gray: np.ndarray) -> np.ndarray:
     """Gray levels (h, w) uint8 in which hot and dead pixels are replaced by the median of their neighbourhood. Noisy pixels are kept."""
     median = cv2.medianBlur(gray, 3)
     away = cv2.absdiff(gray, median)
@@ -115,21 +115,21 @@ def threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> np.ndarray:
     if not blob.threshold_block_px:
         _, binary = cv2.threshold(gray, blob.threshold, 255, cv2.THRESH_BINARY)
         return cv2.bitwise_and(binary, disc)
-    smooth = _smoothed(gray, disc)
+    smooth = _smooth_window(gray, disc)
     binary = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, blob.threshold_block_px | 1, blob.threshold)
     return cv2.bitwise_and(binary, disc)
 
 
 def own_threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> float:
     """The adaptive threshold that separates a frame's bright and dark pixels best (Otsu 1979, of the level above the local mean)."""
-    smooth = _smoothed(gray, disc)
+    smooth = _smooth_window(gray, disc)
     block = blob.threshold_block_px | 1
     above = cv2.subtract(smooth, cv2.blur(smooth, (block, block), borderType=cv2.BORDER_REPLICATE))[disc > 0]
     level, _ = cv2.threshold(np.minimum(above, np.percentile(above, MOST_ABOVE)).astype(np.uint8), 0, 255, cv2.THRESH_OTSU)
     return -max(level, 1.0)
 
 
-def _smoothed(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
+def _smooth_window(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
     """A window (h, w) prepared for an adaptive threshold: smoothed, and uniform outside the disc.
 
     Pixels outside the disc (housing and LEDs) are set to the median inside it. Otherwise they would raise the local mean near the rim.

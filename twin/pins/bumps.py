@@ -93,7 +93,7 @@ def find_bumps(gray: np.ndarray, sigma_px: float) -> Bumps:
         peak[:] = False
     peak[[0, -1]] = peak[:, [0, -1]] = False
     rows, columns = np.nonzero(peak)
-    px, round_enough = _refined(response, rows, columns)
+    px, round_enough = _refine_maxima(response, rows, columns)
     px = (px[round_enough] + 0.5) / scale - 0.5
     height: np.ndarray = response[rows, columns][round_enough].astype(float)
     kept = _not_far_below(px, height)
@@ -126,7 +126,7 @@ def _not_far_below(px: np.ndarray, height: np.ndarray) -> np.ndarray:
     return height > FAR_BELOW * np.percentile(height[around], USUAL, axis=1)
 
 
-def _refined(field: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _refine_maxima(field: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sub-pixel positions (K, 2) of maxima, by a parabola through the neighbours, and whether each maximum (K,) is round enough."""
     here = field[rows, columns]
     left, right, up, down = field[rows, columns - 1], field[rows, columns + 1], field[rows - 1, columns], field[rows + 1, columns]

@@ -14,14 +14,14 @@ from scipy.spatial import cKDTree
 
 from scenes.sensor import Polarity, SensorSpec, UsualCapsSpec
 from twin.camera.capture import expose
-from twin.frames import spread
+from twin.frames import spread_indices
 from twin.frames.forms import blob_spec, gray_levels, known_frames, pin_levels
 from twin.optics.preview import Preview
 from twin.pins.caps import Caps, measure_caps
 from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
-from twin.pins.identify import judge_layout
+from twin.pins.identify import score_layout
 from twin.pins.pipeline import Pipeline
-from twin.pins.reference import Reference, nominal_reference, seen_at_rest
+from twin.pins.reference import Reference, nominal_reference, project_rest
 from twin.pins.tune import other_layout
 from twin.pins.view import MOST_STRETCH, view_of
 from twin.progress import Step
@@ -45,7 +45,7 @@ LEAST_DEFORMED = 0.3
 TOLD_BULGE = 0.002
 """Change of the rim's size by a contact, as a share, below which a text does not mention it."""
 LAYOUT_JUDGED = 4
-"""Most frames on which the layout is judged, evenly spread."""
+"""Most frames on which the layout is evaluated, evenly spread."""
 LISTED = 8
 """Most pins that a sentence lists by number."""
 BRIGHT_PERCENTILE = 99
@@ -125,9 +125,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
         *_place(seen, nominal, spec),
         *_twin(spec, form, nominal),
     ]
-    return (
-        findings if form == Form.PROCESSED else [*_light(frames, seen, spec.pipeline.usual_caps or drawn_caps(spec), pipeline), *findings]
-    )
+    return findings if form == Form.PROCESSED else [*_light(frames, seen, spec.pipeline.usual_caps or rest_caps(spec), pipeline), *findings]
 
 
 @dataclass(frozen=True)
@@ -193,8 +191,8 @@ def _finding(name: str, value: float, limits: tuple[float, float], text: str, re
 
 def _layout(frames: list[Frame], spec: SensorSpec, polarity: Polarity) -> Finding:
     """Finding about the layout: whether the frames show the specification's layout, independent of the camera's place."""
-    images = [pin_levels(frames[k].image, polarity) for k in spread(len(frames), LAYOUT_JUDGED)]
-    layout = judge_layout(spec.pins, images)
+    images = [pin_levels(frames[k].image, polarity) for k in spread_indices(len(frames), LAYOUT_JUDGED)]
+    layout = score_layout(spec.pins, images)
     share = 0.0 if layout is None else layout.explained
     doubts = [f"the frames do not show {spec.pins.in_words()}"] if layout is None else other_layout(layout, images)
     text = f"of the pins in view and the pin-like spots, {100 * share:.1f} % belong together" + (f"; {doubts[0]}" if doubts else "")
@@ -218,7 +216,7 @@ def _pins(frames: list[Frame], seen: list[Observation], pipeline: Pipeline) -> F
     share = float(lost.sum() / max(in_view.sum(), 1))
     steady = np.flatnonzero(lost.mean(axis=0) >= STEADY)
     outside = int(np.median((~in_view).sum(axis=1)))
-    text = f"{100 * share:.2f} % of the pins in view lost; {sum(o.valid for o in seen)} of {len(seen)} frames can be used"
+    text = f"{100 * share:.2f} % of the pins in view lost; {sum(o.valid for o in seen)} of {len(seen)} frames are valid"
     bad = [f.name or f"number {k}" for k, (f, o) in enumerate(zip(frames, seen, strict=True), 1) if not o.valid]
     if 0 < len(bad) < len(seen):
         text += f"; not {', '.join(bad[:LISTED])}{', ...' if len(bad) > LISTED else ''}"
@@ -255,7 +253,13 @@ def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> lis
     drifts = [(d, o) for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost, bulge=bulge))]
     if not drifts:
         return [
-            Finding("place", Grade.BAD, np.nan, "the camera's place can't be told: too few pins at the rim", "see the other findings first")
+            Finding(
+                "place",
+                Grade.BAD,
+                np.nan,
+                "the camera's place can't be determined: too few pins at the rim",
+                "see the other findings first",
+            )
         ]
     drifts = sorted(drifts, key=lambda each: each[0].contact)[: max(round(LEAST_DEFORMED * len(drifts)), 1)]
     found = [d for d, _ in drifts]
@@ -270,7 +274,7 @@ def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> lis
     grown = f" ({seen_scale:.3f} with the bulge of the contact)" if seen_scale - scale > TOLD_BULGE else ""
     away = float(np.linalg.norm(shift))
     again = "fix the camera, or calibrate again ('twin calibrate optics'); 'twin tune' moves the mask"
-    mirror = "the picture is mirrored" if view.mirrored else "the picture is not mirrored" if view.sure else view.undecided()
+    mirror = "the picture is mirrored" if view.mirrored else "the picture is not mirrored" if view.sure else view.describe_ambiguity()
     return [
         _finding("shift", away / pitch, (0.2, 1.0), f"displaced by ({shift[0]:.1f}, {shift[1]:.1f}) px, {away / pitch:.2f} pitches", again),
         _finding("turn", abs(turn), (1.5, 6.0), f"turned by {turn:.2f} deg", again),
@@ -295,11 +299,12 @@ def _twin(spec: SensorSpec, form: Form, nominal: Reference) -> list[Finding]:
     blob = spec.pipeline.raw if form == Form.RAW else spec.pipeline.recording
     if blob is None or not blob.rest_px:
         return []
-    off_px = nominal.pins_px - seen_at_rest(spec, form)
+    off_px = nominal.pins_px - project_rest(spec, form)
     rms, pitch = float(np.sqrt(np.mean(np.sum(off_px**2, axis=1)))), float(np.mean(nominal.spacing_px))
     text = f"the specification's camera sees its pins at rest {rms:.1f} px (rms), {rms / pitch:.2f} pitches, from where they were measured"
     remedy = (
-        "lengths in mm, camera and rest_px do not belong together: the twin's pictures are not of this sensor; make the specification anew "
+        "lengths in mm, camera and rest_px do not belong together: the twin's pictures are not of this sensor; make "
+        "the specification again "
         "('twin new', with `radius_mm` for a tip of another size)"
     )
     return [_finding("twin", rms / pitch, (0.2, 0.5), text, remedy)]
@@ -375,7 +380,7 @@ def usual_caps(caps: list[Caps]) -> UsualCapsSpec | None:
 
 
 @lru_cache(maxsize=2)
-def drawn_caps(spec: SensorSpec) -> UsualCapsSpec | None:
+def rest_caps(spec: SensorSpec) -> UsualCapsSpec | None:
     """The caps measured in the twin's frame at rest; None if that frame shows none."""
     twin = expose(Preview(spec).render(), spec.capture)
     pins_px = Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px

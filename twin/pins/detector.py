@@ -114,7 +114,7 @@ def make_detector(sensor: SensorSpec, detector: DetectorSpec, *, second_look: bo
         return TwinDetector(sensor, detector, second_look=second_look)
     blob = detector.blob
     mask = circular_mask(frame_size(sensor, detector.form), blob.mask_center_px, blob.mask_radius_px)
-    places = partial(_own, detector) if detector.method == OWN else partial(_masked, detector, mask)
+    places = partial(_own, detector) if detector.method == OWN else partial(_find_blobs, detector, mask)
     return MatchedDetector(detector, places, reference)
 
 
@@ -200,14 +200,14 @@ class LegacyDetector:
             return None
 
 
-def _masked(detector: DetectorSpec, mask: Mask, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+def _find_blobs(detector: DetectorSpec, mask: Mask, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Places and areas of the blobs in a frame's mask."""
     window = pin_levels(np.ascontiguousarray(frame.image[mask.window]), detector.blob.polarity)
     return find(np.ascontiguousarray(window), mask, detector)
 
 
 def _own(detector: DetectorSpec, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Places of the user's function. All have the area of a usual cap, because the function tells none."""
+    """Places of the user's function. All have the area of a usual cap, because the function gives none."""
     px = own_places(detector, frame)
     return px, np.full(len(px), np.pi * detector.radius_px[0] * detector.radius_px[1])
 
@@ -219,7 +219,7 @@ def find(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.nda
 
 def _components(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
     """Connected components above a fixed or adaptive threshold."""
-    blob = detector.blob if detector.method == "adaptive" else _fixed(detector.blob)
+    blob = detector.blob if detector.method == "adaptive" else _with_fixed_threshold(detector.blob)
     binary = threshold(window, mask.disc, blob)
     if blob.erosion_px > 1:
         binary = cv2.erode(binary, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
@@ -229,7 +229,7 @@ def _components(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple
     return centroids[1:][keep] + mask.corner_px, area[keep]
 
 
-def _fixed(blob: BlobSpec) -> BlobSpec:
+def _with_fixed_threshold(blob: BlobSpec) -> BlobSpec:
     """The same parameters with a fixed threshold."""
     return blob.model_copy(update={"threshold_block_px": 0})
 
@@ -269,7 +269,7 @@ def _scale_space(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tupl
 FINDERS = {"adaptive": _components, "fixed": _components, "simple": _simple, "log": _scale_space, "dog": _scale_space, "doh": _scale_space}
 
 
-def named(graph: PinGraph, claims_px: np.ndarray, pins_px: np.ndarray) -> PinGraph:
+def reorder_to(graph: PinGraph, claims_px: np.ndarray, pins_px: np.ndarray) -> PinGraph:
     """A graph over found places (N, 2), reordered to the order of the pins (N, 2) that they are nearest to."""
     _, order = cKDTree(claims_px).query(pins_px)
     place = np.empty(len(order), int)

@@ -18,7 +18,7 @@ from scenes.pins import PinsSpec
 from twin.geometry.pins import usual_spacing
 from twin.pins.bumps import Bumps
 from twin.pins.families import family
-from twin.pins.growth import seen_places
+from twin.pins.growth import locate_places
 
 FLAT_SIDE_PX = 5
 """Side of a square around a pixel, px. If all its gray levels are equal, the frame is filled or masked there: camera noise would differ."""
@@ -117,7 +117,7 @@ class Beyond:
     bright: np.ndarray
 
 
-def seen_beyond(images: Sequence[np.ndarray], rest_px: np.ndarray, sigma_px: float) -> Beyond:
+def find_beyond(images: Sequence[np.ndarray], rest_px: np.ndarray, sigma_px: float) -> Beyond:
     """Visible things in gray frames (H, W) uint8 around a layout with pins at rest (N, 2), px, above the noise of the frames' mean."""
     height, width = images[0].shape
     reach = max(round(BESIDE * usual_spacing(rest_px)), 1)
@@ -141,7 +141,7 @@ def seen_beyond(images: Sequence[np.ndarray], rest_px: np.ndarray, sigma_px: flo
 def open_sides(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps, beyond: Beyond) -> int:
     """Number of sides on which the frames do not show the end of a layout with pins at rest (N, 2), px.
 
-    On such a side the frame may cut off more pins. ``beyond`` is the result of ``seen_beyond``.
+    On such a side the frame may cut off more pins. ``beyond`` is the result of ``find_beyond``.
     """
     shape = pins.shape
     if not isinstance(shape, LatticeLayout) or not shape.sides():
@@ -149,19 +149,19 @@ def open_sides(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps, beyond: Beyond
     by, around = family(type(shape)), shape.sides()
     spot = np.full(len(by.lattice), -1)
     spot[np.delete(shape.own_places(), list(pins.missing))] = np.arange(pins.count)
-    places = seen_places(by.lattice, by.around, rest_px, spot, spots.size_px)
+    places = locate_places(by.lattice, by.around, rest_px, spot, spots.size_px)
     framed = in_view(places, replace(spots, hidden=None))
     middle = rest_px.mean(axis=0)
     ends = 0
     for side in around:
         looked = places[side[framed[side]]]
-        past = sum(_ended(place, rest_px, middle, beyond) for place in looked)
+        past = sum(_find_end(place, rest_px, middle, beyond) for place in looked)
         in_frame = len(looked) >= max(FEWEST_IN_FRAME, IN_FRAME * len(side))
         ends += in_frame and past >= max(FEWEST_SEEN_PAST, SEEN_PAST * len(looked))
     return len(around) - ends
 
 
-def _ended(place: np.ndarray, rest_px: np.ndarray, middle: np.ndarray, beyond: Beyond) -> bool:
+def _find_end(place: np.ndarray, rest_px: np.ndarray, middle: np.ndarray, beyond: Beyond) -> bool:
     """Whether the frames show that no cap is at a place (2,): something is visible beyond it, or bright beside it."""
     away = place - middle
     far, spacing = float(np.linalg.norm(away)), float(np.linalg.norm(rest_px - place, axis=1).min())

@@ -75,7 +75,7 @@ def label_spots(found: Bumps, by: Family) -> np.ndarray | None:
     if len(found.px) < LEAST_GROWN:
         return None
     best, most = None, LEAST_GROWN - 1
-    for start, cell in _starts(found, by, by.kind) if by.kind else _laid(found, by):
+    for start, cell in _starts(found, by, by.kind) if by.kind else _lay_lattice(found, by):
         labels = grow(by.lattice, by.around, found.px, start, cell)
         count = int((labels >= 0).sum())
         if count > most:
@@ -106,7 +106,7 @@ def _starts(found: Bumps, by: Family, kind: type[LatticeLayout]) -> Iterator[tup
         yield start, float(np.median(reach))
 
 
-def _laid(found: Bumps, by: Family) -> Iterator[tuple[np.ndarray, float]]:
+def _lay_lattice(found: Bumps, by: Family) -> Iterator[tuple[np.ndarray, float]]:
     """First labels (M,) and the spacing, px: the lattice, laid over the spots by middle, size and turn, labels spots nearby."""
     px = found.px
     tree = cKDTree(px)

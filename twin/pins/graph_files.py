@@ -20,7 +20,7 @@ from twin.pins.reference import Reference, nominal_reference, spread_out
 from twin.report.charts import new_figure, save_figure
 from twin.report.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes
 from twin.store import write_npz, writes
-from twin.types import Form, PinGraph, Readable
+from twin.types import Form, PinGraph, ReadableResult
 
 PINS = ".npz"
 """Suffix of a file of found pins."""
@@ -33,7 +33,7 @@ PICTURE_DPI = 120
 
 
 @dataclass(frozen=True, repr=False)
-class Graphs(Readable):
+class Graphs(ReadableResult):
     """Graphs of many frames and the files they were written to.
 
     Attributes
@@ -163,24 +163,24 @@ def read_pins(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
     except FileNotFoundError as error:
         raise FrameError(f"{path}: no such file; 'twin preprocess' writes it") from error
     except OSError as error:
-        raise FrameError(f"{path}: can't be read ({error.strerror}); write it anew with 'twin preprocess'") from error
+        raise FrameError(f"{path}: can't be read ({error.strerror}); write it again with 'twin preprocess'") from error
     except ValueError as error:
-        raise FrameError(f"{path}: not a pins.npz, or a damaged one; write it anew with 'twin preprocess'") from error
+        raise FrameError(f"{path}: not a pins.npz, or a damaged one; write it again with 'twin preprocess'") from error
     kinds = [names.dtype.kind, pins.dtype.kind, predicted.dtype.kind, valid.dtype.kind]
     if kinds != ["U", "f", "f", "b"]:
-        raise FrameError(f"{path}: its arrays are not texts, numbers, numbers and truths; write it anew with 'twin preprocess'")
+        raise FrameError(f"{path}: its arrays are not texts, numbers, numbers and truths; write it again with 'twin preprocess'")
     frames = names.shape[0] if names.ndim else 0
     if pins.ndim != 3 or pins.shape[2] != 2 or predicted.shape != pins.shape or valid.shape != (frames,) or len(pins) != frames:
-        raise FrameError(f"{path}: its arrays do not fit each other; write it anew with 'twin preprocess'")
+        raise FrameError(f"{path}: its arrays do not fit each other; write it again with 'twin preprocess'")
     if pins.shape[1] != count:
         raise FrameError(f"{path}: holds {pins.shape[1]} pins a frame, the sensor has {count}; give the right `sensor`")
     if not valid.any():
         raise FrameError(f"{path}: no valid frame in it; look at summary.json beside it for the reasons")
     nodes_px = np.where(np.isnan(pins), predicted, pins)[valid]
     if not np.isfinite(nodes_px).all():
-        raise FrameError(f"{path}: a valid frame lacks a pin and its prediction; write it anew with 'twin preprocess'")
+        raise FrameError(f"{path}: a valid frame lacks a pin and its prediction; write it again with 'twin preprocess'")
     if not all(spread_out(nodes) for nodes in nodes_px):
-        raise FrameError(f"{path}: the pins of a valid frame lie in one place, on a line or far off; write it anew with 'twin preprocess'")
+        raise FrameError(f"{path}: the pins of a valid frame lie in one place, on a line or far off; write it again with 'twin preprocess'")
     return names[valid], nodes_px
 
 

@@ -179,7 +179,7 @@ def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndar
     return spot
 
 
-def seen_places(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+def locate_places(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """Positions (M, 2), px, of a lattice's places: of the spots, or predicted from labelled neighbours; NaN without a prediction.
 
     A predicted position may lie outside the frame. It then shows that the frame cuts a pin off.

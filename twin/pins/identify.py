@@ -1,9 +1,9 @@
 """Identification of the pin layout of an unknown sensor from its frames alone.
 
 Each family of layouts (rings, hexagon, grid) labels the pin-like spots of each frame by its lattice (`twin.pins.families`). The part of
-the lattice that holds the spots is a candidate. A candidate is judged by what it does not explain: pins that should be in view but are not
-seen, and pin-like spots that belong to none of its pins, also at its rim and just outside it. Therefore a layout with one ring too few or
-too many explains less than the right layout, and is not chosen.
+the lattice that holds the spots is a candidate. A candidate is evaluated by what it does not explain: pins that should be in view but are
+not seen, and pin-like spots that belong to none of its pins, also at its rim and just outside it. Therefore a layout with one ring too few
+or too many explains less than the right layout, and is not chosen.
 
 Pins may be brighter or darker than the skin. The gaps between dark pins are bright spots, too, and often form a lattice that explains all
 of them. But pins have skin on all sides, while gaps have skin on some sides and pins on others (`stand_out`).
@@ -21,13 +21,13 @@ from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec, layout_from
 from scenes.sensor import Polarity
 from twin.errors import FrameError
-from twin.frames import spread
+from twin.frames import spread_indices
 from twin.frames.forms import is_two_level, levels_at, pin_levels
 from twin.geometry.pins import namings, pin_lattice, usual_spacing
 from twin.pins.bumps import Bumps, find_bumps
-from twin.pins.extent import filled_area, in_view, open_sides, seen_beyond, with_view
+from twin.pins.extent import filled_area, find_beyond, in_view, open_sides, with_view
 from twin.pins.families import Family, families, family, family_of_positions, label_spots
-from twin.pins.growth import seen_places
+from twin.pins.growth import locate_places
 from twin.pins.matching import match
 from twin.pins.reference import make_reference, spread_out, together
 from twin.progress import Step
@@ -73,7 +73,7 @@ LEAST_EXPLAINED = 0.6
 ALIKE, MOST_GAPS = 0.5, 0.25
 """Test of whether spots are pins (`stand_out`): least ratio of the two heights of three neighbours above the places between them, which is
 about 1 for pins and about 0 for gaps; and largest share of threes with a smaller ratio. The share was measured as at most 0.02 in frames of
-seven sensors with bright and of one with dark pins, and as at least 0.44 for gaps of drawn layouts."""
+seven sensors with bright and of one with dark pins, and as at least 0.44 for gaps of sampled layouts."""
 SMOOTHED = 0.5
 """Standard deviation of the smoothing before these heights are measured, in standard deviations of a spot."""
 FEWEST_VIEWED = 12
@@ -81,7 +81,7 @@ FEWEST_VIEWED = 12
 
 
 @dataclass(frozen=True)
-class Seen:
+class LayoutInFrame:
     """A layout's pins in one frame.
 
     Attributes
@@ -140,7 +140,7 @@ class Candidate:
     misfit: float
     rest_px: np.ndarray
     there: np.ndarray
-    seen: tuple[Seen, ...]
+    seen: tuple[LayoutInFrame, ...]
 
     def line(self) -> str:
         """The candidate in words."""
@@ -179,7 +179,7 @@ class Identified:
         return self.candidates[0]
 
 
-Look = Callable[[Bumps], Seen | None]
+Look = Callable[[Bumps], LayoutInFrame | None]
 """Function that finds a layout in a frame's spots; None if it finds none."""
 
 
@@ -199,7 +199,7 @@ def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Ident
     if found is not None and found.sure and found.best.pins.count >= FEWEST_VIEWED:
         return found
     inverted = [pin_levels(image, "dark") for image in images]
-    dark, _ = _attempt([inverted[k] for k in spread(len(images), SIZED_ON)], None)
+    dark, _ = _attempt([inverted[k] for k in spread_indices(len(images), SIZED_ON)], None)
     if dark is not None and len(images) > SIZED_ON and _better(dark, found):
         dark, _ = _attempt(inverted, progress)
     if dark is not None and _better(dark, found):
@@ -212,7 +212,7 @@ def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Ident
 def _attempt(images: list[np.ndarray], progress: Step | None) -> tuple[Identified | None, FrameError | None]:
     """The layout of bright pins in gray frames, or the reason why there is none."""
     try:
-        return _identified(images, progress), None
+        return _identify_bright(images, progress), None
     except FrameError as error:
         return None, error
 
@@ -222,14 +222,14 @@ def _better(dark: Identified, bright: Identified | None) -> bool:
     return bright is None or _merit(dark.best) > _merit(bright.best)
 
 
-def stand_out(images: list[np.ndarray], seen: Sequence[Seen], sigma_px: float) -> bool:
+def stand_out(images: list[np.ndarray], seen: Sequence[LayoutInFrame], sigma_px: float) -> bool:
     """Whether spots of the size ``sigma_px`` in gray frames (H, W) uint8 are bright pins, not the gaps between dark ones.
 
     The level of three neighbours is compared with that midway between them, and with that in the middle of the gap between them (the centre
     of the circle through them). Both are the skin's level between pins. Between gaps one is the skin's and one a pin's.
     """
     odd: list[np.ndarray] = []
-    for k in spread(len(seen), SIZED_ON):
+    for k in spread_indices(len(seen), SIZED_ON):
         px = seen[k].pins_px[np.isfinite(seen[k].pins_px[:, 0])]
         try:
             corners = px[Delaunay(px).simplices]
@@ -252,7 +252,7 @@ def stand_out(images: list[np.ndarray], seen: Sequence[Seen], sigma_px: float) -
     return not len(all_odd) or float(all_odd.mean()) <= MOST_GAPS
 
 
-def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
+def _identify_bright(images: list[np.ndarray], progress: Step | None) -> Identified:
     """Identify the layout in frames whose caps are brighter than the skin.
 
     Raises
@@ -262,12 +262,12 @@ def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
     """
     searched = families()
     looks: list[Look] = [partial(_family_look, by) for by in searched]
-    sizes = [_best_size(images[k], looks) for k in spread(len(images), SIZED_ON)]
+    sizes = [_best_size(images[k], looks) for k in spread_indices(len(images), SIZED_ON)]
     if not any(sizes):
         raise FrameError(f"none of {len(images)} frames shows pins in rings, a hexagon or a grid; {NO_LAYOUT}")
     sigma = float(np.median([size for size in sizes if size]))
     spots = _spots(images, sigma)
-    found: list[tuple[PinsSpec, list[Seen]]] = []
+    found: list[tuple[PinsSpec, list[LayoutInFrame]]] = []
     for k, by in enumerate(searched):
         found += _first_guesses(by, spots)
         if progress:
@@ -285,9 +285,9 @@ def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
         raise FrameError(f"none of {len(images)} frames shows a whole layout of pins; {NO_LAYOUT}")
     doubts = _doubts(candidates)
     best, ends = candidates[0], []
-    if open_sides(best.pins, best.rest_px, spots[0], seen_beyond(images, best.rest_px, sigma)):
-        ends.append(_end_not_seen(best.pins))
-    if _faded(best, images) < FADED:
+    if open_sides(best.pins, best.rest_px, spots[0], find_beyond(images, best.rest_px, sigma)):
+        ends.append(_describe_missing_end(best.pins))
+    if _find_faded(best, images) < FADED:
         ends.append(
             f"the outermost caps of {best.pins.in_words()} are smaller than the others, as where light fades: pins further out "
             "may have been thresholded away; frames that were not thresholded, or with a local threshold, decide, or give the layout"
@@ -298,9 +298,9 @@ def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
     return Identified(tuple(candidates), not doubts, tuple(doubts), sigma)
 
 
-def _faded(layout: Candidate, images: list[np.ndarray]) -> float:
+def _find_faded(layout: Candidate, images: list[np.ndarray]) -> float:
     """Size of the outermost caps relative to the others in thresholded frames. 1 for other frames, which would show caps farther out."""
-    chosen = [k for k in spread(len(images), SIZED_ON) if is_two_level(images[k])]
+    chosen = [k for k in spread_indices(len(images), SIZED_ON) if is_two_level(images[k])]
     outmost = np.isin(np.arange(layout.pins.count), pin_lattice(layout.pins).outmost)
     white = []
     for k in chosen:
@@ -316,7 +316,7 @@ def _faded(layout: Candidate, images: list[np.ndarray]) -> float:
     return float(np.median(outer) / max(np.median(inner), 1.0)) if len(inner) and len(outer) else 1.0
 
 
-def _end_not_seen(pins: PinsSpec) -> str:
+def _describe_missing_end(pins: PinsSpec) -> str:
     """Message: the frames do not show the end of the layout, so the sensor may have more pins."""
     lines = getattr(pins.shape, "lines", "pins")
     return (
@@ -339,24 +339,24 @@ def _with_larger(candidates: list[Candidate], spots: list[Bumps]) -> list[Candid
     return [candidates[0], *larger, *candidates[1:]]
 
 
-def judge_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
+def score_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
     """How well a given layout of bright pins explains gray frames (H, W) uint8; None if no frame shows it, or only gaps between pins do.
 
     Its missing pins are not changed.
     """
     shape = pins.shape
     of_kind = family(type(shape)) if isinstance(shape, LatticeLayout) else None
-    layout = _judged(pins, family_of_positions(pins) if of_kind is None or pins.missing else of_kind, images)
+    layout = _score_layout(pins, family_of_positions(pins) if of_kind is None or pins.missing else of_kind, images)
     if of_kind and pins.missing and (layout is None or layout.explained < SHOWN):
-        grown = _judged(pins, of_kind, images)  # it follows a strongly curved view, but may be a row off
+        grown = _score_layout(pins, of_kind, images)  # it follows a strongly curved view, but may be a row off
         layout = max((one for one in (layout, grown) if one is not None), key=lambda one: one.explained, default=None)
     return layout
 
 
-def _judged(pins: PinsSpec, by: Family, images: list[np.ndarray]) -> Candidate | None:
+def _score_layout(pins: PinsSpec, by: Family, images: list[np.ndarray]) -> Candidate | None:
     """How well a given layout explains frames whose spots are labelled by a family."""
     look = partial(_layout_look, pins, by)
-    sizes = [size for k in spread(len(images), SIZED_ON) if (size := _best_size(images[k], [look]))]
+    sizes = [size for k in spread_indices(len(images), SIZED_ON) if (size := _best_size(images[k], [look]))]
     if not sizes:
         return None
     sigma = float(np.median(sizes))
@@ -388,26 +388,26 @@ def _best_size(image: np.ndarray, looks: list[Look]) -> float | None:
     return best
 
 
-def _family_look(by: Family, spots: Bumps) -> Seen | None:
+def _family_look(by: Family, spots: Bumps) -> LayoutInFrame | None:
     """The part of a family's lattice in one frame, without the other frames; None if there is none."""
     spot = label_spots(spots, by)
     part = None if spot is None else _part(by, spots, spot)
     return None if part is None else part[1]
 
 
-def _layout_look(pins: PinsSpec, by: Family, spots: Bumps) -> Seen | None:
+def _layout_look(pins: PinsSpec, by: Family, spots: Bumps) -> LayoutInFrame | None:
     """A given layout in one frame, without the other frames; None if it is not seen."""
     spot = label_spots(spots, by)
     return None if spot is None else _as_layout(pins, by, spots, spot)
 
 
-def _seen(spots: Bumps, spot: np.ndarray, by: Family, nodes: np.ndarray) -> Seen:
+def _place_lattice(spots: Bumps, spot: np.ndarray, by: Family, nodes: np.ndarray) -> LayoutInFrame:
     """The places ``nodes`` (N,) of a lattice in a labelled frame."""
-    places = seen_places(by.lattice, by.around, spots.px, spot, spots.size_px)[nodes]
-    return _told(spots, spot[nodes], places)
+    places = locate_places(by.lattice, by.around, spots.px, spot, spots.size_px)[nodes]
+    return _make_layout_result(spots, spot[nodes], places)
 
 
-def _told(spots: Bumps, spot: np.ndarray, places: np.ndarray) -> Seen:
+def _make_layout_result(spots: Bumps, spot: np.ndarray, places: np.ndarray) -> LayoutInFrame:
     """Result for a frame, from the spot (N,) of each pin, -1 for no spot, and the pins' positions (N, 2), px."""
     there, taken = spot >= 0, spot[spot >= 0]
     others = np.setdiff1d(np.arange(len(spots.px)), taken)
@@ -420,12 +420,12 @@ def _told(spots: Bumps, spot: np.ndarray, places: np.ndarray) -> Seen:
         high = spots.response[others] > LIKE_ITS_NEIGHBOURS * np.median(spots.response[taken][nearest], axis=1)
         left_over = others[near & high]
     not_seen = int((in_view(places, spots) & ~there).sum())
-    return Seen(np.where(there[:, None], places, np.nan), places, not_seen, spots.px[left_over])
+    return LayoutInFrame(np.where(there[:, None], places, np.nan), places, not_seen, spots.px[left_over])
 
 
-def _first_guesses(by: Family, spots: list[Bumps]) -> list[tuple[PinsSpec, list[Seen]]]:
+def _first_guesses(by: Family, spots: list[Bumps]) -> list[tuple[PinsSpec, list[LayoutInFrame]]]:
     """The two layouts of one family that explain most if each frame is labelled by itself."""
-    votes: dict[PinsSpec, list[Seen]] = {}
+    votes: dict[PinsSpec, list[LayoutInFrame]] = {}
     for one in spots:
         spot = label_spots(one, by)
         if spot is not None and (part := _part(by, one, spot)) is not None:
@@ -433,10 +433,10 @@ def _first_guesses(by: Family, spots: list[Bumps]) -> list[tuple[PinsSpec, list[
     return sorted(votes.items(), key=lambda vote: -sum(seen.explained for seen in vote[1]))[:2]
 
 
-def _part(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[PinsSpec, Seen] | None:
+def _part(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[PinsSpec, LayoutInFrame] | None:
     """The part of a lattice in a frame: the layout, and its pins in the frame."""
     part = by.kind.seen(spot >= 0, _family_in_view(by, spots, spot)) if by.kind else None
-    return None if part is None else (_named(part[0]), _seen(spots, spot, by, part[1]))
+    return None if part is None else (_named(part[0]), _place_lattice(spots, spot, by, part[1]))
 
 
 def _named(shape: LatticeLayout) -> PinsSpec:
@@ -445,28 +445,28 @@ def _named(shape: LatticeLayout) -> PinsSpec:
     return PinsSpec.model_validate({"layout": name, **shape.model_dump()})
 
 
-def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> Seen | None:
+def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> LayoutInFrame | None:
     """A given layout of a family in a labelled frame, at the position with most labels; None if the lattice is too small for it."""
     shape = pins.shape
     if by.kind is None or not isinstance(shape, LatticeLayout):
-        return _seen(spots, spot, by, np.arange(len(by.lattice)))
+        return _place_lattice(spots, spot, by, np.arange(len(by.lattice)))
     nodes = shape.at_most_labels(spot >= 0)
-    return None if nodes is None else _seen(spots, spot, by, np.delete(nodes, list(pins.missing)))
+    return None if nodes is None else _place_lattice(spots, spot, by, np.delete(nodes, list(pins.missing)))
 
 
 def _family_in_view(by: Family, spots: Bumps, spot: np.ndarray) -> np.ndarray:
     """(M,) bool: whether each place of a lattice is in view. A place without a prediction counts as not in view."""
-    return in_view(seen_places(by.lattice, by.around, spots.px, spot, spots.size_px), spots)
+    return in_view(locate_places(by.lattice, by.around, spots.px, spot, spots.size_px), spots)
 
 
-def _candidate(pins: PinsSpec, seen: list[Seen], spots: list[Bumps], *, may_miss: bool = True) -> Candidate:
+def _candidate(pins: PinsSpec, seen: list[LayoutInFrame], spots: list[Bumps], *, may_miss: bool = True) -> Candidate:
     """Match a layout to all frames. The start is ``seen``: the layout in those frames in which it was found without the others."""
     rest = _rest(pins, _turned_alike(pins, seen))
-    again = [_matched(pins, rest, one) for one in spots]
+    again = [_match_known(pins, rest, one) for one in spots]
     good = [k for k, one in enumerate(again) if one.explained > LEAST_EXPLAINED]
     if good:
         rest = _at_likelier_spots(pins, _rest(pins, [again[k] for k in good]), [again[k] for k in good])
-        again = [_matched(pins, rest, one) for one in spots]
+        again = [_match_known(pins, rest, one) for one in spots]
     there = np.mean([np.isfinite(one.pins_px[:, 0]) for one in again], axis=0)
     shown = np.mean([in_view(one.places_px, a) for one, a in zip(again, spots, strict=True)], axis=0) > STEADY
     never = np.flatnonzero((there < NEVER_SEEN) & shown)
@@ -488,7 +488,7 @@ def _candidate(pins: PinsSpec, seen: list[Seen], spots: list[Bumps], *, may_miss
     )
 
 
-def _rest(pins: PinsSpec, seen: list[Seen]) -> np.ndarray:
+def _rest(pins: PinsSpec, seen: list[LayoutInFrame]) -> np.ndarray:
     """Median positions (N, 2), px, of the pins. A pin that is seen in too few frames gets its predicted or smooth-view position."""
     pins_px, places = np.stack([one.pins_px for one in seen]), np.stack([one.places_px for one in seen])
     rest = np.full(places.shape[1:], np.nan)
@@ -498,7 +498,7 @@ def _rest(pins: PinsSpec, seen: list[Seen]) -> np.ndarray:
     return np.where(np.isfinite(rest), rest, smooth_view(pin_lattice(pins).places, rest))
 
 
-def _at_likelier_spots(pins: PinsSpec, rest_px: np.ndarray, seen: Sequence[Seen]) -> np.ndarray:
+def _at_likelier_spots(pins: PinsSpec, rest_px: np.ndarray, seen: Sequence[LayoutInFrame]) -> np.ndarray:
     """Pins at rest (N, 2), px, in which one that is far from a smooth view of the others is at an unnamed spot that fits this view.
 
     Growth by local affine maps may take a spot beside the sensor for a corner pin, where the view is strongly curved.
@@ -522,7 +522,7 @@ def _at_likelier_spots(pins: PinsSpec, rest_px: np.ndarray, seen: Sequence[Seen]
     return moved
 
 
-def unnamed_spots(rest_px: np.ndarray, seen: Sequence[Seen]) -> list[np.ndarray]:
+def unnamed_spots(rest_px: np.ndarray, seen: Sequence[LayoutInFrame]) -> list[np.ndarray]:
     """Places (2,) px of spots near pins at rest (N, 2), and as bright, that are none of them, in most frames."""
     within, frames = usual_spacing(rest_px) / 2, [one.left_over_px for one in seen]
     places: list[np.ndarray] = []
@@ -535,13 +535,13 @@ def unnamed_spots(rest_px: np.ndarray, seen: Sequence[Seen]) -> list[np.ndarray]
     return places
 
 
-def _matched(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps) -> Seen:
+def _match_known(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps) -> LayoutInFrame:
     """Match a layout with known pins at rest (N, 2), px, to a frame's spots."""
     if not spread_out(rest_px) or together(rest_px).any():
-        return _told(spots, np.full(pins.count, -1), rest_px)
+        return _make_layout_result(spots, np.full(pins.count, -1), rest_px)
     found = match(make_reference(rest_px, pins), spots.px, np.ones(len(spots.px)))
     places = np.where((found.blob >= 0)[:, None], spots.px[found.blob] if len(spots.px) else np.nan, found.predicted_px)
-    return _told(spots, found.blob, np.where(np.isfinite(places), places, rest_px))
+    return _make_layout_result(spots, found.blob, np.where(np.isfinite(places), places, rest_px))
 
 
 def symmetries(pins: PinsSpec) -> list[np.ndarray]:
@@ -556,7 +556,7 @@ def _map(pins: PinsSpec, order: np.ndarray) -> np.ndarray:
     return found
 
 
-def _turned_alike(pins: PinsSpec, seen: list[Seen]) -> list[Seen]:
+def _turned_alike(pins: PinsSpec, seen: list[LayoutInFrame]) -> list[LayoutInFrame]:
     """The frames' results with consistent labels: a symmetric layout may be labelled in several turns, so each frame gets the turn of the
     frame that the layout explains best."""
     orders = symmetries(pins)

@@ -159,14 +159,14 @@ class LegacyPipeline:
     Raises
     ------
     FrameError
-        The sensor has no recording form.
+        The sensor has no processed form.
     """
 
     def __init__(self, pins: PinsSpec, recording: RecordingSpec | None, *, polarity: Polarity = "bright") -> None:
         if polarity == "dark":
             raise FrameError("the published method finds bright pins only, and the sensor's are dark (polarity); use another method")
         if recording is None:
-            raise FrameError("the published method takes recordings, and the sensor has no recording form ([recording])")
+            raise FrameError("the published method takes recordings, and the sensor has no processed form ([recording])")
         self.count = pins.count
         self.parameters = legacy_parameters(pins.layout)
         self.size_px = recording.width_px, recording.height_px

@@ -7,7 +7,7 @@ predictions. The start that explains most blobs is used.
 
 One wrong labelling is nearly as smooth as the true one: each ring of pins is shifted along itself by one pin. Ring i has 6 i pins, so it
 is turned by 60 / i degrees, and only the innermost rings, which turn most, are inconsistent. Therefore each labelling is unwound before
-it is judged: its rings are shifted back by the number of pins with which the turns of all rings are most similar.
+it is evaluated: its rings are shifted back by the number of pins with which the turns of all rings are most similar.
 
 Where contacts squeeze and stretch the layout so far that the grown labelling does not prove itself, all pins drift to the blobs at once
 (`twin.geometry.drift`). A labelling proves itself if no triangle of the layout is turned over, and no pin or no blob is left over.
@@ -267,7 +267,7 @@ def _grown(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         count = int((labels >= 0).sum())
         if count >= NEARLY_ALL * n or (count >= NEARLY_ALL**2 * len(px) and count > MIN_SETTLED * n):
             found = _refine(layout, px, area_px2, labels, buckets, cell)
-            away = _displaced(reference, px, found.blob)
+            away = _rim_displacement(reference, px, found.blob)
             settled = found.score >= SETTLED * count and (count >= NEARLY_ALL * n or away < NEAR_REST)
             if settled or (away < HARDLY_MOVED and (found.blob >= 0).sum() == len(px) == n and proven(reference, px, found.blob)):
                 best = found
@@ -287,7 +287,7 @@ def _leading(reference: Reference, px: np.ndarray, refined: list[Match]) -> Matc
     They are compared by their scores, less a cost of the rim's displacement: a contact hardly moves the rim, because it is clamped.
     """
     cost = DISPLACED_COST * np.sqrt(len(reference.pins_px))
-    worth = [one.score - cost * _displaced(reference, px, one.blob) for one in refined]
+    worth = [one.score - cost * _rim_displacement(reference, px, one.blob) for one in refined]
     first = int(np.argmax(worth))
     best, paired = refined[first], refined[first].blob >= 0
     same = SAME_LABELLING * paired.sum()
@@ -295,7 +295,7 @@ def _leading(reference: Reference, px: np.ndarray, refined: list[Match]) -> Matc
     return replace(best, lead=worth[first] - max(others, default=-np.inf))
 
 
-def _displaced(reference: Reference, px: np.ndarray, blob: np.ndarray) -> float:
+def _rim_displacement(reference: Reference, px: np.ndarray, blob: np.ndarray) -> float:
     """Displacement of the rim from its place at rest by a labelling ``blob`` (N,): median over the rim's pins, in spacings."""
     rim = reference.outmost[blob[reference.outmost] >= 0]
     if not len(rim):

@@ -109,7 +109,7 @@ def _function(path: Path, name: str, digest: str) -> Callable[[np.ndarray], Any]
     try:
         described.loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        raise OptionError(f"{path}: ended with {type(error).__name__}: {error}; mend it, and try 'python {path.name}'") from error
+        raise OptionError(f"{path}: ended with {type(error).__name__}: {error}; repair it, and try 'python {path.name}'") from error
     function = getattr(module, name, None)
     if not callable(function):
         there = [key for key, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__ and callable(value)]

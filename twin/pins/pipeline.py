@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
 from twin.frames.forms import blob_spec, form_named, frame_size, levels_at, pin_levels
-from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, find_spots, own_threshold
+from twin.pins.blobs import Blobs, Mask, circular_mask, despeckle, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
-from twin.pins.identify import SHOWN, judge_layout
+from twin.pins.identify import SHOWN, score_layout
 from twin.pins.matching import Match, complete, confirm, look_again, match, proven, rematch
 from twin.pins.reference import Reference, folded_fraction, make_reference, nominal_reference
 from twin.pins.rest import require_even
@@ -149,7 +149,7 @@ class Pipeline:
                 "ambiguous pins: two ways to name them, a row apart, explain the frame nearly alike; press or shear less, uncover "
                 "hidden pins, and hide what looks like pins beside them"
             )
-        if not reason and (unnamed := self._unnamed(blobs, found, nodes_px)) >= LEAST_UNNAMED <= lost:
+        if not reason and (unnamed := self._count_unnamed(blobs, found, nodes_px)) >= LEAST_UNNAMED <= lost:
             reason = (
                 f"ambiguous pins: {unnamed} blobs continue the rows of pins, and {lost} pins are lost: the picture is torn, or part is "
                 "named a row apart; grab the frame again, or hide what looks like pins"
@@ -217,7 +217,7 @@ class Pipeline:
     def _window(self, frame: Frame, mask: Mask) -> np.ndarray:
         """Gray levels (h, w) of the mask's window. For an adaptive threshold hot and dead pixels are removed."""
         window = self._levels(frame.image[mask.window])
-        return despeckled(window) if self.blob_spec.threshold_block_px else window
+        return despeckle(window) if self.blob_spec.threshold_block_px else window
 
     def _levels(self, image: np.ndarray) -> np.ndarray:
         """Gray levels (h, w) of an image or a part of it, in which the pins are bright."""
@@ -287,7 +287,7 @@ class Pipeline:
             "of fewer pins: run 'twin tune' on these frames, or 'twin new'"
         )
 
-    def _unnamed(self, blobs: Blobs, found: Match, nodes_px: np.ndarray) -> int:
+    def _count_unnamed(self, blobs: Blobs, found: Match, nodes_px: np.ndarray) -> int:
         """Number of blobs of a cap's size that are no pins, but stand where the rows of pins go on, if pins are lost.
 
         ``nodes_px`` (N, 2) are the pins. A row goes on as far from a pin as one of its neighbours is, on the other side.
@@ -394,7 +394,7 @@ def measure_reference(spec: SensorSpec, form: Form, frame: Frame, *, known: Refe
         except FrameError as error:
             refused = error
     levels = pin_levels(frame.image, blob_spec(spec.pipeline, form).polarity)
-    shown = judge_layout(spec.pins, [levels])  # it names the pins without known places
+    shown = score_layout(spec.pins, [levels])  # it names the pins without known places
     if shown is not None and shown.explained >= SHOWN:
         other = view_of(shown.seen[0].pins_px, expected, spec.pins, modes)
         if not other.pressed:

@@ -95,7 +95,7 @@ def make_reference(pins_px: np.ndarray, pins: PinsSpec) -> Reference:
     pins_px = np.ascontiguousarray(pins_px, float)
     if not spread_out(pins_px):
         raise FrameError(
-            "the pins at rest lie in one place, on a line or far off any frame; mend [camera] and [pins] of the sensor's specification, "
+            "the pins at rest lie in one place, on a line or far off any frame; repair [camera] and [pins] of the sensor's specification, "
             "or pins_px of the tuned file"
         )
     n = len(pins_px)
@@ -103,7 +103,7 @@ def make_reference(pins_px: np.ndarray, pins: PinsSpec) -> Reference:
     if distance[:, 1].min() == 0:
         one, other = index[distance[:, 1].argmin(), :2]
         raise FrameError(
-            f"pins {one} and {other} are at the same place at rest; mend rest_px of the specification, or pins_px of the tuned file"
+            f"pins {one} and {other} are at the same place at rest; repair rest_px of the specification, or pins_px of the tuned file"
         )
     triangles = Delaunay(pins_px).simplices.astype(np.int64)
     area = _double_areas(pins_px, triangles)
@@ -121,15 +121,15 @@ def nominal_reference(spec: SensorSpec, form: Form) -> Reference:
     Raises
     ------
     FrameError
-        The sensor has no recording form, or there is no such form.
+        The sensor has no processed form, or there is no such form.
     """
     blob = spec.pipeline.raw if form_named(form) == Form.RAW else spec.pipeline.recording
     if blob is not None and blob.rest_px:
         return make_reference(np.array(blob.rest_px), spec.pins)
-    return make_reference(seen_at_rest(spec, form), spec.pins)
+    return make_reference(project_rest(spec, form), spec.pins)
 
 
-def seen_at_rest(spec: SensorSpec, form: Form) -> np.ndarray:
+def project_rest(spec: SensorSpec, form: Form) -> np.ndarray:
     """Places (N, 2) in px at which the specification's camera sees its caps at rest."""
     return from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm))
 

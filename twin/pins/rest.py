@@ -8,7 +8,7 @@ import numpy as np
 from scenes.pins import PinsSpec
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
-from twin.pins.identify import SHOWN, Candidate, judge_layout, symmetries, unevenness
+from twin.pins.identify import SHOWN, Candidate, score_layout, symmetries, unevenness
 from twin.pins.view import MOST_UNEVEN, uneven_dent
 
 STILL = 0.035
@@ -54,7 +54,7 @@ class Rest:
         if self.source == "given":
             return f"no contact: {self.frame}"
         if self.source == "found":
-            return f"no contact: no frame is named as such; {self.frame} shows no contact as far as its pins tell"
+            return f"no contact: no frame is named as such; {self.frame} shows no contact as far as its pins show"
         return (
             "no contact: no frame shows it. The pins' rest places were made from contacts; expect errors of a tenth of a spacing or so. "
             "Record one frame without contact and give it with `no_contact`"
@@ -70,7 +70,7 @@ def rest_of(layout: Candidate, names: list[str], given: np.ndarray | None = None
         The given frame does not show the layout, or shows a contact.
     """
     if given is not None:
-        shown = judge_layout(layout.pins, [given])
+        shown = score_layout(layout.pins, [given])
         if shown is None or shown.explained < SHOWN:
             raise FrameError(
                 f"{given_name}: no use as no-contact frame, it does not show {layout.pins.in_words()} as the other frames do; "

@@ -9,12 +9,12 @@ import numpy as np
 from scenes.pins import PinsSpec
 from scenes.sensor import BlobSpec, Polarity, RecordingSpec, SensorSpec
 from twin.errors import FrameError
-from twin.frames import spread
+from twin.frames import spread_indices
 from twin.frames.forms import pin_levels, polarity_of
 from twin.geometry.pins import pin_lattice
 from twin.pins.detector import Found, make_detector
 from twin.pins.detector_spec import DetectorSpec, Evidence, Method, with_detector
-from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, Identified, identify, judge_layout, smooth_view, symmetries
+from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, Identified, identify, score_layout, smooth_view, symmetries
 from twin.pins.legacy import legacy_parameters
 from twin.pins.reference import Reference, make_reference, nominal_reference, together
 from twin.pins.rest import Rest, rest_of
@@ -125,13 +125,13 @@ def tune(
     FrameError
         No frame shows the layout, or the given frame without contact does not.
     """
-    chosen = spread(len(frames), TUNED_ON)
+    chosen = spread_indices(len(frames), TUNED_ON)
     frames = [frames[k] for k in chosen]
     form = frames[0].form
     polarity = polarity_of(sensor.pipeline, form)
     images = [pin_levels(frame.image, polarity) for frame in frames]
     doubts: list[str] = []
-    layout = judge_layout(sensor.pins, images) if known is None else replace(known, seen=tuple(known.seen[k] for k in chosen))
+    layout = score_layout(sensor.pins, images) if known is None else replace(known, seen=tuple(known.seen[k] for k in chosen))
     if layout is None or layout.explained < LEAST_SHOWN:
         raise FrameError(
             f"none of {len(frames)} frames shows {sensor.pins.in_words()}{_shown_instead(images)}; "
@@ -146,7 +146,7 @@ def tune(
         rest = rest_of(layout, [f.name for f in frames], given_levels, given.name if given else "")
         if given is not None:
             view = view_of(rest.pins_px, nominal_reference(sensor, form), sensor.pins, camera_modes(sensor, form))
-            if not view.displacements():  # else the specification is of another camera, and its places tell nothing
+            if not view.displacements():  # else the specification is of another camera, and its places carry no information
                 view.require_unpressed(given.name, sensor)
     reference = make_reference(turned_as(sensor.pins, layout.rest_px), sensor.pins)
     caps = [caps_in(image, seen.pins_px, reference.spacing_px) for image, seen in zip(images, layout.seen, strict=True)]

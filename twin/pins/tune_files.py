@@ -12,14 +12,14 @@ from twin.pins.pipeline import Pipeline
 from twin.pins.tune import Tuned, tune
 from twin.progress import Progress, silent, stage
 from twin.store import writes_file
-from twin.types import Form, Frame, Readable
+from twin.types import Form, Frame, ReadableResult
 
 # Most frames that are used if no other number is given.
 LIMIT = 12
 
 
 @dataclass(frozen=True, repr=False)
-class TunedOnFrames(Readable):
+class TunedOnFrames(ReadableResult):
     """The result of a tuning on a user's frames.
 
     Attributes

@@ -50,7 +50,7 @@ TILT_DEG, NEARER, CURVED = 0.3, 0.01, 0.01
 
 
 @dataclass(frozen=True)
-class View:
+class PinView:
     """The affine map from known places of the pins to present ones, and what it leaves.
 
     Attributes
@@ -139,7 +139,7 @@ class View:
         found += [f"zoomed by {zoom:+.1%}"] if abs(zoom) > (MOST_ZOOM_PRESSED if contacts else MOST_ZOOM) else []
         return found + ([f"shifted by {shift:.1f} spacings of the pins"] if shift > MOST_SHIFT else [])
 
-    def undecided(self) -> str:
+    def describe_ambiguity(self) -> str:
         """What can't be seen of the view, and what decides; "" if the view is sure."""
         return "" if self.sure else UNDECIDED
 
@@ -175,14 +175,14 @@ def camera_modes(spec: SensorSpec, form: Form) -> np.ndarray:
     caps_mm, view = rest_pins(spec.geometry).caps_mm, spec.view
     steps = {"tilt_x_deg": TILT_DEG, "tilt_y_deg": TILT_DEG, "distance_mm": NEARER * view.camera.distance_mm, "k1": CURVED}
 
-    def seen(**added: float) -> np.ndarray:
+    def project_with(**added: float) -> np.ndarray:
         camera = view.camera.model_copy(update={key: getattr(view.camera, key) + by for key, by in added.items()})
         return from_raw(spec.recording, form, project(view.model_copy(update={"camera": camera}), caps_mm))
 
-    return np.stack([seen(**{key: by}) for key, by in steps.items()]) - seen()
+    return np.stack([project_with(**{key: by}) for key, by in steps.items()]) - project_with()
 
 
-def view_of(pins_px: np.ndarray, known: Reference, pins: PinsSpec, modes: np.ndarray | None = None) -> View:
+def view_of(pins_px: np.ndarray, known: Reference, pins: PinsSpec, modes: np.ndarray | None = None) -> PinView:
     """The view of pins (N, 2), px, NaN where lost, whose known places are ``known``; ``modes`` as by ``camera_modes``.
 
     If no naming is sure, it is the one with the smallest turn, and without a mirror.
@@ -194,7 +194,7 @@ def view_of(pins_px: np.ndarray, known: Reference, pins: PinsSpec, modes: np.nda
     return replace(chosen, sure=sure, same=chosen.left < SAME_LEFT or (sure and len(tried) > 1))
 
 
-def views_of(pins_px: np.ndarray, known: Reference, pins: PinsSpec, modes: np.ndarray | None = None) -> list[View]:
+def views_of(pins_px: np.ndarray, known: Reference, pins: PinsSpec, modes: np.ndarray | None = None) -> list[PinView]:
     """The views by all namings of the layout, none of them sure; parameters as for ``view_of``."""
     spacing, middle = float(known.spacing_px.mean()), known.pins_px.mean(axis=0)
     place = (known.pins_px - middle) / spacing
@@ -216,7 +216,7 @@ def views_of(pins_px: np.ndarray, known: Reference, pins: PinsSpec, modes: np.nd
         alone = (away - _mean(away[nearest[:, 1 : ALONE + 1]]))[seen]
         left = float(np.sqrt(np.mean(np.sum(alone**2, axis=1)) * ALONE / (ALONE + 1)))
         dent, unlike = (float(np.linalg.norm(_mean(each[nearest]), axis=1).max()) for each in (away, still))
-        found.append(View(carry[0] - middle, carry[1:].T / spacing, left, dent, unlike, spacing, order))
+        found.append(PinView(carry[0] - middle, carry[1:].T / spacing, left, dent, unlike, spacing, order))
     return found
 
 

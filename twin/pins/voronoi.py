@@ -93,7 +93,7 @@ def polygon_area(polygon: np.ndarray, count: int) -> float:
 
 
 @compiled()
-def _cut(polygon: np.ndarray, count: int, a: float, b: float, c: float, out: np.ndarray) -> int:
+def _clip_half_plane(polygon: np.ndarray, count: int, a: float, b: float, c: float, out: np.ndarray) -> int:
     """The part of a polygon with a x + b y <= c (Sutherland and Hodgman 1974); returns its vertex count."""
     kept = 0
     px, py = polygon[count - 1, 0], polygon[count - 1, 1]
@@ -123,7 +123,7 @@ def _cell(
         j = neighbours[e]
         a, b = nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1]
         c = 0.5 * (nodes[j, 0] ** 2 + nodes[j, 1] ** 2 - nodes[i, 0] ** 2 - nodes[i, 1] ** 2)
-        count = _cut(here, count, a, b, c, there)
+        count = _clip_half_plane(here, count, a, b, c, there)
         here, there = there, here
         if count == 0:
             break

@@ -5,7 +5,7 @@ being made.
 """
 
 from twin.records.convert import ALSO, FORMATS, Converted, KeptAlso, convert, open_records, open_writer, with_pins
-from twin.records.record import CHANNELS, About, Episode, RecordError, Records, Step
+from twin.records.record import CHANNELS, About, Episode, RecordError, Records, RecordStep
 
 __all__ = [
     "ALSO",
@@ -17,7 +17,7 @@ __all__ = [
     "KeptAlso",
     "RecordError",
     "Records",
-    "Step",
+    "RecordStep",
     "convert",
     "open_records",
     "open_writer",

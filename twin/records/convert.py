@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes import SensorSpec, SpecError, load_sensor
-from scenes.files import LONGEST_PATH, shown
+from scenes.files import LONGEST_PATH, quote
 from twin.errors import FrameError, warn_once
 from twin.frames.forms import frame_size, times
 from twin.frames.lerobot import RESTS
@@ -18,12 +18,12 @@ from twin.progress import Progress, silent, stage
 from twin.records.folder import HELD_STEPS, SIDECAR, FolderWriter, format_of
 from twin.records.huggingface import HuggingFaceWriter, huggingface_records
 from twin.records.lerobot import DATA_MB, INFO, LeRobotWriter, lerobot_records
-from twin.records.record import About, Episode, RecordError, Records, Step, library
+from twin.records.record import About, Episode, RecordError, Records, RecordStep, library
 from twin.records.recording import RecordingWriter, recording_records
 from twin.records.ros2 import Ros2Writer, ros2_records
 from twin.records.session import is_session, session_records
 from twin.store import writes
-from twin.types import Frame, Readable
+from twin.types import Frame, ReadableResult
 
 READERS: dict[str, Callable[[Path], Records]] = {
     RecordingWriter.FORMAT: recording_records,
@@ -52,7 +52,7 @@ def open_records(path: str | Path) -> Records:
     """
     path = Path(path)
     if not path.exists():
-        raise RecordError(f"{shown(path, LONGEST_PATH)}: no such file or folder; give a recording, a session or a translated record")
+        raise RecordError(f"{quote(path, LONGEST_PATH)}: no such file or folder; give a recording, a session or a translated record")
     if path.suffix == ".mcap":
         return ros2_records(path)
     if path.is_dir():
@@ -60,7 +60,7 @@ def open_records(path: str | Path) -> Records:
             return session_records(path)
         if told := format_of(path):
             if told not in READERS:
-                raise RecordError(f"{path}: of the unknown format {shown(told)}; read it with the program that wrote it")
+                raise RecordError(f"{path}: of the unknown format {quote(told)}; read it with the program that wrote it")
             return READERS[told](path)
         if (path / INFO).is_file():
             return lerobot_records(path)
@@ -97,7 +97,7 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
         raise FrameError(f"{got}, those of {spec.name} are {times(expected)}; give the matching `sensor`, or another recording or session")
     numbers = {"pins": 2 * spec.pins.count, **records.about.numbers}
     about = replace(records.about, sensor=spec.name, numbers=numbers)
-    found = [replace(episode, steps=partial(_seen, episode, about, spec)) for episode in records.episodes]
+    found = [replace(episode, steps=partial(_translated_steps, episode, about, spec)) for episode in records.episodes]
     return Records(about, found, records.notes)
 
 
@@ -112,7 +112,7 @@ def _require_pins_of(spec: SensorSpec, about: About) -> None:
     raise FrameError(f"{told}; leave `sensor` out, or give the matching one")
 
 
-def _seen(episode: Episode, about: About, spec: SensorSpec) -> Iterator[Step]:
+def _translated_steps(episode: Episode, about: About, spec: SensorSpec) -> Iterator[RecordStep]:
     reference = None
     if episode.rest is not None:
         reference = measure_reference(spec, about.form, Frame(episode.rest, about.form, "the picture without contact"))
@@ -140,7 +140,7 @@ def open_writer(folder: Path, to: str, about: About, rate_hz: int, *, video: boo
         There is no such format, or the format has no videos.
     """
     if to not in FORMATS:
-        raise RecordError(f"no format {shown(to)}; there are {', '.join(FORMATS)}")
+        raise RecordError(f"no format {quote(to)}; there are {', '.join(FORMATS)}")
     if video and to != LeRobotWriter.FORMAT:
         raise RecordError(f"`video` goes with the format {LeRobotWriter.FORMAT}; {to} keeps every picture as it is")
     if to == LeRobotWriter.FORMAT:
@@ -152,7 +152,7 @@ def open_writer(folder: Path, to: str, about: About, rate_hz: int, *, video: boo
 
 
 @dataclass(frozen=True, repr=False)
-class Converted(Readable):
+class Converted(ReadableResult):
     """The result of ``convert``.
 
     Attributes
@@ -224,7 +224,7 @@ def convert(
         The folder can't be written to, or another run uses it.
     """
     out = Path(out)
-    opened = [with_pins(open_records(source), sensor).named(task) for source in sources]
+    opened = [with_pins(open_records(source), sensor).with_task(task) for source in sources]
     if not any(records.episodes for records in opened):
         named = ", ".join(map(str, sources[:3])) or "nothing was given"
         raise RecordError(f"{named}: no finished episode to translate; give a recording, a session or a translated record")
@@ -276,7 +276,7 @@ class KeptAlso:
         self.folder, self.formats, self.sensor, self.at_once = folder, tuple(dict.fromkeys(formats)), sensor, at_once
         for name in self.formats:
             if name not in ALSO:
-                raise RecordError(f"no format {shown(name)} to keep the record in, too; there are {', '.join(ALSO)}")
+                raise RecordError(f"no format {quote(name)} to keep the record in, too; there are {', '.join(ALSO)}")
             for needed in WRITERS[name].LIBRARIES:
                 library(needed)
         self._writers: list[FolderWriter] = []

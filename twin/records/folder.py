@@ -16,11 +16,11 @@ from typing import Any, ClassVar, Self
 import cv2
 import numpy as np
 
-from scenes.files import read_regular, shown
+from scenes.files import quote, read_regular
 from twin.errors import FrameError
 from twin.frames.images import read_image
 from twin.frames.lerobot import RESTS
-from twin.records.record import About, Episode, RecordError, Records, Step, digest, library
+from twin.records.record import About, Episode, RecordError, Records, RecordStep, digest, library
 from twin.store import contents, output, write_bytes, write_json
 from twin.types import ImageArray
 
@@ -76,7 +76,7 @@ class FolderWriter(ABC):
             held.enter_context(output(self.folder, gone_on=(SIDECAR, RESTS, *self.NAMES)))
             if fresh:
                 self._begin()
-                write_json(self.folder / SIDECAR, self._said())
+                write_json(self.folder / SIDECAR, self._metadata())
             else:
                 self._go_on()
             self._held = held.pop_all()
@@ -110,7 +110,7 @@ class FolderWriter(ABC):
         for name in self.FOLDERS:
             (self.folder / name).mkdir(exist_ok=True)
 
-    def _said(self) -> dict[str, Any]:
+    def _metadata(self) -> dict[str, Any]:
         return {"format": self.FORMAT, "version": VERSION, "rate_hz": self.rate_hz, "about": self.about.plain()}
 
     def _go_on(self) -> None:
@@ -133,7 +133,7 @@ class FolderWriter(ABC):
             write_bytes(self.folder / RESTS / name, data)
         return name
 
-    def _require_fitting(self, episode: Episode, step: Step) -> None:
+    def _require_fitting(self, episode: Episode, step: RecordStep) -> None:
         """Raise ``RecordError`` if a step does not agree with ``about``, or its time is not a valid number."""
         if not 0.0 <= step.time_s < float("inf"):
             raise RecordError(f"{episode.key}: a picture {step.time_s} s after its first; look at its times, or record it again")
@@ -227,7 +227,7 @@ def records_in(folder: Path, form: str, facts: Sequence[dict[str, Any]], steps_o
     return Records(about, [episode_of(folder, each, steps) for each, steps in zip(facts, whole, strict=True)])
 
 
-def whole_steps(path: Path, facts: dict[str, Any], steps: Callable[[], Iterator[Step]]) -> Iterator[Step]:
+def whole_steps(path: Path, facts: dict[str, Any], steps: Callable[[], Iterator[RecordStep]]) -> Iterator[RecordStep]:
     """The steps of an episode.
 
     Raises
@@ -240,7 +240,7 @@ def whole_steps(path: Path, facts: dict[str, Any], steps: Callable[[], Iterator[
         count += 1
         yield step
     if count != facts["length"]:
-        raise RecordError(f"{path}: damaged, {count} of {facts['length']} steps of {shown(facts['key'])} are there; {AGAIN}")
+        raise RecordError(f"{path}: damaged, {count} of {facts['length']} steps of {quote(facts['key'])} are there; {AGAIN}")
 
 
 def png(image: ImageArray) -> bytes:

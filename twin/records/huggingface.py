@@ -18,7 +18,7 @@ from twin.errors import FrameError
 from twin.frames.images import read_image, write_image
 from twin.frames.tables import base_name
 from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, read_facts, records_in, require_numbered
-from twin.records.record import CHANNELS, TIME, About, Episode, RecordError, Records, Step, library
+from twin.records.record import CHANNELS, TIME, About, Episode, RecordError, Records, RecordStep, library
 from twin.store import remove_parts, replace_folder, write_json, write_text, write_with
 from twin.store.atomic import PART
 
@@ -69,7 +69,7 @@ class HuggingFaceWriter(FolderWriter):
     def _find(self) -> list[dict[str, Any]]:
         self._begin()
         remove_parts(self.folder / DATA)
-        listed = _listed(self.folder)
+        listed = _list_files(self.folder)
         self._next = len(listed)
         return [facts for _, facts in _facts_in(self.folder)]
 
@@ -94,7 +94,7 @@ class HuggingFaceWriter(FolderWriter):
             yield self._commit(part, group, lines)
         remove_parts(self.folder / DATA)
 
-    def _line(self, name: str, episode: int, number: int, whole: Episode, step: Step) -> dict[str, Any]:
+    def _line(self, name: str, episode: int, number: int, whole: Episode, step: RecordStep) -> dict[str, Any]:
         """One row of the metadata. Every row has the same keys, as the reader requires."""
         numbers = {CHANNELS[key].column: step.values[key].tolist() for key in self.about.numbers}
         head = {"file_name": name, "episode_index": episode, "frame_index": number, "task": whole.task}
@@ -129,7 +129,7 @@ def _reader(folder: Path, found: list[tuple[str, dict[str, Any]]], about: About,
     return partial(_steps_of, folder / DATA / found[index][0], about, index)
 
 
-def _steps_of(folder: Path, about: About, index: int) -> Iterator[Step]:
+def _steps_of(folder: Path, about: About, index: int) -> Iterator[RecordStep]:
     try:
         for line in (
             library("pyarrow.parquet").read_table(folder / METADATA, partitioning=None, page_checksum_verification=True).to_pylist()
@@ -137,12 +137,12 @@ def _steps_of(folder: Path, about: About, index: int) -> Iterator[Step]:
             if line["episode_index"] != index:
                 continue
             values = {name: np.array(line[CHANNELS[name].column], np.float32).reshape(about.shape(name)) for name in about.numbers}
-            yield Step(read_image(folder / base_name(line["file_name"]))[0], float(line[TIME]), values)
+            yield RecordStep(read_image(folder / base_name(line["file_name"]))[0], float(line[TIME]), values)
     except (OSError, KeyError, ValueError, TypeError, AttributeError, FrameError, library("pyarrow").ArrowException) as error:
         raise RecordError(f"{folder}: damaged ({error}); {AGAIN}") from error
 
 
-def _listed(folder: Path) -> list[Path]:
+def _list_files(folder: Path) -> list[Path]:
     """Files that list the episodes, in their order.
 
     Raises
@@ -157,4 +157,4 @@ def _listed(folder: Path) -> list[Path]:
 
 def _facts_in(folder: Path) -> list[tuple[str, dict[str, Any]]]:
     """Folder and facts of each episode."""
-    return [(path.stem, facts) for path in _listed(folder) for facts in read_facts(path)]
+    return [(path.stem, facts) for path in _list_files(folder) for facts in read_facts(path)]

@@ -2,7 +2,7 @@
 
 Each file appears under its name only when it is complete, and ``meta/info.json`` counts an episode only after its files. Therefore the data
 set is readable after any interruption, up to its last finished episode. As LeRobot requires, ``timestamp`` is the frame's number divided by
-the whole number of frames per second. The true times are in ``observation.time_s``; a note tells where the two differ by more than half a
+the whole number of frames per second. The true times are in ``observation.time_s``; a note states where the two differ by more than half a
 frame. In addition to LeRobot's columns, the table of episodes has ``tactip/facts``.
 """
 
@@ -21,7 +21,7 @@ from twin.errors import FrameError
 from twin.frames import open_recording
 from twin.frames.videos import describe_pauses
 from twin.records.folder import AGAIN, FolderWriter, image_of, png, read_json, read_sidecar, records_in
-from twin.records.record import CHANNELS, IMAGE, TIME, About, Episode, RecordError, Records, Step, library, off_s
+from twin.records.record import CHANNELS, IMAGE, TIME, About, Episode, RecordError, Records, RecordStep, library, off_s
 from twin.store import write_json, write_text, write_with
 from twin.types import Form
 
@@ -76,11 +76,11 @@ class LeRobotWriter(FolderWriter):
         self._off: list[tuple[float, str, str]] = []  # largest error of a time (s), key and pauses of an episode
         self._stats: dict[str, dict[str, np.ndarray]] = {}
 
-    def _said(self) -> dict[str, Any]:
-        return super()._said() | {"video": self.video}
+    def _metadata(self) -> dict[str, Any]:
+        return super()._metadata() | {"video": self.video}
 
     def _begin(self) -> None:
-        write_text(_made(self.folder / CARD), _card(self.about))
+        write_text(_make_folder(self.folder / CARD), _card(self.about))
 
     def _find(self) -> list[dict[str, Any]]:
         self.video = bool(read_sidecar(self.folder)[1].get("video", False))
@@ -107,7 +107,7 @@ class LeRobotWriter(FolderWriter):
         """Write a file of episodes, then the data set's description. Returns row, facts and statistics of each episode."""
         group: list[tuple[dict[str, Any], dict[str, Any], dict[str, dict[str, np.ndarray]]]] = []
         at = {"chunk_index": self._file // CHUNK_FILES, "file_index": self._file % CHUNK_FILES}
-        path = _made(self.folder / DATA_PATH.format(**at))
+        path = _make_folder(self.folder / DATA_PATH.format(**at))
         with tempfile.TemporaryDirectory(prefix="twin-video-") as aside:
             video = Path(aside) / "episodes.mp4"
             write_with(path, partial(self._fill, waiting=waiting, group=group, at=at, video=video))
@@ -115,7 +115,7 @@ class LeRobotWriter(FolderWriter):
                 path.unlink()
                 return []
             if self.video:
-                into = _made(self.folder / VIDEO_PATH.format(video_key=IMAGE, **at))
+                into = _make_folder(self.folder / VIDEO_PATH.format(video_key=IMAGE, **at))
                 with video.open("rb") as made:
                     write_with(into, lambda file: shutil.copyfileobj(made, file))
         stats = self._stats
@@ -131,7 +131,7 @@ class LeRobotWriter(FolderWriter):
         parquet, pa = library("pyarrow.parquet"), library("pyarrow")
         schema = pa.schema(self._schema(pa), metadata={"huggingface": json.dumps({"info": {"features": self._hf_features()}})})
         frames, written = self._frames, 0
-        film = _Film(video, self.rate_hz, self.about.size_px) if self.video else None
+        film = _VideoWriter(video, self.rate_hz, self.about.size_px) if self.video else None
         with parquet.ParquetWriter(file, schema, compression="snappy", write_page_checksum=True) as table:
             while (not group or written < self.held_bytes) and waiting.has_next:
                 episode = next(waiting)
@@ -181,7 +181,7 @@ class LeRobotWriter(FolderWriter):
             self._tasks.append(text)
         return self._tasks.index(text)
 
-    def _row(self, step: Step, number: int, episode: int, index: int, task: int) -> dict[str, Any]:
+    def _row(self, step: RecordStep, number: int, episode: int, index: int, task: int) -> dict[str, Any]:
         row: dict[str, Any] = {} if self.video else {IMAGE: {"bytes": png(_colour(step.image)), "path": f"frame-{number:06d}.png"}}
         for name, count in self.about.numbers.items():  # a single number is no list
             values = np.asarray(step.values[name], np.float32)
@@ -252,13 +252,13 @@ class LeRobotWriter(FolderWriter):
         pandas = {"index_columns": ["__index_level_0__"], "column_indexes": [], "columns": [column, index], "pandas_version": "2.2.0"}
         tasks = pa.table({"task_index": pa.array(range(len(self._tasks)), pa.int64()), "__index_level_0__": self._tasks})
         tasks = tasks.replace_schema_metadata({"pandas": json.dumps(pandas)})
-        write_with(_made(self.folder / TASKS), lambda file: parquet.write_table(tasks, file, write_page_checksum=True))
+        write_with(_make_folder(self.folder / TASKS), lambda file: parquet.write_table(tasks, file, write_page_checksum=True))
         rows = [
             row | {f"stats/{key}/{k}": v.tolist() for key, each in found.items() for k, v in each.items()} | {FACTS: json.dumps(facts)}
             for row, facts, found in group
         ]
         write_with(
-            _made(self.folder / EPISODES_PATH.format(**at)),
+            _make_folder(self.folder / EPISODES_PATH.format(**at)),
             lambda file: parquet.write_table(pa.Table.from_pylist(rows), file, write_page_checksum=True),
         )
         write_json(self.folder / STATS, {key: {k: v.tolist() for k, v in each.items()} for key, each in stats.items()})
@@ -313,7 +313,7 @@ class _Gathered:
         self._pictures: list[np.ndarray] = []
         self._every = 1
 
-    def add(self, step: Step, number: int) -> None:
+    def add(self, step: RecordStep, number: int) -> None:
         """Add a step. Of a long episode only every second picture is kept, then every fourth, and so on."""
         for name, values in self._values.items():
             values.append(np.asarray(step.values[name], np.float32))
@@ -327,18 +327,18 @@ class _Gathered:
         """Statistics of each column, in LeRobot's shapes: (3, 1, 1) for pictures, with values from 0 to 1, and (2,) for pins."""
         length = len(self.times_s)
         pixels = np.stack(self._pictures).reshape(-1, 3) / 255.0
-        found = {IMAGE: {key: value.reshape(-1, 1, 1) for key, value in _spread(pixels).items()}}
+        found = {IMAGE: {key: value.reshape(-1, 1, 1) for key, value in _deviations(pixels).items()}}
         for name, values in self._values.items():
             stacked = np.stack(values).astype(float)
-            found[CHANNELS[name].column] = _spread(stacked.reshape(-1, stacked.shape[-1]))
+            found[CHANNELS[name].column] = _deviations(stacked.reshape(-1, stacked.shape[-1]))
         frames = np.arange(length)
         counters = (frames, np.full(length, number), start + frames, np.full(length, task))
         plain = {TIME: np.array(self.times_s), "timestamp": frames / rate_hz} | dict(zip(COUNTERS, counters, strict=True))
-        found |= {name: _spread(np.asarray(values, float)[:, None]) for name, values in plain.items()}
+        found |= {name: _deviations(np.asarray(values, float)[:, None]) for name, values in plain.items()}
         return {name: each | {"count": np.array([len(self._pictures) if name == IMAGE else length])} for name, each in found.items()}
 
 
-def _spread(rows: np.ndarray) -> dict[str, np.ndarray]:
+def _deviations(rows: np.ndarray) -> dict[str, np.ndarray]:
     """Statistics (K,) of rows (M, K), without NaN; 0 for a column of NaN only."""
     known = np.isfinite(rows)
     some = known.any(axis=0)
@@ -375,7 +375,7 @@ def _together(a: dict[str, dict[str, np.ndarray]], b: dict[str, dict[str, np.nda
     return found
 
 
-class _Film:
+class _VideoWriter:
     """A video to which frames are written."""
 
     def __init__(self, path: Path, rate_hz: int, size_px: tuple[int, int]) -> None:
@@ -406,7 +406,7 @@ def _reader(folder: Path, rows: list[dict[str, Any]], about: About, index: int) 
     return partial(_steps_of, folder, rows[index], about)
 
 
-def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Step]:
+def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[RecordStep]:
     parquet = library("pyarrow.parquet")
     at = {key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}
     path, number = folder / DATA_PATH.format(**at), row["episode_index"]
@@ -426,7 +426,7 @@ def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Step]
                     continue
                 image = next(pictures) if video else image_of(line[IMAGE]["bytes"], about.gray, str(path))
                 values = {name: np.asarray(line[CHANNELS[name].column], np.float32).reshape(about.shape(name)) for name in about.numbers}
-                yield Step(image, float(line[TIME]), values)
+                yield RecordStep(image, float(line[TIME]), values)
     except (OSError, KeyError, ValueError, TypeError, StopIteration, library("pyarrow").ArrowException) as error:
         raise RecordError(f"{path}: damaged ({error}); {AGAIN}") from error
 
@@ -489,7 +489,7 @@ def _colour(image: np.ndarray) -> np.ndarray:
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
-def _made(path: Path) -> Path:
+def _make_folder(path: Path) -> Path:
     """The path. Its folder is made if it does not exist."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return path

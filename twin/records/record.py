@@ -174,7 +174,7 @@ class About:
 
 
 @dataclass(frozen=True)
-class Step:
+class RecordStep:
     """One moment of an episode.
 
     Attributes
@@ -215,7 +215,7 @@ class Episode:
 
     key: str
     task: str
-    steps: Callable[[], Iterator[Step]]
+    steps: Callable[[], Iterator[RecordStep]]
     length: int
     rest: ImageArray | None = None
     started_s: float = 0.0
@@ -227,7 +227,7 @@ class Episode:
         return {"key": self.key, "task": self.task, "length": self.length, "started_s": self.started_s, "T_tool_sensor": T}
 
     @classmethod
-    def from_facts(cls, facts: Mapping[str, Any], steps: Callable[[], Iterator[Step]], rest: ImageArray | None) -> "Episode":
+    def from_facts(cls, facts: Mapping[str, Any], steps: Callable[[], Iterator[RecordStep]], rest: ImageArray | None) -> "Episode":
         """An episode from the result of ``facts``.
 
         Raises
@@ -255,7 +255,7 @@ class Records:
     episodes: list[Episode]
     notes: list[str] = field(default_factory=list)
 
-    def named(self, task: str) -> "Records":
+    def with_task(self, task: str) -> "Records":
         """The same records with another task; unchanged for ""."""
         return self if not task else replace(self, episodes=[replace(episode, task=task) for episode in self.episodes])
 

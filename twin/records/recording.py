@@ -25,7 +25,7 @@ from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
 from twin.frames.tables import numbers
 from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, episode_of, format_of, read_facts, read_json, read_sidecar
-from twin.records.record import CHANNELS, NOMINAL_HZ, About, Channel, Episode, RecordError, Records, Step, digest, float32, seconds
+from twin.records.record import CHANNELS, NOMINAL_HZ, About, Channel, Episode, RecordError, Records, RecordStep, digest, float32, seconds
 from twin.rig.labels import as_executed, read_executed
 from twin.rig.mounting import Mounting
 from twin.store import write_json, write_npz, write_text
@@ -66,12 +66,12 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
     values, estimates = _table_values(recording)
     notes = list(recording.problems)
     _take_out_moves(path, recording, values, notes)
-    values |= _pins_beside(path, recording) | _truth_beside(path, recording) | _asked_beside(path, recording)
+    values |= _read_pins(path, recording) | _read_truth(path, recording) | _read_requested_poses(path, recording)
     values = {name: values[name] for name in CHANNELS if name in values}
     found = next(iter(recording), None)
     if found is None:
         raise RecordError(f"{path}: no frame can be read; {AGAIN}")
-    said = _said_beside(path)
+    said = _read_description(path)
     about = About(
         sensor=str(said.get("sensor", "")),
         form=recording.form,
@@ -107,7 +107,7 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
 
 def _steps_of(
     recording: Recording, values: dict[str, np.ndarray], rows: np.ndarray, times_s: np.ndarray, notes: list[str]
-) -> Iterator[Step]:
+) -> Iterator[RecordStep]:
     for row, time_s in zip(rows.tolist(), times_s.tolist(), strict=True):
         try:
             frame = recording.read(row)
@@ -115,7 +115,7 @@ def _steps_of(
             if (note := f"skipped {error}") not in notes:
                 notes.append(note)
             continue
-        yield Step(frame.image, seconds(time_s - times_s[0]), {name: array[row] for name, array in values.items()})
+        yield RecordStep(frame.image, seconds(time_s - times_s[0]), {name: array[row] for name, array in values.items()})
 
 
 def _paths(recording: Recording) -> list[np.ndarray]:
@@ -172,7 +172,7 @@ def _take_out_moves(path: Path, recording: Recording, values: dict[str, np.ndarr
         values["pose"], values["move"] = as_executed(values["pose"], values["move"], executed)
 
 
-def _pins_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
+def _read_pins(path: Path, recording: Recording) -> dict[str, np.ndarray]:
     """Pins that ``twin preprocess`` or a translation found, for the recording's frames; NaN for frames without pins."""
     if not (path / PINS).is_file():
         return {}
@@ -186,7 +186,7 @@ def _pins_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
     return {"pins": np.where((rows >= 0)[:, None, None], pins_px[rows], np.float32(np.nan))}
 
 
-def _truth_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
+def _read_truth(path: Path, recording: Recording) -> dict[str, np.ndarray]:
     """Pins, wrench, and the pose that the arm was commanded to, of a simulated data set."""
     if not (path / TRUTH).is_dir():
         return {}
@@ -202,7 +202,7 @@ def _truth_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
     return {name: a[rows].astype(np.float32) for name, a in (("pins", arrays["pins_px"]), ("wrench", wrench), ("action", arrays["pose"]))}
 
 
-def _asked_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
+def _read_requested_poses(path: Path, recording: Recording) -> dict[str, np.ndarray]:
     """The poses that a collection requested."""
     if not (path / LOG).is_file():
         return {}
@@ -217,7 +217,7 @@ def _asked_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
     return {"action": np.stack([asked.get(name, none) for name in recording.names])} if asked else {}
 
 
-def _said_beside(path: Path) -> dict[str, Any]:
+def _read_description(path: Path) -> dict[str, Any]:
     """Sensor, arm, task and ``T_tool_sensor`` of a recording, if its files state them."""
     told: dict[str, Any] = {"task": "touch"}
     for name in (META, MADE):
@@ -308,7 +308,7 @@ class RecordingWriter(FolderWriter):
         if group:
             yield self._commit(group, rows, pins)
 
-    def _row(self, name: str, number: int, step: Step) -> list[str]:
+    def _row(self, name: str, number: int, step: RecordStep) -> list[str]:
         cells = [name, name.rpartition("_")[0], "1", str(number + 1), str(number), repr(float(step.time_s))]
         for channel in self._columns():
             cells += ["" if np.isnan(value) else repr(float(value)) for value in step.values[channel]]

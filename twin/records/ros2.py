@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from twin.records.folder import AGAIN, VERSION, FolderWriter, image_of, png, read_sidecar, require_numbered, whole_steps
-from twin.records.record import CHANNELS, About, Episode, RecordError, Records, Step, float32, library
+from twin.records.record import CHANNELS, About, Episode, RecordError, Records, RecordStep, float32, library
 from twin.store import write_with
 
 IMAGE_TOPIC, CONTACT_TOPIC, POSE_TOPIC = "/tactip/image/compressed", "/tactip/contact", "/tactip/pose"
@@ -62,7 +62,7 @@ class Ros2Writer(FolderWriter):
     LIBRARIES = ("mcap_ros2.writer",)
 
     def _find(self) -> list[dict[str, Any]]:
-        return [_said(path)[1] for path in _files(self.folder)]
+        return [_read_description(path)[1] for path in _files(self.folder)]
 
     def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
         for episode in episodes:
@@ -92,7 +92,7 @@ class _Bag:
         self._static = episode.T_tool_sensor
         self._start_ns = round(episode.started_s * NS_PER_S)
 
-    def add(self, step: Step) -> None:
+    def add(self, step: RecordStep) -> None:
         """Write the messages of a step. All have the time of its exposure."""
         at_ns = self._start_ns + round(step.time_s * NS_PER_S)
         send = partial(self._send, at_ns=at_ns)
@@ -147,7 +147,7 @@ def ros2_records(path: Path) -> Records:
     files = _files(path) if path.is_dir() else [path]
     if not files:
         return Records(read_sidecar(path)[0], [])
-    found = [_said(file) for file in files]
+    found = [_read_description(file) for file in files]
     about = found[0][0]
     episodes = []
     for file, (its, facts, rest) in zip(files, found, strict=True):
@@ -162,7 +162,7 @@ def ros2_records(path: Path) -> Records:
     return Records(about, episodes)
 
 
-def _said(path: Path) -> tuple[About, dict[str, Any], bytes | None]:
+def _read_description(path: Path) -> tuple[About, dict[str, Any], bytes | None]:
     """The description of a file, and its picture without contact."""
     reader = library("mcap.reader")
     try:
@@ -182,7 +182,7 @@ def _said(path: Path) -> tuple[About, dict[str, Any], bytes | None]:
         raise RecordError(f"{path}: damaged or cut ({' '.join(str(error).split())[:MOST_SAID]}); {AGAIN}") from error
 
 
-def _steps_of(path: Path, about: About) -> Iterator[Step]:
+def _steps_of(path: Path, about: About) -> Iterator[RecordStep]:
     """The steps of a file. Messages with the same sequence number belong to one step."""
     reader, decoder = library("mcap.reader"), library("mcap_ros2.decoder").DecoderFactory()
     named = {CHANNELS[name].topic: name for name in about.numbers}
@@ -195,7 +195,7 @@ def _steps_of(path: Path, about: About) -> Iterator[Step]:
             for _, channel, message, ros in bag.iter_decoded_messages(topics, log_time_order=False):
                 if message.sequence != count:
                     if image is not None:
-                        yield Step(image, (at_ns - start_ns) / NS_PER_S, {name: values[name] for name in about.numbers})
+                        yield RecordStep(image, (at_ns - start_ns) / NS_PER_S, {name: values[name] for name in about.numbers})
                     start_ns = message.log_time if count < 0 else start_ns
                     image, at_ns, count, values = None, message.log_time, message.sequence, {}
                 if channel.topic == IMAGE_TOPIC:
@@ -203,7 +203,7 @@ def _steps_of(path: Path, about: About) -> Iterator[Step]:
                 else:
                     values[named[channel.topic]] = _numbers(named[channel.topic], ros, about)
             if image is not None:
-                yield Step(image, (at_ns - start_ns) / NS_PER_S, {name: values[name] for name in about.numbers})
+                yield RecordStep(image, (at_ns - start_ns) / NS_PER_S, {name: values[name] for name in about.numbers})
     except RecordError:
         raise
     except Exception as error:  # the libraries raise exceptions of any type for damaged files

@@ -19,12 +19,12 @@ from pydantic import BaseModel, ValidationError
 
 from scenes import load_experiment, load_sensor
 from scenes.base import Name, SpecError
-from scenes.files import read_regular, shown
+from scenes.files import quote, read_regular
 from twin.errors import FrameError, StoreError
 from twin.frames.forms import times
 from twin.frames.images import read_image, write_image
 from twin.frames.videos import describe_pauses
-from twin.records.record import CHANNELS, About, Episode, Records, Step, digest, float32, seconds
+from twin.records.record import CHANNELS, About, Episode, Records, RecordStep, digest, float32, seconds
 from twin.rig.mounting import Mounting
 from twin.store import contents, unwritten, write_json
 from twin.types import Form, Frame
@@ -187,7 +187,7 @@ class Session:
         self.steps, note = _steps_and_note(self.folder)
         if not self.steps:
             raise FrameError(f"{folder}: {note or 'the session ended before its first step'}; nothing to replay, record it again")
-        self._lines = [self._checked(number, step).frame for number, step in enumerate(self.steps, 1)]
+        self._lines = [self._check_step(number, step).frame for number, step in enumerate(self.steps, 1)]
         loose = {path.name for path in (self.folder / FRAMES).glob("*.png")} - {line.file for line in self._lines}
         loose_note = f"{len(loose)} pictures in {FRAMES}/ have no step in {STEPS}: the session was cut" if loose else ""
         self.notes = [each for each in (note, loose_note) if each]
@@ -203,18 +203,18 @@ class Session:
         if not isinstance(about, dict) or "version" not in about:
             raise FrameError(f"{self.folder}: {ABOUT} is not that of a session; copy the session again")
         if about["version"] != VERSION:
-            version = shown(about["version"])
+            version = quote(about["version"])
             raise FrameError(
                 f"{self.folder}: {ABOUT} is of version {version}, expected {VERSION}; replay it with the program that wrote it"
             )
         return about
 
-    def _checked(self, number: int, step: dict) -> _StepLine:
+    def _check_step(self, number: int, step: dict) -> _StepLine:
         try:
             line = _StepLine.model_validate(step)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
-            key, problem = ".".join(shown(part) for part in first["loc"]), shown(first["msg"].removeprefix("Value error, "))
+            key, problem = ".".join(quote(part) for part in first["loc"]), quote(first["msg"].removeprefix("Value error, "))
             raise FrameError(f"{self.folder}: {STEPS}, line {number}: {key}: {problem}; copy the session again") from error
         if line.step != number - 1:
             raise FrameError(f"{self.folder}: {STEPS}, line {number} is of step {line.step}: lines are missing; copy the session again")
@@ -301,7 +301,7 @@ _POSES = {"pose": "exposed_pose", "action": "sent"}
 _ESTIMATES = {"estimate": "value", "low": "low", "high": "high"}
 
 
-def _steps_of(session: Session, about: About, first_s: float) -> Iterator[Step]:
+def _steps_of(session: Session, about: About, first_s: float) -> Iterator[RecordStep]:
     keys = {name: (_POSES | _ESTIMATES)[name] for name in about.numbers}
     for index, line in enumerate(session.steps):
         frame = session.frame(index)
@@ -311,7 +311,7 @@ def _steps_of(session: Session, about: About, first_s: float) -> Iterator[Step]:
                 f"{session.folder}: {line['frame']['file']}: expected {expected} as the first frame, got {got}; record it again"
             )
         values = {name: float32(line.get(key, []), about.numbers[name]) for name, key in keys.items()}
-        yield Step(frame.image, seconds(frame.time_s - first_s), values)
+        yield RecordStep(frame.image, seconds(frame.time_s - first_s), values)
 
 
 def _started_s(session: Session) -> float:

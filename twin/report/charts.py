@@ -54,7 +54,7 @@ def write_chart(path: Path, draw: Callable[[], Figure], *, dpi: int = DPI) -> Pa
     dpi : int
     """
     for theme, target in ((LIGHT, path), (DARK, dark_of(path))):
-        with drawn_in(theme):
+        with draw_in_theme(theme):
             save_figure(target, draw(), dpi=dpi)
     return path
 
@@ -67,7 +67,7 @@ def save_figure(path: Path, figure: Figure, *, dpi: int = DPI) -> Path:
 
 
 @contextmanager
-def drawn_in(theme: Theme) -> Iterator[None]:
+def draw_in_theme(theme: Theme) -> Iterator[None]:
     """Context in which everything is drawn in the colours of a theme."""
     token = _theme.set(theme)
     try:
@@ -82,7 +82,7 @@ def ink() -> str:
     return _theme.get().ink
 
 
-def muted() -> str:
+def muted_colour() -> str:
     """Colour of secondary elements in the current theme: limits, references, the true course."""
     return _theme.get().muted
 

@@ -59,7 +59,7 @@ def number(value: object, digits: int = 3, *, decimals: int | None = None, signe
     text = f"{abs(size):.{decimals}f}"
     if not float(text):
         sign = ""  # a number that is rounded to zero has no sign
-    return sign + _grouped(text)
+    return sign + _group_digits(text)
 
 
 def column(values: Sequence[object], digits: int = 3, *, decimals: int | None = None, signed: bool = False) -> list[str]:
@@ -89,6 +89,6 @@ def _power(size: float, digits: int) -> int:
     return int(f"{abs(size):.{digits - 1}e}".partition("e")[2])
 
 
-def _grouped(text: str) -> str:
+def _group_digits(text: str) -> str:
     whole, point, rest = text.partition(".")
     return (f"{int(whole):,}".replace(",", GROUP) if int(whole) >= GROUPED_FROM else whole) + point + rest

@@ -18,7 +18,7 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from twin.report.table import Column, Row, Table, make_table
+from twin.report.table import Column, Row, TemplateTable, make_table
 from twin.report.themes import dark_of, stylesheet
 from twin.store import write_text
 
@@ -29,7 +29,7 @@ MIME = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".svg"
 
 
 @dataclass(frozen=True)
-class Picture:
+class PagePicture:
     """A picture of a page.
 
     Attributes
@@ -65,8 +65,8 @@ class _Block:
     lines: Sequence[str] = ()
     tone: str = ""
     layout: str = ""
-    table: Table | None = None
-    pictures: Sequence[Picture] = ()
+    table: TemplateTable | None = None
+    pictures: Sequence[PagePicture] = ()
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class Page:
         """Add a table (see `twin.report.table.make_table`)."""
         self._blocks.append(_Block("table", table=make_table(rows, columns, caption=caption)))
 
-    def figures(self, *pictures: Picture, layout: Literal["", "row", "beside"] = "") -> None:
+    def figures(self, *pictures: PagePicture, layout: Literal["", "row", "beside"] = "") -> None:
         """Add pictures: one below the other, in a ``row`` that wraps, or a narrow one ``beside`` a wide one."""
         self._blocks.append(_Block("figures", pictures=pictures, layout=layout))
 
@@ -226,14 +226,14 @@ def link_to(anchor: str) -> str:
     return f"#{quote(anchor, safe='')}"
 
 
-def _source(picture: Picture, folder: Path, embed: bool) -> _Source:
+def _source(picture: PagePicture, folder: Path, embed: bool) -> _Source:
     dark = dark_of(picture.path) if picture.kind == "chart" else None
     paths = [_within(path, folder) for path in (picture.path, dark) if path is not None]
-    found = [_embedded(folder / path) if embed else quote(path.as_posix(), safe="/") for path in paths]
+    found = [_embed_file(folder / path) if embed else quote(path.as_posix(), safe="/") for path in paths]
     return _Source(found[0], found[1] if dark else "", picture.alt, picture.caption, picture.kind, picture.width_px)
 
 
-def _embedded(path: Path) -> str:
+def _embed_file(path: Path) -> str:
     return f"data:{MIME[path.suffix.lower()]};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
 
 

@@ -116,7 +116,7 @@ def area_surface_figure(rest: PinGraph, contact: PinGraph) -> Figure:
 
 
 @dataclass(frozen=True)
-class Look:
+class ObservedFrame:
     """A frame with its observation, and the graph of the same sensor's pins without contact."""
 
     frame: Frame
@@ -136,7 +136,7 @@ class Look:
         return self.observation.graph, self.rest
 
 
-def contact_panel(skin_picture: Path, look: Look, title: str) -> Figure:
+def contact_panel(skin_picture: Path, look: ObservedFrame, title: str) -> Figure:
     """A figure with six panels of one contact. If the pipeline found no graph, the reason is shown instead."""
     figure, axes = new_figure(3, 2, panel_inch=4.4)
     figure.suptitle(title)
@@ -159,7 +159,7 @@ def contact_panel(skin_picture: Path, look: Look, title: str) -> Figure:
     return figure
 
 
-def area_change_at(look: Look, center_px: np.ndarray, *, count: int) -> float:
+def area_change_at(look: ObservedFrame, center_px: np.ndarray, *, count: int) -> float:
     """Mean relative change (percent) of the Voronoi areas of the ``count`` pins nearest to a point."""
     graph, rest = look.graphs()
     near = np.argsort(np.hypot(*(graph.nodes_px - center_px).T))[:count]

@@ -161,7 +161,7 @@ def _draw_with_pyvista(folder: Path, path: str) -> None:
     plotter.set_background("#0d1117", top="#27313f")  # type: ignore[arg-type]  # its decorator hides self from the checker
     scalars = "displacement_mm" if "displacement_mm" in skin.point_data else None
     plotter.add_mesh(
-        _cut(skin),
+        _clip_surface(skin),
         scalars=scalars,
         cmap=_glow(),
         ambient=0.2,
@@ -175,15 +175,15 @@ def _draw_with_pyvista(folder: Path, path: str) -> None:
             "position_y": 0.04,
         },
     )
-    plotter.add_mesh(_cut(pins), color="#f2f7ff", smooth_shading=True, split_sharp_edges=True, specular=0.3)
+    plotter.add_mesh(_clip_surface(pins), color="#f2f7ff", smooth_shading=True, split_sharp_edges=True, specular=0.3)
     if touched.n_points:
-        plotter.add_mesh(_cut(touched), color="#8fb8e8", opacity=0.5, smooth_shading=True, split_sharp_edges=True)
+        plotter.add_mesh(_clip_surface(touched), color="#8fb8e8", opacity=0.5, smooth_shading=True, split_sharp_edges=True)
     plotter.camera_position = [(22.0, -84.0, 30.0), (0.0, 0.0, 12.5), (0.0, 0.0, 1.0)]
     plotter.enable_anti_aliasing("ssaa")
     plotter.screenshot(path)
 
 
-def _cut(surface: "pv.PolyData") -> "pv.PolyData":
+def _clip_surface(surface: "pv.PolyData") -> "pv.PolyData":
     return surface.clip(normal=CUT_NORMAL, origin=CUT_ORIGIN)
 
 
@@ -200,7 +200,7 @@ def _plain_figure(skin: "pv.PolyData", touched: "pv.PolyData") -> "Figure":
 
     figure = Figure(figsize=(WINDOW_PX[0] / 100, WINDOW_PX[1] / 100), layout="constrained")
     axes = figure.add_subplot(projection="3d")
-    half = _cut(skin).triangulate()
+    half = _clip_surface(skin).triangulate()
     triangles = half.regular_faces
     shell = axes.plot_trisurf(*half.points.T, triangles=triangles, cmap=_glow())
     if "displacement_mm" in half.point_data:

@@ -95,7 +95,7 @@ class Head:
 
 
 @dataclass(frozen=True)
-class Shown:
+class StyledCell:
     """A cell in the form that the template needs; ``style`` holds its CSS classes."""
 
     text: object
@@ -107,15 +107,15 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class Table:
+class TemplateTable:
     """A table in the form that the template needs: ``body`` has a list of cells for each row, one for each of ``heads``."""
 
     heads: list[Head]
-    body: list[list[Shown]]
+    body: list[list[StyledCell]]
     caption: str
 
 
-def make_table(rows: Sequence[Row], columns: Sequence[Column | str], *, caption: str = "") -> Table:
+def make_table(rows: Sequence[Row], columns: Sequence[Column | str], *, caption: str = "") -> TemplateTable:
     """Format rows for a page.
 
     Parameters
@@ -130,13 +130,13 @@ def make_table(rows: Sequence[Row], columns: Sequence[Column | str], *, caption:
     heads, shown = [], []
     for entry in chosen:
         cells = [value if isinstance(value, Cell) else Cell(value) for value in (row.get(entry.key) for row in rows)]
-        values = [_scaled(cell.value, entry.scale) for cell in cells]
+        values = [_scale_value(cell.value, entry.scale) for cell in cells]
         numeric = entry.align == "right" or any(is_number(value) for value in values)
         texts = column(values, entry.digits, decimals=entry.decimals, signed=entry.signed)
         marked = _best(values, entry.best)
         heads.append(Head(entry.title, entry.unit, numeric))
-        shown.append([_shown(c, v, t, numeric, k in marked) for k, (c, v, t) in enumerate(zip(cells, values, texts, strict=True))])
-    return Table(heads, [list(row) for row in zip(*shown, strict=True)], caption)
+        shown.append([_style_cell(c, v, t, numeric, k in marked) for k, (c, v, t) in enumerate(zip(cells, values, texts, strict=True))])
+    return TemplateTable(heads, [list(row) for row in zip(*shown, strict=True)], caption)
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> Path:
@@ -162,7 +162,7 @@ def _plain(value: object) -> str:
     return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _scaled(value: object, scale: float) -> object:
+def _scale_value(value: object, scale: float) -> object:
     return float(value) * scale if scale != 1 and is_number(value) else value
 
 
@@ -174,8 +174,8 @@ def _best(values: list[object], best: str) -> set[int]:
     return {k for k, value in known.items() if value == wanted}
 
 
-def _shown(cell: Cell, value: object, text: str, numeric: bool, best: bool) -> Shown:
+def _style_cell(cell: Cell, value: object, text: str, numeric: bool, best: bool) -> StyledCell:
     styles = [name for name, given in (("number", numeric), ("best", best), (cell.tone, bool(cell.tone))) if given]
     bar = None if cell.bar is None else round(100 * min(max(cell.bar, 0.0), 1.0))
     shown = value if isinstance(value, str) else text  # texts with markup are not changed
-    return Shown(shown, numeric, " ".join(styles), cell.note, bar, cell.href)
+    return StyledCell(shown, numeric, " ".join(styles), cell.note, bar, cell.href)

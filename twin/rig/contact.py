@@ -71,12 +71,12 @@ class ArmTurning:
         return there
 
 
-def friction_between(rig: RigSpec | None, touched: ObjectSpec) -> Friction:
+def friction_between(rig: RigSpec | None, obj: ObjectSpec) -> Friction:
     """Friction between sensor and object: the rig's single coefficient, or the object's own friction if there is no rig."""
-    return Friction(rig.friction, rig.friction) if rig else friction_of(touched)
+    return Friction(rig.friction, rig.friction) if rig else friction_of(obj)
 
 
-def contact_law(rig: RigSpec | None, mounting: Mounting, touched: ObjectSpec, *, friction: float | Friction | None = None) -> ContactLaw:
+def contact_law(rig: RigSpec | None, mounting: Mounting, obj: ObjectSpec, *, friction: float | Friction | None = None) -> ContactLaw:
     """Friction and compliance of a mounted sensor and an object.
 
     Parameters
@@ -91,8 +91,8 @@ def contact_law(rig: RigSpec | None, mounting: Mounting, touched: ObjectSpec, *,
     turning = None
     if rig and rig.turn_compliance_deg_per_n:
         turning = ArmTurning(mounting.across_in_sensor, mounting.label_turn, mounting.tool_point_mm, rig.turn_compliance_deg_per_n)
-    compliance = touched.compliance_mm_per_n + (rig.compliance_mm_per_n if rig else 0.0)
-    return ContactLaw(friction_between(rig, touched), compliance, turning).override(friction=friction)
+    compliance = obj.compliance_mm_per_n + (rig.compliance_mm_per_n if rig else 0.0)
+    return ContactLaw(friction_between(rig, obj), compliance, turning).override(friction=friction)
 
 
 class RigContact:
@@ -114,14 +114,14 @@ class RigContact:
     law : ContactLaw
     """
 
-    def __init__(self, solver: SkinSolver, experiment: ExperimentSpec, touched: ObjectSpec, *, rig: RigSpec | None = None) -> None:
+    def __init__(self, solver: SkinSolver, experiment: ExperimentSpec, obj: ObjectSpec, *, rig: RigSpec | None = None) -> None:
         self.solver, self.experiment = solver, experiment
-        self.rig = rig or rig_of(solver.spec, touched.name)
-        self.field = build_field(touched)
+        self.rig = rig or rig_of(solver.spec, obj.name)
+        self.field = build_field(obj)
         mounting = Mounting.on(self.rig, experiment, solver.spec.skin)
-        self.law = contact_law(self.rig if rig or solver.spec.rig else None, mounting, touched)
+        self.law = contact_law(self.rig if rig or solver.spec.rig else None, mounting, obj)
 
-    def way(self, label: ArmLabel) -> ArmPath:
+    def commanded_path(self, label: ArmLabel) -> ArmPath:
         """The commanded path of the object (see ``arm_path``, also for errors)."""
         return arm_path(self.rig, self.experiment, self.solver.spec.skin, self.field, label)
 
@@ -137,4 +137,4 @@ class RigContact:
 
     def end(self, label: ArmLabel, *, friction: float | Friction | None = None) -> ContactState:
         """The state at the end of the path of a label. Errors as ``along``."""
-        return self.solver.press(self.field, self.way(label).path, law=self.law, friction=friction)
+        return self.solver.press(self.field, self.commanded_path(label).path, law=self.law, friction=friction)

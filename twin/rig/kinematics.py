@@ -74,7 +74,7 @@ def rig_of(sensor: SensorSpec, before: str | None = None) -> RigSpec:
     A sensor without a rig gets a default one: its tool point is the tip of the skin, and it has no compliance.
     """
     rig = sensor.rig or RigSpec(tcp_to_dome_mm=-sensor.skin.apex_mm)
-    return rig if before is None else rig.before(before)
+    return rig if before is None else rig.for_object(before)
 
 
 def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, apex_mm: float) -> np.ndarray:

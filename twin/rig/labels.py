@@ -15,7 +15,7 @@ from scenes.experiment import ExperimentSpec
 from scenes.rig import RigSpec
 from twin.errors import FrameError
 from twin.frames import Recording
-from twin.frames.tables import bare_name, counted, numbers, pair_rows, read_table
+from twin.frames.tables import bare_name, describe_count, numbers, pair_rows, read_table
 
 EXECUTED_FILES = ("labels_corrected.csv", "move_executed.csv")  # in the order of precedence
 EXECUTED_COLUMNS = ("executed", "executed_estimate")
@@ -77,7 +77,7 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
     odd = ~np.isfinite(np.hstack([values["pose"], values["move"]])).all(axis=1)
     if odd.any():
         names = [recording.names[k] for k in np.flatnonzero(odd)[:3]]
-        raise FrameError(f"{recording.path}: {odd.sum()} rows hold no number in a pose or move ({', '.join(names)}); mend or remove them")
+        raise FrameError(f"{recording.path}: {odd.sum()} rows hold no number in a pose or move ({', '.join(names)}); repair or remove them")
     if experiment is not None and (fixed := _varied_beyond(experiment, values)):
         recording.problems.append(
             f"{', '.join(fixed)} varies in the table, and not in the experiment {experiment.name}: what is simulated by this experiment "
@@ -158,11 +158,11 @@ def read_executed(folder: Path, names: Sequence[str], problems: list[str]) -> di
         if column is None:
             problems.append(f"{name}: no column {' or '.join(EXECUTED_COLUMNS)}; {NOT_USED}")
             continue
-        return _paired(name, table.name_lists[0], [_share(cell) for cell in column], names, problems)
+        return _pair_shares(name, table.name_lists[0], [_share(cell) for cell in column], names, problems)
     return {}
 
 
-def _paired(file: str, listed: list[str], shares: list[float], names: Sequence[str], problems: list[str]) -> dict[str, float]:
+def _pair_shares(file: str, listed: list[str], shares: list[float], names: Sequence[str], problems: list[str]) -> dict[str, float]:
     """``shares`` by frame's name. Messages about rows that do not fit are added to ``problems``."""
     pairing = pair_rows(listed, [Path(name) for name in names])
     found = {picture.name: shares[row] for row, picture in pairing.files.items()}
@@ -178,10 +178,10 @@ def _paired(file: str, listed: list[str], shares: list[float], names: Sequence[s
         "rows name a frame with another suffix or case": pairing.loose,
         "rows repeat an earlier row": [row for row in pairing.doubled if row not in contradicting],
     }
-    problems += [f"{file}: {counted(len(rows), what, [listed[k] for k in rows])}" for what, rows in odd.items() if rows]
+    problems += [f"{file}: {describe_count(len(rows), what, [listed[k] for k in rows])}" for what, rows in odd.items() if rows]
     known = {name: share for name, share in found.items() if not np.isnan(share)}
     if without := [name for name in names if name not in known]:
-        problems.append(f"{file}: {counted(len(without), 'frames have no usable row; their moves count as executed', without)}")
+        problems.append(f"{file}: {describe_count(len(without), 'frames have no usable row; their moves count as executed', without)}")
     return known
 
 

@@ -27,7 +27,7 @@ LONGEST_OUTLINE_MM = 2000.0
 
 
 @dataclass(frozen=True)
-class Touch:
+class TrueTouch:
     """True depth and angle of a rigid sensor in M poses of a rigid object.
 
     Attributes
@@ -49,7 +49,7 @@ class Touch:
     place_mm: np.ndarray
 
 
-class Surface:
+class SmoothSurface:
     """Smooth surface of an object: the object without its texture, moved outwards by the height of the texture.
 
     Parameters
@@ -88,7 +88,7 @@ class Surface:
         outline.flags.writeable = False
         return outline
 
-    def touched(self, mounting: Mounting, T_sensor_object: np.ndarray) -> Touch:
+    def depth_and_angle(self, mounting: Mounting, T_sensor_object: np.ndarray) -> TrueTouch:
         """Depth and angle of a mounted sensor for poses (M, 4, 4) of the object."""
         turn, shift = T_sensor_object[:, :3, :3], T_sensor_object[:, :3, 3]
         centre_mm = -np.einsum("mji,mj->mi", turn, shift)
@@ -98,7 +98,7 @@ class Surface:
         azimuth = np.radians(mounting.image_turn_deg)
         across, axial = inward[:, :2] @ [np.cos(azimuth), np.sin(azimuth)], inward[:, 2]
         along_mm, lateral_mm = mounting.centre_mm @ mounting.axis, mounting.centre_mm @ mounting.across
-        return Touch(
+        return TrueTouch(
             mounting.skin_apex_mm + along_mm - (gap_mm + along_mm * axial + lateral_mm * across),
             np.degrees(np.arctan2(across, axial)),
             mounting.skin_apex_mm - gap_mm,
@@ -106,7 +106,9 @@ class Surface:
         )
 
 
-def surface_labels(experiment: ExperimentSpec, mounting: Mounting, surface: Surface, T_sensor_object: np.ndarray) -> dict[str, np.ndarray]:
+def surface_labels(
+    experiment: ExperimentSpec, mounting: Mounting, surface: SmoothSurface, T_sensor_object: np.ndarray
+) -> dict[str, np.ndarray]:
     """Labels of depth and angle that an arm would have for the same contact with a flat plate.
 
     Returns
@@ -119,13 +121,13 @@ def surface_labels(experiment: ExperimentSpec, mounting: Mounting, surface: Surf
     turned = {name for name in ("pose_4", "pose_5", "pose_6", "move_4", "move_5", "move_6") if ranges[name] != (0.0, 0.0)}
     if not turned <= {mounting.angle_label, mounting.angle_label.replace("pose", "move")}:
         return {}
-    touch = surface.touched(mounting, T_sensor_object)
+    touch = surface.depth_and_angle(mounting, T_sensor_object)
     depth, angle = mounting.labels(touch.depth_mm, touch.angle_deg)
     return {mounting.depth_label: depth, mounting.angle_label: angle}
 
 
 def tilted_labels(
-    rig: RigSpec, experiment: ExperimentSpec, surface: Surface, apex_mm: float, T_sensor_object: np.ndarray
+    rig: RigSpec, experiment: ExperimentSpec, surface: SmoothSurface, apex_mm: float, T_sensor_object: np.ndarray
 ) -> dict[str, float]:
     """Labels of depth and both tilts that an arm would have for the same contact with a flat plate.
 

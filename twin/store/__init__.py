@@ -2,7 +2,7 @@
 
 from twin.store.arrays import ArrayFile, Layers, layers_from, layers_to
 from twin.store.atomic import (
-    locked,
+    lock_folder,
     remove_parts,
     replace_folder,
     text_file,
@@ -39,7 +39,7 @@ __all__ = [
     "kept_json",
     "layers_from",
     "layers_to",
-    "locked",
+    "lock_folder",
     "made_by",
     "output",
     "output_file",

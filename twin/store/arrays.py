@@ -70,11 +70,11 @@ class ArrayFile:
         TwinError
             Of the type ``error``, if there is no such file, or if the file is not of this kind and version.
         """
-        with self._told(path), safe_open(path, framework="numpy") as file:
+        with self._convert_errors(path), safe_open(path, framework="numpy") as file:
             return self._about(path, file.metadata() or {})
 
     @contextmanager
-    def opened(self, path: Path) -> Iterator[tuple[dict[str, Any], dict[str, FloatArray]]]:
+    def open_arrays(self, path: Path) -> Iterator[tuple[dict[str, Any], dict[str, FloatArray]]]:
         """Context that yields the description of a file's arrays, and the arrays as float32.
 
         If the body of the context does not find a key or array that it needs, the file counts as damaged.
@@ -84,7 +84,7 @@ class ArrayFile:
         TwinError
             Of the type ``error``: as ``about``, and if the file is damaged.
         """
-        with self._told(path):
+        with self._convert_errors(path):
             with safe_open(path, framework="numpy") as file:
                 metadata = file.metadata() or {}
                 about = self._about(path, metadata)
@@ -101,10 +101,10 @@ class ArrayFile:
 
     @property
     def _remedy(self) -> str:
-        return self.again or f"make it anew with '{self.command}'"
+        return self.again or f"make it again with '{self.command}'"
 
     @contextmanager
-    def _told(self, path: Path) -> Iterator[None]:
+    def _convert_errors(self, path: Path) -> Iterator[None]:
         """Context that converts the errors of a file to errors of the type ``error``, on one line and with the remedy."""
         try:
             require_regular(path)

@@ -157,7 +157,7 @@ def unwritten(path: Path, error: OSError) -> StoreError:
 
 
 @contextmanager
-def locked(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
+def lock_folder(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     """Context that reserves a folder, made if missing, for this run. The lock of a killed run is released.
 
     Parameters

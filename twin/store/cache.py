@@ -60,7 +60,7 @@ def cached_arrays(
     except UnknownCodeError as error:
         warn_once(str(error))
         return _arrays(compute)
-    found = _read(path)
+    found = _read_arrays(path)
     if found is None:
         found = _arrays(compute)
         _write(path, found)
@@ -82,7 +82,7 @@ def _arrays(compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarra
     return found
 
 
-def _read(path: Path) -> dict[str, np.ndarray] | None:
+def _read_arrays(path: Path) -> dict[str, np.ndarray] | None:
     try:
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name] for name in file.files}

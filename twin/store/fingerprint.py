@@ -45,7 +45,7 @@ class UnknownCodeError(StoreError):
 
 
 @dataclass(frozen=True)
-class Code:
+class CodeOf:
     """The code behind a result.
 
     Attributes
@@ -86,7 +86,7 @@ def fingerprint(*makers: Maker) -> str:
     return code_of(*makers).fingerprint
 
 
-def code_of(*makers: Maker, root: Path = ROOT) -> Code:
+def code_of(*makers: Maker, root: Path = ROOT) -> CodeOf:
     """The code of functions. It is read once in a process.
 
     Parameters
@@ -107,16 +107,16 @@ def code_of(*makers: Maker, root: Path = ROOT) -> Code:
 
 def name_of(maker: Maker) -> str:
     """Name of a function or class with its module, or name of a module."""
-    maker = _called(maker)
+    maker = _unwrap(maker)
     return maker if isinstance(maker, str) else f"{maker.__module__}.{maker.__qualname__}"
 
 
 def _module_of(maker: Maker) -> str:
-    maker = _called(maker)
+    maker = _unwrap(maker)
     return maker if isinstance(maker, str) else maker.__module__
 
 
-def _called(maker: Maker) -> Maker:
+def _unwrap(maker: Maker) -> Maker:
     """The function or class itself: the one that a partial or a decorated function calls, or the class of a callable instance."""
     while isinstance(maker, partial):
         maker = maker.func
@@ -127,7 +127,7 @@ def _called(maker: Maker) -> Maker:
 
 
 @cache
-def _code(root: Path, starts: tuple[str, ...]) -> Code:
+def _code(root: Path, starts: tuple[str, ...]) -> CodeOf:
     modules, libraries, waiting = {}, set(), [(name, _file_of(root, name)) for name in starts]
     while waiting:
         name, file = waiting.pop()
@@ -135,15 +135,15 @@ def _code(root: Path, starts: tuple[str, ...]) -> Code:
             continue
         if file is None:
             raise UnknownCodeError(f"{name}: its source can't be read, so what it computes can't be kept; write it to a file")
-        found = _read(root, file, name)
+        found = _read_module(root, file, name)
         modules[name] = found.digest
         for imported, asked in found.imports:
             top = imported.partition(".")[0]
             if top in LIBRARIES:
                 libraries.add(LIBRARIES[top])
             elif top in PACKAGES:
-                waiting += [(each, _source(root, each)) for each in _resolved(root, imported, asked)]
-    return Code(modules, {name: _version(name) for name in libraries})
+                waiting += [(each, _source(root, each)) for each in _resolve_import(root, imported, asked)]
+    return CodeOf(modules, {name: _version(name) for name in libraries})
 
 
 def _file_of(root: Path, name: str) -> Path | None:
@@ -160,19 +160,19 @@ def _source(root: Path, name: str) -> Path | None:
     return next((file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()), None)
 
 
-def _resolved(root: Path, name: str, asked: str | None) -> list[str]:
+def _resolve_import(root: Path, name: str, asked: str | None) -> list[str]:
     """Modules whose code ``from name import asked`` (or ``import name``) uses."""
     if name == KEEPER or name.startswith(f"{KEEPER}."):
         return []
     if asked is None or asked == "*":
         return [name]
     if _source(root, f"{name}.{asked}") is not None:
-        return _resolved(root, f"{name}.{asked}", None)
+        return _resolve_import(root, f"{name}.{asked}", None)
     file = _source(root, name)
     if file is None or file.name != "__init__.py":
         return [name]
-    passed_on = _read(root, file, name).names.get(asked)
-    return [name] if passed_on is None else _resolved(root, *passed_on)
+    passed_on = _read_module(root, file, name).names.get(asked)
+    return [name] if passed_on is None else _resolve_import(root, *passed_on)
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def source_text(file: Path) -> str:
 
 
 @cache
-def _read(root: Path, file: Path, name: str) -> _Module:
+def _read_module(root: Path, file: Path, name: str) -> _Module:
     collecting = gc.isenabled()
     gc.disable()  # a syntax tree has many small objects, and garbage collection would double the time
     try:

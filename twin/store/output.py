@@ -24,7 +24,7 @@ from typing import ParamSpec, TypeVar
 import platformdirs
 
 from twin.errors import StoreError
-from twin.store.atomic import LOCK, PART, locked, unwritten, write_json
+from twin.store.atomic import LOCK, PART, lock_folder, unwritten, write_json
 from twin.store.made import PROGRAM
 
 WRITTEN = ".written.json"
@@ -72,7 +72,7 @@ def output(folder: Path, *names: str, gone_on: tuple[str, ...] = ()) -> Iterator
         If the folder can't be written to, if another run uses it, if it contains a file with one of these names that this program did not
         write or that has changed since, or if the disk becomes full during the work.
     """
-    with _unmade_if_empty(folder), _held_once(folder), _told(folder):
+    with _unmade_if_empty(folder), _held_once(folder), _convert_disk_error(folder):
         every = (*names, *gone_on)
         written = _require_ours(folder, every)
         _write_list(folder / WRITTEN, written | dict.fromkeys(every, _ANY))
@@ -102,7 +102,7 @@ def output_file(path: Path, *beside: str) -> Iterator[None]:
         As ``output``.
     """
     folder, names = path.parent, [glob.escape(path.name), *(glob.escape(path.stem) + ending for ending in beside)]
-    with _unmade_if_empty(folder), _told(path):
+    with _unmade_if_empty(folder), _convert_disk_error(path):
         with _held_once(folder, wait_s=_WAIT_S):
             _require_ours(folder, names)
             _require_room(folder)
@@ -124,22 +124,22 @@ def writes_file(*beside: str, to: str = "out") -> Callable[[Callable[Given, Made
 
 
 def _opening(to: str, context: Callable[[Path], AbstractContextManager[None]]) -> Callable[[Callable[Given, Made]], Callable[Given, Made]]:
-    def decorated(function: Callable[Given, Made]) -> Callable[Given, Made]:
+    def decorate(function: Callable[Given, Made]) -> Callable[Given, Made]:
         signature = inspect.signature(function)
         if to not in signature.parameters:
             raise TypeError(f"{function.__qualname__} has no parameter {to!r}")
 
         @wraps(function)
-        def opened(*args: Given.args, **kwargs: Given.kwargs) -> Made:
+        def call_in_context(*args: Given.args, **kwargs: Given.kwargs) -> Made:
             path = signature.bind(*args, **kwargs).arguments.get(to)
             if path is None:
                 return function(*args, **kwargs)
             with context(Path(path)):
                 return function(*args, **kwargs)
 
-        return opened
+        return call_in_context
 
-    return decorated
+    return decorate
 
 
 def contents(folder: Path) -> list[str]:
@@ -270,7 +270,7 @@ def _unmade_if_empty(folder: Path) -> Iterator[None]:
     except BaseException:
         with suppress(StoreError, OSError):  # another run is at work there, or a folder holds something
             if made:
-                with locked(folder):
+                with lock_folder(folder):
                     for each in made:
                         each.rmdir()
         raise
@@ -278,12 +278,12 @@ def _unmade_if_empty(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _held_once(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
-    """Context that reserves a folder as ``locked`` does, unless this context has reserved it already."""
+    """Context that reserves a folder as ``lock_folder`` does, unless this context has reserved it already."""
     place = Path(os.path.abspath(folder))
     if place in _held.get():
         yield
         return
-    with locked(folder, wait_s=wait_s):
+    with lock_folder(folder, wait_s=wait_s):
         before = _held.set(_held.get() | {place})
         try:
             yield
@@ -292,7 +292,7 @@ def _held_once(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _convert_disk_error(path: Path) -> Iterator[None]:
     """Context that converts the error of a full or read-only disk to the ``StoreError`` of ``unwritten``."""
     try:
         yield

@@ -136,7 +136,7 @@ def require_same_code(folder: Path, *by: Maker, begun: bool) -> None:
     if not begun:
         write_json(path, made_by(*by, dated=False) | code.record())
         return
-    remedy = "give another `out`, or remove the folder to make it anew"
+    remedy = "give another `out`, or remove the folder to make it again"
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:

@@ -72,7 +72,7 @@ def in_window(planes: tuple[FloatArray, FloatArray], window_px: tuple[int, int, 
     return planes[0][y0:y1, x0:x1], planes[1][y0:y1, x0:x1]
 
 
-class DomeCamera:
+class StudioCamera:
     """Draws the dome, and makes frames from drawn or traced light.
 
     Parameters
@@ -100,13 +100,13 @@ class DomeCamera:
         image[y0:y1, x0:x1] = expose(light, self.spec.capture, np.random.default_rng(seed), origin_px=(x0, y0))
         return Frame(image, Form.RAW)
 
-    def recorded(self, raw: Frame) -> Frame:
+    def as_recorded(self, raw: Frame) -> Frame:
         """A raw frame in the form of the sensor's recordings.
 
         Raises
         ------
         FrameError
-            The sensor has no recording form.
+            The sensor has no processed form.
         """
         if self.spec.recording is None:
             raise FrameError(f"{self.spec.name} has no recordings' form; show raw frames")

@@ -17,7 +17,7 @@ from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.camera.projection import project
 from twin.errors import ContactError
-from twin.estimate import Estimate, SensorModel, seen_in
+from twin.estimate import Estimate, SensorModel, pins_in
 from twin.frames.forms import from_raw
 from twin.geometry.solid import Resolution
 from twin.mechanics.follow import STEP_MM, Follower
@@ -28,8 +28,8 @@ from twin.objects import build_field
 from twin.pins import Pipeline
 from twin.rig.kinematics import rig_of
 from twin.rig.mounting import Mounting
-from twin.rig.touch import Surface, surface_labels, tilted_labels
-from twin.studio.camera import DomeCamera
+from twin.rig.touch import SmoothSurface, surface_labels, tilted_labels
+from twin.studio.camera import StudioCamera
 from twin.studio.pose import ObjectPose, bend_mm, motion_mm
 from twin.types import FINE, ContactState, FloatArray, Form, Frame, Observation
 
@@ -61,7 +61,7 @@ class Light(StrEnum):
     TRACED = "path-traced"
 
 
-class Mesh(StrEnum):
+class SolvedMesh(StrEnum):
     """The mesh on which a contact was solved."""
 
     USUAL = "usual mesh"
@@ -69,7 +69,7 @@ class Mesh(StrEnum):
 
 
 @dataclass(frozen=True)
-class Answer:
+class ContactAnswer:
     """Everything that the page shows of one pose.
 
     Attributes
@@ -107,7 +107,7 @@ class Answer:
         Time of each stage.
     """
 
-    setup: "Setup"
+    setup: "ContactSetup"
     number: int
     solved: int
     pose: ObjectPose
@@ -121,20 +121,20 @@ class Answer:
     estimate: Estimate | None
     labels: dict[str, float]
     lit: Light
-    mesh: Mesh
+    mesh: SolvedMesh
     arrived: bool
     stopped: str
     ms: dict[str, float]
 
 
 @dataclass(frozen=True)
-class Setup:
+class ContactSetup:
     """The sensor, the object that is moved against it, and the settings of the view.
 
     Attributes
     ----------
     sensor : SensorSpec
-    touched : ObjectSpec
+    obj : ObjectSpec
     friction : float or None
         Value that replaces the object's own friction.
     form : Form
@@ -142,14 +142,14 @@ class Setup:
     """
 
     sensor: SensorSpec
-    touched: ObjectSpec
+    obj: ObjectSpec
     friction: float | None = None
     form: Form = Form.RAW
 
     @property
     def law(self) -> ContactLaw:
         """The contact law of the pair. No arm holds the object, so nothing else gives way."""
-        return ContactLaw.of_object(self.touched).override(friction=self.friction)
+        return ContactLaw.of_object(self.obj).override(friction=self.friction)
 
 
 class MovingContact:
@@ -169,9 +169,9 @@ class MovingContact:
         The object's pose.
     """
 
-    def __init__(self, setup: Setup, model: SensorModel | None = None) -> None:
+    def __init__(self, setup: ContactSetup, model: SensorModel | None = None) -> None:
         self.setup = setup
-        self.camera = DomeCamera(setup.sensor)
+        self.camera = StudioCamera(setup.sensor)
         self.solver = SkinSolver(setup.sensor)
         self._fine_solver: SkinSolver | None = None
         skin, shape = setup.sensor.skin, self.solver.shape
@@ -183,7 +183,7 @@ class MovingContact:
         self.model: SensorModel | None = None
         self._count, self._solved = 0, 0
         self.pose = ObjectPose()
-        self._last: Answer | None = None
+        self._last: ContactAnswer | None = None
         self._take_up(setup)
         if model is not None:
             self.use(model)
@@ -200,35 +200,35 @@ class MovingContact:
         self.model = model
         self._experiment = experiment_of(model)
 
-    def change(self, *, touched: ObjectSpec | None = None, friction: float | None = None, form: Form | None = None) -> None:
+    def change(self, *, obj: ObjectSpec | None = None, friction: float | None = None, form: Form | None = None) -> None:
         """Use another object, friction or form of the frames. Arguments that are not given stay as they are. A contact starts again.
 
         Another object has its own friction until a friction is given again.
         """
         setup = self.setup
-        if touched is not None:
-            setup = replace(setup, touched=touched, friction=None)
+        if obj is not None:
+            setup = replace(setup, obj=obj, friction=None)
         if friction is not None:
             setup = replace(setup, friction=friction)
         if form is not None:
             setup = replace(setup, form=form)
         if setup.form is Form.PROCESSED and setup.sensor.recording is None:
-            self.camera.recorded(Frame(np.zeros((1, 1), np.uint8), Form.RAW))  # raises the error that there is no such form
-        pressed_anew = setup.touched != self.setup.touched or setup.friction != self.setup.friction
+            self.camera.as_recorded(Frame(np.zeros((1, 1), np.uint8), Form.RAW))  # raises the error that there is no such form
+        pressed_anew = setup.obj != self.setup.obj or setup.friction != self.setup.friction
         if pressed_anew:
             self._take_up(setup)
         else:
             self.setup, self._pipeline = setup, Pipeline(setup.sensor, setup.form)
 
-    def _take_up(self, setup: Setup) -> None:
+    def _take_up(self, setup: ContactSetup) -> None:
         self.setup = setup
-        self._surface, self._field = Surface(setup.touched), build_field(setup.touched)
+        self._surface, self._field = SmoothSurface(setup.obj), build_field(setup.obj)
         self._pipeline = Pipeline(setup.sensor, setup.form)
-        self.begin_anew()
+        self.restart()
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """Forget the contact and its friction. The next move presses the object straight down to its pose."""
-        self._follower = Follower(self.solver, self.setup.touched, self.setup.law)
+        self._follower = Follower(self.solver, self.setup.obj, self.setup.law)
         self._T: FloatArray | None = None
         self._blocked: FloatArray | None = None
         self._why_blocked = ""
@@ -269,10 +269,10 @@ class MovingContact:
         low, high = 0.0, MOST_LIFT_MM
         for _ in range(HALVINGS):
             lift = 0.5 * (low + high)
-            low, high = (low, lift) if not self.refusal(_lifted(T, lift)) else (lift, high)
-        return _lifted(T, high), "; ".join(part for part in (reason, f"the object stops here: {why}") if part)
+            low, high = (low, lift) if not self.refusal(_lift(T, lift)) else (lift, high)
+        return _lift(T, high), "; ".join(part for part in (reason, f"the object stops here: {why}") if part)
 
-    def arrived(self, wished: ObjectPose) -> bool:
+    def has_arrived(self, wished: ObjectPose) -> bool:
         """Whether the object is at the pose to which a wish moves it, or the solver found no path there."""
         goal, _ = self.admissible(wished)
         return self._is_there(goal)
@@ -297,7 +297,7 @@ class MovingContact:
 
     # answers
 
-    def step(self, wished: ObjectPose) -> Answer:
+    def step(self, wished: ObjectPose) -> ContactAnswer:
         """Move one load step towards a wish, draw, and observe. If the solver finds nothing, the object stays and the answer says why."""
         started = time.perf_counter()
         goal, reason = self.admissible(wished)
@@ -311,14 +311,14 @@ class MovingContact:
             self._count += 1
             self._last = replace(self._last, number=self._count, arrived=True, stopped=self._why_blocked)
             return self._last
-        self._remember(T)
+        self._store_path(T)
         self._solved += 1
         solved_ms = 1e3 * (time.perf_counter() - started)
         arrived = self._is_there(goal)
         stopped = (self._why_blocked if self._blocked is not None and np.array_equal(self._blocked, goal) else reason) if arrived else ""
-        return self._answer(T, state, Mesh.USUAL, arrived=arrived, stopped=stopped, ms={"contact": solved_ms})
+        return self._answer(T, state, SolvedMesh.USUAL, arrived=arrived, stopped=stopped, ms={"contact": solved_ms})
 
-    def traced(self, solved: int, light: FloatArray, lit: Light, traced_ms: float) -> Answer | None:
+    def newest_traced(self, solved: int, light: FloatArray, lit: Light, traced_ms: float) -> ContactAnswer | None:
         """The newest answer with path-traced light (h, w) or (h, w, 3) of a contact; None if a newer contact was solved since."""
         last = self._last
         if last is None or last.solved != solved:
@@ -326,14 +326,14 @@ class MovingContact:
         self._last = replace(last, light=light, lit=lit, ms={"contact": last.ms["contact"], "trace": traced_ms})
         return self.again()
 
-    def refine(self) -> Answer | None:
+    def refine(self) -> ContactAnswer | None:
         """Cover one part of the contact's path on the fine mesh. Returns the answer at the path's end; None before."""
         if self.refined or self._last is None or self._T is None:
             return None
         if self._fine_solver is None:
             self._fine_solver = SkinSolver(self.setup.sensor, resolution=Resolution(across=FINE))
         if self._fine is None:
-            self._fine = Follower(self._fine_solver, self.setup.touched, self.setup.law)
+            self._fine = Follower(self._fine_solver, self.setup.obj, self.setup.law)
         started = time.perf_counter()
         piece = [self._way.popleft()]
         pressed = self._fine.pressed_mm(piece[0])
@@ -354,7 +354,7 @@ class MovingContact:
         self._refined = True
         self._solved += 1
         last, ms = self._last, 1e3 * (time.perf_counter() - started)
-        return self._answer(self._T, state, Mesh.FINE, arrived=last.arrived, stopped=last.stopped, ms={"contact": ms})
+        return self._answer(self._T, state, SolvedMesh.FINE, arrived=last.arrived, stopped=last.stopped, ms={"contact": ms})
 
     @property
     def refined(self) -> bool:
@@ -367,7 +367,7 @@ class MovingContact:
         """Why this contact has no answer on the fine mesh; "" if it has one or may still get one."""
         return self._fine_lost
 
-    def again(self) -> Answer | None:
+    def again(self) -> ContactAnswer | None:
         """The newest answer, computed again after a change of form or model; None before the first answer."""
         last = self._last
         if last is None:
@@ -376,7 +376,7 @@ class MovingContact:
         T = last.pose.matrix(self._apex_mm)
         return self._answer(T, last.state, last.mesh, traced, arrived=last.arrived, stopped=last.stopped, ms=last.ms)
 
-    def _remember(self, T: FloatArray) -> None:
+    def _store_path(self, T: FloatArray) -> None:
         """Store the path for the fine mesh. A contact's path begins at the last free pose, or where the contact was started again."""
         begun_anew = self._T is None or self._blocked is not None or self._follower.restarts != self._restarts
         self._blocked, self._refined, self._restarts = None, False, self._follower.restarts
@@ -393,27 +393,27 @@ class MovingContact:
         self,
         T: FloatArray,
         state: ContactState,
-        mesh: Mesh,
+        mesh: SolvedMesh,
         traced: tuple[FloatArray, Light] | None = None,
         *,
         arrived: bool,
         stopped: str,
         ms: dict[str, float],
-    ) -> Answer:
+    ) -> ContactAnswer:
         self._count += 1
         started = time.perf_counter()
         light, lit = traced or (self.camera.draw(state), Light.DRAWN)
         raw = self.camera.raw(light, seed=self._count)
         now = time.perf_counter()
         needs_recorded = self.setup.form is Form.PROCESSED or (self.model is not None and self.model.form is Form.PROCESSED)
-        frames = {Form.RAW: raw} | ({Form.PROCESSED: self.camera.recorded(raw)} if needs_recorded else {})
+        frames = {Form.RAW: raw} | ({Form.PROCESSED: self.camera.as_recorded(raw)} if needs_recorded else {})
         frame = frames[self.setup.form]
         estimate = None if self.model is None else self.model(frames[self.model.form])
         estimated = time.perf_counter()
         of_frame = self.model is not None and self.model.form is self.setup.form
-        seen = seen_in(frame, estimate if of_frame else None, self._pipeline)
+        seen = pins_in(frame, estimate if of_frame else None, self._pipeline)
         times = {"picture": now - started, "estimate": estimated - now, "pins": time.perf_counter() - estimated}
-        self._last = Answer(
+        self._last = ContactAnswer(
             self.setup,
             self._count,
             self._solved,
@@ -459,7 +459,7 @@ def experiment_of(model: SensorModel) -> ExperimentSpec | None:
     return None
 
 
-def _lifted(T: FloatArray, by_mm: float) -> FloatArray:
+def _lift(T: FloatArray, by_mm: float) -> FloatArray:
     """An object's pose (4, 4) moved along the sensor's z, out of the tip."""
     lifted = T.copy()
     lifted[2, 3] += by_mm

@@ -6,19 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.errors import TwinError
-from twin.estimate import Estimate, seen_in
-from twin.judge.degradation.condition import Case, Condition
-from twin.judge.degradation.conditions import CONDITIONS, condition
-from twin.judge.degradation.measures import MEASURES, judge_shot
-from twin.judge.degradation.shots import DegradedShot, degraded_state
-from twin.judge.degradation.sweep import SEVERITIES
+from twin.estimate import Estimate, pins_in
+from twin.evaluation.degradation.condition import Condition, DegradedCase
+from twin.evaluation.degradation.conditions import CONDITIONS, condition
+from twin.evaluation.degradation.measures import MEASURES, measure_frame
+from twin.evaluation.degradation.shots import DegradedFrame, degraded_state
+from twin.evaluation.degradation.sweep import SEVERITIES
 from twin.optics.preview import Shading
 from twin.pins import make_detector, nominal_reference, shipped_detector
 from twin.pins.pipeline import Pipeline
-from twin.studio.contact import Answer
+from twin.studio.contact import ContactAnswer
 from twin.studio.mode import PageMode
-from twin.studio.page import Page, put
-from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, paragraph
+from twin.studio.page import StudioPage, put
+from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, paragraph
 from twin.studio.pose import ObjectPose
 from twin.studio.twin_mode import TwinMode
 from twin.types import Form, Frame, Observation
@@ -31,18 +31,18 @@ FIRST = ("defocus", "caps-missing", "camera-rolled")
 """Conditions that are selected at first, if they exist."""
 
 
-def offered() -> dict[str, Condition]:
+def selectable_conditions() -> dict[str, Condition]:
     """The selectable conditions by title. Those that change mechanics or pipeline settings are left out, as the contact is given."""
     return {f"{c.title} ({c.family})": c for c in CONDITIONS.values() if not c.solves and c.setting is None}
 
 
 @dataclass(frozen=True)
-class Judged:
+class EvaluatedFrame:
     """A degraded frame, and the results of pipeline and model for it.
 
     Attributes
     ----------
-    shot : DegradedShot
+    degraded : DegradedShot
     seen : Observation
     figures : dict of str to float
         Values by the names of ``MEASURES``.
@@ -51,15 +51,15 @@ class Judged:
     estimate : Estimate or None
     """
 
-    shot: DegradedShot
+    degraded: DegradedFrame
     seen: Observation
     figures: dict[str, float]
     failed: tuple[str, ...]
     estimate: Estimate | None
 
 
-class Judge:
-    """Degrades contacts of one sensor and judges the results as ``twin robustness`` does.
+class FrameEvaluator:
+    """Degrades contacts of one sensor and evaluates the results as ``twin robustness`` does.
 
     Parameters
     ----------
@@ -76,19 +76,19 @@ class Judge:
         pitch_px = float(np.mean(self.reference.spacing_px))
         self.limits = {m.name: m.limit * (pitch_px if m.in_pitches else 1.0) for m in MEASURES}
 
-    def __call__(self, answer: Answer, cases: list[tuple[Case, float]], shading: Shading) -> Judged:
-        """Judge a contact with cases, each at its severity."""
+    def __call__(self, answer: ContactAnswer, cases: list[tuple[DegradedCase, float]], shading: Shading) -> EvaluatedFrame:
+        """Evaluate a contact with cases, each at its severity."""
         touched = bool(len(answer.state.contact_mm))
         shot = degraded_state(self.spec, answer.state, cases, shading=shading, touched=touched)
-        figures = judge_shot(self._detector, self._detector(shot.frame), shot)
-        failed = tuple(m.title for m in MEASURES if m.failed(figures[m.name], self.limits[m.name]))
+        figures = measure_frame(self._detector, self._detector(shot.frame), shot)
+        failed = tuple(m.title for m in MEASURES if m.exceeds(figures[m.name], self.limits[m.name]))
         model = self.contact.model
         estimate = None if model is None else model(self._in_form(shot.frame, model.form))
         of_frame = model is not None and model.form is Form.RAW
-        return Judged(shot, seen_in(shot.frame, estimate if of_frame else None, self._pipeline), figures, failed, estimate)
+        return EvaluatedFrame(shot, pins_in(shot.frame, estimate if of_frame else None, self._pipeline), figures, failed, estimate)
 
     def _in_form(self, raw: Frame, form: Form) -> Frame:
-        return raw if form is Form.RAW else self.contact.camera.recorded(raw)
+        return raw if form is Form.RAW else self.contact.camera.as_recorded(raw)
 
 
 class DegradeMode(PageMode):
@@ -102,14 +102,14 @@ class DegradeMode(PageMode):
 
     title = "Degrade"
 
-    def __init__(self, page: Page, twin: TwinMode) -> None:
+    def __init__(self, page: StudioPage, twin: TwinMode) -> None:
         super().__init__(page)
         self._twin = twin
-        self._judge: Judge | None = None
+        self._judge: FrameEvaluator | None = None
         self._edge, self._finding = "", False
         self._pose: ObjectPose | None = None
         self._wanted = self.newest(self._show, "degrade")
-        conditions = offered()
+        conditions = selectable_conditions()
         titles = (NO_CONDITION, *conditions)
         by_name = {c.name: title for title, c in conditions.items()}
         self._conditions, self._choices, self._severities = conditions, [], []
@@ -117,13 +117,15 @@ class DegradeMode(PageMode):
             for k in range(SLIDERS):
                 first = by_name.get(FIRST[k], NO_CONDITION)
                 choice = page.gui.add_dropdown(f"condition {k + 1}", titles, initial_value=first)
-                slider = page.gui.add_slider(f"severity {k + 1}", 0.0, 1.0, 0.01, 0.0, hint="1: so severe that nobody would use the sensor")
+                slider = page.gui.add_slider(f"severity {k + 1}", 0.0, 1.0, 0.01, 0.0, hint="1: unusable")
                 for control in (choice, slider):
-                    control.on_update(lambda event: self._changed())
+                    control.on_update(lambda event: self._restart())
                 self._choices.append(choice)
                 self._severities.append(slider)
-            edge = page.gui.add_button("Find the edge", hint="raise the severity of condition 1 until something fails; the others stay")
-            none = page.gui.add_button("Nothing is wrong")
+            edge = page.gui.add_button(
+                "Find breaking point", hint="raise the severity of condition 1 until something fails; the others stay"
+            )
+            none = page.gui.add_button("Reset")
         edge.on_click(lambda event: self._find())
         none.on_click(lambda event: self._reset())
 
@@ -132,14 +134,14 @@ class DegradeMode(PageMode):
         self._page.show_nothing("The contact is drawn as a sensor sees it that something is wrong with ...")
         self._wanted.give(None)
 
-    def follow(self, answer: Answer) -> None:
+    def follow(self, answer: ContactAnswer) -> None:
         """Use the twin's new contact."""
         if self._active:
             if answer.pose != self._pose:
                 self._edge = ""
             self._wanted.give(None)
 
-    def _changed(self) -> None:
+    def _restart(self) -> None:
         self._edge, self._finding = "", False
         self._wanted.give(None)
 
@@ -150,19 +152,19 @@ class DegradeMode(PageMode):
     def _reset(self) -> None:
         for slider in self._severities:
             put(slider, 0.0)
-        self._changed()
+        self._restart()
 
-    def cases(self) -> list[tuple[Case, float]]:
+    def cases(self) -> list[tuple[DegradedCase, float]]:
         """The chosen conditions with their severities."""
         chosen = [(choice.value, float(slider.value)) for choice, slider in zip(self._choices, self._severities, strict=True)]
-        return [(Case((condition(self._conditions[title].name),)), severity) for title, severity in chosen if title != NO_CONDITION]
+        return [(DegradedCase((condition(self._conditions[title].name),)), severity) for title, severity in chosen if title != NO_CONDITION]
 
     def _show(self, _: None) -> None:
         answer = self._twin.worker.newest
         if answer is None or not self._active:
             return
         if self._judge is None or self._judge.contact is not self._twin.contact:
-            self._judge = Judge(self._twin)
+            self._judge = FrameEvaluator(self._twin)
         judge, shading, started = self._judge, self._twin.contact.camera.preview.shading, time.perf_counter()
         self._pose = answer.pose
         if self._finding:
@@ -171,9 +173,9 @@ class DegradeMode(PageMode):
         cases = self.cases()
         judged = judge(answer, cases, shading)
         ms = 1e3 * (time.perf_counter() - started)
-        frame = judged.shot.frame
+        frame = judged.degraded.frame
         crop = self._twin.contact.camera.crop
-        camera = crop(camera_picture(frame, judged.seen, judge.reference.pins_px, Drawn.GRAPH), Form.RAW)
+        camera = crop(camera_picture(frame, judged.seen, judge.reference.pins_px, OverlayChoices.GRAPH), Form.RAW)
         cells = crop(cell_picture(frame, judged.seen, judge.reference.area_px2), Form.RAW)
         words = "; ".join(f"{case.title} {case.label(severity)}" for case, severity in cases if severity) or "nothing is wrong"
         numbers = [
@@ -181,13 +183,13 @@ class DegradeMode(PageMode):
             paragraph(words, "note"),
             _measures(judged, judge.limits),
             paragraph("" if judged.seen.valid else f"The pipeline refuses the frame: {judged.seen.reason}", "stop"),
-            estimate_table(judged.estimate, answer.labels) if judged.shot.touched else "",
+            estimate_table(judged.estimate, answer.labels) if judged.degraded.touched else "",
             paragraph(self._edge, "said"),
-            paragraph(f"{ms:.0f} ms for this answer", "note"),
+            paragraph(f"{ms:.0f} ms latency", "note"),
         ]
         self.put_up((camera, cells), "camera, raw frame, degraded", numbers)
 
-    def _edge_of(self, judge: Judge, answer: Answer, shading: Shading) -> str:
+    def _edge_of(self, judge: FrameEvaluator, answer: ContactAnswer, shading: Shading) -> str:
         """The severity of the first chosen condition at which this contact leaves the envelope, in words."""
         cases = self.cases()
         if not cases:
@@ -208,7 +210,7 @@ class DegradeMode(PageMode):
         return f"Edge for this contact: {case.title} is borne up to its most severe value, {case.label(1.0)}."
 
 
-def _measures(judged: Judged, limits: dict[str, float]) -> str:
+def _measures(judged: EvaluatedFrame, limits: dict[str, float]) -> str:
     """HTML of the measures with their limits."""
     rows = []
     for m in MEASURES:

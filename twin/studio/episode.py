@@ -9,15 +9,15 @@ import numpy as np
 
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.estimate import seen_in
+from twin.estimate import pins_in
 from twin.geometry.pins import rest_pins
 from twin.optics.surfaces import SkinSurface
 from twin.pins import Pipeline, nominal_reference
-from twin.studio.live_page import shot_pictures
+from twin.studio.live_page import frame_pictures
 from twin.studio.mode import PageMode
-from twin.studio.page import Chart, Page
+from twin.studio.page import LineChart, StudioPage
 from twin.studio.pictures import badge, number_table
-from twin.studio.scene import PinScene, Shown, Surface, colours
+from twin.studio.scene import PinColour, PinScene, TriangleMesh, colours
 from twin.types import FloatArray, Form, Frame, PinState
 
 AROUND_MM, MOST_BESIDE_MM = 22.0, 8.0
@@ -35,7 +35,7 @@ class EpisodeStep:
     frame : Frame
         The sensor's picture.
     pins : PinState
-    touched : ObjectSpec
+    obj : ObjectSpec
     T_sensor_object : (4, 4) float
     force_n : (3,) float
         Force of the skin on the object.
@@ -43,19 +43,19 @@ class EpisodeStep:
         Start of the force's arrow.
     reward : float
         Reward of this step.
-    told : dict of str to str
+    description : dict of str to str
         Names and values of further data to show.
     """
 
     number: int
     frame: Frame
     pins: PinState
-    touched: ObjectSpec
+    obj: ObjectSpec
     T_sensor_object: FloatArray
     force_n: FloatArray
     foot_mm: FloatArray
     reward: float
-    told: dict[str, str]
+    description: dict[str, str]
 
 
 class EpisodeMode(PageMode):
@@ -71,17 +71,17 @@ class EpisodeMode(PageMode):
 
     title = "Episode"
 
-    def __init__(self, page: Page, sensor: SensorSpec, form: Form) -> None:
+    def __init__(self, page: StudioPage, sensor: SensorSpec, form: Form) -> None:
         super().__init__(page)
         self._sensor, self._rest = sensor, rest_pins(sensor.geometry)
         self._pipeline, self._reference = Pipeline(sensor, form), nominal_reference(sensor, form)
         self._skin = SkinSurface(sensor.skin, self._rest.base_mm)  # interpolated between the pins' feet, because some backends give no skin
-        self._scene = PinScene(page.server, sensor, Surface(self._skin.rest_mm.astype(np.float32), self._skin.faces), self._rest)
+        self._scene = PinScene(page.server, sensor, TriangleMesh(self._skin.rest_mm.astype(np.float32), self._skin.faces), self._rest)
         self._touched: ObjectSpec | None = None
         self._middle_mm = np.zeros(3)  # of the part of the object that is shown
         self._last: EpisodeStep | None = None
         self._steps = self.newest(self._show, "episode")
-        self._rewards, self._forces = Chart(page, "reward of a step"), Chart(page, "force on the object, N")
+        self._rewards, self._forces = LineChart(page, "reward of a step"), LineChart(page, "force on the object, N")
 
     def give(self, step: EpisodeStep) -> None:
         """Give the next step to show. Returns at once."""
@@ -96,33 +96,39 @@ class EpisodeMode(PageMode):
             self._steps.give(self._last)
 
     def _show(self, step: EpisodeStep) -> None:
-        seen = seen_in(step.frame, None, self._pipeline)
+        seen = pins_in(step.frame, None, self._pipeline)
         place = step.T_sensor_object[:3, :3].T @ (step.foot_mm - step.T_sensor_object[:3, 3])
-        if step.touched != self._touched or np.abs(place - self._middle_mm).max() > MOST_BESIDE_MM:
-            self._scene.put_object(step.touched, np.add.outer(place, [-AROUND_MM, AROUND_MM]).ravel().tolist())
-            self._touched, self._middle_mm = step.touched, place
+        if step.obj != self._touched or np.abs(place - self._middle_mm).max() > MOST_BESIDE_MM:
+            self._scene.put_object(step.obj, np.add.outer(place, [-AROUND_MM, AROUND_MM]).ravel().tolist())
+            self._touched, self._middle_mm = step.obj, place
         rows = {
             "step": str(step.number),
             "reward": f"{step.reward:+.3f}",
-            "object": step.touched.name,
+            "object": step.obj.name,
             "force x, y, z": "  ".join(f"{value:+.2f}" for value in step.force_n + 0.0) + " N",
             "pins found": f"{seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}"),
         }
         way_mm = np.linalg.norm(step.pins.caps_mm - self._rest.caps_mm, axis=1)
 
         def scene() -> None:
-            self._scene.show_pins(step.pins, self._skin.vertices(step.pins.base_mm).astype(np.float32), colours(way_mm, Shown.DISPLACEMENT))
+            self._scene.show_pins(
+                step.pins, self._skin.vertices(step.pins.base_mm).astype(np.float32), colours(way_mm, PinColour.DISPLACEMENT)
+            )
             self._scene.show_object(step.T_sensor_object)
             self._scene.show_force(step.foot_mm, step.force_n)
             self._rewards.add({"reward": step.reward})
             self._forces.add(dict(zip("xyz", step.force_n.tolist(), strict=True)))
 
-        numbers = [f"<span data-number='{step.number}' data-depth='0'></span>", badge("episode", "moving"), number_table(rows | step.told)]
-        pictures = shot_pictures(self._sensor, self._reference, step.frame, seen)
+        numbers = [
+            f"<span data-number='{step.number}' data-depth='0'></span>",
+            badge("episode", "moving"),
+            number_table(rows | step.description),
+        ]
+        pictures = frame_pictures(self._sensor, self._reference, step.frame, seen)
         self.put_up(pictures, f"camera, {step.frame.form} frame", numbers, also=scene)
 
 
-class EpisodePage(Page):
+class EpisodePage(StudioPage):
     """A page that shows the steps of episodes to any number of browsers. A context manager.
 
     Parameters
@@ -132,7 +138,7 @@ class EpisodePage(Page):
     form : Form
         Form of the frames.
     host, port : str, int
-        As for ``Page``.
+        As for ``StudioPage``.
 
     Raises
     ------

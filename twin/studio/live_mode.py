@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Protocol
 
 from twin.errors import TwinError
-from twin.estimate import SensorModel, seen_in
+from twin.estimate import SensorModel, pins_in
 from twin.pins.check import Grade, examine
 from twin.pins.pipeline import Pipeline
-from twin.studio.live_page import LiveShot, charted, shot_numbers, shot_pictures
+from twin.studio.live_page import LiveFrame, chart_values, frame_numbers, frame_pictures
 from twin.studio.mode import PageMode
-from twin.studio.page import Chart, Page, put
+from twin.studio.page import LineChart, StudioPage, put
 from twin.studio.pictures import badge, paragraph
 from twin.studio.twin_mode import TwinMode
 
@@ -61,7 +61,7 @@ class LiveFeed(Protocol):
     def robot(self) -> LiveArm | None:
         """The arm; None if there is none."""
 
-    def start(self, on_shot: Callable[[LiveShot], None], on_end: Callable[[str], None]) -> None:
+    def start(self, on_frame: Callable[[LiveFrame], None], on_end: Callable[[str], None]) -> None:
         """Connect, and deliver frames from a thread. When it ends, ``on_end`` is called with the reason."""
 
     def stop(self) -> None:
@@ -95,14 +95,14 @@ class LiveMode(PageMode):
 
     title = "Live"
 
-    def __init__(self, page: Page, twin: TwinMode, open_feed: FeedOpener, out: Path, *, camera: str = "", arm: str = "") -> None:
+    def __init__(self, page: StudioPage, twin: TwinMode, open_feed: FeedOpener, out: Path, *, camera: str = "", arm: str = "") -> None:
         super().__init__(page)
         self._twin, self._open_feed, self._out = twin, open_feed, out
         self._feed: LiveFeed | None = None
         self._connecting = threading.RLock()  # the page calls from many threads, and a feed that is forgotten would keep its arm
         self._pipeline: Pipeline | None = None
         self._health: list[str] = []
-        self._last: LiveShot | None = None
+        self._last: LiveFrame | None = None
         self._shots = self.newest(self._show, "live")
         gui = page.gui
         with self.folder:
@@ -117,15 +117,15 @@ class LiveMode(PageMode):
             self._limits = gui.add_html("")
             nudges = gui.add_button_group("move, mm", NUDGES, visible=False)
         self._nudges = nudges
-        connect.on_click(page.guarded(self.connect))
-        disconnect.on_click(page.guarded(self.disconnect))
-        health.on_click(page.guarded(self.check_health))
-        stop.on_click(page.guarded(self.emergency_stop))
-        self._record.on_update(page.guarded(self._toggle_record))
-        self._armed.on_update(page.guarded(self._toggle_armed))
-        nudges.on_click(page.guarded(lambda: self._nudge(nudges.value)))
-        gui.add_command("Emergency stop of the arm", hotkey="space", modifier="shift").on_trigger(page.guarded(self.emergency_stop))
-        self._chart = Chart(page, "live estimates")
+        connect.on_click(page.guard(self.connect))
+        disconnect.on_click(page.guard(self.disconnect))
+        health.on_click(page.guard(self.check_health))
+        stop.on_click(page.guard(self.emergency_stop))
+        self._record.on_update(page.guard(self._toggle_record))
+        self._armed.on_update(page.guard(self._toggle_armed))
+        nudges.on_click(page.guard(lambda: self._nudge(nudges.value)))
+        gui.add_command("Emergency stop of the arm", hotkey="space", modifier="shift").on_trigger(page.guard(self.emergency_stop))
+        self._chart = LineChart(page, "live estimates")
 
     def stop(self) -> None:
         """End, and release camera and arm."""
@@ -138,7 +138,7 @@ class LiveMode(PageMode):
         with self._connecting:
             absent = self._feed is None and bool(self._camera.value)
             if absent:
-                self._page.guarded(self.connect)(self)
+                self._page.guard(self.connect)(self)
         if not absent and self._last is not None:  # this frame came before the mode was entered, or after it was left
             self._shots.give(self._last)
 
@@ -187,7 +187,7 @@ class LiveMode(PageMode):
         self._page.say("The arm was stopped and its power cut. Look at it, then arm it again.", bad=True)
 
     def check_health(self) -> None:
-        """Show the sensor's condition, judged from the newest frame."""
+        """Show the sensor's condition, evaluated from the newest frame."""
         if self._last is None or self._feed is None:
             raise TwinError("there is no frame yet; connect a camera first")
         findings = examine([self._last.frame], self._feed.model.sensor)
@@ -224,21 +224,21 @@ class LiveMode(PageMode):
         axis, _, by = text.partition(" ")
         self._robot().nudge("xyz".index(axis), float(by))
 
-    def _show(self, shot: LiveShot) -> None:
+    def _show(self, shot: LiveFrame) -> None:
         feed, pipeline = self._feed, self._pipeline
         self._last = shot
         if feed is None or pipeline is None or not self._active:
             return
-        seen = seen_in(shot.frame, shot.estimate, pipeline)
-        pictures = shot_pictures(feed.model.sensor, pipeline.reference, shot.frame, seen)
+        seen = pins_in(shot.frame, shot.estimate, pipeline)
+        pictures = frame_pictures(feed.model.sensor, pipeline.reference, shot.frame, seen)
         robot = feed.robot
         numbers = [
             badge("live", "moving") + (badge("recording", "moving") if self._record.value else ""),
             paragraph(feed.name, "note"),
-            *shot_numbers(shot, seen),
+            *frame_numbers(shot, seen),
             "" if robot is None else badge("ARMED" if robot.armed else "arm: read only", "moving" if robot.armed else ""),
             "" if robot is None else paragraph(robot.words(), "note"),
             *(paragraph(line, "said") for line in self._health),
         ]
         label = f"live {shot.frame.form} frame {shot.frame.sequence}"
-        self.put_up(pictures, label, numbers, also=lambda: self._chart.add(charted(shot.estimate)))
+        self.put_up(pictures, label, numbers, also=lambda: self._chart.add(chart_values(shot.estimate)))

@@ -10,8 +10,8 @@ from scenes.sensor import SensorSpec
 from twin.estimate import Estimate
 from twin.pins.reference import Reference
 from twin.studio.camera import dome_part
-from twin.studio.page import Chart, Page
-from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, label_name, paragraph
+from twin.studio.page import LineChart, StudioPage
+from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, label_name, paragraph
 from twin.types import Frame, ImageArray, Observation
 
 CHARTED = 3
@@ -19,7 +19,7 @@ CHARTED = 3
 
 
 @dataclass(frozen=True)
-class LiveShot:
+class LiveFrame:
     """A live frame, the model's estimate, and lines about rates and losses."""
 
     frame: Frame
@@ -27,26 +27,26 @@ class LiveShot:
     lines: tuple[str, ...]
 
 
-def shot_pictures(sensor: SensorSpec, reference: Reference, frame: Frame, seen: Observation) -> tuple[ImageArray, ImageArray]:
+def frame_pictures(sensor: SensorSpec, reference: Reference, frame: Frame, seen: Observation) -> tuple[ImageArray, ImageArray]:
     """The dome's part of a frame with pins and graph, and its Voronoi cells by their change of area; (h, w, 3) uint8 RGB each."""
-    pictures = camera_picture(frame, seen, reference.pins_px, Drawn.GRAPH), cell_picture(frame, seen, reference.area_px2)
+    pictures = camera_picture(frame, seen, reference.pins_px, OverlayChoices.GRAPH), cell_picture(frame, seen, reference.area_px2)
     camera, cells = (dome_part(sensor, picture, frame.form) for picture in pictures)
     return camera, cells
 
 
-def shot_numbers(shot: LiveShot, seen: Observation) -> list[str]:
+def frame_numbers(live: LiveFrame, seen: Observation) -> list[str]:
     """HTML of the estimate, the number of found pins, and the lines."""
     found = f"pins found: {seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}")
-    return [estimate_table(shot.estimate, {}), *(paragraph(line, "note") for line in (found, *shot.lines))]
+    return [estimate_table(live.estimate, {}), *(paragraph(line, "note") for line in (found, *live.lines))]
 
 
-def charted(estimate: Estimate) -> dict[str, float]:
+def chart_values(estimate: Estimate) -> dict[str, float]:
     """The values for the chart, by label; none without an estimate."""
     named = zip(estimate.names[:CHARTED], estimate.value, strict=False)
     return {label_name(name)[0]: float(value) for name, value in named} if estimate.valid else {}
 
 
-class LivePage(Page):
+class LivePage(StudioPage):
     """A page that shows live frames to any number of browsers. A context manager.
 
     Parameters
@@ -56,7 +56,7 @@ class LivePage(Page):
     reference : Reference
         Pins at rest.
     host, port : str, int
-        As for ``Page``.
+        As for ``StudioPage``.
 
     Raises
     ------
@@ -67,17 +67,17 @@ class LivePage(Page):
     def __init__(self, title: str, sensor: SensorSpec, reference: Reference, *, host: str = "127.0.0.1", port: int = 0) -> None:
         super().__init__(title, host=host, port=port)
         self._title, self._sensor, self._reference = title, sensor, reference
-        self._chart = Chart(self, "live estimates")
+        self._chart = LineChart(self, "live estimates")
         self.show_nothing("Waiting for the first frame.")
 
-    def show(self, shot: LiveShot, seen: Observation) -> None:
+    def show(self, live: LiveFrame, seen: Observation) -> None:
         """Show a frame with the pipeline's observation of it. Browsers get pictures and numbers together."""
-        pictures = shot_pictures(self._sensor, self._reference, shot.frame, seen)
-        numbers = [badge("live", "moving"), paragraph(self._title, "note"), *shot_numbers(shot, seen)]
+        pictures = frame_pictures(self._sensor, self._reference, live.frame, seen)
+        numbers = [badge("live", "moving"), paragraph(self._title, "note"), *frame_numbers(live, seen)]
 
         def change() -> None:
-            self.show_pictures(*pictures, f"live {shot.frame.form} frame {shot.frame.sequence}")
+            self.show_pictures(*pictures, f"live {live.frame.form} frame {live.frame.sequence}")
             self.show_numbers(*numbers)
-            self._chart.add(charted(shot.estimate))
+            self._chart.add(chart_values(live.estimate))
 
         self.together(change)

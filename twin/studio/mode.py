@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
-from twin.studio.page import CELLS, Page
+from twin.studio.page import CELLS, StudioPage
 from twin.studio.worker import Newest
 from twin.types import ImageArray
 
@@ -28,7 +28,7 @@ class PageMode(ABC):
 
     title: ClassVar[str]
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: StudioPage) -> None:
         self._page, self._active = page, False
         self.folder = page.gui.add_folder(self.title, visible=False)
         self._threads: list[Newest[Any]] = []

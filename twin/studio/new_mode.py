@@ -9,13 +9,13 @@ import viser
 from scenes.base import SpecError
 from scenes.pins import PinsSpec, layout_from
 from scenes.sensor import SensorSpec
+from twin.calibration.new_sensor import NewSensor, new_sensor
 from twin.errors import TwinError
-from twin.fit.new_sensor import NewSensor, new_sensor
 from twin.frames import Recording, frames_at, open_recording
 from twin.pins.pipeline import Pipeline
 from twin.studio.mode import PageMode
-from twin.studio.page import Page, put
-from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, number_table, paragraph
+from twin.studio.page import StudioPage, put
+from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, number_table, paragraph
 from twin.studio.state import next_path
 from twin.studio.twin_mode import TwinMode
 
@@ -42,7 +42,7 @@ class Wish:
     layout: str
 
 
-def corrected(pins: PinsSpec, by: int) -> str:
+def enlarge_layout(pins: PinsSpec, by: int) -> str:
     """A layout that is larger or smaller by one ring (a grid: by one row and column), as text for ``layout_from``.
 
     Raises
@@ -69,7 +69,7 @@ class NewMode(PageMode):
 
     title = "Your own sensor"
 
-    def __init__(self, page: Page, twin: TwinMode, out: Path) -> None:
+    def __init__(self, page: StudioPage, twin: TwinMode, out: Path) -> None:
         super().__init__(page)
         self._twin, self._out = twin, out
         self._made: NewSensor | None = None
@@ -77,7 +77,7 @@ class NewMode(PageMode):
         self._pipeline: Pipeline | None = None
         self._making = self.newest(self._make, "new")
         self._looking = self.newest(self._look, "new-frame")
-        gui, guarded = page.gui, page.guarded
+        gui, guarded = page.gui, page.guard
         with self.folder:
             self._frames = gui.add_text("frames", "", hint="folder, video or recording on the studio's machine")
             self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
@@ -89,7 +89,7 @@ class NewMode(PageMode):
         propose.on_click(guarded(self.propose))
         correct.on_click(guarded(lambda: self.correct(+1 if correct.value == LARGER else -1)))
         use.on_click(guarded(self.use))
-        self._number.on_update(self._slid)
+        self._number.on_update(self._follow_slider)
 
     def show(self) -> None:
         """Show the newest proposal."""
@@ -118,7 +118,7 @@ class NewMode(PageMode):
         TwinError, SpecError
             Nothing has been proposed yet, or there is no such layout.
         """
-        put(self._layout, corrected(self._proposal().sensor.pins, by))
+        put(self._layout, enlarge_layout(self._proposal().sensor.pins, by))
         self.propose()
 
     def use(self) -> None:
@@ -138,12 +138,12 @@ class NewMode(PageMode):
             raise TwinError("nothing has been proposed yet; press 'Propose a specification' first")
         return self._made
 
-    def _slid(self, event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
+    def _follow_slider(self, event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
         if event.client is not None:  # otherwise this program moved the slider
             self._looking.give(int(event.target.value))
 
     def _make(self, wish: Wish) -> None:
-        def tell(stage: str, done: float, total: float, note: str = "") -> None:
+        def report(stage: str, done: float, total: float, note: str = "") -> None:
             share = f", {100 * done / total:.0f} %" if total else ""
             self._page.say(f"looking at the frames: {stage}{share}")
 
@@ -151,7 +151,7 @@ class NewMode(PageMode):
         try:
             layout = layout_from(wish.layout) if wish.layout else None
             out = next_path(self._out, "my-sensor", ".toml")
-            made = new_sensor(Path(wish.frames), out, layout=layout, no_contact=no_contact, progress=tell)
+            made = new_sensor(Path(wish.frames), out, layout=layout, no_contact=no_contact, progress=report)
         except SpecError as error:
             raise TwinError(str(error)) from error
         recording = open_recording(frames_at(Path(wish.frames), None, no_contact), made.sensor)
@@ -170,7 +170,7 @@ class NewMode(PageMode):
             return
         frame = recording.read(int(np.clip(index, 0, len(recording) - 1)))
         seen = pipeline(frame)
-        camera = camera_picture(frame, seen, pipeline.reference.pins_px, Drawn.GRAPH)
+        camera = camera_picture(frame, seen, pipeline.reference.pins_px, OverlayChoices.GRAPH)
         cells = cell_picture(frame, seen, pipeline.reference.area_px2)
         numbers = _numbers(made, f"{frame.name} ({index + 1} of {len(recording)})", f"{seen.found} of {seen.expected}", pipeline.spec)
         self.put_up((camera, cells), f"frame {frame.name} with the proposed layout", numbers)

@@ -21,9 +21,9 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from scenes.base import SpecError
-from scenes.files import shown
+from scenes.files import quote
 from twin.errors import TwinError
-from twin.studio.pictures import boxed, paragraph
+from twin.studio.pictures import numbers_html, paragraph
 from twin.types import ImageArray
 
 Value = TypeVar("Value")
@@ -52,7 +52,7 @@ SAID_S = 12.0
 """Time, s, for which a message is shown."""
 
 
-class Mode(Protocol):
+class StudioMode(Protocol):
     """Interface of a mode for the page."""
 
     @property
@@ -81,7 +81,7 @@ def value_of(control: viser.GuiInputHandle[str], kind: Callable[[str], Value], n
         return kind(given)
     except ValueError:
         put(control, now)
-        raise TwinError(f"'{shown(given)}' is no value of this control; choose one that the page offers") from None
+        raise TwinError(f"'{quote(given)}' is no value of this control; choose one that the page offers") from None
 
 
 def put(control: viser.GuiInputHandle[Any], value: object) -> None:
@@ -89,7 +89,7 @@ def put(control: viser.GuiInputHandle[Any], value: object) -> None:
     setattr(control, "value", value)  # noqa: B010  # by its annotations the value can't be set
 
 
-class _Server(viser.ViserServer):
+class _ViserServer(viser.ViserServer):
     """viser's server without its tunnel to an external server."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
@@ -120,7 +120,7 @@ def from_own_page(request: Request, hosts: Sequence[str]) -> bool:
 
 
 @contextmanager
-def guarded_server(hosts: Sequence[str], tell: Callable[[str], None]) -> Iterator[None]:
+def guarded_server(hosts: Sequence[str], report: Callable[[str], None]) -> Iterator[None]:
     """Context in which a new viser server refuses requests of foreign pages, and reports the address of each loaded page that has a query.
 
     A foreign page is refused before its connection is open, so that none of its messages is read (see ``from_own_page``). viser itself
@@ -130,15 +130,15 @@ def guarded_server(hosts: Sequence[str], tell: Callable[[str], None]) -> Iterato
     serve = websockets.asyncio.server.serve
 
     def serving(*args: Any, process_request: Callable[[ServerConnection, Request], Response | None] | None = None, **more: Any) -> Any:
-        def heard(connection: ServerConnection, request: Request) -> Response | None:
+        def answer_request(connection: ServerConnection, request: Request) -> Response | None:
             if not from_own_page(request, hosts):
                 return connection.respond(HTTPStatus.FORBIDDEN, "only the studio's own page may connect\n")
             address = urlsplit(request.path)
             if address.path == "/" and address.query and request.headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin"):
-                tell(request.path)
+                report(request.path)
             return None if process_request is None else process_request(connection, request)
 
-        return serve(*args, process_request=heard, **more)
+        return serve(*args, process_request=answer_request, **more)
 
     websockets.asyncio.server.serve = serving  # type: ignore[assignment, misc]
     try:
@@ -167,7 +167,7 @@ def free_port(host: str, port: int) -> int:
     raise OSError(errno.EADDRINUSE, f"no port from {port} on is free")
 
 
-class Chart:
+class LineChart:
     """Chart of lines over the last seconds. It appears with its first values.
 
     Parameters
@@ -176,7 +176,7 @@ class Chart:
     title : str
     """
 
-    def __init__(self, page: "Page", title: str) -> None:
+    def __init__(self, page: "StudioPage", title: str) -> None:
         self._page, self._title = page, title
         self._order = page.next_chart()
         self._plot: viser.GuiUplotHandle | None = None
@@ -221,7 +221,7 @@ class Chart:
             )
 
 
-class Page:
+class StudioPage:
     """The page, served to any number of browsers, which all show the same state. A context manager.
 
     Parameters
@@ -247,7 +247,7 @@ class Page:
             port = free_port(host, port)
             hosts = LOCAL if host in LOCAL else ()
             with redirect_stdout(StringIO()), guarded_server(hosts, lambda address: self.on_address(address)):  # viser prints its addresses
-                self.server = _Server(host=host, port=port, label=title, verbose=False)
+                self.server = _ViserServer(host=host, port=port, label=title, verbose=False)
         except (OSError, RuntimeError) as error:
             raise TwinError(f"`host` {host} `port` {port}: can't listen there ({error}); give another `host` or `port`") from error
         self._host = host
@@ -264,10 +264,10 @@ class Page:
         pictures.set_width(PICTURES_PX)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(CONTROLS_PX)
-        self._numbers = gui.add_html(boxed())
+        self._numbers = gui.add_html(numbers_html())
         self._said = gui.add_html("", visible=False)
         self._forget_s = 0.0
-        self._modes: dict[str, Mode] = {}
+        self._modes: dict[str, StudioMode] = {}
         self._mode: str = ""
         self._choice: viser.GuiDropdownHandle[str] | None = None
 
@@ -278,11 +278,11 @@ class Page:
         return f"http://{shown}:{self.server.get_port()}/"
 
     @property
-    def mode(self) -> Mode:
+    def mode(self) -> StudioMode:
         """The mode that the user has chosen."""
         return self._modes[self._mode]
 
-    def set_modes(self, modes: Sequence[Mode]) -> None:
+    def set_modes(self, modes: Sequence[StudioMode]) -> None:
         """Offer these modes, and enter the first one."""
         self._modes = {mode.title: mode for mode in modes}
         if self._choice is not None:
@@ -324,7 +324,7 @@ class Page:
 
     def show_numbers(self, *parts: str) -> None:
         """Show parts of HTML above the controls."""
-        self._numbers.content = boxed(*parts)
+        self._numbers.content = numbers_html(*parts)
         if self._said.visible and time.monotonic() > self._forget_s:
             self._said.visible = False
 
@@ -349,10 +349,10 @@ class Page:
         done.result(CHANGE_S)
         self.server.flush()
 
-    def guarded(self, action: Callable[[], None]) -> Callable[[object], None]:
+    def guard(self, action: Callable[[], None]) -> Callable[[object], None]:
         """A callback of a control that calls ``action`` and shows the user's errors. Changes that this program makes do nothing."""
 
-        def called(event: object) -> None:
+        def call_action(event: object) -> None:
             if getattr(event, "client", self) is None:
                 return
             self.hush()
@@ -361,11 +361,11 @@ class Page:
             except (TwinError, SpecError) as error:
                 self.say(str(error), bad=True)
 
-        return called
+        return call_action
 
     def say(self, text: str, *, bad: bool = False) -> None:
         """Show a message for some seconds."""
-        self._said.content = boxed(paragraph(text, "stop" if bad else "said"))
+        self._said.content = numbers_html(paragraph(text, "stop" if bad else "said"))
         self._said.visible = True
         self._forget_s = time.monotonic() + SAID_S
 

@@ -19,7 +19,7 @@ TOLD_APART_PX = 0.7
 """Length, px, below which displacements of pins are not drawn."""
 
 
-class Drawn(StrEnum):
+class OverlayChoices(StrEnum):
     """Choices of what is drawn over the camera's picture."""
 
     NOTHING = "picture alone"
@@ -27,12 +27,12 @@ class Drawn(StrEnum):
     WAYS = "ways of the pins"
 
 
-def camera_picture(frame: Frame, seen: Observation, rest_px: FloatArray, drawn: Drawn) -> ImageArray:
+def camera_picture(frame: Frame, seen: Observation, rest_px: FloatArray, drawn: OverlayChoices) -> ImageArray:
     """(H, W, 3) uint8 RGB: the frame alone, or with found pins and graph, or with the displacements of the pins."""
-    if drawn is Drawn.GRAPH:
+    if drawn is OverlayChoices.GRAPH:
         return draw_overlay(frame, seen, scale=1)
     image = frame.image if frame.image.ndim == 3 else cv2.cvtColor(frame.image, cv2.COLOR_GRAY2RGB)
-    if drawn is Drawn.NOTHING:
+    if drawn is OverlayChoices.NOTHING:
         return np.asarray(image, np.uint8)
     canvas = np.array(image, np.uint8)
     for start, stop in zip(rest_px, seen.pins_px, strict=True):
@@ -95,7 +95,7 @@ STYLE = """<style>
 """CSS of the numbers, for light and dark pages."""
 
 
-def boxed(*parts: str) -> str:
+def numbers_html(*parts: str) -> str:
     """HTML of the page's numbers."""
     return f"{STYLE}<div class='studio'>{''.join(parts)}</div>"
 

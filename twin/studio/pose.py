@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from twin.errors import ContactError
-from twin.mechanics.path import carried
+from twin.mechanics.path import carry_points
 from twin.types import FloatArray
 
 LIMITS: dict[str, tuple[float, float, str]] = {
@@ -66,12 +66,12 @@ class ObjectPose:
                 raise ContactError(f"{name}: {value} is no finite number; give one between {low:g} and {high:g}")
             kept[name] = min(max(value, low), high)
             if kept[name] != value:
-                reasons.append(f"{spoken(name)} ends at {kept[name]:g} {unit_of(name)}: {why}")
+                reasons.append(f"{readable_name(name)} ends at {kept[name]:g} {unit_of(name)}: {why}")
         return ObjectPose(**kept), "; ".join(reasons)
 
     def words(self) -> str:
         """All six numbers with their units."""
-        return ", ".join(f"{spoken(name)} {value:+.2f} {unit_of(name)}" for name, value in asdict(self).items())
+        return ", ".join(f"{readable_name(name)} {value:+.2f} {unit_of(name)}" for name, value in asdict(self).items())
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ NAMES = tuple(field.name for field in fields(ObjectPose))
 """Names of the six numbers, in their order."""
 
 
-def spoken(name: str) -> str:
+def readable_name(name: str) -> str:
     """A number's readable name: ``tilt_x_deg`` gives 'tilt x'."""
     return name.rpartition("_")[0].replace("_", " ")
 
@@ -110,4 +110,4 @@ def bend_mm(way: list[FloatArray]) -> float:
 
 def motion_mm(places_mm: FloatArray, start: FloatArray, stop: FloatArray) -> float:
     """Largest displacement of points (k, 3) that move with an object from one pose (4, 4) to another; 0 for no points."""
-    return float(np.linalg.norm(carried(places_mm, start, stop), axis=1).max(initial=0.0))
+    return float(np.linalg.norm(carry_points(places_mm, start, stop), axis=1).max(initial=0.0))

@@ -8,7 +8,7 @@ import numpy as np
 from scenes import load_object
 from scenes.experiment import ExperimentSpec
 from twin.errors import ContactError, FrameError, TwinError
-from twin.estimate import Estimate, SensorModel, seen_in
+from twin.estimate import Estimate, SensorModel, pins_in
 from twin.frames import Recording, open_recording
 from twin.pins.batch import recording_reference
 from twin.pins.pipeline import Pipeline
@@ -16,8 +16,8 @@ from twin.rig.contact import RigContact
 from twin.rig.labels import ArmLabel, poses_and_moves, read_arm_labels
 from twin.studio.contact import MovingContact, experiment_of
 from twin.studio.mode import PageMode
-from twin.studio.page import CELLS, Page, put
-from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
+from twin.studio.page import CELLS, StudioPage, put
+from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
 from twin.studio.twin_mode import TwinMode
 from twin.types import FloatArray, Form, Frame, Observation
 
@@ -37,7 +37,7 @@ class Looked:
     estimate : Estimate or None
     label : ArmLabel or None
         None where the recording has no labels.
-    told : dict of str to float
+    values : dict of str to float
         The labels' values by the names of the model's estimates.
     doubts : tuple of str
         Reasons to doubt the label.
@@ -48,7 +48,7 @@ class Looked:
     seen: Observation
     estimate: Estimate | None
     label: ArmLabel | None
-    told: dict[str, float]
+    values: dict[str, float]
     doubts: tuple[str, ...]
 
 
@@ -114,9 +114,9 @@ class RecordingView:
         """
         frame = self.recording.read(index)
         estimate = None if self._model is None else self._model(frame)
-        seen = seen_in(frame, estimate, self._pipeline)
+        seen = pins_in(frame, estimate, self._pipeline)
         label = self._labels[index] if self._labels else None
-        told = {} if label is None else _told(label)
+        told = {} if label is None else _label_values(label)
         doubts = [] if label is None or label.executed else ["the audit says that the move was not executed"]
         executed = float(getattr(estimate, "executed", np.nan))
         if label is not None and np.abs(label.move).max() > 0 and executed < UNSURE:
@@ -142,16 +142,16 @@ class RecordingView:
         return self.contact.camera.draw(self._rig.end(looked.label))
 
     def twin_frame(self, light: FloatArray) -> Frame:
-        """A frame in the recording's form, made from the light of ``twin_light``."""
+        """A processed frame, made from the light of ``twin_light``."""
         raw = self.contact.camera.raw(light, seed=0)
-        return raw if self.recording.form is Form.RAW else self.contact.camera.recorded(raw)
+        return raw if self.recording.form is Form.RAW else self.contact.camera.as_recorded(raw)
 
     def crop(self, image: np.ndarray) -> np.ndarray:
-        """The dome's part of a picture in the recording's form."""
+        """The dome's part of a processed picture."""
         return self.contact.camera.crop(image, self.recording.form)
 
 
-def _told(label: ArmLabel) -> dict[str, float]:
+def _label_values(label: ArmLabel) -> dict[str, float]:
     """A label's values by the tables' names: the arm's real pose and move, which differ from the table's if the move was not executed."""
     (pose,), (move,) = poses_and_moves([label])
     return {f"pose_{axis + 1}": float(value) for axis, value in enumerate(pose)} | {
@@ -172,7 +172,7 @@ class RecordingMode(PageMode):
 
     title = "Recording"
 
-    def __init__(self, page: Page, twin: TwinMode, first: str = "") -> None:
+    def __init__(self, page: StudioPage, twin: TwinMode, first: str = "") -> None:
         super().__init__(page)
         self._twin, self._first = twin, first
         self._view: RecordingView | None = None
@@ -183,10 +183,10 @@ class RecordingMode(PageMode):
             opened = gui.add_button("Open")
             self._number = gui.add_slider("frame number", 0, 1, 1, 0, disabled=True)
             steps = gui.add_button_group("step", ("-10", "-1", "+1", "+10"))
-            doubt = gui.add_button("Next doubt", hint="the next frame whose label is doubted")
+            doubt = gui.add_button("Next doubtful label", hint="the next frame whose label is doubtful")
             self._against = gui.add_checkbox("the twin's picture beside it", True)
         opened.on_click(lambda event: self.open(self._path.value))
-        self._number.on_update(page.guarded(lambda: self._go(int(self._number.value))))
+        self._number.on_update(page.guard(lambda: self._go(int(self._number.value))))
         steps.on_click(lambda event: self._go(int(self._number.value) + int(event.target.value)))
         doubt.on_click(lambda event: self._wanted.give(-1))
         self._against.on_update(lambda event: self._wanted.give(int(self._number.value)))
@@ -228,17 +228,17 @@ class RecordingMode(PageMode):
         if looked is None:
             return
         beside = cell_picture(looked.frame, looked.seen, view.reference.area_px2)
-        self._put(view, looked, beside)
+        self._show_frame(view, looked, beside)
         if not self._against.value or looked.label is None or self._wanted.overtaken:
             return
         try:
             light = view.twin_light(looked)
         except ContactError as error:
-            self._put(view, looked, beside, note=f"The twin has no picture of this contact: {error}")
+            self._show_frame(view, looked, beside, note=f"The twin has no picture of this contact: {error}")
             return
         if light is not None and not self._wanted.overtaken:
             made = view.twin_frame(light).image
-            self._put(
+            self._show_frame(
                 view, looked, made if made.ndim == 3 else np.repeat(made[..., None], 3, axis=2), label="the twin's picture of this contact"
             )
 
@@ -255,20 +255,20 @@ class RecordingMode(PageMode):
         self._page.say("No label of this recording is doubted.")
         return None
 
-    def _put(self, view: RecordingView, looked: Looked, beside: np.ndarray, *, label: str = CELLS, note: str = "") -> None:
+    def _show_frame(self, view: RecordingView, looked: Looked, beside: np.ndarray, *, label: str = CELLS, note: str = "") -> None:
         told = looked.label
         found = f"{looked.seen.found} of {len(looked.seen.pins_px)}"
         rows = {"frame": f"{looked.frame.name} ({looked.index + 1} of {len(view)})", "pins found": found}
         if told is not None:
             rows |= {"label, pose": _six(told.pose), "label, move": _six(told.move)}
-        camera = view.crop(camera_picture(looked.frame, looked.seen, view.reference.pins_px, Drawn.GRAPH))
+        camera = view.crop(camera_picture(looked.frame, looked.seen, view.reference.pins_px, OverlayChoices.GRAPH))
         numbers = [
             badge("recorded") + badge(str(view.recording.form)),
             paragraph("; ".join(looked.doubts), "stop"),
             paragraph("" if looked.seen.valid else f"The pipeline refuses the frame: {looked.seen.reason}", "stop"),
             number_table(rows),
-            estimate_table(looked.estimate, looked.told, missing=next((n for n in view.notes if n.startswith("no estimates")), "")),
-            paragraph("Here the truth is the label." if looked.told else "", "note"),
+            estimate_table(looked.estimate, looked.values, missing=next((n for n in view.notes if n.startswith("no estimates")), "")),
+            paragraph("Here the truth is the label." if looked.values else "", "note"),
             paragraph(note, "said"),
             *(paragraph(text, "note") for text in [*view.recording.problems, *view.notes][:4]),
         ]

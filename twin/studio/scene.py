@@ -42,7 +42,7 @@ GLOW = cv2.applyColorMap(np.linspace(0.22 * 255, 0.97 * 255, 256).astype(np.uint
 """Colours (256, 3) RGB of pins, for increasing values."""
 
 
-class Shown(StrEnum):
+class PinColour(StrEnum):
     """Quantities that the pins' colours can show."""
 
     DISPLACEMENT = "displacement"
@@ -50,19 +50,19 @@ class Shown(StrEnum):
     SLIP = "slip"
 
 
-FULL_SCALE = {Shown.DISPLACEMENT: (4.0, "mm"), Shown.PRESSURE: (0.05, "MPa"), Shown.SLIP: (1.0, "slipping share")}
+FULL_SCALE = {PinColour.DISPLACEMENT: (4.0, "mm"), PinColour.PRESSURE: (0.05, "MPa"), PinColour.SLIP: (1.0, "slipping share")}
 """Value with the brightest colour, and its unit."""
 
 
 @dataclass(frozen=True)
-class Surface:
+class TriangleMesh:
     """A triangle mesh: vertices (v, 3) in mm and faces (f, 3)."""
 
     corners_mm: FloatArray
     faces: IntArray
 
 
-class SkinShape:
+class SmoothSkin:
     """The outer skin's surface, smoothly interpolated between the nodes of the mesh.
 
     Parameters
@@ -78,11 +78,11 @@ class SkinShape:
         index = np.arange(high * wide).reshape(high, wide)
         quads = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1).reshape(-1, 4)
         faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-        self.rest = Surface(self.corners(mesh.nodes_mm), faces)
+        self.rest = TriangleMesh(self.corners(mesh.nodes_mm), faces)
         corners = self.rest.corners_mm[faces]
         outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         if np.median((outward * corners.mean(axis=1)).sum(axis=1)) < 0:
-            self.rest = Surface(self.rest.corners_mm, faces[:, ::-1])
+            self.rest = TriangleMesh(self.rest.corners_mm, faces[:, ::-1])
 
     def corners(self, nodes_mm: FloatArray) -> FloatArray:
         """Vertices (v, 3) float32 for nodes (n, 3) of the mesh."""
@@ -97,9 +97,9 @@ def _finer(count: int) -> FloatArray:
     return np.asarray(make_interp_spline(at, np.eye(count), k=3)(np.linspace(0, count - 1, FINER * (count - 1) + 1)))
 
 
-def pin_values(state: ContactState, rest: ContactState, shown: Shown) -> FloatArray:
+def pin_values(state: ContactState, rest: ContactState, shown: PinColour) -> FloatArray:
     """The shown value of each pin, (N,): displacement of its cap, mm, or mean pressure, MPa, or slipping share of the skin at its foot."""
-    if shown is Shown.DISPLACEMENT:
+    if shown is PinColour.DISPLACEMENT:
         return np.linalg.norm(state.caps_mm - rest.caps_mm, axis=1)
     count = len(state.base_mm)
     if not len(state.contact_mm):
@@ -107,16 +107,16 @@ def pin_values(state: ContactState, rest: ContactState, shown: Shown) -> FloatAr
     away, pin = cKDTree(state.base_mm).query(state.contact_mm)
     near = away < NEAR_FOOT_MM
     weight = np.bincount(pin[near], state.point_area_mm2[near], minlength=count)
-    amount = state.normal_n if shown is Shown.PRESSURE else state.slipping * state.point_area_mm2
+    amount = state.normal_n if shown is PinColour.PRESSURE else state.slipping * state.point_area_mm2
     return np.asarray(np.bincount(pin[near], amount[near], minlength=count) / np.maximum(weight, 1e-9))
 
 
-def colours(values: FloatArray, shown: Shown) -> np.ndarray:
+def colours(values: FloatArray, shown: PinColour) -> np.ndarray:
     """Colours (N, 3) uint8 of values (N,)."""
     return GLOW[np.clip(255 * values / FULL_SCALE[shown][0], 0, 255).astype(int)]
 
 
-def turned(axis: FloatArray) -> FloatArray:
+def turns_to(axis: FloatArray) -> FloatArray:
     """Quaternions (N, 4), w first, that turn -z to unit vectors (N, 3)."""
     turn = np.stack([1 - axis[:, 2], axis[:, 1], -axis[:, 0], np.zeros(len(axis))], axis=1)
     straight = turn[:, 0] < 1e-9
@@ -137,7 +137,7 @@ def matrix(wxyz: FloatArray, position: FloatArray) -> FloatArray:
     return T
 
 
-def pin_shape(pins: PinsSpec) -> Surface:
+def pin_shape(pins: PinsSpec) -> TriangleMesh:
     """A pin that points along -z, with the centre of its cap at the origin; stem and cap are tubes."""
     half, length = pins.cap_height_mm / 2, pins.length_mm + pins.cap_height_mm / 2
     around = np.arange(SIDES) * 2 * np.pi / SIDES
@@ -157,7 +157,7 @@ def pin_shape(pins: PinsSpec) -> Surface:
         faces += [np.stack([a + place, b + place, b + ahead], axis=1), np.stack([a + place, b + ahead, a + ahead], axis=1)]
     last = (len(rings) - 1) * SIDES
     faces.append(np.stack([last + place, np.full(SIDES, len(corners) - 1), last + ahead], axis=1))
-    return Surface(corners, np.concatenate(faces))
+    return TriangleMesh(corners, np.concatenate(faces))
 
 
 class PinScene:
@@ -172,7 +172,7 @@ class PinScene:
     rest : PinState
     """
 
-    def __init__(self, server: viser.ViserServer, sensor: SensorSpec, skin: Surface, rest: PinState) -> None:
+    def __init__(self, server: viser.ViserServer, sensor: SensorSpec, skin: TriangleMesh, rest: PinState) -> None:
         radius_mm, pin = max(sensor.skin.half_size_mm), pin_shape(sensor.pins)
         self._scene = server.scene
         self._scene.configure_environment_map(None)
@@ -194,9 +194,9 @@ class PinScene:
             "/sensor/pins",
             pin.corners_mm,
             pin.faces,
-            turned(rest.axis),
+            turns_to(rest.axis),
             rest.caps_mm.astype(np.float32),
-            batched_colors=colours(np.zeros(len(rest.caps_mm)), Shown.DISPLACEMENT),
+            batched_colors=colours(np.zeros(len(rest.caps_mm)), PinColour.DISPLACEMENT),
             lod="off",
             side="double",
             cast_shadow=False,
@@ -217,9 +217,9 @@ class PinScene:
         )
         self._object: viser.MeshHandle | None = None
 
-    def put_object(self, touched: ObjectSpec, bounds_mm: Sequence[float] = OBJECT_BOX_MM) -> None:
+    def put_object(self, obj: ObjectSpec, bounds_mm: Sequence[float] = OBJECT_BOX_MM) -> None:
         """Show another object, or another part of it: that in a box (x0, x1, y0, y1, z0, z1) of its frame."""
-        surface = object_surface(build_field(touched).distance, np.eye(4), bounds_mm=bounds_mm, samples=OBJECT_SAMPLES).triangulate()
+        surface = object_surface(build_field(obj).distance, np.eye(4), bounds_mm=bounds_mm, samples=OBJECT_SAMPLES).triangulate()
         corners, faces = np.asarray(surface.points, np.float32), np.asarray(surface.regular_faces)
         self._object = self._scene.add_mesh_simple(
             "/object", corners, faces, color=OBJECT_RGB, opacity=0.35, side="double", cast_shadow=False, receive_shadow=False
@@ -229,7 +229,7 @@ class PinScene:
         """Show pins with their colours (N, 3) uint8, and the skin's vertices (v, 3)."""
         self._skin.vertices = skin_mm
         self._pins.batched_positions = pins.caps_mm.astype(np.float32)
-        self._pins.batched_wxyzs = turned(pins.axis)
+        self._pins.batched_wxyzs = turns_to(pins.axis)
         self._pins.batched_colors = colour
 
     def show_object(self, T: FloatArray) -> None:
@@ -256,7 +256,7 @@ class Scene(PinScene):
     """
 
     def __init__(self, server: viser.ViserServer, sensor: SensorSpec, mesh: SensorMesh, rest: ContactState) -> None:
-        self._skin_shape, self._rest = SkinShape(mesh), rest
+        self._skin_shape, self._rest = SmoothSkin(mesh), rest
         super().__init__(server, sensor, self._skin_shape.rest, rest)
         self.gizmo = self._scene.add_transform_controls("/wish", scale=GIZMO_MM, depth_test=False, line_width=3.0)
         self.dragging = False
@@ -278,7 +278,7 @@ class Scene(PinScene):
         if not self.dragging:
             self.gizmo.position, self.gizmo.wxyz = T[:3, 3], quaternion(T)
 
-    def show(self, state: ContactState, shown: Shown) -> None:
+    def show(self, state: ContactState, shown: PinColour) -> None:
         """Show a state of the sensor and its object."""
         self.show_pins(state, self._skin_shape.corners(state.nodes_mm), colours(pin_values(state, self._rest, shown), shown))
         self.show_object(state.T_sensor_object)

@@ -14,9 +14,9 @@ from scenes.base import NonNegative, Section
 from scenes.files import read_regular
 from twin.errors import TwinError
 from twin.store import unwritten, write_json, write_text
-from twin.studio.pictures import Drawn
+from twin.studio.pictures import OverlayChoices
 from twin.studio.pose import NAMES, ObjectPose
-from twin.studio.scene import Shown
+from twin.studio.scene import PinColour
 from twin.types import Form
 
 MOST_BYTES = 4_000_000
@@ -54,8 +54,8 @@ class StudioState(Section):
     friction: NonNegative | None = None
     pose: dict[str, float] = {}
     form: str = str(Form.RAW)
-    colour: str = str(Shown.DISPLACEMENT)
-    drawn: str = str(Drawn.GRAPH)
+    colour: str = str(PinColour.DISPLACEMENT)
+    drawn: str = str(OverlayChoices.GRAPH)
 
     def object_pose(self) -> ObjectPose:
         """The object's pose."""
@@ -74,7 +74,7 @@ class StudioState(Section):
             raise TwinError(f"{name}: {len(content)} bytes are no state of the studio; {remedy}")
         try:
             state = cls.model_validate(json.loads(content))
-            Form(state.form), Shown(state.colour), Drawn(state.drawn)
+            Form(state.form), PinColour(state.colour), OverlayChoices(state.drawn)
         except ValidationError as error:
             first = error.errors()[0]
             raise TwinError(f"{name}: {'.'.join(map(str, first['loc']))}: {first['msg']}; {remedy}") from error
@@ -149,7 +149,7 @@ Way = list[tuple[float, ObjectPose]]
 """Poses with their times in s, increasing from 0."""
 
 
-def way_text(way: Way) -> str:
+def trajectory_text(way: Way) -> str:
     """A path as a CSV table (``COLUMNS``)."""
     out = io.StringIO()
     writer = csv.DictWriter(out, COLUMNS, lineterminator="\n")
@@ -158,12 +158,12 @@ def way_text(way: Way) -> str:
     return out.getvalue()
 
 
-def save_way(path: Path, way: Way) -> Path:
+def save_trajectory(path: Path, way: Way) -> Path:
     """Write a path to a file."""
-    return write_text(path, way_text(way))
+    return write_text(path, trajectory_text(way))
 
 
-def read_way(content: bytes, name: str) -> Way:
+def read_trajectory(content: bytes, name: str) -> Way:
     """Read a path from a CSV table with ``time_s`` and any of the object's six numbers. Missing numbers are zero.
 
     Raises
@@ -172,7 +172,7 @@ def read_way(content: bytes, name: str) -> Way:
         It is not such a table, or its times do not increase.
     """
     if len(content) > MOST_BYTES:
-        raise TwinError(f"{name}: {len(content)} bytes; a way has at most {MOST_ROWS} rows")
+        raise TwinError(f"{name}: {len(content)} bytes; a trajectory has at most {MOST_ROWS} rows")
     try:
         table = csv.DictReader(io.StringIO(content.decode("utf-8-sig")), strict=True)
         columns = set(table.fieldnames or ())
@@ -180,9 +180,11 @@ def read_way(content: bytes, name: str) -> Way:
             raise TwinError(f"{name}: expected the columns {', '.join(COLUMNS)}, found {', '.join(table.fieldnames or ['none'])}")
         rows = [{key: float(cell) for key, cell in row.items()} for row in table]
     except (UnicodeDecodeError, ValueError, TypeError, csv.Error) as error:
-        raise TwinError(f"{name}: not readable as a way ({error}); expected a CSV table of numbers with {', '.join(COLUMNS)}") from error
+        raise TwinError(
+            f"{name}: not readable as a trajectory ({error}); expected a CSV table of numbers with {', '.join(COLUMNS)}"
+        ) from error
     if not 0 < len(rows) <= MOST_ROWS:
-        raise TwinError(f"{name}: {len(rows)} rows; a way has 1 to {MOST_ROWS}")
+        raise TwinError(f"{name}: {len(rows)} rows; a trajectory has 1 to {MOST_ROWS}")
     times = [row.pop("time_s") for row in rows]
     if any(not later > earlier for earlier, later in zip(times, times[1:], strict=False)):
         raise TwinError(f"{name}: time_s does not rise; sort the rows by time")

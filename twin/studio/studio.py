@@ -10,7 +10,7 @@ from twin.studio.degrade_mode import DegradeMode
 from twin.studio.live_mode import FeedOpener, LiveMode
 from twin.studio.mode import PageMode
 from twin.studio.new_mode import NewMode
-from twin.studio.page import LOCAL, Page
+from twin.studio.page import LOCAL, StudioPage
 from twin.studio.recording_mode import RecordingMode
 from twin.studio.state import StudioState, heading
 from twin.studio.twin_mode import ModelOf, TwinMode
@@ -75,7 +75,7 @@ class Studio:
     """
 
     def __init__(self, plan: StudioPlan, model_of: ModelOf, open_feed: FeedOpener) -> None:
-        self.page = Page(heading(plan.state), host=plan.host, port=plan.port)
+        self.page = StudioPage(heading(plan.state), host=plan.host, port=plan.port)
         self.page.add_mode_choice([mode.title for mode in (TwinMode, DegradeMode, RecordingMode, LiveMode, NewMode)])
         self.twin = TwinMode(self.page, plan.state, plan.out, model_of, traces=plan.traces)
         degrade = DegradeMode(self.page, self.twin)

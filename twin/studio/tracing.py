@@ -75,7 +75,7 @@ class _Trace:
 @dataclass(frozen=True)
 class _Save:
     out: Path
-    touched: ObjectSpec
+    obj: ObjectSpec
     pose: PressedPose
     state: ContactState
     form: Form
@@ -129,9 +129,9 @@ class Tracer:
             self._tracing = True
         self._send(_Trace(solved, state))
 
-    def save(self, out: Path, touched: ObjectSpec, pose: PressedPose, state: ContactState, form: Form) -> None:
+    def save(self, out: Path, obj: ObjectSpec, pose: PressedPose, state: ContactState, form: Form) -> None:
         """Request a contact's files in a folder that exists."""
-        self._send(_Save(out, touched, pose, state, form))
+        self._send(_Save(out, obj, pose, state, form))
 
     def outcomes(self) -> list[Outcome]:
         """Outcomes that have arrived since the last call; never waits."""
@@ -156,7 +156,9 @@ class Tracer:
         except (EOFError, OSError, TypeError):  # this end of the connection, or the other, was closed
             if not self._ended:
                 self._ended = True
-                self._found.append(Failed("the path tracer's process has ended; pictures stay drawn. Start the studio again", tracing=True))
+                self._found.append(
+                    Failed("the path tracer's process has ended; pictures stay rasterised. Start the studio again", tracing=True)
+                )
 
     def __enter__(self) -> "Tracer":
         return self
@@ -189,7 +191,7 @@ def serve(number: int) -> None:
     there = Connection(number)
     try:
         spec: SensorSpec = there.recv()
-        for shading in _tried(lambda: iter([dome_shading(spec)]), tracing=True):
+        for shading in _catch_render_errors(lambda: iter([dome_shading(spec)]), tracing=True):
             there.send(shading)
         jobs: deque[_Trace | _Save | None] = deque()
 
@@ -200,7 +202,7 @@ def serve(number: int) -> None:
 
         maker = _Maker(spec, overtaken)
         while (job := jobs.popleft() if jobs else there.recv()) is not None:
-            for outcome in _tried(partial(maker, job), tracing=isinstance(job, _Trace)):
+            for outcome in _catch_render_errors(partial(maker, job), tracing=isinstance(job, _Trace)):
                 there.send(outcome)
     except (EOFError, OSError):
         return
@@ -234,10 +236,10 @@ class _Maker:
         if self._simulator is None:
             self._simulator = Simulator(self._spec)
         rendered = self._simulator.render(job.state, form=job.form)
-        yield Saved(write_contact(job.out, self._simulator, job.touched, job.pose, job.state, rendered)[0])
+        yield Saved(write_contact(job.out, self._simulator, job.obj, job.pose, job.state, rendered)[0])
 
 
-def _tried(make: Callable[[], Iterator[Outcome]], *, tracing: bool = False) -> Iterator[Outcome]:
+def _catch_render_errors(make: Callable[[], Iterator[Outcome]], *, tracing: bool = False) -> Iterator[Outcome]:
     try:
         yield from make()
     except RenderError as error:

@@ -16,13 +16,13 @@ from twin.errors import TwinError
 from twin.estimate import SensorModel
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
-from twin.studio.contact import Answer, Light, MovingContact, Setup
+from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
 from twin.studio.mode import PageMode
-from twin.studio.page import Chart, Page, put, value_of
-from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, label_name, number_table, paragraph
-from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, spoken, unit_of
-from twin.studio.scene import FULL_SCALE, Scene, Shown
-from twin.studio.state import StudioState, Way, heading, next_path, read_way, save_way, tap_and_shear
+from twin.studio.page import LineChart, StudioPage, put, value_of
+from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, label_name, number_table, paragraph
+from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of
+from twin.studio.scene import FULL_SCALE, PinColour, Scene
+from twin.studio.state import StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
 from twin.studio.tracing import Tracer
 from twin.studio.video import FilmWriter
 from twin.studio.worker import Worker
@@ -67,18 +67,18 @@ class TwinMode(PageMode):
 
     title = "Twin"
 
-    def __init__(self, page: Page, state: StudioState, out: Path, model_of: ModelOf, *, traces: bool = True) -> None:
+    def __init__(self, page: StudioPage, state: StudioState, out: Path, model_of: ModelOf, *, traces: bool = True) -> None:
         super().__init__(page)
         self._out, self._model_of, self._traces = out, model_of, traces
         self._state = state
-        self._shown, self._drawn = Shown(state.colour), Drawn(state.drawn)
+        self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
         self._wish, self._wished_s = state.object_pose(), 0.0
         self._undo: list[ObjectPose] = []
         self._model_note, self._loading = "the model is being loaded", False
         self._path: Way | None = None
         self._path_s = 0.0
         self._film: FilmWriter | None = None
-        self.followers: list[Callable[[Answer], None]] = []
+        self.followers: list[Callable[[ContactAnswer], None]] = []
         self._rebuilding = threading.RLock()
         self._showing = threading.Lock()  # held while the scene is changed or built again
         self._take_up(*self._prepare(state))
@@ -87,7 +87,7 @@ class TwinMode(PageMode):
         page.on_address = self._links.give
         self._build_controls()
         self._forces, self._estimates, self._depths = (
-            Chart(page, title) for title in ("force on the object, N", "estimates less truth", "indentation, mm")
+            LineChart(page, title) for title in ("force on the object, N", "estimates less truth", "indentation, mm")
         )
 
     # start and end
@@ -95,7 +95,7 @@ class TwinMode(PageMode):
     def _prepare(self, state: StudioState) -> tuple[MovingContact, Tracer | None]:
         """The contact of a state and its tracer. The page is not changed."""
         sensor = load_sensor(state.sensor)
-        contact = MovingContact(Setup(sensor, load_object(state.object), state.friction, Form(state.form)))
+        contact = MovingContact(ContactSetup(sensor, load_object(state.object), state.friction, Form(state.form)))
         return contact, Tracer(sensor) if self._traces else None
 
     def _take_up(self, contact: MovingContact, tracer: Tracer | None) -> None:
@@ -103,12 +103,12 @@ class TwinMode(PageMode):
         setup = contact.setup
         with self._showing:
             self.contact, self._tracer = contact, tracer
-            self.worker = Worker(contact, tracer, self._answered, self._said)
+            self.worker = Worker(contact, tracer, self._publish_answer, self._show_message)
             self._rest = nominal_reference(setup.sensor, setup.form)
             self._scene = Scene(self._page.server, setup.sensor, contact.solver.mesh, contact.solver.rest())
             if self._loading:  # otherwise ``_load_rest`` shows the object
-                self._scene.put_object(setup.touched)
-            self._scene.on_drag(self._dragged)
+                self._scene.put_object(setup.obj)
+            self._scene.on_drag(self._follow_drag)
 
     def start(self) -> None:
         """Start to answer. The first wish is the state's pose. The model is loaded at the same time."""
@@ -191,7 +191,7 @@ class TwinMode(PageMode):
         self._wish = way[-1][1]
         self.worker.play(way)
 
-    def _dragged(self, T: np.ndarray, ended: bool) -> None:
+    def _follow_drag(self, T: np.ndarray, ended: bool) -> None:
         self.ask(ObjectPose.of(T, self.contact.setup.sensor.skin.apex_mm))
         if ended and self.worker.newest is not None:
             self._publisher.give(self.worker.newest)
@@ -199,30 +199,35 @@ class TwinMode(PageMode):
     # controls
 
     def _build_controls(self) -> None:
-        gui, guarded, setup = self._page.gui, self._page.guarded, self.contact.setup
+        gui, guarded, setup = self._page.gui, self._page.guard, self.contact.setup
         with self.folder:
             self._sliders = {}
             for name in NAMES:
                 low, high, why = LIMITS[name]
                 self._sliders[name] = slider = gui.add_slider(
-                    f"{spoken(name)}, {unit_of(name)}", low, high, 0.05, getattr(self._wish, name), hint=f"{low:g} to {high:g}: {why}"
+                    f"{readable_name(name)}, {unit_of(name)}",
+                    low,
+                    high,
+                    0.05,
+                    getattr(self._wish, name),
+                    hint=f"{low:g} to {high:g}: {why}",
                 )
-                slider.on_update(self._slid(name))
+                slider.on_update(self._slider_callback(name))
             with gui.add_folder("Contact"):
                 sensors, objects = (tuple(sorted({*names(), chosen})) for names, chosen in (
                     (list_sensors, self._state.sensor), (list_objects, self._state.object)))  # fmt: skip
                 self._sensor = gui.add_dropdown("sensor", sensors, initial_value=self._state.sensor)
                 self._object = gui.add_dropdown("object", objects, initial_value=self._state.object)
                 self._friction = gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction())
-                anew = gui.add_button("Begin the contact anew", hint="forget the friction's history and press straight down")
+                anew = gui.add_button("Restart contact", hint="clear the history of friction and press straight down")
             with gui.add_folder("Show"):
                 forms = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
                 self._form = gui.add_dropdown("frame", forms, initial_value=str(setup.form))
-                self._drawing = gui.add_dropdown("over it", tuple(map(str, Drawn)), initial_value=str(self._drawn))
-                self._colour = gui.add_dropdown("pins by", tuple(map(str, Shown)), initial_value=str(self._shown))
+                self._drawing = gui.add_dropdown("overlay", tuple(map(str, OverlayChoices)), initial_value=str(self._drawn))
+                self._colour = gui.add_dropdown("colour pins by", tuple(map(str, PinColour)), initial_value=str(self._shown))
             with gui.add_folder("Move", expand_by_default=False):
                 tap = gui.add_button("Tap and shear")
-                upload = gui.add_upload_button("Play a way (CSV)", mime_type=".csv", hint="columns time_s, x_mm, y_mm, depth_mm, ...")
+                upload = gui.add_upload_button("Play trajectory (CSV)", mime_type=".csv", hint="columns time_s, x_mm, y_mm, depth_mm, ...")
                 self._record_way = gui.add_checkbox("record the way", False)
                 undo = gui.add_button("Undo")
             with gui.add_folder("Save", expand_by_default=False):
@@ -243,24 +248,24 @@ class TwinMode(PageMode):
         self._friction.on_update(guarded(self._change_friction))
         self._object.on_update(guarded(self._change_object))
         self._sensor.on_update(guarded(self._change_sensor))
-        anew.on_click(guarded(self.begin_anew))
+        anew.on_click(guarded(self.restart_contact))
         tap.on_click(guarded(lambda: self.play(tap_and_shear(self._wish))))
         undo.on_click(guarded(self.undo))
-        upload.on_upload(guarded(lambda: self.play(read_way(upload.value.content, upload.value.name))))
+        upload.on_upload(guarded(lambda: self.play(read_trajectory(upload.value.content, upload.value.name))))
         opened.on_upload(guarded(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
         self._link.on_update(guarded(lambda: self._links.give(self._link.value)))
-        self._record_way.on_update(guarded(self._toggle_way))
+        self._record_way.on_update(guarded(self._toggle_trajectory))
         self._filming.on_update(guarded(self._toggle_film))
         for modifier, names in CHANGED.items():
             for keys, name in zip(KEYS, names, strict=True):
                 for key, sign in zip(keys, (-1, +1), strict=True):
-                    label = f"{spoken(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
+                    label = f"{readable_name(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
                     command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # viser defines it as a literal
                     command.on_trigger(partial(self._keyed, name, sign))
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
         gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(lambda: self.play(tap_and_shear(self._wish))))
 
-    def _slid(self, name: str) -> Callable[[viser.GuiEvent[viser.GuiSliderHandle[float]]], None]:
+    def _slider_callback(self, name: str) -> Callable[[viser.GuiEvent[viser.GuiSliderHandle[float]]], None]:
         def moved(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
             if event.client is not None:  # otherwise this program moved the slider
                 self.ask(replace(self._wish, **{name: float(event.target.value)}))
@@ -272,11 +277,11 @@ class TwinMode(PageMode):
 
     def _own_friction(self) -> float:
         setup = self.contact.setup
-        return min(MOST_FRICTION, setup.touched.friction if setup.friction is None else setup.friction)
+        return min(MOST_FRICTION, setup.obj.friction if setup.friction is None else setup.friction)
 
-    def begin_anew(self) -> None:
+    def restart_contact(self) -> None:
         """Press the object straight down to its pose, without the friction's history."""
-        self.worker.do(self.contact.begin_anew)
+        self.worker.do(self.contact.restart)
         self.worker.ask(self._wish)
 
     def _change_form(self) -> None:
@@ -290,8 +295,8 @@ class TwinMode(PageMode):
         self.worker.do(change)
 
     def _change_look(self) -> None:
-        self._shown = value_of(self._colour, Shown, str(self._shown))
-        self._drawn = value_of(self._drawing, Drawn, str(self._drawn))
+        self._shown = value_of(self._colour, PinColour, str(self._shown))
+        self._drawn = value_of(self._drawing, OverlayChoices, str(self._drawn))
         if self.worker.newest is not None:
             self._publisher.give(self.worker.newest)
 
@@ -310,7 +315,7 @@ class TwinMode(PageMode):
 
     def _touch(self, name: str) -> None:
         try:
-            touched = load_object(name)
+            obj = load_object(name)
         except SpecError:
             put(self._object, self._state.object)
             raise
@@ -318,9 +323,9 @@ class TwinMode(PageMode):
         self._state = self._state.model_copy(update={"object": name})
 
         def change() -> None:
-            self.contact.change(touched=touched)
+            self.contact.change(obj=obj)
             with self._showing:
-                self._scene.put_object(touched)
+                self._scene.put_object(obj)
             put(self._friction, self._own_friction())
 
         self.worker.do(change)
@@ -351,7 +356,7 @@ class TwinMode(PageMode):
                 self._tracer.__exit__(None, None, None)
             self._page.gui.set_panel_label(heading(state))
             self._state, self._wish = state, state.object_pose()
-            self._shown, self._drawn = Shown(state.colour), Drawn(state.drawn)
+            self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
             self._model_note = "the model is being loaded"
             self._take_up(*prepared)
             setup = self.contact.setup
@@ -375,10 +380,10 @@ class TwinMode(PageMode):
 
     # answers
 
-    def _said(self, text: str) -> None:
+    def _show_message(self, text: str) -> None:
         self._page.say(text)
 
-    def _answered(self, answer: Answer) -> None:
+    def _publish_answer(self, answer: ContactAnswer) -> None:
         if self._path is not None:
             self._path.append((time.monotonic() - self._path_s, answer.pose))
         self._publisher.give(answer)
@@ -392,10 +397,10 @@ class TwinMode(PageMode):
     def _put_object(self) -> None:
         """Show the object in the scene. Only the worker's thread may call this."""
         with self._showing:
-            self._scene.put_object(self.contact.setup.touched)
+            self._scene.put_object(self.contact.setup.obj)
         self.worker.show_again()
 
-    def _publish(self, answer: Answer) -> None:
+    def _publish(self, answer: ContactAnswer) -> None:
         """Show an answer. Scene, pictures and numbers belong to one pose, and browsers get them together."""
         with self._showing:
             if answer.setup.sensor is not self.contact.setup.sensor:  # the page now shows another sensor
@@ -406,7 +411,7 @@ class TwinMode(PageMode):
         for follow in self.followers:
             follow(answer)
 
-    def _show_answer(self, answer: Answer) -> None:
+    def _show_answer(self, answer: ContactAnswer) -> None:
         contact = self.contact
         if self._active:
             camera = camera_picture(answer.frame, answer.seen, self._rest.pins_px, self._drawn)
@@ -431,10 +436,10 @@ class TwinMode(PageMode):
 
         self._page.together(change)
 
-    def _gizmo_pose(self, answer: Answer) -> np.ndarray:
+    def _gizmo_pose(self, answer: ContactAnswer) -> np.ndarray:
         return answer.pose.matrix(self.contact.setup.sensor.skin.apex_mm)
 
-    def _follow_sliders(self, answer: Answer) -> None:
+    def _follow_sliders(self, answer: ContactAnswer) -> None:
         """Set the sliders to the object's final pose, unless the user has made a new wish."""
         wishing = self.worker.newest is not answer or time.monotonic() - self._wished_s < ONE_GESTURE_S
         if wishing and not self._scene.dragging and not answer.stopped:
@@ -444,7 +449,7 @@ class TwinMode(PageMode):
             if abs(slider.value - value) > 0.02:
                 put(slider, value)
 
-    def _numbers(self, answer: Answer) -> list[str]:
+    def _numbers(self, answer: ContactAnswer) -> list[str]:
         state, seen = answer.state, answer.seen
         moving = "moving" if not answer.arrived else "still"
         mesh = str(answer.mesh) if len(state.contact_mm) else "no contact"
@@ -468,10 +473,10 @@ class TwinMode(PageMode):
             if len(state.contact_mm)
             else paragraph("No contact: an estimate would mean nothing.", "note"),
             paragraph(self.contact.fine_lost, "note"),
-            paragraph(f"pins by {self._shown}: dark 0, bright {full:g} {unit}; {sum(answer.ms.values()):.0f} ms for this answer", "note"),
+            paragraph(f"pins coloured by {self._shown}: dark 0, bright {full:g} {unit}; {sum(answer.ms.values()):.0f} ms latency", "note"),
         ]
 
-    def _draw_charts(self, answer: Answer) -> None:
+    def _draw_charts(self, answer: ContactAnswer) -> None:
         self._forces.add(dict(zip("xyz", answer.state.force_n.tolist(), strict=True)))
         self._depths.add({"indentation": answer.indent_mm})
         estimate = answer.estimate
@@ -481,7 +486,7 @@ class TwinMode(PageMode):
 
     # saving
 
-    def _require_answer(self) -> Answer:
+    def _require_answer(self) -> ContactAnswer:
         if self.worker.newest is None:
             raise TwinError("there is no picture yet; wait for the first one")
         return self.worker.newest
@@ -501,7 +506,7 @@ class TwinMode(PageMode):
         out = next_path(self._out, "contact", "")
         out.mkdir()
         pose = PressedPose(**asdict(answer.pose), indent_mm=answer.indent_mm)
-        self._tracer.save(out, self.contact.setup.touched, pose, answer.state, answer.frame.form)
+        self._tracer.save(out, self.contact.setup.obj, pose, answer.state, answer.frame.form)
         self._page.say(f"writing {out} ...")
 
     def save_state(self) -> None:
@@ -510,14 +515,14 @@ class TwinMode(PageMode):
         self._page.server.send_file_download(path.name, path.read_bytes())
         self._page.say(f"saved {path}; open it here or with: twin studio --state {path}")
 
-    def _toggle_way(self) -> None:
+    def _toggle_trajectory(self) -> None:
         if self._record_way.value:
             self._path, self._path_s = [], time.monotonic()
             return
         way, self._path = self._path, None
         if way:
             kept = [pair for k, pair in enumerate(way) if k == 0 or pair[0] > way[k - 1][0]]
-            self._page.say(f"saved {save_way(next_path(self._out, 'way', '.csv'), kept)} ({len(kept)} poses)")
+            self._page.say(f"saved {save_trajectory(next_path(self._out, 'way', '.csv'), kept)} ({len(kept)} poses)")
 
     def _toggle_film(self) -> None:
         if self._filming.value:

@@ -10,7 +10,7 @@ from typing import Generic, TypeVar
 
 from twin.errors import TwinError
 from twin.optics.preview import Shading
-from twin.studio.contact import Answer, Light, MovingContact
+from twin.studio.contact import ContactAnswer, Light, MovingContact
 from twin.studio.pose import ObjectPose
 from twin.studio.tracing import Failed, Outcome, Saved, Traced, Tracer
 
@@ -23,7 +23,7 @@ LOOK_S = 0.02
 """Interval, s, at which due work is looked for."""
 
 
-def told(error: Exception) -> str:
+def describe_error(error: Exception) -> str:
     """An error as text for the page. A fault of this program is also logged with its traceback, and the thread continues."""
     if isinstance(error, TwinError):
         return str(error)
@@ -73,7 +73,7 @@ class Worker(_OwnThread):
     ----------
     contact : MovingContact
     tracer : Tracer or None
-        If it is None, pictures stay drawn.
+        If it is None, pictures stay rasterised.
     on_answer : callable
         Called with each answer, in the worker's thread.
     on_message : callable
@@ -84,7 +84,7 @@ class Worker(_OwnThread):
         self,
         contact: MovingContact,
         tracer: Tracer | None,
-        on_answer: Callable[[Answer], None],
+        on_answer: Callable[[ContactAnswer], None],
         on_message: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._contact, self._tracer = contact, tracer
@@ -95,7 +95,7 @@ class Worker(_OwnThread):
         self._way: deque[Wish] = deque()
         self._asked_trace = 0
         self._moved_s = time.monotonic()
-        self._newest: Answer | None = None
+        self._newest: ContactAnswer | None = None
         self._traces = tracer is not None
         if tracer is not None:
             tracer.on_outcome = self._wake
@@ -106,7 +106,7 @@ class Worker(_OwnThread):
             self._news.notify()
 
     @property
-    def newest(self) -> Answer | None:
+    def newest(self) -> ContactAnswer | None:
         """The newest answer."""
         return self._newest
 
@@ -164,7 +164,7 @@ class Worker(_OwnThread):
                     if self._wish is wish:
                         self._wish = None
                 self._moved_s = time.monotonic()  # so that a failed step on the fine mesh is not repeated without a pause
-                self._on_message(told(error))
+                self._on_message(describe_error(error))
 
     def _due(self) -> Wish | None:
         """The wish to move to now. A pose of a played path waits for its time, and for the pose before it."""
@@ -215,7 +215,7 @@ class Worker(_OwnThread):
                 answer = None
                 if not (outcome.rough and self._newest is not None and self._newest.lit is Light.TRACED):  # no good picture gives way
                     lit = Light.ROUGH if outcome.rough else Light.TRACED
-                    answer = self._contact.traced(outcome.solved, outcome.light, lit, outcome.ms)
+                    answer = self._contact.newest_traced(outcome.solved, outcome.light, lit, outcome.ms)
                 if answer is not None:
                     self._publish(answer)
             case Shading():
@@ -229,7 +229,7 @@ class Worker(_OwnThread):
                     self._traces = False
                 self._on_message(outcome.reason)
 
-    def _publish(self, answer: Answer) -> None:
+    def _publish(self, answer: ContactAnswer) -> None:
         if self._newest is None and self._tracer is not None:
             self._tracer.start()  # not earlier, so that the first picture does not wait for it
         self._newest = answer
@@ -277,4 +277,4 @@ class Newest(_OwnThread, Generic[T]):
             try:
                 self._take(thing)
             except Exception as error:
-                self._failed(told(error))
+                self._failed(describe_error(error))

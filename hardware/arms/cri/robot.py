@@ -113,13 +113,13 @@ class SyncRobot(Closing):
 
     @property
     def pose(self) -> np.ndarray:
-        return self._seen(self.controller.pose)
+        return self._from_controller(self.controller.pose)
 
     @property
     def target_pose(self) -> np.ndarray | None:
         """The last requested pose; None before the first one."""
         commanded = self.controller.commanded_pose
-        return None if commanded is None else self._seen(commanded)
+        return None if commanded is None else self._from_controller(commanded)
 
     @property
     def target_joint_angles(self) -> np.ndarray | None:
@@ -140,21 +140,21 @@ class SyncRobot(Closing):
         self.controller.move_joints(joint_angles)
 
     def move_linear(self, pose: Numbers, elbow: float | None = None) -> None:
-        self.controller.move_linear(self._commanded(pose), elbow)
+        self.controller.move_linear(self._to_controller(pose), elbow)
 
     def move_circular(self, via_pose: Numbers, end_pose: Numbers, elbow: float | None = None) -> None:
         """Along the circle through the present place, that of ``via_pose`` and that of ``end_pose``."""
-        self.controller.move_circular(self._commanded(via_pose), self._commanded(end_pose), elbow)
+        self.controller.move_circular(self._to_controller(via_pose), self._to_controller(end_pose), elbow)
 
     def close(self) -> None:
         self.controller.close()
 
-    def _commanded(self, pose: Numbers) -> np.ndarray:
+    def _to_controller(self, pose: Numbers) -> np.ndarray:
         """The controller's pose (7,) for one (6,) in the work frame."""
         return mat2quat(self._T_base_work @ euler2mat(pose, self._axes) @ self._T_tip_flange)
 
-    def _seen(self, pose: np.ndarray) -> np.ndarray:
-        """The reverse of ``_commanded``."""
+    def _from_controller(self, pose: np.ndarray) -> np.ndarray:
+        """The reverse of ``_to_controller``."""
         return mat2euler(np.linalg.inv(self._T_base_work) @ quat2mat(pose) @ np.linalg.inv(self._T_tip_flange), self._axes)
 
 

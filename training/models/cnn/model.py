@@ -36,7 +36,7 @@ class CnnModel(Model):
         """See ``Model``."""
         return Prepared(image_inputs(data))
 
-    def seen(self, data: Dataset) -> object:
+    def inputs_seen(self, data: Dataset) -> object:
         """See ``Model``: the small images."""
         return image_inputs(data).images.numpy()
 

@@ -193,10 +193,10 @@ class Gcn(nn.Module):
         graphs, nodes = x.shape[:2]
         h = x.reshape(graphs * nodes, -1)
         for layer, norm in zip(self.convolutions, self.norms, strict=True):
-            h = self._convolved(h, matrix, transpose, cast(nn.Linear, layer).weight, cast(nn.BatchNorm1d, norm))
+            h = self._convolve(h, matrix, transpose, cast(nn.Linear, layer).weight, cast(nn.BatchNorm1d, norm))
         return {"mean": self.dense(h.view(graphs, nodes, -1).mean(dim=1))}
 
-    def _convolved(
+    def _convolve(
         self, h: torch.Tensor, matrix: torch.Tensor, transpose: torch.Tensor, weight: torch.Tensor, norm: nn.BatchNorm1d
     ) -> torch.Tensor:
         running_mean, running_var = cast(torch.Tensor, norm.running_mean), cast(torch.Tensor, norm.running_var)

@@ -23,7 +23,7 @@ DERIVED = ("fit", "order")
 PROCESS_MODES = 20
 
 
-class Displacements:
+class BatchDisplacements:
     """Displacements from rest of every frame: ``batch`` gives (B, N, 2), in mean rest spacings.
 
     Parameters
@@ -53,9 +53,9 @@ class SteeredModel(PinModel):
         refuse_sizes(self, size, tuple(field.name for field in fields(SteeredSize)))
         return Steered(waves_of(reference.pins_px), outputs, SteeredSize(**size))
 
-    def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> Displacements:
+    def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> BatchDisplacements:
         """See ``PinModel``. A lost pin is where its neighbours predict it."""
-        return Displacements((pins.nodes_px - pins.reference.pins_px) / reference.spacing_px.mean())
+        return BatchDisplacements((pins.nodes_px - pins.reference.pins_px) / reference.spacing_px.mean())
 
     def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
         """See ``Model``. Sets the principal components, and the turning sense in which the direction's label grows.
@@ -69,7 +69,7 @@ class SteeredModel(PinModel):
             raise TrainingError(
                 f"{self.name} is for labels of which one is a direction on the whole circle, these have {sum(code.circular)}; train vgnn"
             )
-        cast(Steered, network).prepare(cast(Displacements, inputs).moved[rows], numbers[rows], code)
+        cast(Steered, network).prepare(cast(BatchDisplacements, inputs).moved[rows], numbers[rows], code)
 
     def modes(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> Modes:
         """See ``Model``. The inputs are the network's estimates, and the first components of the field after it is turned by them."""

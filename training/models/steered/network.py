@@ -37,7 +37,7 @@ class SteeredSize:
     depth: int = 3
 
 
-class Look(nn.Module):
+class ComponentsPerceptron(nn.Module):
     """Principal components of coefficients, and a perceptron on them.
 
     Parameters
@@ -107,8 +107,8 @@ class Steered(nn.Module):
         self.register_buffer("order", torch.from_numpy(waves.order.astype(np.float32)))
         self.register_buffer("sine", torch.tensor(0))
         self.register_buffer("sense", torch.tensor(1.0))
-        self.first = Look(len(waves.order), outputs, size)
-        self.second = Look(len(waves.order), 2 * outputs, size)
+        self.first = ComponentsPerceptron(len(waves.order), outputs, size)
+        self.second = ComponentsPerceptron(len(waves.order), 2 * outputs, size)
 
     def coefficients(self, moved: torch.Tensor) -> torch.Tensor:
         """Complex coefficients (B, C) of displacements (B, N, 2)."""
@@ -116,7 +116,7 @@ class Steered(nn.Module):
         x, y = moved[..., 0], moved[..., 1]
         return torch.complex(x @ real.T - y @ imaginary.T, x @ imaginary.T + y @ real.T)
 
-    def turned(self, seen: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
+    def turn_coefficients(self, seen: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
         """Coefficients (B, C) of the same contacts turned by ``turn`` (B,) rad in the picture, from x to y."""
         return seen * torch.exp(1j * turn[:, None] * self.order)
 
@@ -125,12 +125,15 @@ class Steered(nn.Module):
         sine = int(np.flatnonzero(np.repeat(code.circular, np.where(code.circular, 2, 1)))[0])
         self.sine.fill_(sine)
         seen, direction = self.coefficients(moved), torch.atan2(numbers[:, sine], numbers[:, sine + 1])
-        alike = [float(self.turned(seen, -sense * direction)[:, self.order != 0].mean(dim=0).abs().square().sum()) for sense in (1, -1)]
+        alike = [
+            float(self.turn_coefficients(seen, -sense * direction)[:, self.order != 0].mean(dim=0).abs().square().sum())
+            for sense in (1, -1)
+        ]
         self.sense.fill_(1.0 if alike[0] >= alike[1] else -1.0)
         copies = seen.repeat(COPIES, 1)
-        self.first.prepare(self.turned(copies, 2 * torch.pi * torch.rand(len(copies))))
+        self.first.prepare(self.turn_coefficients(copies, 2 * torch.pi * torch.rand(len(copies))))
         guess = (self.sense * direction).repeat(COPIES) + GUESS_ERROR_RAD * torch.randn(len(copies))
-        self.second.prepare(self.turned(copies, -guess))
+        self.second.prepare(self.turn_coefficients(copies, -guess))
 
     def forward(self, moved: torch.Tensor) -> dict[str, torch.Tensor]:
         """Numbers of the labels from displacements (B, N, 2).
@@ -158,7 +161,7 @@ class Steered(nn.Module):
     def view(self, moved: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The estimated numbers (B, E) of displacements (B, N, 2), and the components (B, modes) of the field turned by the estimate."""
         mean = self(moved)["mean"]
-        return mean, self.second.amplitudes(self.turned(self.coefficients(moved), -self._direction(mean)))
+        return mean, self.second.amplitudes(self.turn_coefficients(self.coefficients(moved), -self._direction(mean)))
 
     def _direction(self, numbers: torch.Tensor) -> torch.Tensor:
         """(B,) direction in the picture, rad."""
@@ -168,18 +171,18 @@ class Steered(nn.Module):
         return numbers[:, int(self.sine)], numbers[:, int(self.sine) + 1]
 
     def _first(self, seen: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
-        said = self.first(self.turned(seen, turn), turn)
-        return self._put(said, *_spun(*self._pair(said), -self.sense * turn))
+        said = self.first(self.turn_coefficients(seen, turn), turn)
+        return self._with_direction(said, *_spun(*self._pair(said), -self.sense * turn))
 
     def _second(self, seen: torch.Tensor, guess: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        said = self.second(self.turned(seen, -guess), -guess)
+        said = self.second(self.turn_coefficients(seen, -guess), -guess)
         mean, scale = said[:, : self.outputs], said[:, self.outputs :]
         rest = self._pair(mean)[0]  # rad: what is left of the direction
         label = self.sense * guess + rest
         length = torch.full_like(label, 2**0.5)  # standardised numbers of a direction are root 2 long
-        return self._put(mean, length * label.sin(), length * label.cos()), scale
+        return self._with_direction(mean, length * label.sin(), length * label.cos()), scale
 
-    def _put(self, numbers: torch.Tensor, sine: torch.Tensor, cosine: torch.Tensor) -> torch.Tensor:
+    def _with_direction(self, numbers: torch.Tensor, sine: torch.Tensor, cosine: torch.Tensor) -> torch.Tensor:
         """The numbers (B, E) with another direction."""
         columns = list(numbers.unbind(dim=1))
         columns[int(self.sine)], columns[int(self.sine) + 1] = sine, cosine

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from training.models.vgnn.registration import spanned
+from training.models.vgnn.registration import count_modes
 
 SMALL = 0.15
 """Size, in rest spacings times the root of the number of coordinates, below which displacements are noise rather than a contact."""
@@ -68,7 +68,7 @@ class Bases:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @classmethod
-    def learnt(cls, moved: np.ndarray, light: np.ndarray, lost: np.ndarray, *, modes: int, light_modes: int) -> "Bases":
+    def learn_bases(cls, moved: np.ndarray, light: np.ndarray, lost: np.ndarray, *, modes: int, light_modes: int) -> "Bases":
         """Learn the bases from displacements (m, 2 N), levels (m, N) and lost pins (m, N) of training frames."""
         seen = (lost.mean(axis=0) <= MOST_LOST).astype(float)
         if not seen.any():
@@ -89,6 +89,6 @@ def _directions(centred: np.ndarray, count: int) -> np.ndarray:
     _, sizes, rows = np.linalg.svd(centred, full_matrices=False)
     found = np.zeros((centred.shape[1], count))
     if sizes.size and sizes[0] > 0:
-        keep = spanned(sizes, count)
+        keep = count_modes(sizes, count)
         found[:, :keep] = rows[:keep].T * np.sqrt(len(centred) / (sizes[:keep] * sizes[0]))
     return found

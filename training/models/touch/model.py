@@ -78,26 +78,26 @@ class TouchModel(PinModel):
         nodes_px, lost = pins.nodes_px, pins.lost
         for _ in range(ROUNDS):
             registration, _ = fit_registration(nodes_px[train], pins.reference.pins_px)
-            lost = _untrusted(registration, pins, pins.reference)
+            lost = _find_untrusted(registration, pins, pins.reference)
             nodes_px = np.stack(
                 [registration.fill(each, gone) if gone.any() else each for each, gone in zip(pins.nodes_px, lost, strict=True)]
             )
-        moved = _moved(registration, pins, pins.reference, lost, together=False)
-        bases = Bases.learnt(moved[train], pins.light[train], lost[train], modes=SIZES["modes"], light_modes=SIZES["light_modes"])
+        moved = _remove_camera_motion(registration, pins, pins.reference, lost, together=False)
+        bases = Bases.learn_bases(moved[train], pins.light[train], lost[train], modes=SIZES["modes"], light_modes=SIZES["light_modes"])
         learnt = {"registration": registration.arrays(), "bases": bases.arrays()}
         return Prepared(TouchInputs(bases(moved, pins.light)), learnt)
 
-    def seen(self, data: Dataset) -> object:
+    def inputs_seen(self, data: Dataset) -> object:
         """See ``Model``: the pins, their places at rest, and the light of the caps."""
-        return [super().seen(data), np.round(data.pins.light, LIGHT_DECIMALS) + 0.0]
+        return [super().inputs_seen(data), np.round(data.pins.light, LIGHT_DECIMALS) + 0.0]
 
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> TouchInputs:
         """See ``PinModel``. If a frame without contact shows the camera's place, no displacement of the camera is estimated."""
-        pins = pins.seen_from(reference) if pins.measured else pins
+        pins = pins.relative_to(reference) if pins.measured else pins
         registration, bases = Registration(**learnt["registration"]), Bases(**learnt["bases"])
         if bases.light_mean.any() and not pins.light.any():
-            raise TrainingError("the model learnt from the light on the caps as well, and these pins come without it; give it frames")
-        moved = _moved(registration, pins, reference, _untrusted(registration, pins, reference), together=together)
+            raise TrainingError("the model was trained on the light on the caps as well, and these pins come without it; give it frames")
+        moved = _remove_camera_motion(registration, pins, reference, _find_untrusted(registration, pins, reference), together=together)
         return TouchInputs(bases(moved, _as_bright(pins.light, bases)))
 
     def initialise(self, network: torch.nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
@@ -119,7 +119,9 @@ class TouchModel(PinModel):
         return packed
 
 
-def _moved(registration: Registration, pins: PinTable, reference: Reference, lost: np.ndarray, *, together: bool) -> np.ndarray:
+def _remove_camera_motion(
+    registration: Registration, pins: PinTable, reference: Reference, lost: np.ndarray, *, together: bool
+) -> np.ndarray:
     """Displacements (M, 2 N) in rest spacings, with lost pins filled in, without the displacement of a moved camera."""
     nodes_px = pins.nodes_px.copy()
     for k in np.flatnonzero(lost.any(axis=1)):
@@ -136,7 +138,7 @@ def _as_bright(light: np.ndarray, bases: Bases) -> np.ndarray:
     return found
 
 
-def _untrusted(registration: Registration, pins: PinTable, reference: Reference) -> np.ndarray:
+def _find_untrusted(registration: Registration, pins: PinTable, reference: Reference) -> np.ndarray:
     """Pins (M, N) that are lost, or so far from their places by the modes of all pins that they are something else (reflections)."""
     aligned, _ = align(pins.nodes_px, reference.pins_px)
     away = aligned.reshape(len(aligned), -1) - registration.mean

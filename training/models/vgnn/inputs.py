@@ -37,7 +37,7 @@ def pin_features(nodes_px: np.ndarray, area_px2: np.ndarray, reference: Referenc
     return np.concatenate([moved, np.log(area_px2 / reference.area_px2)[..., None]], axis=-1)
 
 
-def filled(
+def fill_lost(
     registration: Registration, nodes_px: np.ndarray, area_px2: np.ndarray, lost: np.ndarray, reference: Reference
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pins (M, N, 2) and areas (M, N). A lost pin (M, N) is placed by the modes of the other pins' displacements."""
@@ -57,6 +57,6 @@ def seated_inputs(
     *,
     together: bool = False,
 ) -> PinInputs:
-    """Inputs of frames (see ``filled``) without the camera's displacement; ``together`` as in ``Registration``."""
+    """Inputs of frames (see ``fill_lost``) without the camera's displacement; ``together`` as in ``Registration``."""
     nodes, area, _, share = registration(nodes_px, area_px2, together=together)
     return PinInputs(pin_features(nodes, area, reference), lost, share)

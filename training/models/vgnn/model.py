@@ -13,7 +13,7 @@ from training.data.pins import PinTable
 from training.errors import TrainingError
 from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Variant, Weights, refuse_sizes
 from training.models.recipes import Recipe
-from training.models.vgnn.inputs import PinInputs, filled, pin_features, seated_inputs
+from training.models.vgnn.inputs import PinInputs, fill_lost, pin_features, seated_inputs
 from training.models.vgnn.network import Vgnn, VgnnSize
 from training.models.vgnn.registration import Registration, fit_registration
 from twin.pins.reference import Reference
@@ -47,7 +47,7 @@ class VgnnModel(PinModel):
         In view 1 the whole difference of each frame from the expected camera is removed, as for a camera at another place.
         """
         registration, left = fit_registration(pins.nodes_px[train], pins.reference.pins_px)
-        nodes_px, area_px2 = filled(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
+        nodes_px, area_px2 = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
         seated = seated_inputs(registration, nodes_px, area_px2, pins.lost, pins.reference)
         taken = registration.difference(nodes_px)
         taken[train] = left
@@ -59,8 +59,8 @@ class VgnnModel(PinModel):
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> PinInputs:
         """See ``PinModel``. If a frame without contact shows the camera's place, no displacement of the camera is estimated."""
         registration = Registration(**learnt["registration"])
-        pins = pins.seen_from(reference) if pins.measured else pins
-        nodes_px, area_px2 = filled(registration, pins.nodes_px, pins.area_px2, pins.lost, reference)
+        pins = pins.relative_to(reference) if pins.measured else pins
+        nodes_px, area_px2 = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, reference)
         if pins.measured:
             return PinInputs(pin_features(nodes_px, area_px2, reference), pins.lost)
         return seated_inputs(registration, nodes_px, area_px2, pins.lost, reference, together=together)
@@ -73,7 +73,7 @@ class VgnnModel(PinModel):
         """See ``Model``. The inputs are the first modes of the displacement and all modes of the areas."""
         vgnn, pins = cast(Vgnn, network), cast(PinInputs, inputs)
         with torch.no_grad():
-            amplitudes = vgnn.amplitudes(vgnn.known(*pins.batch(rows))).double().numpy()
+            amplitudes = vgnn.amplitudes(vgnn.fill_lost_features(*pins.batch(rows))).double().numpy()
         modes = vgnn.size.modes
         seen = np.concatenate([amplitudes[:, : min(PROCESS_MODES, modes)], amplitudes[:, modes:]], axis=1)
         return Modes(seen, pins.displaced[rows].numpy())

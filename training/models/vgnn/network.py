@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from training.models.vgnn.registration import spanned
+from training.models.vgnn.registration import count_modes
 
 # Features of a node: dx, dy and the logarithm of the area ratio.
 FEATURES = 3
@@ -108,14 +108,14 @@ class Vgnn(nn.Module):
         ----------
         x : (B, N, F) float
         lost : (B, N) bool, optional
-            Pins whose features are unknown. They are filled in: see ``known``.
+            Pins whose features are unknown. They are filled in: see ``fill_lost_features``.
 
         Returns
         -------
         dict
             ``mean`` (B, K) and ``log_scale`` (B, K), standardised; ``executed`` (B,) logit; ``embedding`` (B, width).
         """
-        x = self.known(x, lost)
+        x = self.fill_lost_features(x, lost)
         parts = []
         if self.size.modes or self.size.area_modes:
             parts.append(self.amplitudes(x))
@@ -131,7 +131,7 @@ class Vgnn(nn.Module):
         k = self.outputs
         return {"mean": out[:, :k] + self.linear(z), "log_scale": out[:, k : 2 * k], "executed": out[:, 2 * k], "embedding": h}
 
-    def known(self, x: torch.Tensor, lost: torch.Tensor | None) -> torch.Tensor:
+    def fill_lost_features(self, x: torch.Tensor, lost: torch.Tensor | None) -> torch.Tensor:
         """Features with those of lost pins filled in: the displacement by the modes of the other pins, the area by the neighbours."""
         if lost is None or not bool(lost.any()):
             return x
@@ -205,7 +205,7 @@ def mode_components(centred: torch.Tensor, count: int) -> torch.Tensor:
     are 0.
     """
     _, sizes, directions = torch.linalg.svd(centred.double(), full_matrices=False)
-    keep = spanned(sizes.numpy(), count)
+    keep = count_modes(sizes.numpy(), count)
     deviation = sizes[:keep] / len(centred) ** 0.5
     found = torch.zeros(centred.shape[1], count)
     found[:, :keep] = (directions[:keep].T * (3 * (sizes[:keep] / sizes[0]).sqrt() / deviation)).float()

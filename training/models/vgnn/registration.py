@@ -134,7 +134,7 @@ def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[Registr
     flat = aligned.reshape(len(aligned), -1)
     mean = flat.mean(axis=0)
     _, sizes, directions = np.linalg.svd(flat - mean, full_matrices=False)
-    keep = spanned(sizes, MODES)
+    keep = count_modes(sizes, MODES)
     components = directions[:keep].T / np.maximum(sizes[:keep] / np.sqrt(len(flat)), 1e-9)
     terms = _terms((flat - mean) @ components)
     inverse = np.linalg.inv(terms.T @ terms + RIDGE * np.eye(terms.shape[1]))
@@ -169,7 +169,7 @@ def align(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[np.ndarray, np.nda
     return np.stack([left.real, left.imag], axis=-1), np.column_stack([np.log(np.abs(factor)), np.angle(factor), shift])
 
 
-def spanned(sizes: np.ndarray, most: int) -> int:
+def count_modes(sizes: np.ndarray, most: int) -> int:
     """Number of modes of centred rows to keep, at most ``most``; ``sizes`` are the rows' singular values, the largest first.
 
     M centred rows span at most M - 1 directions. All further modes are rounding errors. If they were scaled to a standard deviation of 1,

@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 
 from scenes.object import ObjectSpec
 from training.data.targets import unit_of
-from training.studies.objects.plan import MIXED, TIMES, Plan
-from twin.report.charts import muted, sized_figure, write_chart
+from training.studies.objects.plan import MIXED, TIMES, ObjectsPlan
+from twin.report.charts import muted_colour, sized_figure, write_chart
 from twin.report.numbers import number
-from twin.report.page import Page, Picture, sentence, strong
+from twin.report.page import Page, PagePicture, sentence, strong
 from twin.report.table import Column
 from twin.report.themes import BLUE, RED
 
@@ -19,7 +19,7 @@ from twin.report.themes import BLUE, RED
 def write_page(
     folder: Path,
     *,
-    plan: Plan,
+    plan: ObjectsPlan,
     names: Sequence[str],
     ranges: Mapping[str, Sequence[float]],
     rows: Sequence[Mapping],
@@ -34,7 +34,7 @@ def write_page(
     names : sequence of str
         Labels.
     ranges : mapping of str to (low, high)
-        Ranges of the labels that are judged.
+        Ranges of the labels that are evaluated.
     rows, verdicts : sequences
         As ``table`` and ``verdicts`` give them.
     """
@@ -42,13 +42,14 @@ def write_page(
     judged = ", ".join(f"{name} {number(ranges[name][0])} to {number(ranges[name][1])} {unit_of(name)}".rstrip() for name in names)
     page = Page(f"Objects never seen: {plan.sensor.name}", "twin study objects", topic="TacTip twin: study")
     page.lead = (
-        f"Two models from {number(plan.count * len(plan.train))} simulated contacts each, judged on {number(plan.tests)} other contacts of "
+        f"Two models from {number(plan.count * len(plan.train))} simulated contacts each, evaluated on "
+        f"{number(plan.tests)} other contacts of "
         "every object, seen or not."
     )
     page.notice("Objects never seen", verdicts)
     chart = write_chart(folder / "errors.png", lambda: errors_figure(rows, names, alone))
     page.figures(
-        Picture(
+        PagePicture(
             chart,
             f"Errors of both models on every object, as multiples of their error on {alone}",
             f"Mean absolute error of each label, as a multiple of the same model's error on {alone} (dashed). Filled: the object was "
@@ -66,11 +67,11 @@ def write_page(
         sentence(
             f"Contacts: {plan.wider.name}, {plan.randomisation.name}, {plan.across} elements across, seed {plan.seed}. Model",
             strong(MIXED),
-            f"learnt from {number(plan.count)} contacts of each of {_described(plan.train)}; model",
+            f"learnt from {number(plan.count)} contacts of each of {_describe_objects(plan.train)}; model",
             strong(alone),
-            f"from that alone. Never seen: {_described(plan.unseen)}.",
+            f"from that alone. Never seen: {_describe_objects(plan.unseen)}.",
         ),
-        f"Judged on {number(plan.tests)} other contacts of each object ({plan.experiment.name}), on all their states whose labels lie "
+        f"Evaluated on {number(plan.tests)} other contacts of each object ({plan.experiment.name}), on all their states whose labels lie "
         f"within {judged}.",
         "A label means the same on every object: that of the flat plate which would be touched at the same distance from the dome's centre "
         "and with the same normal.",
@@ -91,8 +92,8 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str], alone: str) -> 
                 places = [len(objects) - 1 - objects.index(row["object"]) + above for row in part]
                 label = f"trained on {'several objects' if model == MIXED else model}" if seen else None
                 ax.plot([row[f"{name}_times"] for row in part], places, mark, color=color, mfc=color if seen else "none", label=label)
-        ax.axvline(1.0, color=muted(), ls="--", lw=1.0)
-        ax.axvline(TIMES, color=muted(), ls=":", lw=1.2)
+        ax.axvline(1.0, color=muted_colour(), ls="--", lw=1.0)
+        ax.axvline(TIMES, color=muted_colour(), ls=":", lw=1.2)
         ax.set_yticks(np.arange(len(objects))[::-1], objects if panel == 0 else [])
         ax.set(xlabel=f"{name}: times the error on {alone}", xlim=(0, None))
     axes[0].legend()
@@ -108,5 +109,5 @@ def _column(key: str, names: Sequence[str]) -> Column:
     return Column.of(key)
 
 
-def _described(things: Sequence[ObjectSpec]) -> str:
+def _describe_objects(things: Sequence[ObjectSpec]) -> str:
     return "; ".join(f"{thing.name} ({thing.description})" for thing in things)

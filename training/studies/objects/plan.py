@@ -1,17 +1,17 @@
-"""The plan of the study of unseen objects: what is simulated, learnt and judged."""
+"""The plan of the study of unseen objects: what is simulated, trained and evaluated."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_experiment
-from training.data.dataset import Dataset, joined
+from training.data.dataset import Dataset, join_datasets
 from training.errors import TrainingError
 from training.generation import GenerationConfig, require_count
-from training.studies.sim_to_real.twins import contact_of
+from training.studies.sim_to_real.variants import contact_of
 from twin.types import FINE
 
-# Difference between the seeds of the judged contacts and of the training contacts, so that no judged contact is trained on.
+# Difference between the seeds of the evaluated contacts and of the training contacts, so that no evaluated contact is trained on.
 TESTS_APART = 1000
 # Name of the model that is trained on all objects of ``Plan.train``.
 MIXED = "mixed"
@@ -20,19 +20,19 @@ TIMES = 1.5
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is simulated, learnt and judged.
+class ObjectsPlan:
+    """What is simulated, trained and evaluated.
 
     Attributes
     ----------
     sensor : SensorSpec
     experiment : ExperimentSpec
-        Its ranges contain the labels of the judged contacts. Training uses its wide form, if it has one.
+        Its ranges contain the labels of the evaluated contacts. Training uses its wide form, if it has one.
     randomisation : RandomisationSpec
     train, unseen : tuple of ObjectSpec
         Objects. The first of ``train`` is also trained on alone.
     count, tests : int
-        Contacts to train on, and to judge on, for each object.
+        Contacts to train on, and to evaluate on, for each object.
     seed, across : int
     epochs : int or None
         Epochs of both trainings; None: the model's own number.
@@ -79,13 +79,13 @@ class Plan:
         judged = [(f"tests/{o.name}", self._config(o, self.experiment, TESTS_APART), self.tests) for o in (*self.train, *self.unseen)]
         return learnt + judged
 
-    def _config(self, thing: ObjectSpec, experiment: ExperimentSpec, apart: int) -> GenerationConfig:
+    def _config(self, obj: ObjectSpec, experiment: ExperimentSpec, apart: int) -> GenerationConfig:
         return GenerationConfig(
             sensor=self.sensor,
-            object=thing,
+            object=obj,
             experiment=experiment,
             randomisation=self.randomisation,
-            friction=thing.friction,
+            friction=obj.friction,
             seed=self.seed + apart,
             images="none",
             states="all",
@@ -96,4 +96,4 @@ class Plan:
         """The data set that each model is trained on, by the model's name. Both have the same number of contacts."""
         parts = [sets[f"sim/{thing.name}"] for thing in self.train]
         first = parts[0].rows(np.flatnonzero(contact_of(parts[0]) < self.count))
-        return {MIXED: joined([first, *parts[1:]]), self.alone.name: parts[0]}
+        return {MIXED: join_datasets([first, *parts[1:]]), self.alone.name: parts[0]}

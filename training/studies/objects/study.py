@@ -17,17 +17,17 @@ from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.generation import GenerationConfig, generate
 from training.studies.objects.page import write_page
-from training.studies.objects.plan import MIXED, TIMES, Plan
+from training.studies.objects.plan import MIXED, TIMES, ObjectsPlan
 from training.studies.sim_to_real.steps import train_in_twin
-from training.studies.sim_to_real.twins import contact_of
+from training.studies.sim_to_real.variants import contact_of
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
-from twin.types import Readable
+from twin.types import ReadableResult
 
 
 @dataclass(frozen=True, repr=False)
-class Result(Readable):
+class ObjectsResult(ReadableResult):
     """The result of the study.
 
     Attributes
@@ -56,8 +56,8 @@ class Result(Readable):
 
 
 @writes("objects.csv", "index.html", "errors*.png")
-def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
-    """Simulate contacts of all objects, train both models, and judge them on contacts of every object.
+def run(plan: ObjectsPlan, out: Path, *, progress: Progress = silent) -> ObjectsResult:
+    """Simulate contacts of all objects, train both models, and evaluate them on contacts of every object.
 
     Writes data sets, runs, ``objects.csv`` and ``index.html`` to ``out``. Results of an earlier call with the same plan are used again.
 
@@ -66,9 +66,9 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     DatasetError
         A folder holds another data set, or contacts can't be made.
     TrainingError
-        A folder holds another run, or no contact of an object lies within the ranges that are judged.
+        A folder holds another run, or no contact of an object lies within the ranges that are evaluated.
     """
-    sets = {folder: _simulated(plan, out / folder, folder, config, count, progress) for folder, config, count in plan.sets()}
+    sets = {folder: _simulate(plan, out / folder, folder, config, count, progress) for folder, config, count in plan.sets()}
     runs = {}
     for name, data in plan.trained_on(sets).items():
         runs[name] = out / name
@@ -77,10 +77,10 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     names, rows = plan.experiment.targets, table(plan, runs, sets)
     said, ranges = verdicts(plan, rows, names), plan.experiment.ranges()
     page = write_page(out, plan=plan, names=names, ranges=ranges, rows=rows, verdicts=said)
-    return Result(rows, said, names, [write_table(out / "objects.csv", rows), page])
+    return ObjectsResult(rows, said, names, [write_table(out / "objects.csv", rows), page])
 
 
-def _simulated(plan: Plan, folder: Path, title: str, config: GenerationConfig, count: int, progress: Progress) -> Dataset:
+def _simulate(plan: ObjectsPlan, folder: Path, title: str, config: GenerationConfig, count: int, progress: Progress) -> Dataset:
     with stage(progress, title) as step:
         generate(folder, config, count, workers=plan.workers, progress=step)
     with stage(progress, f"{title}: states") as step:
@@ -96,7 +96,7 @@ def rows_in_range(data: Dataset, experiment: ExperimentSpec) -> np.ndarray:
     return np.flatnonzero(((data.targets.corrected >= low) & (data.targets.corrected <= high)).all(axis=1))
 
 
-def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[dict[str, Any]]:
+def table(plan: ObjectsPlan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[dict[str, Any]]:
     """A row for each model and object: mean absolute errors, biases, and the ratios of the errors to those on the first object."""
     rows = []
     for model, run in runs.items():
@@ -121,7 +121,7 @@ def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[d
     return rows
 
 
-def verdicts(plan: Plan, rows: list[dict[str, Any]], names: tuple[str, ...]) -> list[str]:
+def verdicts(plan: ObjectsPlan, rows: list[dict[str, Any]], names: tuple[str, ...]) -> list[str]:
     """A sentence for each unseen object: are the mixed model's errors at most ``TIMES`` its errors on the first object?"""
     lines = []
     for row in rows:

@@ -8,7 +8,7 @@ Gaussian process of the label l,
 
 (Higdon et al. 2008). c, s, w and n maximise the marginal likelihood; l is the pose of the tap and the executed move, and of a direction
 on the whole circle the pose after the move, with its cosine and sine. For each
-simulated contact one function is drawn from the posterior and added to the pins. So a model is trained with the twin's known
+simulated contact one function is sampled from the posterior and added to the pins. So a model is trained with the twin's known
 discrepancy, and with a wide spread of discrepancies where no labelled frame is near.
 """
 
@@ -21,10 +21,10 @@ from scenes.randomisation import FrictionSpread
 from training.data.audit import LabelColumns
 from training.errors import TrainingError
 from training.runs.gaussian_process import CONSTANT_AND_SMOOTH, Kernel, Points, Posterior, likeliest
-from twin.fit.contact.fit import expect, mean_squared, simulate
-from twin.fit.contact.parameters import PARAMETERS
-from twin.fit.contact.simulate import Setup
-from twin.judge.labelled.model import MeasuredFrames
+from twin.calibration.contact.fit import expect, mean_squared, simulate
+from twin.calibration.contact.parameters import PARAMETERS
+from twin.calibration.contact.simulate import CalibrationSetup
+from twin.evaluation.labelled.model import MeasuredFrames
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
 
@@ -35,7 +35,7 @@ FRICTIONS = (0.05, 0.15, 0.25, 0.35, 0.5, 0.8, 3.0)
 PLAIN_PX = 0.5
 # Quantiles of the frames' frictions between which friction is drawn.
 USUAL = (0.05, 0.95)
-# Factor by which the range of drawn frictions is extended at both ends.
+# Factor by which the range of sampled frictions is extended at both ends.
 WIDER = 1.25
 # Least number of labelled frames that the twin must be able to simulate and explain.
 FEWEST = 8
@@ -85,7 +85,7 @@ class Residuals:
         return float(np.linalg.norm(self.missing_px, axis=-1).mean())
 
     def friction_spread(self) -> FrictionSpread | None:
-        """Range in which friction is drawn for simulated contacts; None if too few executed moves show it.
+        """Range in which friction is sampled for simulated contacts; None if too few executed moves show it.
 
         A frame in which the object slides, or sticks, with every friction does not show its friction and is left out. All other frames
         have the same weight.
@@ -103,7 +103,7 @@ def label_axes(labels: list[ArmLabel]) -> np.ndarray:
 
 
 def measure_residuals(
-    setup: Setup, measured: MeasuredFrames, progress: Callable | None = None, *, frictions: tuple = FRICTIONS
+    setup: CalibrationSetup, measured: MeasuredFrames, progress: Callable | None = None, *, frictions: tuple = FRICTIONS
 ) -> Residuals:
     """Simulate labelled frames with several frictions, and compare each frame with the simulated state that is most like it.
 
@@ -128,7 +128,8 @@ def measure_residuals(
     good = np.flatnonzero(np.isfinite(moved).all(axis=(1, 2, 3)) & (weights.trust > TRUSTED))
     if len(good) < FEWEST:
         raise TrainingError(
-            f"{len(good)} of {len(labels)} labelled frames fit the twin, at least {FEWEST} are needed; give more `labels`, or `calibrate`"
+            f"{len(good)} of {len(labels)} labelled frames fit the twin, at least {FEWEST} are needed; give a larger "
+            f"`num_labelled`, or `calibrate`"
         )
     executed = weights.executed[good] > 0.5
     told = [replace(labels[k], executed=bool(done)) for k, done in zip(good, executed, strict=True)]
@@ -173,7 +174,7 @@ class Discrepancy:
     def __init__(self, residuals: Residuals) -> None:
         axes = residuals.axes
         self.columns = LabelColumns.of(axes[:, :6] + axes[:, 6:], axes[:, 6:])
-        told = self._told(axes)
+        told = self._known_labels(axes)
         self.used = told.std(axis=0) > VARIES
         self.middle, self.spread = told[:, self.used].mean(axis=0), told[:, self.used].std(axis=0)
         relative = residuals.missing_px.reshape(len(axes), -1) / _rms_px(residuals.moved_px)[:, None]
@@ -183,17 +184,17 @@ class Discrepancy:
         self.rest = amplitudes[:, kept:] @ self.modes[kept:] / np.sqrt(len(axes))  # ``draw_px`` adds random combinations of these rows
         self.modes = self.modes[:kept]
         self.sizes = np.sqrt((amplitudes[:, :kept] ** 2).mean(axis=0))
-        self.processes = [_process(self._scaled(axes), column) for column in (amplitudes[:, :kept] / self.sizes).T]
+        self.processes = [_process(self._scale_axes(axes), column) for column in (amplitudes[:, :kept] / self.sizes).T]
 
     def mean_px(self, labels: list[ArmLabel], moved_px: np.ndarray) -> np.ndarray:
         """(S, N, 2) expected discrepancy of S simulated displacements (S, N, 2), px."""
-        scaled = self._scaled(label_axes(labels))
+        scaled = self._scale_axes(label_axes(labels))
         amplitudes = np.stack([process.mean(Points.of(scaled)) for process in self.processes], axis=1)
         return self._fields(amplitudes, moved_px)
 
     def draw_px(self, labels: list[ArmLabel], moved_px: np.ndarray, contact: np.ndarray, seed: int) -> np.ndarray:
-        """(S, N, 2) random discrepancy of S simulated displacements, px. One function is drawn for all states of a contact (S,)."""
-        scaled = self._scaled(label_axes(labels))
+        """(S, N, 2) random discrepancy of S simulated displacements, px. One function is sampled for all states of a contact (S,)."""
+        scaled = self._scale_axes(label_axes(labels))
         amplitudes = np.empty((len(scaled), len(self.modes)))
         shares = np.empty((len(scaled), len(self.rest)))
         for number in np.unique(contact):
@@ -211,14 +212,14 @@ class Discrepancy:
         noise = [process.kernel.noises[0] ** 2 for process in self.processes]
         return [{"share": float(a), "told": float(max(0.0, 1 - n))} for a, n in zip(share, noise, strict=True)]
 
-    def _told(self, axes: np.ndarray) -> np.ndarray:
+    def _known_labels(self, axes: np.ndarray) -> np.ndarray:
         """The labels (K, A) that the processes know: as ``label_axes``, but a direction by its cosine and sine (``LabelColumns``)."""
         if self.columns.direction is None:
             return axes
         return self.columns.columns(axes[:, :6] + axes[:, 6:], axes[:, 6:])
 
-    def _scaled(self, axes: np.ndarray) -> np.ndarray:
-        return (self._told(axes)[:, self.used] - self.middle) / self.spread
+    def _scale_axes(self, axes: np.ndarray) -> np.ndarray:
+        return (self._known_labels(axes)[:, self.used] - self.middle) / self.spread
 
     def _fields(self, amplitudes: np.ndarray, moved_px: np.ndarray, rest: np.ndarray | float = 0.0) -> np.ndarray:
         relative = (amplitudes * self.sizes) @ self.modes + rest

@@ -10,7 +10,7 @@ import numpy as np
 
 from training.data.audit import LabelColumns
 from training.models.steered.field import waves_of
-from training.runs.gaussian_process import SMOOTH_AND_LINEAR, Kernel, Points, climbed
+from training.runs.gaussian_process import SMOOTH_AND_LINEAR, Kernel, Points, climb_likelihood
 
 MOST_STATES = 5000
 """Simulated states that the process learns from. The cost grows with the third power of their number; a sheared contact needs thousands."""
@@ -73,9 +73,9 @@ class TwinField:
         seen, self._sense = self.waves(moved_px[rows]), 1
         alike = {}
         for self._sense in (1, -1):  # in the picture a contact turns one way or the other as its direction's label grows
-            alike[self._sense] = float((np.abs((seen * self.turned(self.known, back=True)).mean(axis=0)) ** 2)[self.order != 0].sum())
+            alike[self._sense] = float((np.abs((seen * self.turn_factors(self.known, back=True)).mean(axis=0)) ** 2)[self.order != 0].sum())
         self._sense = max(alike, key=lambda sense: alike[sense])
-        own = seen * self.turned(self.known, back=True)
+        own = seen * self.turn_factors(self.known, back=True)
         self._mean = own.mean(axis=0)
         left = parts(own - self._mean)
         self._points = Points.of(self._inputs(self.known))
@@ -116,7 +116,7 @@ class TwinField:
             shared = np.where(self.order[:, None] == self.order, shared, 0)
         return np.block([[shared.real, -shared.imag], [shared.imag, shared.real]])
 
-    def turned(self, known: np.ndarray, *, back: bool = False) -> np.ndarray:
+    def turn_factors(self, known: np.ndarray, *, back: bool = False) -> np.ndarray:
         """Factors of the waves from the object's frame to the sensor's, or ``back``: (B, C), or (B, 1) ones if there is no direction."""
         if self.direction is None:
             return np.ones((len(known), 1))
@@ -124,17 +124,17 @@ class TwinField:
         factors: np.ndarray = np.exp((-1j if back else 1j) * angle * self.order)
         return factors
 
-    def scaled(self, known: np.ndarray) -> np.ndarray:
+    def scale_labels(self, known: np.ndarray) -> np.ndarray:
         """The varied labels (B, V), from -1 to 1 over their ranges."""
         found: np.ndarray = (known[:, self.varied] - self.middle[self.varied]) / self.half[self.varied]
         return found
 
-    def slipped(self, known: np.ndarray) -> np.ndarray:
-        """As ``scaled``, with moves m as m / sqrt(m0^2 + |m|^2), m0 = ``SLIPS_AT``.
+    def scale_moves(self, known: np.ndarray) -> np.ndarray:
+        """As ``scale_labels``, with moves m as m / sqrt(m0^2 + |m|^2), m0 = ``SLIPS_AT``.
 
         A move beyond the limit of friction changes the pins by its direction alone.
         """
-        found, moves = self.scaled(known), self.varied >= MOVES_FROM
+        found, moves = self.scale_labels(known), self.varied >= MOVES_FROM
         found[:, moves] /= np.sqrt(SLIPS_AT**2 + (found[:, moves] ** 2).sum(axis=1, keepdims=True))
         return found
 
@@ -145,7 +145,7 @@ class TwinField:
 
     def _inputs(self, known: np.ndarray) -> np.ndarray:
         """Inputs of the process: labels, the moves also as they slip, and cosine and sine of a direction."""
-        return np.hstack([self.scaled(known), self.slipped(known)[:, self.varied >= MOVES_FROM], self.around(known)])
+        return np.hstack([self.scale_labels(known), self.scale_moves(known)[:, self.varied >= MOVES_FROM], self.around(known)])
 
 
 def parts(waves: np.ndarray) -> np.ndarray:
@@ -158,5 +158,7 @@ def _likeliest(points: Points, outputs: np.ndarray, rng: np.random.Generator) ->
     left, sizes, _ = np.linalg.svd(outputs, full_matrices=False)
     rows = rng.permutation(len(points))[:FITTED]
     start = Kernel(SMOOTH_AND_LINEAR, np.full(points.inputs.shape[1], 1.5), np.array([1.0, 0.3]), np.array([0.1]))
-    fitted = [climbed(start, points.rows(rows), left[rows, k] * np.sqrt(len(left))).logs() for k in range(min(LEADING, len(sizes)))]
+    fitted = [
+        climb_likelihood(start, points.rows(rows), left[rows, k] * np.sqrt(len(left))).logs() for k in range(min(LEADING, len(sizes)))
+    ]
     return start.with_logs(np.average(fitted, axis=0, weights=sizes[: len(fitted)] ** 2))

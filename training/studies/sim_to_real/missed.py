@@ -71,9 +71,9 @@ class Missed:
 
     def __init__(self, field: TwinField, known: np.ndarray, seen: np.ndarray, noisier: np.ndarray) -> None:
         self._field, self._known, self._turns = field, known, field.direction is not None
-        turn = field.turned(known, back=True) * np.ones(seen.shape)
+        turn = field.turn_factors(known, back=True) * np.ones(seen.shape)
         residual = seen * turn - field.own(known)
-        own, there = self._own(known) + np.diag(noisier), self._seen(known) if self._turns else 0.0
+        own, there = self._own(known) + np.diag(noisier), self._sensor_covariance(known) if self._turns else 0.0
         self._weight, self.left = np.empty_like(residual), np.empty_like(residual)
         order = field.order if self._turns else np.zeros_like(field.order)  # waves of one order turn alike
         for alike in (order == each for each in np.unique(order)):
@@ -90,19 +90,19 @@ class Missed:
         """The discrepancy (B, C) of contacts (B, 12), in the object's frame."""
         found = self._own(known) @ self._weight
         if self._turns:
-            found = found + self._field.turned(known, back=True) * (self._seen(known) @ self._turned_weight)
+            found = found + self._field.turn_factors(known, back=True) * (self._sensor_covariance(known) @ self._turned_weight)
         return np.asarray(found)
 
     def _own(self, known: np.ndarray) -> np.ndarray:
         """Covariance (B, n) in the object's frame."""
-        here, there = self._field.slipped(known), self._field.slipped(self._known)
+        here, there = self._field.scale_moves(known), self._field.scale_moves(self._known)
         bent: np.ndarray = polynomials(here, 2)[:, 1:] @ polynomials(there, 2)[:, 1:].T
         lengths = np.full(here.shape[1], OWN_LENGTH)
         return bent + _covariance(CONSTANT if self._turns else FREE, OWN_SIZE, lengths, here, there)
 
-    def _seen(self, known: np.ndarray) -> np.ndarray:
+    def _sensor_covariance(self, known: np.ndarray) -> np.ndarray:
         """Covariance (B, n) in the sensor's frame, where a label is a direction."""
-        here, there = (np.hstack([self._field.slipped(each), self._field.around(each)]) for each in (known, self._known))
+        here, there = (np.hstack([self._field.scale_moves(each), self._field.around(each)]) for each in (known, self._known))
         lengths = np.r_[np.full(here.shape[1] - 2, SEEN_LENGTH), 1.0, 1.0]
         return _covariance(FREE, SEEN_SIZE, lengths, here, there)
 
@@ -123,7 +123,7 @@ class Left:
     def __init__(self, left: np.ndarray, seen: np.ndarray, noise: np.ndarray) -> None:
         self._size = float(np.median(_amplitude(seen))) if len(seen) else None
         white = np.linalg.inv(np.linalg.cholesky(noise)).T
-        residual, grown = parts(left) @ white, self._grown(seen)
+        residual, grown = parts(left) @ white, self._growth_factor(seen)
         expected = EXPECTED * np.eye(len(noise))
         spread = expected
         for _ in range(ROUNDS if len(seen) else 0):
@@ -139,14 +139,14 @@ class Left:
 
     def weights(self, seen: np.ndarray) -> np.ndarray:
         """(B, 2C) reciprocal standard deviation of each component along ``axes``, for frames with waves (B, C)."""
-        return np.asarray(1 / np.sqrt(1 + self._grown(seen)[:, None] * self._sizes))
+        return np.asarray(1 / np.sqrt(1 + self._growth_factor(seen)[:, None] * self._sizes))
 
-    def _grown(self, seen: np.ndarray) -> np.ndarray:
+    def _growth_factor(self, seen: np.ndarray) -> np.ndarray:
         """(B,) factor g of D."""
         return np.ones(len(seen)) if not self._size else SHALLOW + (1 - SHALLOW) * _amplitude(seen) / self._size
 
 
-def chosen(count: int, most: int) -> np.ndarray:
+def choose_evenly(count: int, most: int) -> np.ndarray:
     """At most ``most`` of ``count`` indices, evenly through their order."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(int)
 

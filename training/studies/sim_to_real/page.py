@@ -10,17 +10,17 @@ from matplotlib.ticker import NullLocator
 
 from scenes.randomisation import FrictionSpread
 from training.data.targets import unit_of
+from training.studies.sim_to_real.inverse_estimates import READ
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
-from training.studies.sim_to_real.read import READ
-from twin.report.charts import muted, plain_log, sized_figure, write_chart
+from twin.report.charts import muted_colour, plain_log, sized_figure, write_chart
 from twin.report.numbers import number
-from twin.report.page import Page, Picture
+from twin.report.page import Page, PagePicture
 from twin.report.table import Column
 from twin.report.themes import BLUE, OLIVE, PURPLE, RED
 
 # Name of the row of the model trained in the twin alone. Names of rows without one ingredient begin with this word and a comma.
 SIMULATED = "simulated"
-# Name of the row of the model trained on simulated pins without a drawn discrepancy.
+# Name of the row of the model trained on simulated pins without a sampled discrepancy.
 BARE = "simulated, bare"
 # Colours and lines of the models trained on real frames, in the order of the rows.
 STYLES = ((RED, "o-"), (OLIVE, "s--"))
@@ -53,7 +53,7 @@ def write_page(
     folder : Path
     sensor : str
     tested, frames, labelled : int
-        Number of frames that are judged, of all frames of the recording, and of frames that are labelled for the twin.
+        Number of frames that are evaluated, of all frames of the recording, and of frames that are labelled for the twin.
     seed : int
         Seed with which the frames were drawn.
     calibrated : bool
@@ -63,7 +63,7 @@ def write_page(
     modes : sequence
         First modes of the discrepancy: the ``share`` of each, and the part of it that the label explains (``told``).
     friction : FrictionSpread or None
-        Range in which friction was drawn for simulated contacts; None if all of them had the rig's friction.
+        Range in which friction was sampled for simulated contacts; None if all of them had the rig's friction.
     simulated, contacts : int
         Number of simulated states, and of the contacts that they belong to.
     names : sequence of str
@@ -79,7 +79,7 @@ def write_page(
     page = Page(f"From the twin to real frames: {sensor}", "twin study sim-to-real", topic="TacTip twin: study")
     page.lead = (
         f"Mean absolute errors on the same {number(tested)} real frames, a random fifth of {number(frames)} that no model has seen and no "
-        f"choice was made by. The {number(labelled)} labelled frames were drawn at random from the others (seed {seed})."
+        f"choice was made by. The {number(labelled)} labelled frames were sampled at random from the others (seed {seed})."
     )
     page.notice("The reader says", problems)
     page.figures(*_charts(folder, rows, names, labelled))
@@ -93,12 +93,12 @@ def write_page(
     page.section("How it was made")
     page.items(
         [
-            _twin_said(simulated, contacts, calibrated=calibrated),
-            _pins_said(error_px, friction),
-            _missing_said(modes, bare=bool(_of(rows, BARE))),
-            _beside_said(names, left_out),
-            "Twin backwards: the labels whose simulated pins are most like the frame's. What the twin misses is a quadratic of the label, "
-            "fitted to the labelled frames. Even: these are not drawn at random, but nearest to an even sequence.",
+            _describe_twin(simulated, contacts, calibrated=calibrated),
+            _describe_pins(error_px, friction),
+            _describe_missing(modes, bare=bool(_of(rows, BARE))),
+            _describe_combination(names, left_out),
+            "Model inversion: the labels whose simulated pins are most like the frame's. What the twin misses is a quadratic of the label, "
+            "fitted to the labelled frames. Even: these are not sampled at random, but nearest to an even sequence.",
             "Pins are counted from the no-contact frame of the recording, or of each simulated sensor.",
         ]
     )
@@ -106,10 +106,10 @@ def write_page(
     return page.write(folder / "index.html")
 
 
-def _charts(folder: Path, rows: Sequence[Mapping], names: Sequence[str], labelled: int) -> list[Picture]:
+def _charts(folder: Path, rows: Sequence[Mapping], names: Sequence[str], labelled: int) -> list[PagePicture]:
     """Errors by the number of labelled frames, and errors without one ingredient at a time if there are such rows."""
     charts = [
-        Picture(
+        PagePicture(
             write_chart(folder / "errors.png", lambda: errors_figure(rows, names)),
             "Errors of each label against the number of labelled real frames, for training in the twin and on real frames",
             "Errors against corrected labels by the number of labelled real frames. The dashed line is training in the twin alone: it "
@@ -119,7 +119,7 @@ def _charts(folder: Path, rows: Sequence[Mapping], names: Sequence[str], labelle
     others = [row for row in rows if row["trained_on"].startswith(f"{SIMULATED},")]
     if others:
         charts.append(
-            Picture(
+            PagePicture(
                 write_chart(folder / "ingredients.png", lambda: ingredients_figure([*_of(rows, SIMULATED), *others], names)),
                 "Errors of training in the twin with one ingredient left out or changed at a time",
                 "Training in the twin alone, with one ingredient left out or changed at a time; the line is the full recipe.",
@@ -128,7 +128,7 @@ def _charts(folder: Path, rows: Sequence[Mapping], names: Sequence[str], labelle
     return charts
 
 
-def _twin_said(simulated: int, contacts: int, *, calibrated: bool) -> str:
+def _describe_twin(simulated: int, contacts: int, *, calibrated: bool) -> str:
     fitted = "fitted to the labelled frames first" if calibrated else "as shipped, not fitted to the labelled frames"
     return (
         f"The twin: {number(simulated)} states of {number(contacts)} simulated contacts. Its specification is {fitted}"
@@ -136,7 +136,7 @@ def _twin_said(simulated: int, contacts: int, *, calibrated: bool) -> str:
     )
 
 
-def _pins_said(error_px: float, friction: FrictionSpread | None) -> str:
+def _describe_pins(error_px: float, friction: FrictionSpread | None) -> str:
     drawn = "that of the rig" if friction is None else f"drawn between {friction.low:.2f} and {friction.high:.2f}"
     return (
         f"On the labelled frames its pins miss the real ones by {number(error_px, decimals=2)} px, friction found frame by frame; for "
@@ -144,15 +144,15 @@ def _pins_said(error_px: float, friction: FrictionSpread | None) -> str:
     )
 
 
-def _missing_said(modes: Sequence[Mapping[str, float]], *, bare: bool) -> str:
+def _describe_missing(modes: Sequence[Mapping[str, float]], *, bare: bool) -> str:
     return (
-        "What the pins miss was learnt as a Gaussian process of the label and drawn for every simulated contact"
+        "What the pins miss was learnt as a Gaussian process of the label and sampled for every simulated contact"
         f"{', but for the rows called bare and uncalibrated' if bare else ''}. Its first modes hold "
-        f"{_percents(mode['share'] for mode in modes)} of it, of which the label tells {_percents(mode['told'] for mode in modes)}."
+        f"{_percents(mode['share'] for mode in modes)} of it, of which the label contains {_percents(mode['told'] for mode in modes)}."
     )
 
 
-def _beside_said(names: Sequence[str], left_out: np.ndarray) -> str:
+def _describe_combination(names: Sequence[str], left_out: np.ndarray) -> str:
     missed = ", ".join(f"{number(float(error))} {unit_of(name)} ({name})" for name, error in zip(names, left_out, strict=True))
     return (
         "Simulated and real: the model from the twin, averaged with a Gaussian process that takes the labelled frames for the simulated "
@@ -176,9 +176,9 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
             if row["model"] != READ:
                 ax.plot(row["labelled_frames"], row[key], "*", color=PURPLE, ms=13, label="twin and labelled frames")
             elif not row["labelled_frames"]:
-                ax.axhline(row[key], color=PURPLE, ls=(0, (1, 2)), label="twin read, no label")
+                ax.axhline(row[key], color=PURPLE, ls=(0, (1, 2)), label="model inversion, no label")
         _curve(ax, _model(rows, BOTH, READ), key, "^-", PURPLE, "twin read")
-        _curve(ax, _model(rows, f"{BOTH}{EVENLY}", READ), key, "^:", PURPLE, "twin read, evenly chosen frames")
+        _curve(ax, _model(rows, f"{BOTH}{EVENLY}", READ), key, "^:", PURPLE, "model inversion, evenly chosen frames")
         ax.set(
             title=f"{name} error", xlabel="labelled real frames", ylabel=f"mean absolute error, {unit_of(name)}", xscale="log", yscale="log"
         )
@@ -208,7 +208,7 @@ def ingredients_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
     places = np.arange(len(rows))[::-1]
     for panel, (ax, name) in enumerate(zip(axes, names, strict=True)):
         errors = [row[f"{name}_corrected"] for row in rows]
-        ax.axvline(errors[0], color=muted(), ls="--", lw=1.0)
+        ax.axvline(errors[0], color=muted_colour(), ls="--", lw=1.0)
         ax.plot(errors, places, "o", color=BLUE)
         ax.set_yticks(places, [row["trained_on"] for row in rows] if panel == 0 else [])
         ax.set(xlabel=f"{name}: mean absolute error, {unit_of(name)}", xlim=(0, 1.08 * max(errors)))

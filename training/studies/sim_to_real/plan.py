@@ -15,15 +15,15 @@ FULL = "sim_only"
 MOST_DRAWS = 1000
 """Most draws of what the twin misses, for each contact. More would not fit into memory."""
 REAL, BOTH = "real", "simulated and real"
-"""Names of rows of models that learnt from real frames alone, and from simulated contacts and real frames."""
+"""Names of rows of models that were trained on real frames alone, and from simulated contacts and real frames."""
 EVENLY = ", even"
-"""What is added to these where the frames are not drawn at random, but nearest to an even sequence."""
+"""What is added to these where the frames are not sampled at random, but nearest to an even sequence."""
 WITHOUT = ", {count} without labels"
 """What is added to these where the model also learnt from ``count`` frames without labels."""
 
 
 @dataclass(frozen=True)
-class Plan:
+class SimToRealPlan:
     """Settings of a study.
 
     Attributes
@@ -32,7 +32,7 @@ class Plan:
     frames : Path
         A labelled real recording.
     experiment : ExperimentSpec
-        The experiment that the recording was made with. It also names the labels that are learnt.
+        The experiment that the recording was made with. It also names the labels that are trained on.
     contacts : ExperimentSpec or None
         The experiment that is simulated; None: ``experiment`` with its wider ranges.
     labels : int
@@ -40,7 +40,7 @@ class Plan:
     seed : int
         Seed of the choice of frames, the contacts and the weights.
     draws : int
-        Number of discrepancies that are drawn for each contact.
+        Number of discrepancies that are sampled for each contact.
     count : int
         Number of contacts to simulate.
     simulated : tuple of Path
@@ -88,7 +88,7 @@ class Plan:
                 raise TrainingError(f"`sim` {folder}: no simulated data set; give the folder of one that 'twin dataset' has finished")
 
     @property
-    def touched(self) -> ObjectSpec:
+    def target_object(self) -> ObjectSpec:
         """The object of the recording's experiment."""
         return load_object(self.experiment.object)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from scenes.object import ObjectSpec
-from training.data.dataset import Dataset, joined, split_rows
+from training.data.dataset import Dataset, join_datasets, split_rows
 from training.data.design import nearest_to_even
 from training.data.label_code import LabelCode, goes_round, label_error
 from training.data.pins import voronoi_areas
@@ -26,11 +26,11 @@ from training.runs.identity import frame_marks, identity_of
 from training.runs.loop import epoch_step
 from training.runs.run import is_finished, train_run
 from training.runs.run_files import CONFIG, TENSORS, read_tensors, write_tensors
-from training.studies.judging import judge, leak_check
+from training.studies.judging import leak_check, measure_errors
 from training.studies.sim_to_real.discrepancy import Discrepancy
-from training.studies.sim_to_real.twins import contact_of
+from training.studies.sim_to_real.variants import contact_of
+from twin.evaluation.labelled.model import MeasuredFrames
 from twin.frames import open_recording
-from twin.judge.labelled.model import MeasuredFrames
 from twin.progress import Step
 from twin.rig.labels import ArmLabel, poses_and_moves, read_arm_labels
 from twin.store import output, overwriting, write_text, writes
@@ -52,17 +52,17 @@ RIDGES = 10.0 ** np.arange(-4, 3.1, 0.5)
 
 
 @dataclass(frozen=True)
-class Frames:
+class StudyFrames:
     """Which frames of a recording are used for what.
 
     Attributes
     ----------
     test : (t,) int
-        A random fifth, on which all models are judged and none is trained.
+        A random fifth, on which all models are evaluated and none is trained.
     few : (n,) int
-        The labelled frames, drawn at random from the others.
+        The labelled frames, sampled at random from the others.
     trained : dict of str to (m,) int
-        Frames to train on without the twin: ``few``, more of them, and all that are not judged on. Each set contains those before it.
+        Frames to train on without the twin: ``few``, more of them, and all that are not evaluated on. Each set contains those before it.
     nested : list of (m,) int
         Sets of ``COUNTS`` frames, with ``few`` among them, for models that learn at once. Each contains those before it.
     """
@@ -73,7 +73,7 @@ class Frames:
     nested: list[np.ndarray]
 
 
-def choose_frames(count: int, labels: int, seed: int) -> Frames:
+def choose_frames(count: int, labels: int, seed: int) -> StudyFrames:
     """Draw the frames of a recording of ``count``, which is in the order of its names.
 
     Raises
@@ -83,15 +83,15 @@ def choose_frames(count: int, labels: int, seed: int) -> Frames:
     """
     rest, test = split_rows(count, seed)
     if labels > len(rest):
-        raise TrainingError(f"`labels` {labels}: the recording has {len(rest)} frames beside those that are judged on")
+        raise TrainingError(f"`num_labelled` {labels}: the recording has {len(rest)} frames beside those that are evaluated on")
     order = np.random.default_rng([seed, labels]).permutation(rest)
     trained = {str(n): np.sort(order[:n]) for n in (labels, MANY) if n < len(rest)}
     nested = [np.sort(order[:n]) for n in sorted({*COUNTS, labels, MANY}) if n < len(rest)]
-    return Frames(test, np.sort(order[:labels]), trained | {"all": rest}, nested)
+    return StudyFrames(test, np.sort(order[:labels]), trained | {"all": rest}, nested)
 
 
-def designed_frames(real: Dataset, chosen: Frames, seed: int) -> list[np.ndarray]:
-    """Sets of ``DESIGNED`` frames that are not judged on, nearest to contacts that are spread evenly; each contains those before it."""
+def designed_frames(real: Dataset, chosen: StudyFrames, seed: int) -> list[np.ndarray]:
+    """Sets of ``DESIGNED`` frames that are not evaluated on, nearest to contacts that are spread evenly; each contains those before it."""
     pool = chosen.trained["all"]
     numbers = [count for count in DESIGNED if count < len(pool)]
     order = pool[nearest_to_even(real.targets.corrected[pool], real.targets.units, max(numbers, default=0), seed=seed)]
@@ -114,7 +114,7 @@ def stands_and_moves(labels: Sequence[ArmLabel]) -> np.ndarray:
 def with_missing(
     simulated: Dataset, labels: list[ArmLabel], discrepancy: Discrepancy, seed: int, *, progress: Step | None = None
 ) -> Dataset:
-    """A simulated data set with a discrepancy, drawn for each contact, added to its pins; ``labels`` are its ``arm_labels``."""
+    """A simulated data set with a discrepancy, sampled for each contact, added to its pins; ``labels`` are its ``arm_labels``."""
     pins = simulated.pins
     missing_px = discrepancy.draw_px(labels, pins.nodes_px - pins.reference.pins_px, contact_of(simulated), seed)
     nodes_px = pins.nodes_px + missing_px
@@ -152,7 +152,7 @@ def train_in_twin(
     epochs : int or None
         None: ``TWIN_EPOCHS``.
     labelled : Dataset, optional
-        The real frames that told what the simulated contacts miss.
+        The real frames that determined what the simulated contacts miss.
     """
     model = model_for(sim)
     recipe = recipe_of(model, members=1, epochs=epochs or TWIN_EPOCHS, kernel=False)
@@ -206,14 +206,14 @@ def states_within(simulated: Dataset, low: np.ndarray, high: np.ndarray, least: 
     return found
 
 
-def states_touching(parts: list[Dataset], touched: ObjectSpec) -> Dataset:
+def states_touching(parts: list[Dataset], obj: ObjectSpec) -> Dataset:
     """The simulated data sets of one object, joined; all data sets if none is of this object."""
-    return joined([part for part in parts if config_of(part.folder).object.name == touched.name] or parts)
+    return join_datasets([part for part in parts if config_of(part.folder).object.name == obj.name] or parts)
 
 
 @dataclass(frozen=True)
-class Beside:
-    """Result of ``put_beside``.
+class CoKriging:
+    """Result of ``combine_co_kriging``.
 
     Attributes
     ----------
@@ -229,7 +229,7 @@ class Beside:
 
 
 @writes(TENSORS, CONFIG)
-def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, seed: int) -> Beside:
+def combine_co_kriging(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, seed: int) -> CoKriging:
     """Average a run of ``vgnn`` or ``steered`` with a Gaussian process of labelled frames, and write the result as a run to ``out``.
 
     The run ``run`` is not changed. The average has smaller errors than either model, because their errors differ. Both have the same
@@ -246,7 +246,7 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
     out : Path
         Folder of the new run; made if missing.
     simulated : Dataset
-        Contacts simulated without a drawn discrepancy, with labels like those of the labelled frames (``states_like``).
+        Contacts simulated without a sampled discrepancy, with labels like those of the labelled frames (``states_like``).
     labelled : Dataset
         The n labelled frames.
     seed : int
@@ -267,12 +267,12 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
     known = ensemble.modes(*estimator.inputs_of(simulated.pins, together=not simulated.pins.measured)).inputs
     truth = getattr(labelled.targets, labels)
     process, alone = fit_two_fidelities(
-        known, ensemble.standardised(getattr(simulated.targets, labels)), seen, ensemble.standardised(truth), seed=seed
+        known, ensemble.standardise(getattr(simulated.targets, labels)), seen, ensemble.standardise(truth), seed=seed
     )
     content = read_tensors(run / TENSORS)
 
     def widths(made: np.ndarray) -> dict[str, np.ndarray]:
-        return intervals(*ensemble.labelled(made, scale), truth, labelled.targets.raw, executed, labelled.targets.units)
+        return intervals(*ensemble.destandardise(made, scale), truth, labelled.targets.raw, executed, labelled.targets.units)
 
     missed = [widths(made) for made in (mean, alone)]
     wider = {key: np.maximum.reduce([content[key].numpy(), *(said[key] for said in missed)]) for key in missed[0]}
@@ -282,8 +282,8 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
     write_tensors(out / TENSORS, content)
     about = {"data": str(labelled.folder), "frames": labelled.pins.image_name.tolist()}
     write_text(out / CONFIG, json.dumps(estimator.config | {"beside": about}, indent=1) + "\n")
-    left_out = label_error(ensemble.labelled(alone, scale)[0], truth, labelled.targets.units)
-    return Beside(np.abs(left_out).mean(axis=0), wider)
+    left_out = label_error(ensemble.destandardise(alone, scale)[0], truth, labelled.targets.units)
+    return CoKriging(np.abs(left_out).mean(axis=0), wider)
 
 
 def widen_intervals(run: Path, wider: dict[str, np.ndarray]) -> None:
@@ -296,10 +296,10 @@ def widen_intervals(run: Path, wider: dict[str, np.ndarray]) -> None:
         write_tensors(run / TENSORS, content | wider)
 
 
-def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict[str, Any]:
-    """A row of the study's table: mean errors of a run on the judged frames."""
+def evaluate_run_row(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict[str, Any]:
+    """A row of the study's table: mean errors of a run on the evaluated frames."""
     estimator = PoseEstimator.load(run)
-    found = judge(estimator.predict_rows(real, test), real, test)
+    found = measure_errors(estimator.predict_rows(real, test), real, test)
     row = {"trained_on": name, "labelled_frames": labelled, "model": estimator.model}
     for kind in ("corrected", "raw"):
         row |= {f"{label}_{kind}": found[kind][label]["mae"] for label in real.targets.names}

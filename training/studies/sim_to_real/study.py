@@ -7,21 +7,21 @@ from typing import Any
 import numpy as np
 
 from scenes import SensorSpec, load_randomisation
-from training.data.dataset import Dataset, joined, load_dataset
+from training.data.dataset import Dataset, join_datasets, load_dataset
 from training.generation import generate
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
+from training.studies.sim_to_real.inverse_estimates import TwinRead, read_row, read_twin
 from training.studies.sim_to_real.page import write_page
-from training.studies.sim_to_real.plan import BOTH, EVENLY, FULL, REAL, WITHOUT, Plan
-from training.studies.sim_to_real.read import TwinRead, read_row, read_twin
+from training.studies.sim_to_real.plan import BOTH, EVENLY, FULL, REAL, WITHOUT, SimToRealPlan
 from training.studies.sim_to_real.steps import (
-    Beside,
-    Frames,
+    CoKriging,
+    StudyFrames,
     arm_labels,
     choose_frames,
+    combine_co_kriging,
     designed_frames,
-    judged,
+    evaluate_run_row,
     measured_of,
-    put_beside,
     quadratic_row,
     states_like,
     states_touching,
@@ -31,14 +31,14 @@ from training.studies.sim_to_real.steps import (
     with_missing,
 )
 from training.studies.sim_to_real.taught import teach
-from training.studies.sim_to_real.twins import Twin, as_mounted, contact_of, without_one_ingredient
-from twin.fit.contact import fit_contact
-from twin.fit.contact.simulate import Setup
-from twin.judge.labelled.model import MeasuredFrames
+from training.studies.sim_to_real.variants import Twin, as_mounted, contact_of, without_one_ingredient
+from twin.calibration.contact import fit_contact
+from twin.calibration.contact.simulate import CalibrationSetup
+from twin.evaluation.labelled.model import MeasuredFrames
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
-from twin.types import Readable
+from twin.types import ReadableResult
 
 SEEDS_APART = 1000  # between the draws of one study, so that those of seeds 0, 1, 2... differ
 BESIDE, TAUGHT = "sim_plus_real", "sim_taught"  # folders of the run with labelled frames beside it, and of the one that the twin taught
@@ -46,7 +46,7 @@ SHOWN_MODES = 4  # of what the twin misses, that the page names
 
 
 @dataclass(frozen=True, repr=False)
-class Result(Readable):
+class SimToRealResult(ReadableResult):
     """The result of the study.
 
     Attributes
@@ -54,7 +54,7 @@ class Result(Readable):
     rows : list of dict
         A row for each model: what it was trained on, and its errors (mm, deg) against corrected and raw labels.
     left_out : (K,) float
-        See ``Beside``.
+        See ``CoKriging``.
     residual_px : float
         Mean distance between the labelled frames' pins and the twin's.
     written : list of Path
@@ -94,13 +94,13 @@ class _Ground:
         The twin with all ingredients. ``twins``: this twin and those without one ingredient.
     """
 
-    plan: Plan
+    plan: SimToRealPlan
     out: Path
     progress: Progress
     sensor: SensorSpec
     real: Dataset
     few: Dataset
-    chosen: Frames
+    chosen: StudyFrames
     measured: MeasuredFrames
     residuals: Residuals
     full: Twin
@@ -108,8 +108,8 @@ class _Ground:
 
 
 @writes("study.csv", "index.html", "errors*.png", "ingredients*.png", "calibration", "labelled")
-def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
-    """Train in the twin, in the twin with labelled frames, and without the twin; judge all models on the same real frames.
+def run(plan: SimToRealPlan, out: Path, *, progress: Progress = silent) -> SimToRealResult:
+    """Train in the twin, in the twin with labelled frames, and without the twin; evaluate all models on the same real frames.
 
     Writes runs, ``study.csv`` and ``index.html`` to ``out``. Results of an earlier call with the same plan are used again.
 
@@ -119,30 +119,30 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
         There are too few frames, or the labels of the simulated contacts differ from theirs.
     """
     ground = _prepare(plan, out, progress)
-    known = {_tried(ground.full): Discrepancy(ground.residuals)}
+    known = {_residual_key(ground.full): Discrepancy(ground.residuals)}
     sets: dict[str, list[Dataset]] = {}
     rows: list[dict[str, Any]] = []
     for twin in ground.twins:
         missing = _missing(ground, twin, known)
         if twin.contacts not in sets:
-            sets[twin.contacts] = _simulated(ground, twin)
-        learnt = _learnt(ground, twin, sets[twin.contacts], missing)
-        folder = _trained(ground, twin, learnt, missing is not None)
+            sets[twin.contacts] = _simulate_contacts(ground, twin)
+        learnt = _training_sets(ground, twin, sets[twin.contacts], missing)
+        folder = _train_simulated(ground, twin, learnt, missing is not None)
         if twin is ground.full:
-            beside = _beside(ground, folder, sets[twin.contacts])
+            beside = _combine_co_kriging(ground, folder, sets[twin.contacts])
             full_learnt = learnt[0]
-        rows.append(judged(twin.says, 0, folder, ground.real, ground.chosen.test))
+        rows.append(evaluate_run_row(twin.says, 0, folder, ground.real, ground.chosen.test))
         if twin is ground.full:
-            rows.append(judged(BOTH, plan.labels, out / BESIDE, ground.real, ground.chosen.test))
+            rows.append(evaluate_run_row(BOTH, plan.labels, out / BESIDE, ground.real, ground.chosen.test))
     rows += _without_the_twin(ground)
-    read = read_twin(sets[ground.full.contacts], plan.touched, plan.experiment, seed=plan.seed)
-    rows += _read(ground, read)
-    rows.append(_taught(ground, read))
-    page = _write_page(ground, rows, beside, known[_tried(ground.full)], full_learnt)
-    return Result(rows, beside.left_out, ground.residuals.error_px, [write_table(out / "study.csv", rows), page])
+    read = read_twin(sets[ground.full.contacts], plan.target_object, plan.experiment, seed=plan.seed)
+    rows += _invert_model_rows(ground, read)
+    rows.append(_train_on_labelled(ground, read))
+    page = _write_page(ground, rows, beside, known[_residual_key(ground.full)], full_learnt)
+    return SimToRealResult(rows, beside.left_out, ground.residuals.error_px, [write_table(out / "study.csv", rows), page])
 
 
-def _prepare(plan: Plan, out: Path, progress: Progress) -> _Ground:
+def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> _Ground:
     """Read and choose frames, fit the specification if the plan says so, and measure the residuals on the labelled frames."""
     with stage(progress, "frames") as step:
         real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
@@ -150,11 +150,11 @@ def _prepare(plan: Plan, out: Path, progress: Progress) -> _Ground:
     few = real.rows(chosen.few)
     measured, sensor = measured_of(few), plan.sensor
     if plan.calibrate:
-        setup = Setup(sensor, plan.experiment, plan.touched, measured.form, plan.across, out / "calibration", plan.workers)
+        setup = CalibrationSetup(sensor, plan.experiment, plan.target_object, measured.form, plan.across, out / "calibration", plan.workers)
         with stage(progress, "calibration") as step:
             sensor = fit_contact(setup, measured, progress=step).sensor
     with stage(progress, "labelled frames") as step:
-        residuals = measure_residuals(_labelled(plan, sensor, measured, out, plan.across), measured, step)
+        residuals = measure_residuals(_labelled_setup(plan, sensor, measured, out, plan.across), measured, step)
     moves = load_randomisation("moves")
     sheared = any(label.move.any() for label in measured.labels)
     seen = moves.model_copy(update={"friction": (residuals.friction_spread() or moves.friction) if sheared else None})
@@ -165,12 +165,12 @@ def _prepare(plan: Plan, out: Path, progress: Progress) -> _Ground:
     return _Ground(plan, out, progress, sensor, real, few, chosen, measured, residuals, full, [full, *others])
 
 
-def _labelled(plan: Plan, sensor: SensorSpec, measured: MeasuredFrames, out: Path, across: int) -> Setup:
+def _labelled_setup(plan: SimToRealPlan, sensor: SensorSpec, measured: MeasuredFrames, out: Path, across: int) -> CalibrationSetup:
     """The setup with which the labelled frames are simulated."""
-    return Setup(sensor, plan.experiment, plan.touched, measured.form, across, out / "labelled", plan.workers, ())
+    return CalibrationSetup(sensor, plan.experiment, plan.target_object, measured.form, across, out / "labelled", plan.workers, ())
 
 
-def _tried(twin: Twin) -> tuple[int, tuple[float, ...]]:
+def _residual_key(twin: Twin) -> tuple[int, tuple[float, ...]]:
     """Everything that the residuals of a twin depend on within one study."""
     return twin.across, twin.frictions
 
@@ -179,20 +179,20 @@ def _missing(ground: _Ground, twin: Twin, known: dict[tuple[int, tuple[float, ..
     """The discrepancy of a twin that uses one, else None. ``known`` stores it for other twins with the same residuals."""
     if not twin.learns:
         return None
-    if _tried(twin) not in known:
-        setup = _labelled(ground.plan, ground.sensor, ground.measured, ground.out, twin.across)
+    if _residual_key(twin) not in known:
+        setup = _labelled_setup(ground.plan, ground.sensor, ground.measured, ground.out, twin.across)
         with stage(ground.progress, f"{twin.name}: labelled frames") as step:
-            known[_tried(twin)] = Discrepancy(measure_residuals(setup, ground.measured, step, frictions=twin.frictions))
-    return known[_tried(twin)]
+            known[_residual_key(twin)] = Discrepancy(measure_residuals(setup, ground.measured, step, frictions=twin.frictions))
+    return known[_residual_key(twin)]
 
 
-def _simulated(ground: _Ground, twin: Twin) -> list[Dataset]:
+def _simulate_contacts(ground: _Ground, twin: Twin) -> list[Dataset]:
     """The twin's contacts: simulated, or read from finished data sets."""
     plan, folders = ground.plan, list(ground.plan.simulated) if twin is ground.full else []
     if not folders:
         folders = [ground.out / twin.contacts]
         with stage(ground.progress, f"{twin.name}: {twin.experiment.name}") as step:
-            generate(folders[0], twin.config(plan.touched, plan.seed), plan.count, workers=plan.workers, progress=step)
+            generate(folders[0], twin.config(plan.target_object, plan.seed), plan.count, workers=plan.workers, progress=step)
     found = []
     for folder in folders:
         with stage(ground.progress, f"states of {folder.name}") as step:
@@ -200,25 +200,25 @@ def _simulated(ground: _Ground, twin: Twin) -> list[Dataset]:
     return found
 
 
-def _learnt(ground: _Ground, twin: Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
+def _training_sets(ground: _Ground, twin: Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
     """The data sets to train on: the states once for each draw of the discrepancy, or once unchanged if there is none."""
     if missing is None:
-        return [twin.part(joined(sets))]
+        return [twin.part(join_datasets(sets))]
     labels, drawn = [arm_labels(each) for each in sets], []
     for k in range(ground.plan.draws):
         seed = ground.plan.seed + SEEDS_APART * k
         with stage(ground.progress, f"{twin.name}: draw {k + 1}") as step:
             pairs = zip(sets, labels, strict=True)
-            drawn.append(joined([with_missing(each, told, missing, seed, progress=step) for each, told in pairs]))
+            drawn.append(join_datasets([with_missing(each, told, missing, seed, progress=step) for each, told in pairs]))
     return [twin.part(each) for each in drawn]
 
 
-def _trained(ground: _Ground, twin: Twin, learnt: list[Dataset], told: bool) -> Path:
+def _train_simulated(ground: _Ground, twin: Twin, learnt: list[Dataset], told: bool) -> Path:
     """Train the twin's run, and return its folder; ``told``: whether a discrepancy was learnt from labelled frames."""
     folder, plan = ground.out / twin.name, ground.plan
     with stage(ground.progress, twin.name) as step:
         train_in_twin(
-            learnt[0].beside([each.pins for each in learnt[1:]]),
+            learnt[0].with_copies([each.pins for each in learnt[1:]]),
             folder,
             seed=plan.seed,
             split=plan.seed,
@@ -229,29 +229,30 @@ def _trained(ground: _Ground, twin: Twin, learnt: list[Dataset], told: bool) -> 
     return folder
 
 
-def _beside(ground: _Ground, folder: Path, sets: list[Dataset]) -> Beside:
+def _combine_co_kriging(ground: _Ground, folder: Path, sets: list[Dataset]) -> CoKriging:
     """Average the twin's run with a Gaussian process of the labelled frames, and widen its intervals to its errors on these frames."""
-    bare = states_touching(sets, ground.plan.touched)
-    made = put_beside(folder, ground.out / BESIDE, bare.rows(states_like(bare, ground.few)), ground.few, seed=ground.plan.seed)
+    bare = states_touching(sets, ground.plan.target_object)
+    made = combine_co_kriging(folder, ground.out / BESIDE, bare.rows(states_like(bare, ground.few)), ground.few, seed=ground.plan.seed)
     widen_intervals(folder, made.intervals)
     return made
 
 
-def _read(ground: _Ground, twin: TwinRead) -> list[dict[str, Any]]:
-    """Rows of the table for the twin that is read, with growing numbers of labelled frames."""
+def _invert_model_rows(ground: _Ground, twin: TwinRead) -> list[dict[str, Any]]:
+    """Rows of the table for model inversion, with growing numbers of labelled frames."""
     labels, test = arm_labels(ground.real), ground.chosen.test
     rows = [read_row(BOTH, twin, ground.real, labels, rows, test) for rows in (np.zeros(0, int), *ground.chosen.nested)]
     designed = designed_frames(ground.real, ground.chosen, ground.plan.seed)
     return rows + [read_row(f"{BOTH}{EVENLY}", twin, ground.real, labels, rows, test) for rows in designed]
 
 
-def _taught(ground: _Ground, twin: TwinRead) -> dict[str, Any]:
-    """Train a run on the labelled frames and on all others that are not judged, with the labels that the twin tells of them."""
+def _train_on_labelled(ground: _Ground, twin: TwinRead) -> dict[str, Any]:
+    """Train a run on the labelled frames and on all others that are not evaluated, with the labels that model inversion estimates for
+    them."""
     plan, real, few = ground.plan, ground.real, ground.chosen.few
     others = np.setdiff1d(ground.chosen.trained["all"], few)
     with stage(ground.progress, TAUGHT) as step:
         teach(twin, real, arm_labels(real), few, others, ground.out / TAUGHT, seed=plan.seed, epochs=plan.epochs, progress=step)
-    return judged(BOTH + WITHOUT.format(count=len(others)), len(few), ground.out / TAUGHT, real, ground.chosen.test)
+    return evaluate_run_row(BOTH + WITHOUT.format(count=len(others)), len(few), ground.out / TAUGHT, real, ground.chosen.test)
 
 
 def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
@@ -261,7 +262,7 @@ def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
         folder = ground.out / f"real_{name}"
         with stage(ground.progress, folder.name) as step:
             train_on_real(ground.real.rows(index), folder, seed=ground.plan.seed, epochs=ground.plan.epochs, progress=step)
-        rows.append(judged(REAL, len(index), folder, ground.real, ground.chosen.test))
+        rows.append(evaluate_run_row(REAL, len(index), folder, ground.real, ground.chosen.test))
         rows.append(quadratic_row(REAL, ground.real, index, ground.chosen.test))
     counts = {len(index) for index in ground.chosen.trained.values()}
     others = [index for index in ground.chosen.nested if len(index) not in counts]
@@ -270,7 +271,7 @@ def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
     return rows + [quadratic_row(f"{REAL}{EVENLY}", ground.real, index, ground.chosen.test) for index in designed]
 
 
-def _write_page(ground: _Ground, rows: list[dict[str, Any]], beside: Beside, missing: Discrepancy, learnt: Dataset) -> Path:
+def _write_page(ground: _Ground, rows: list[dict[str, Any]], beside: CoKriging, missing: Discrepancy, learnt: Dataset) -> Path:
     return write_page(
         ground.out,
         sensor=ground.sensor.name,

@@ -1,4 +1,4 @@
-"""A network that a twin taught: it learns from real frames without labels, whose labels the twin tells when it is read.
+"""A network that a twin taught: it learns from real frames without labels, whose labels that model inversion estimates.
 
 The twin is read in seconds for hundreds of frames, but not by a live loop. The network has nearly its errors, and is a run as any other. It
 needs no label of these frames, only more of them.
@@ -14,7 +14,7 @@ from training.data.dataset import Dataset
 from training.data.targets import Targets
 from training.estimate.estimator import PoseEstimator
 from training.runs.assemble import intervals
-from training.studies.sim_to_real.read import TwinRead, named_labels
+from training.studies.sim_to_real.inverse_estimates import TwinRead, named_labels
 from training.studies.sim_to_real.steps import train_on_real, widen_intervals
 from twin.progress import Step
 from twin.rig.labels import ArmLabel
@@ -32,7 +32,7 @@ def teach(
     epochs: int | None,
     progress: Step | None = None,
 ) -> None:
-    """Train a run on labelled frames and on frames whose labels a twin tells, or continue it.
+    """Train a run on labelled frames and on frames whose labels that model inversion estimates, or continue it.
 
     The intervals are at least as wide as the twin's errors on labelled frames that are estimated from other ones.
 
@@ -53,7 +53,11 @@ def teach(
     told = named_labels(twin.estimate(moved[few], known, moved[unlabelled], moved[unlabelled]), real.targets.names)
     rows = np.sort(np.concatenate([few, unlabelled]))
     train_on_real(
-        replace(real, targets=_with_told(real.targets, few, unlabelled, told)).rows(rows), out, seed=seed, epochs=epochs, progress=progress
+        replace(real, targets=_with_estimated(real.targets, few, unlabelled, told)).rows(rows),
+        out,
+        seed=seed,
+        epochs=epochs,
+        progress=progress,
     )
     judged, found = twin.left_out(moved[few], known)
     part = real.rows(few[judged])
@@ -62,14 +66,14 @@ def teach(
     estimator = PoseEstimator.load(out)
     inputs, index = estimator.inputs_of(part.pins, together=not part.pins.measured)
     mean, scale, executed = estimator.ensemble.outputs(inputs, index)
-    _, scale = estimator.ensemble.labelled(mean, scale)
+    _, scale = estimator.ensemble.destandardise(mean, scale)
     made = named_labels(found, part.targets.names)
     said = intervals(made, scale, part.targets.corrected, part.targets.raw, executed, part.targets.units)
     widen_intervals(out, {key: np.maximum(getattr(estimator.ensemble, key), width) for key, width in said.items()})
 
 
-def _with_told(targets: Targets, few: np.ndarray, unlabelled: np.ndarray, told: np.ndarray) -> Targets:
-    """Targets with the labels (u, K) that are told of frames without; nothing is known of their moves."""
+def _with_estimated(targets: Targets, few: np.ndarray, unlabelled: np.ndarray, told: np.ndarray) -> Targets:
+    """Targets with the labels (u, K) that are estimated for frames without; nothing is known of their moves."""
     corrected, nothing = targets.corrected.copy(), np.full(len(targets.executed), np.nan)
     corrected[unlabelled] = told
     raw = corrected.copy()

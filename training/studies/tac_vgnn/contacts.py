@@ -147,10 +147,10 @@ def twin_contacts(
     found = []
     for name in names:
         stimulus, turn_deg, aside_mm = CONTACTS[name]
-        thing = load_object(stimulus)
+        obj = load_object(stimulus)
         for depth in depths_mm:
-            poses = plan_path(spec.geometry, build_field(thing), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
-            state = [state for _, state in simulator.solver.path(thing, ContactPath(_turned(turn_deg) @ poses))][-1]
+            poses = plan_path(spec.geometry, build_field(obj), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
+            state = [state for _, state in simulator.solver.path(obj, ContactPath(_rotation_about_z(turn_deg) @ poses))][-1]
             seen = pipeline(simulator.render(state, form=form).frame)
             if not seen.valid or seen.graph is None:
                 raise TwinError(f"{spec.name}, {name}, {depth:g} mm: {seen.reason}")
@@ -183,7 +183,7 @@ def recorded_contacts(data: Dataset) -> list[AreaChange]:
     return found
 
 
-def _turned(turn_deg: float) -> np.ndarray:
+def _rotation_about_z(turn_deg: float) -> np.ndarray:
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     T = np.eye(4)
     T[:2, :2] = [[c, -s], [s, c]]

@@ -1,4 +1,4 @@
-"""The models of the paper's comparison. All are trained and judged on the same rows, and timed at several batch sizes."""
+"""The models of the paper's comparison. All are trained and evaluated on the same rows, and timed at several batch sizes."""
 
 import csv
 import ctypes
@@ -20,11 +20,11 @@ from training.estimate.estimator import PoseEstimator
 from training.models import model_named, recipe_of, variant_named
 from training.models.part import Inputs
 from training.runs.config import RunConfig
-from training.runs.loop import Loop, Rows, epoch_step
+from training.runs.loop import Loop, TrainingRows, epoch_step
 from training.runs.networks import parameter_count
 from training.runs.run import is_finished, train_run
 from training.runs.run_files import CHECKPOINT, TENSORS, read_config
-from training.studies.judging import judge, rows_to_judge
+from training.studies.judging import measure_errors, rows_to_evaluate
 from twin.progress import Progress, silent, stage
 
 # Number of rows from which a timed network takes its scales and modes. Its speed does not depend on this number.
@@ -114,8 +114,8 @@ def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None)
     if not (folder / TENSORS).is_file():
         return row
     estimator = PoseEstimator.load(folder)
-    rows = rows_to_judge(estimator, data, "validation")
-    metrics = judge(estimator.predict_rows(data, rows), data, rows)
+    rows = rows_to_evaluate(estimator, data, "validation")
+    metrics = measure_errors(estimator.predict_rows(data, rows), data, rows)
     curves = read_curves(folder)
     row |= {
         "state": "ended early" if (folder / CHECKPOINT).exists() else "finished",
@@ -216,7 +216,7 @@ def measure_training(model: str, pins: PinTable, inputs: Inputs, batch: int, *, 
     part.initialise(network, inputs, torch.arange(min(INITIAL_ROWS, count)), labels, LabelCode((False, False)))
     timed = count if part.timed_batches is None else min(part.timed_batches * batch, count)
     executed, none = torch.full((count,), torch.nan), torch.zeros(0, dtype=torch.long)
-    rows = Rows(inputs, labels, torch.ones(2), executed, torch.arange(timed), none)
+    rows = TrainingRows(inputs, labels, torch.ones(2), executed, torch.arange(timed), none)
     loop = Loop(network.to(device), recipe_of(model, batch=batch), rows, 0, part.penalty)
     with PeakMemory(device) as memory:
         loop.epoch()

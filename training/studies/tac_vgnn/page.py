@@ -12,7 +12,7 @@ from training.studies.tac_vgnn.contacts import AreaChange, contacts_figure
 from training.studies.tac_vgnn.models import PlannedRun, error_columns, ordering, read_curves
 from twin.report.charts import new_figure, plain_log, sized_figure, write_chart
 from twin.report.numbers import number
-from twin.report.page import Page, Picture
+from twin.report.page import Page, PagePicture
 from twin.report.table import Column
 from twin.report.themes import SERIES
 
@@ -101,14 +101,14 @@ def write_page(
             "networks some batches were timed. Ours sees every frame twice in an epoch.",
         )
         page.table(efficiency, [_column(key) for key in efficiency[0]])
-        page.figures(Picture(out / "efficiency.png", "Time of training against batch size", width_px=760))
+        page.figures(PagePicture(out / "efficiency.png", "Time of training against batch size", width_px=760))
     if contacts:
         page.section(
             "What the areas show",
             "Change of the Voronoi areas against no contact. Depth is beyond first touch. The place of growth is that of the grown cells, "
             "weighted, from the middle of the pins; y is down. Recorded frames are those nearest to a straight press without shear.",
         )
-        page.figures(Picture(out / "contacts.png", "Change of the Voronoi areas of each contact, shallow above deep"))
+        page.figures(PagePicture(out / "contacts.png", "Change of the Voronoi areas of each contact, shallow above deep"))
         page.table(contacts, [_column(key) for key in contacts[0]])
     tables = {"models": models, "graphs": graphs, "efficiency": efficiency, "contacts": contacts}
     for name, rows in tables.items():
@@ -145,7 +145,7 @@ def _errors_section(page: Page, out: Path, data: Dataset, models: list[dict], no
         "The paper: depth Tac-VGNN 0.05, CNN (ver 1) 0.06, CNN (ver 2) 0.07, GNN 0.07 mm; angle Tac-VGNN 1.02, GNN 1.16, CNN (ver 1) 1.20, "
         "CNN (ver 2) 1.25 deg."
     )
-    page.figures(Picture(out / "curves.png", "Learning curves against epochs and against time"))
+    page.figures(PagePicture(out / "curves.png", "Learning curves against epochs and against time"))
 
 
 def _column(key: str, errors: Sequence[str] = ()) -> Column:

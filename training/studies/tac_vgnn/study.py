@@ -18,7 +18,7 @@ from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
-from twin.types import Form, Readable
+from twin.types import Form, ReadableResult
 
 MODELS = ("gnn", "tac-vgnn", "vgnn", "cnn-v2", "cnn-v1")
 # Batch sizes of the efficiency figure.
@@ -31,7 +31,7 @@ FILES = (
 
 
 @dataclass(frozen=True)
-class Plan:
+class TacVgnnPlan:
     """Settings of the comparison.
 
     Attributes
@@ -44,7 +44,7 @@ class Plan:
     seeds : tuple of int
         Seeds of the weights and of the order of rows; every model is trained with each seed.
     labels : {"raw", "corrected"}
-        Kind of labels that are learnt.
+        Kind of labels that are trained on.
     target : str or tuple of str
         A preset, or the label columns.
     split : int
@@ -81,7 +81,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         if self.labels not in ("corrected", "raw"):
-            raise OptionError(f"`labels` must be corrected or raw, got {self.labels!r}")
+            raise OptionError(f"`label_kind` must be corrected or raw, got {self.labels!r}")
         if not self.models or not self.seeds:
             raise OptionError("nothing to compare: give at least one of `models` and of `seeds`")
         if any(batch < 1 for batch in self.batches):
@@ -97,7 +97,7 @@ class Plan:
 
 
 @dataclass(frozen=True, repr=False)
-class Result(Readable):
+class TacVgnnResult(ReadableResult):
     """The result of the comparison.
 
     Attributes
@@ -109,7 +109,7 @@ class Result(Readable):
     names : tuple of str
         Names of the labels.
     frames : int
-        Labelled frames that the models learnt from and were judged on.
+        Labelled frames that the models were trained on and were evaluated on.
     written : list of Path
     """
 
@@ -133,7 +133,7 @@ class Result(Readable):
 
 
 @writes(*FILES)
-def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
+def run(plan: TacVgnnPlan, out: Path, *, progress: Progress = silent) -> TacVgnnResult:
     """Compare graphs, models and training efficiency, and show the Voronoi areas of contacts.
 
     Writes ``runs/``, ``models.csv``, ``graphs.csv``, ``efficiency.csv``, ``contacts.csv``, their figures and ``index.html`` to ``out``.
@@ -168,10 +168,10 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     notes = {"device": device, "threads": torch.get_num_threads(), "labels": plan.labels, "max_minutes": plan.max_minutes}
     notes["columns"] = [*SHOWN, *error_columns(data)]
     written.append(write_page(out, data=data, models=rows, graphs=graphs, efficiency=efficiency, contacts=contacts, notes=notes))
-    return Result(rows, graphs, efficiency, contacts, data.targets.names, len(data), written)
+    return TacVgnnResult(rows, graphs, efficiency, contacts, data.targets.names, len(data), written)
 
 
-def _efficiency(plan: Plan, runs: list[PlannedRun], data: Dataset, device: str, progress: Progress) -> list[dict[str, Any]]:
+def _efficiency(plan: TacVgnnPlan, runs: list[PlannedRun], data: Dataset, device: str, progress: Progress) -> list[dict[str, Any]]:
     """Time and memory of training for each model and batch size."""
     if not plan.batches:
         return []
@@ -185,7 +185,7 @@ def _efficiency(plan: Plan, runs: list[PlannedRun], data: Dataset, device: str, 
     return rows
 
 
-def _contacts(plan: Plan, data: Dataset, progress: Progress) -> list[AreaChange]:
+def _contacts(plan: TacVgnnPlan, data: Dataset, progress: Progress) -> list[AreaChange]:
     """Contacts of the twin if they are asked for, and recorded contacts."""
     recorded = recorded_contacts(data)
     if not plan.contacts:

@@ -99,7 +99,7 @@ class Elements:
         which = np.arange(len(out)) if which is None else which
         _stiffness(*self._arrays, which, np.ascontiguousarray(control_mm), stress, pressure_mpa, out)
 
-    def changed(self, control_mm: FloatArray, at: FloatArray, strain: float) -> IntArray:
+    def find_changed(self, control_mm: FloatArray, at: FloatArray, strain: float) -> IntArray:
         """Elements (k,) in which an entry of F differs from ``at`` (m, 8, 3, 3) by more than ``strain``; ``at`` receives their new F."""
         cells = self.cells
         return np.flatnonzero(_changed(cells.controls, cells.gradients, np.ascontiguousarray(control_mm), strain, at))
@@ -145,7 +145,7 @@ class KeptStiffness:
         if anew or len(stress) or not same:
             self._at[:] = _FAR_STRAIN
         self._made_of = kind, pressure_mpa
-        which = kind.changed(control_mm, self._at, self._kept_strain)
+        which = kind.find_changed(control_mm, self._at, self._kept_strain)
         kind.stiffness(control_mm, stress, pressure_mpa, self.blocks, which=which)
 
 
@@ -231,7 +231,7 @@ def _add_second(c01: float, f: FloatArray, weights: FloatArray, stress: FloatArr
 
 
 @compiled(fastmath=True)
-def _add_given(given: FloatArray, f: FloatArray, weights: FloatArray, stress: FloatArray) -> float:
+def _add_prescribed(given: FloatArray, f: FloatArray, weights: FloatArray, stress: FloatArray) -> float:
     """Add a given second Piola-Kirchhoff stress to the first Piola-Kirchhoff stress at all points; returns its energy."""
     energy = 0.0
     for q in range(8):
@@ -278,7 +278,7 @@ def _forces(
         if law[1] != 0:
             energy += _add_second(law[1], f, weights[m], stress)
         if len(given):
-            energy += _add_given(given[m], f, weights[m], stress)
+            energy += _add_prescribed(given[m], f, weights[m], stress)
         _push(gradients[m], weights[m], stress, push)
         for a in range(count):
             for i in range(3):

@@ -250,7 +250,7 @@ def whole(lower: FloatArray, shift: float) -> FloatArray:
 
 
 @compiled()
-def split(matrix: FloatArray, far: IntArray, near: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def split_matrix(matrix: FloatArray, far: IntArray, near: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Parts of a symmetric matrix: (f, f) of the unknowns ``far``, (n, f) of ``near`` and ``far``, and (n, n) of ``near``."""
     f, n = len(far), len(near)
     within, across, rest = np.empty((f, f), matrix.dtype), np.empty((n, f), matrix.dtype), np.empty((n, n), matrix.dtype)

@@ -67,7 +67,7 @@ def load_needed_libraries(folder: Path = PRIVATE_FOLDER) -> str:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ProbeResult:
     """Result of a probe: ``ok``, the backend's ``version`` ("" if unknown), and the reason if it does not work."""
 
     ok: bool
@@ -75,7 +75,7 @@ class Verdict:
     reason: str
 
 
-def probe(backend: str, library: Path, *, remember_failure: bool = True) -> Verdict:
+def probe(backend: str, library: Path, *, remember_failure: bool = True) -> ProbeResult:
     """Run a tiny kernel on ``backend`` ("llvm" or "cuda") with ``library``, or return the stored result."""
     key = "|".join(
         [
@@ -93,7 +93,7 @@ def probe(backend: str, library: Path, *, remember_failure: bool = True) -> Verd
     store = folder / "backend-probes.json"
     known = _read(store)
     if key in known:
-        return Verdict(**known[key])
+        return ProbeResult(**known[key])
     verdict = _run(backend, library)
     if verdict.ok or remember_failure:
         _write(store, _read(store) | {key: asdict(verdict)})
@@ -101,11 +101,11 @@ def probe(backend: str, library: Path, *, remember_failure: bool = True) -> Verd
 
 
 @cache
-def _run_once(key: str, backend: str, library: Path) -> Verdict:
+def _run_once(key: str, backend: str, library: Path) -> ProbeResult:
     return _run(backend, library)
 
 
-def _run(backend: str, library: Path) -> Verdict:
+def _run(backend: str, library: Path) -> ProbeResult:
     with tempfile.TemporaryDirectory() as home:
         env = dict(os.environ, HOME=home, APPDATA=home, LOCALAPPDATA=home, PYTHONPATH=os.pathsep.join(p for p in sys.path if p))
         env["LD_LIBRARY_PATH"] = os.pathsep.join(filter(None, [str(PRIVATE_FOLDER), os.environ.get("LD_LIBRARY_PATH")]))
@@ -115,15 +115,15 @@ def _run(backend: str, library: Path) -> Verdict:
         try:
             done = subprocess.run(command, env=env, cwd=home, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S)
         except (subprocess.TimeoutExpired, OSError) as error:
-            return Verdict(False, "", f"the probe did not finish: {error.__class__.__name__}")
+            return ProbeResult(False, "", f"the probe did not finish: {error.__class__.__name__}")
     for line in done.stdout.splitlines():
         if line.startswith("probe-ok") and done.returncode == 0:
             numbers = [n for n in "".join(c if c.isdigit() else " " for c in line).split() if n != "0"]
-            return Verdict(True, ".".join(numbers), "")
+            return ProbeResult(True, ".".join(numbers), "")
     lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
     telling = [line for line in lines if "LLVM ERROR" in line or "Error" in line or "failed" in line] or lines[-1:] or ["no message"]
     how = f"killed by signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
-    return Verdict(False, "", f"a tiny kernel does not run ({how}: {telling[0][:160]})")
+    return ProbeResult(False, "", f"a tiny kernel does not run ({how}: {telling[0][:160]})")
 
 
 def _read(store: Path) -> dict:

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from twin.extend import Condition, View
+from twin.extend import Condition, PictureView
 
 
-def hazy(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+def hazy(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """Light scattered evenly over the window; ``value`` is its share of the brightest light."""
     return light + value * light.max() if value else light
 

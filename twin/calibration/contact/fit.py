@@ -1,0 +1,290 @@
+"""Fit of the contact to labelled frames when it is unknown whether each frame's move was executed.
+
+d_k1 and d_k0 are the mean squared pin errors of frame k after the move and after the tap alone, s^2 the median squared error, w the share
+of executed moves, and theta the parameters with their prior:
+
+    E-step:  p_k = w exp(-n d_k1 / 2 s^2) / (w exp(-n d_k1 / 2 s^2) + (1 - w) exp(-n d_k0 / 2 s^2))
+    M-step:  theta minimises sum_k c_k n (p_k d_k1 + (1 - p_k) d_k0) / s^2 + sum ((theta - theta_0) / prior)^2
+
+n is the number of independent observations in a frame. It is smaller than the number of pins, because the model's errors are common to all
+pins. c_k is smaller for frames that neither hypothesis (move executed, or not) fits. The M-step is one Gauss-Newton step with difference
+quotients. The uncertainty is the inverse of its matrix at the end.
+
+If no frame shows the pins at rest, their places are fitted, too. For every theta, they are the mean over the frames of measured places
+minus simulated displacements. Therefore errors and slopes are taken relative to their means over the frames.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.calibration.contact.parameters import values_of, with_quantities
+from twin.calibration.contact.simulate import CalibrationSetup
+from twin.errors import FrameError
+from twin.evaluation.labelled.model import MeasuredFrames
+from twin.frames.forms import blob_spec
+from twin.progress import Step
+from twin.rig.kinematics import rig_of
+from twin.types import Form
+
+INDEPENDENT = 6.0
+"""n above: the number of modes that contain nearly all of the displacement."""
+ROUNDS = 3
+"""Most rounds of E-step and M-step."""
+SHORTEST = 1 / 8
+"""Least share of a Gauss-Newton step. A step that does not lower the cost is halved until this share, then the search ends."""
+DISTRUST = 9.0
+"""Ratio of a frame's squared error to the median (3 standard deviations) above which the frame has a smaller weight."""
+EXPECT_ROUNDS = 20
+"""Rounds of the E-step, in which the share of executed moves and the variance are found alternately. Fewer rounds are enough."""
+START_FRAMES = 3
+"""Number of frames with the largest turns, and of frames with the largest moves, by which the signs at the start are chosen."""
+TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
+"""Turns of the image, deg, that are tried at the start."""
+FEWEST = 4
+"""Fewest frames to which a contact is fitted."""
+LEAST_PX2 = 0.01
+"""Least variance of a pin's place, px^2: the precision of the measurement."""
+SMALLEST_SHARE, LARGEST_SHARE = 0.05, 0.95
+"""Bounds of the share of executed moves, so that its logarithm stays finite."""
+
+
+@dataclass(frozen=True)
+class ContactFit:
+    """The result of a calibration.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    start, value, sd : (P,) float
+        Fitted quantities of the setup's parameters (see ``Parameter.scale``) at the start and at the end, and their standard deviations.
+    determined : (P,) float
+        Share of the prior's variance that the frames removed: 1 if the frames determine the parameter, 0 if it stayed at its start.
+    correlation : (P, P) float
+    executed : (M,) float
+        Probability that each frame's move was executed.
+    trust : (M,) float
+        1 for a frame that one of the two hypotheses explains; near 0 for a frame that neither explains.
+    before_px, after_px : (M,) float
+        Mean pin error of each frame for the hypothesis that fits it better.
+    share : float
+        Share of the moves that were executed.
+    rest_px : (N, 2) float
+        Pins at rest, from which displacements are computed. If no frame shows them, they are fitted, and ``sensor`` contains them.
+    """
+
+    sensor: SensorSpec
+    start: np.ndarray
+    value: np.ndarray
+    sd: np.ndarray
+    determined: np.ndarray
+    correlation: np.ndarray
+    executed: np.ndarray
+    trust: np.ndarray
+    before_px: np.ndarray
+    after_px: np.ndarray
+    share: float
+    rest_px: np.ndarray
+
+
+@dataclass(frozen=True)
+class Weights:
+    """The E-step's result for M frames."""
+
+    executed: np.ndarray
+    trust: np.ndarray
+    share: float
+    variance_px2: float
+
+    def cost(self, squared_px2: np.ndarray) -> float:
+        """Cost of squared errors (M, 2), after tap and after move. A failed contact (NaN) has no cost."""
+        squared = np.nan_to_num(squared_px2)
+        each = (1 - self.executed) * squared[:, 0] + self.executed * squared[:, 1]
+        return float(INDEPENDENT / self.variance_px2 * self.trust @ each)
+
+
+def fit_contact(setup: CalibrationSetup, measured: MeasuredFrames, *, progress: Step | None = None) -> ContactFit:
+    """Fit the setup's parameters and the sign of the turns.
+
+    Raises
+    ------
+    FrameError
+        There are too few frames, or none of their contacts can be simulated.
+    """
+    if len(measured) < FEWEST:
+        raise FrameError(f"{len(measured)} frames with pins are too few; give `num_labelled` {FEWEST} or more")
+    target = measured.pins_px - measured.no_contact_px
+    start, sign = _start(setup, measured, target, progress)
+    prior = np.array([p.prior for p in setup.parameters])
+    value, moved, weights = _search_values(setup, measured, target, start, sign, progress)
+    slopes = _slopes(setup, measured, value, sign, moved, progress)
+    seen_at_rest = measured.at_rest_seen
+    shift = np.zeros_like(measured.no_contact_px) if seen_at_rest else _mean(target[:, None] - moved, weights)
+    matrix, _ = _normal(slopes, target[:, None] - moved, weights, seen_at_rest)
+    covariance = np.linalg.inv(matrix + np.diag(prior**-2))
+    sd = np.sqrt(np.diag(covariance))
+    shipped = values_of(setup.sensor, setup.experiment, setup.parameters)
+    first = simulate(setup, measured, [shipped], rig_of(setup.sensor).turn_sign, progress)[0]
+    sensor = with_quantities(setup.sensor, setup.experiment, value, sign, setup.parameters)
+    rest_px = measured.no_contact_px + shift
+    return ContactFit(
+        sensor=sensor if seen_at_rest else at_rest(sensor, measured.form, rest_px),
+        start=shipped,
+        value=value,
+        sd=sd,
+        determined=1 - (sd / prior) ** 2,
+        correlation=covariance / np.outer(sd, sd),
+        executed=weights.executed,
+        trust=weights.trust,
+        before_px=likelier_px(first, target),
+        after_px=likelier_px(moved, target - shift),
+        share=weights.share,
+        rest_px=rest_px,
+    )
+
+
+def _search_values(
+    setup: CalibrationSetup, measured: MeasuredFrames, target: np.ndarray, start: np.ndarray, sign: int, progress: Step | None
+) -> tuple[np.ndarray, np.ndarray, Weights]:
+    """The values (P,) with the least cost, their displacements (M, 2, N, 2) px, and the weights of the E-step for them."""
+    prior = np.array([p.prior for p in setup.parameters])
+    value = start.copy()
+    seen_at_rest = measured.at_rest_seen
+    moved = simulate(setup, measured, [value], sign, progress)[0]
+    weights = expect(mean_squared(moved, target if seen_at_rest else target - np.nanmedian(target - moved[:, 1], axis=0)))
+
+    def squared_of(displacements: np.ndarray) -> np.ndarray:
+        shift = 0.0 if seen_at_rest else _mean(target[:, None] - displacements, weights)
+        return mean_squared(displacements, target - shift)
+
+    for _ in range(ROUNDS):
+        slopes = _slopes(setup, measured, value, sign, moved, progress)
+        matrix, force = _normal(slopes, target[:, None] - moved, weights, seen_at_rest)
+        step = np.linalg.solve(matrix + np.diag(prior**-2), force + (start - value) / prior**2)
+        squared = squared_of(moved)
+        now, solved = weights.cost(squared) + np.sum(((value - start) / prior) ** 2), np.isfinite(squared).sum()
+        length = 1.0
+        while length >= SHORTEST:
+            tried = value + length * step
+            there = simulate(setup, measured, [tried], sign, progress)[0]
+            squared = squared_of(there)
+            cost = weights.cost(squared) + np.sum(((tried - start) / prior) ** 2)
+            if cost < now and np.isfinite(squared).sum() >= solved:
+                value, moved = tried, there
+                break
+            length /= 2
+        weights = expect(squared_of(moved))
+        if length < SHORTEST:
+            break
+    return value, moved, weights
+
+
+def held_out_px(setup: CalibrationSetup, fit: ContactFit, measured: MeasuredFrames, *, progress: Step | None = None) -> tuple[float, float]:
+    """Mean pin error, before and after, on held-out frames. Each frame's error is that of the hypothesis that fits it better."""
+    target = measured.pins_px - measured.no_contact_px
+    errors = []
+    ends = ((fit.start, rig_of(setup.sensor).turn_sign, measured.no_contact_px), (fit.value, rig_of(fit.sensor).turn_sign, fit.rest_px))
+    for values, sign, rest_px in ends:
+        moved = simulate(setup, measured, [values], sign, progress)[0]
+        errors.append(float(np.nanmean(likelier_px(moved, target - (rest_px - measured.no_contact_px)))))
+    return errors[0], errors[1]
+
+
+def likelier_px(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(M,) mean pin error of displacements (M, 2, N, 2) from (M, N, 2), for the hypothesis with the smaller one."""
+    seen = np.isfinite(target[:, None, :, 0])
+    each = np.where(seen, np.linalg.norm(moved - target[:, None], axis=-1), 0.0)
+    return np.fmin(*(each.sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)).T)
+
+
+def expect(squared_px2: np.ndarray) -> Weights:
+    """The E-step from squared errors (M, 2) after tap and after move. Share and variance are found alternately until they converge."""
+    failed = ~np.isfinite(squared_px2).all(axis=1)
+    squared = np.where(failed[:, None], 0.0, squared_px2)
+    best, share = squared.min(axis=1), 0.5
+    variance = max(float(np.median(best[~failed])), LEAST_PX2) if (~failed).any() else LEAST_PX2
+    for _ in range(EXPECT_ROUNDS):
+        odds = INDEPENDENT * (squared[:, 0] - squared[:, 1]) / (2 * variance) + np.log(share / (1 - share))
+        executed = 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
+        trust = np.where(failed, 0.0, np.minimum(1.0, DISTRUST * variance / np.maximum(best, 1e-12)) ** 2)
+        each = (1 - executed) * squared[:, 0] + executed * squared[:, 1]
+        if trust.sum() == 0:
+            break
+        variance = max(float(np.median(each[~failed])), LEAST_PX2)  # the median, because frames that nothing fits do not change it
+        share = float(np.clip(trust @ executed / trust.sum(), SMALLEST_SHARE, LARGEST_SHARE))
+    return Weights(executed, trust, share, variance)
+
+
+def _start(setup: CalibrationSetup, measured: MeasuredFrames, target: np.ndarray, progress: Step | None) -> tuple[np.ndarray, int]:
+    """Values (P,) and sign of the turns at the start: the best fit among both signs and all quarter turns of the image."""
+    value = values_of(setup.sensor, setup.experiment, setup.parameters)
+    by_turn = np.argsort([-np.abs(label.pose[3:] - label.move[3:]).max() for label in measured.labels])[:START_FRAMES]
+    by_move = np.argsort([-np.abs(label.move[:3]).max() for label in measured.labels])[:START_FRAMES]
+    telling = np.union1d(by_turn, by_move)
+    turns = np.array([p.name == "rig.image_turn_deg" for p in setup.parameters])
+    tries = []
+    for degrees, sign in product(TURNS_DEG if turns.any() else (0.0,), (1, -1)):
+        tried = value + degrees * turns
+        tries.append((tried, sign * rig_of(setup.sensor).turn_sign))
+    jobs = [(tried, sign, int(row)) for tried, sign in tries for row in telling]
+    moved = setup.displacements(jobs, measured.labels, progress).reshape(len(tries), len(telling), 2, -1, 2)
+    errors = [np.mean(likelier_px(each, target[telling])) for each in moved]
+    if not np.isfinite(errors).any():
+        raise FrameError("none of the first contacts can be simulated; are `experiment` and `sensor` those of the frames?")
+    return tries[int(np.nanargmin(errors))]
+
+
+def simulate(setup: CalibrationSetup, measured: MeasuredFrames, values: list, sign: int, progress: Step | None = None) -> np.ndarray:
+    """(V, M, 2, N, 2) px for V vectors of values."""
+    jobs = [(each, sign, row) for each in values for row in range(len(measured))]
+    return setup.displacements(jobs, measured.labels, progress).reshape(len(values), len(measured), 2, -1, 2)
+
+
+def _slopes(
+    setup: CalibrationSetup, measured: MeasuredFrames, value: np.ndarray, sign: int, moved: np.ndarray, progress: Step | None
+) -> np.ndarray:
+    """Derivatives (P, M, 2, N, 2) of the displacements by each fitted quantity, px; 0 for a failed contact."""
+    steps = np.diag([p.step for p in setup.parameters])
+    there = simulate(setup, measured, [value + step for step in steps], sign, progress)
+    return np.nan_to_num((there - moved) / np.diag(steps)[:, None, None, None, None])
+
+
+def mean_squared(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(M, 2) mean squared pin error, px^2, of displacements (M, 2, N, 2). Lost pins are left out; a failed contact gives NaN."""
+    seen = np.isfinite(target[:, None, :, 0])
+    each = np.sum((moved - target[:, None]) ** 2, axis=-1)
+    return np.where(seen, each, 0.0).sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)
+
+
+def at_rest(sensor: SensorSpec, form: Form, pins_px: np.ndarray) -> SensorSpec:
+    """The sensor with these places (N, 2) of its pins at rest in frames of a form."""
+    blob = blob_spec(sensor.pipeline, form).model_copy(update={"rest_px": tuple(map(tuple, pins_px.round(3).tolist()))})
+    return sensor.model_copy(update={"pipeline": sensor.pipeline.model_copy(update={str(form): blob})})
+
+
+def _shares(weights: Weights) -> np.ndarray:
+    """(M, 2) weight of each frame's two hypotheses."""
+    return np.stack([1 - weights.executed, weights.executed], axis=1) * weights.trust[:, None]
+
+
+def _mean(missing: np.ndarray, weights: Weights) -> np.ndarray:
+    """(..., N, 2) mean over frames and hypotheses of (..., M, 2, N, 2); NaN values are left out."""
+    share = _shares(weights)[..., None, None] * np.isfinite(missing)
+    mean: np.ndarray = (share * np.nan_to_num(missing)).sum(axis=(-4, -3)) / np.maximum(share.sum(axis=(-4, -3)), 1e-12)
+    return mean
+
+
+def _normal(slopes: np.ndarray, missing: np.ndarray, weights: Weights, seen_at_rest: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix (P, P) and right-hand side (P,) of the Gauss-Newton step. Lost pins are left out."""
+    seen = np.isfinite(missing)
+    share = _shares(weights)
+    if not seen_at_rest:
+        missing = missing - _mean(missing, weights)
+        slopes = slopes - _mean(np.where(seen, slopes, np.nan), weights)[:, None, None]
+    pins = np.maximum(seen[..., 0].sum(axis=-1), 1)
+    each = (INDEPENDENT / weights.variance_px2 * share / pins)[..., None, None] * seen
+    weighted = slopes * each
+    rows = slopes.reshape(len(slopes), -1)
+    return weighted.reshape(len(slopes), -1) @ rows.T, weighted.reshape(len(slopes), -1) @ np.nan_to_num(missing).ravel()

@@ -1,0 +1,184 @@
+"""Page, figures and table of a contact calibration."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from twin.calibration.contact.fit import INDEPENDENT, ContactFit
+from twin.calibration.contact.simulate import CalibrationSetup
+from twin.evaluation.labelled.model import MeasuredFrames
+from twin.frames import distinct_stems
+from twin.report.charts import new_figure, write_chart
+from twin.report.numbers import number
+from twin.report.page import Page, PagePicture
+from twin.report.plots import draw_displacement, enlargement
+from twin.report.table import Cell, Column
+from twin.rig.kinematics import rig_of
+from twin.store import made_by, write_json
+
+TOLD = 0.5
+"""Least share of a parameter's prior variance that the frames must remove for it to count as determined."""
+TRUSTED = 0.5
+"""Trust below which a frame is listed as not trusted, and not drawn."""
+ALIKE = 0.9
+"""Absolute correlation above which two parameters are listed as hardly distinguishable."""
+
+
+def summary_of(setup: CalibrationSetup, measured: MeasuredFrames, fit: ContactFit, held_out: tuple | None, held_frames: int) -> dict:
+    """All figures, as ``calibration.json`` holds them."""
+    parameters = []
+    for k, parameter in enumerate(setup.parameters):
+        start, value = (parameter.number(v[k]) for v in (fit.start, fit.value))
+        sd = float(fit.sd[k] * parameter.slope(fit.value[k]))
+        told = float(fit.determined[k])
+        parameters.append({"name": parameter.name, "start": start, "value": value, "sd": sd, "told": told, "known": told >= TOLD})
+    pairs = [
+        [setup.parameters[i].name, setup.parameters[k].name, float(fit.correlation[i, k])]
+        for i in range(len(setup.parameters))
+        for k in range(i)
+        if abs(fit.correlation[i, k]) >= ALIKE
+    ]
+    frames: list[dict] = [
+        {"image_name": name, "executed": float(executed), "trust": float(trust), "before_px": _number(before), "after_px": _number(after)}
+        for name, executed, trust, before, after in zip(measured.names, fit.executed, fit.trust, fit.before_px, fit.after_px, strict=True)
+    ]
+    return {
+        "sensor": setup.sensor.name,
+        "experiment": setup.experiment.name,
+        "parameters": parameters,
+        "turn_sign": {"start": rig_of(setup.sensor).turn_sign, "value": rig_of(fit.sensor).turn_sign},
+        "hardly_told_apart": pairs,
+        "executed_share": fit.share,
+        "fitted_px": {"before": float(np.nanmean(fit.before_px)), "after": float(np.nanmean(fit.after_px)), "frames": len(measured)},
+        "held_out_px": {"before": held_out[0], "after": held_out[1], "frames": held_frames} if held_out else {},
+        "warnings": warnings_of(fit, held_out, held_frames),
+        "distrusted": [frame["image_name"] for frame in frames if frame["trust"] < TRUSTED],
+        "frames": frames,
+        "independent_numbers_a_frame": INDEPENDENT,
+        "problems": measured.problems,
+    }
+
+
+def warnings_of(fit: ContactFit, held_out: tuple | None, held_frames: int) -> list[str]:
+    """Warnings about everything that is worse than before the fit, or unknown; empty if there are none."""
+    found = []
+    if not held_out:
+        found.append(
+            "no frame was left to keep out of the fit: how well it does on other frames is not known; give more frames, "
+            "or a smaller `num_labelled`"
+        )
+    pairs = {"the fitted frames": (float(np.nanmean(fit.before_px)), float(np.nanmean(fit.after_px)))}
+    if held_out:
+        pairs[f"the {held_frames} frames kept out"] = held_out
+    for frames, (before, after) in pairs.items():
+        if not after <= before:
+            found.append(
+                f"the fit ended worse than it began on {frames}: {before:.2f} -> {after:.2f} px; look at the page before you use it"
+            )
+    return found
+
+
+def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray, fit: ContactFit, summary: dict) -> Path:
+    """Write ``calibration.json``, charts and ``index.html``, and return the page.
+
+    Parameters
+    ----------
+    moved : (2, 2, M, N, 2) float
+        Simulated displacements, px. Axes: before and after the calibration; after the tap and after the move; frame; pin; x and y.
+    """
+    figures = write_json(folder / "calibration.json", summary | {"made_by": made_by("twin.calibration.contact.fit")})
+    solved = np.flatnonzero(np.isfinite(fit.after_px) & np.isfinite(fit.before_px) & (fit.trust >= TRUSTED))
+    chosen = solved[np.argsort(fit.before_px[solved])[[len(solved) // 2, -1]]] if len(solved) else solved
+    page = Page(f"Contact of {summary['sensor']}", "twin calibrate contact", topic="TacTip twin: contact calibration", lead=_lead(summary))
+    page.notice(
+        "Not trusted, as neither hypothesis fits them", [", ".join(summary["distrusted"])] if summary["distrusted"] else [], tone="bad"
+    )
+    page.notice("Warnings", summary["warnings"], tone="bad")
+    page.notice("Noted", [summary["newtons"]["said"], *summary["problems"]])
+    _parameters_section(page, summary)
+    page.section("Frames")
+    page.table(
+        summary["frames"],
+        [
+            Column("image_name", "frame"),
+            Column("executed", "move executed", "%", decimals=0, scale=100),
+            Column("trust", "trust", "%", decimals=0, scale=100),
+            Column("before_px", "before", "px", decimals=2),
+            Column("after_px", "after", "px", decimals=2),
+        ],
+        caption="Mean pin error of each frame; a dash: its contact failed.",
+    )
+    page.section("Real pins to simulated ones")
+    for k, name in zip(chosen, distinct_stems([measured.names[k] for k in chosen]), strict=True):
+        chart = write_chart(folder / f"{name}.png", partial(_frame_figure, measured, moved, fit, int(k)))
+        page.figures(PagePicture(chart, f"Pin errors of {name} before and after the calibration", measured.names[k]))
+    page.download(figures, "all figures of this page")
+    return page.write(folder / "index.html")
+
+
+def _lead(summary: dict) -> str:
+    def px(key: str, part: str) -> str:
+        return number(summary[key][part], decimals=2)
+
+    held = ""
+    if summary["held_out_px"]:
+        frames = summary["held_out_px"]["frames"]
+        held = f"; on {frames} held-out frames {px('held_out_px', 'before')} and {px('held_out_px', 'after')} px"
+    return (
+        f"Fitted to {summary['fitted_px']['frames']} labelled frames of {summary['experiment']}: mean pin error "
+        f"{px('fitted_px', 'before')} px before, {px('fitted_px', 'after')} px after{held}. Each frame counts under "
+        f"its likelier hypothesis: "
+        f"move executed, or tap alone. Moves executed: {100 * summary['executed_share']:.0f} %."
+    )
+
+
+def _parameters_section(page: Page, summary: dict) -> None:
+    page.section("Parameters")
+    rows: list[dict] = [
+        {
+            "name": Cell(p["name"], "" if p["known"] else "bad"),
+            "start": number(p["start"], 4),
+            "value": number(p["value"], 4),
+            "sd": number(p["sd"], 2),
+            "told": Cell(100 * p["told"], "" if p["known"] else "bad"),
+        }
+        for p in summary["parameters"]
+    ]
+    sign = summary["turn_sign"]
+    rows.append({"name": "rig.turn_sign", "start": number(sign["start"]), "value": number(sign["value"]), "sd": "", "told": ""})
+    page.table(
+        rows,
+        [
+            Column("name", "parameter"),
+            Column("start", "start", align="right"),
+            Column("value", "fitted", align="right"),
+            Column("sd", "sd", align="right"),
+            Column("told", "determined by the frames", "%", decimals=0),
+        ],
+    )
+    independent = f"{summary['independent_numbers_a_frame']:.0f}"
+    page.text(
+        "Told: the share of the prior uncertainty that the frames took away. A parameter that they do not determine "
+        "(red) stays near its start. "
+        f"The sd counts a frame's pins as {independent} independent numbers, because all pins share the model's own errors."
+    )
+    if alike := summary["hardly_told_apart"]:
+        said = "; ".join(f"{a} and {b} ({number(r, decimals=2, signed=True)})" for a, b, r in alike)
+        page.text(f"Hardly distinguished: {said}.")
+
+
+def _frame_figure(measured: MeasuredFrames, moved: np.ndarray, fit: ContactFit, k: int) -> Figure:
+    seen = np.isfinite(measured.pins_px[k, :, 0])
+    real = measured.pins_px[k][seen]
+    hypotheses = [(measured.no_contact_px + both[int(fit.executed[k] > 0.5), k])[seen] for both in moved]
+    enlarged = enlargement(real, hypotheses[0])
+    figure, axes = new_figure(2, panel_inch=5.0)
+    for ax, title, hypothesis, error in zip(axes, ("before", "after"), hypotheses, (fit.before_px[k], fit.after_px[k]), strict=True):
+        draw_displacement(ax, real, hypothesis, f"{title}: {error:.2f} px", enlarged=enlarged)
+    return figure
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

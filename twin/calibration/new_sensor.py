@@ -1,0 +1,661 @@
+"""Makes a specification from the frames of an unknown sensor: layout, pins at rest, camera and pin detection."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import Delaunay
+
+from scenes.layouts.base import LatticeLayout
+from scenes.pins import PinsSpec
+from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Polarity, RecordingSpec, SensorSpec
+from twin.calibration.camera_pose import LEAST_PINS, MODEL_PX, CameraReport, fit_camera
+from twin.calibration.sensor_file import sibling_folder, write_sensor
+from twin.calibration.size import of_radius, require_radius
+from twin.errors import FrameError
+from twin.frames import Recording, evenly_read, frames_at, open_recording, spread_indices
+from twin.frames.forms import gray_levels, pin_levels
+from twin.frames.images import write_image
+from twin.geometry.pins import rest_pins, usual_spacing
+from twin.optics.relief import cap_planes
+from twin.pins.batch import draw_overlay
+from twin.pins.caps import measure_caps
+from twin.pins.check import CAPS_MEASURED, lost_in_view, usual_caps
+from twin.pins.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, with_detector
+from twin.pins.identify import STEADY, Candidate, Identified, identify, score_layout, unnamed_spots
+from twin.pins.pipeline import Pipeline
+from twin.pins.rest import Rest, rest_of, turn_of
+from twin.pins.tune import Tuned, tune
+from twin.progress import Progress, silent, stage
+from twin.report.numbers import number
+from twin.report.page import Page, PagePicture
+from twin.store import output, writes_file
+from twin.types import Form, Frame
+
+DARK_CAPS = AppearanceSpec(skin_albedo=(0.4, 0.4, 0.4), pin_albedo=(0.4, 0.4, 0.4), cap_albedo=(0.03, 0.03, 0.03))
+"""Assumed reflectances of a sensor with dark caps. With the default LEDs and exposure the skin is bright, but not white."""
+LIMIT = 40
+"""Number of frames, evenly spread, from which the specification is made: enough contacts to estimate the pins at rest."""
+JUDGED = 40
+"""Number of frames on which the result is evaluated."""
+SHOWN_FRAMES = 4
+"""Most frames whose overlay pictures are shown."""
+PINHOLE_MM, FISHEYE_MM = 45.0, 7.5
+"""Distance of the pupil from the centre of a dome of 20 mm, mm, at the start of a fit. The values are those of two TacTip cameras, without
+and with a wide-angle lens."""
+FITTED_PINHOLE = ("fx_px", "cx_px", "cy_px", "k1", "tilt_x_deg", "tilt_y_deg", "phase_deg")
+"""Parameters of a pinhole camera that pins at rest may determine (see ``twin.calibration.camera_pose``)."""
+FITTED_FISHEYE = (*FITTED_PINHOLE, "k2")
+"""Parameters of a fisheye camera that pins at rest may determine. Its distortion has a second coefficient."""
+UNTUNED_OFFSET = -12.0
+"""Threshold, gray levels above the local mean, for raw frames if only thresholded frames of the sensor were given."""
+BETTER = 0.85
+"""Largest ratio of misfits at which a more complex camera model replaces a simpler one."""
+SIZE_SD = 0.05
+"""Standard deviation of a cap's diameter from the model's, as a share. It covers uneven prints, uneven light and contact."""
+MADE_SD = 0.1
+"""Standard deviation, in spacings, of rest positions that were estimated from contacts (see ``Rest.line``)."""
+FAIR_SHARE = 0.9
+"""Least share of frames with all pins. If the share is smaller, the report advises to improve light, focus or exposure."""
+STEADILY_LOST = 0.5
+"""Least share of the frames in which a pin that should be in view is missing, for the pin to count as steadily lost."""
+GIVEN_SHOWN = 0.9
+"""Least share of the pins and pin-like spots in the frames that a given layout must explain. With a smaller share the layout is doubted."""
+LEAST_SHOWN = 0.6
+"""Least share of the pins and pin-like spots in the frames that a given layout must explain. A smaller share is an error."""
+FEW_FRAMES = 20
+"""Least number of frames from which the camera's model and the pins at rest are known well enough to give no warning."""
+MOST_AWAY = 0.2
+"""Rms distance, in spacings, between projected and found pins at rest above which the camera does not fit. Frames stretched in one
+direction cause such a distance, because no lens model describes them."""
+USUALLY_AWAY = 0.1
+"""Rms distance, in spacings, above which a camera is doubted that was fitted to a frame without contact. Usual: 0.02 to 0.05."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """How well the new specification finds pins in frames.
+
+    Attributes
+    ----------
+    frames : int
+    all_pins : float
+        Share of the frames in which every pin in view is found.
+    found : float
+        Mean share of the pins in view that are found.
+    valid : float
+        Share of the frames that can be used.
+    extra : float
+        Median number of pin-like spots that belong to no pin.
+    steadily_lost : tuple of int
+        Pins that are lost in at least half of the frames although they should be in view.
+    reasons : tuple of str
+        Reasons why frames cannot be used, one example of each kind.
+    """
+
+    frames: int
+    all_pins: float
+    found: float
+    valid: float
+    extra: float
+    steadily_lost: tuple[int, ...]
+    reasons: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """The same as lines of text."""
+        lines = [
+            f"all pins in view found in {100 * self.all_pins:.1f} % of {self.frames} frames, {100 * self.found:.2f} % of all pins; "
+            f"{100 * self.valid:.0f} % of the frames are valid"
+        ]
+        if self.steadily_lost:
+            lines.append(
+                f"lost in most frames: pin {', '.join(map(str, self.steadily_lost))}; look for dirt, reflections or missing caps there"
+            )
+        return lines + [f"not usable, for example: {reason}" for reason in self.reasons]
+
+
+@dataclass(frozen=True)
+class NewSensor:
+    """A specification made from frames, and how certain it is.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    identified : Identified
+        The layout; other candidates come after it.
+    rest : Rest
+    camera : CameraReport
+    tuned : Tuned
+    health : Health
+    size : str
+        Where the size of the tip comes from, which frames do not determine.
+    known, assumed, next_steps : tuple of str
+        What the frames determine, what is assumed instead, and how to learn more.
+    odd : tuple of str
+        Irregularities of the recording.
+    written : list of Path
+    """
+
+    sensor: SensorSpec
+    identified: Identified
+    rest: Rest
+    camera: CameraReport
+    tuned: Tuned
+    health: Health
+    size: str
+    known: tuple[str, ...]
+    assumed: tuple[str, ...]
+    next_steps: tuple[str, ...]
+    odd: tuple[str, ...]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """The results and the doubts about them, as lines of text."""
+        lines = [f"{'sure' if self.identified.sure else 'unsure'}: {self.identified.best.line()}"]
+        lines += [f"doubt: {doubt}" for doubt in self.identified.doubts]
+        if not self.identified.sure:
+            lines += [f"or: {other.line()}" for other in self.identified.candidates[1:2]]
+        lines += [self.rest.line(), *self.known[2:], *self.health.lines(), self.size]
+        return lines + [f"next: {step}" for step in self.next_steps] + [f"note: {note}" for note in self.odd]
+
+
+@writes_file(".*.csv", ".*.uri")
+def new_sensor(
+    frames: Path,
+    out: Path,
+    *,
+    layout: PinsSpec | None = None,
+    radius_mm: float | None = None,
+    no_contact: Path | None = None,
+    table: Path | None = None,
+    form: Form | None = None,
+    limit: int = LIMIT,
+    progress: Progress = silent,
+) -> NewSensor:
+    """Make a specification from frames of an unknown sensor, and write it.
+
+    A folder ``NAME-new`` beside the specification gets the overlay pictures and the page.
+
+    Parameters
+    ----------
+    frames : Path
+        Anything ``open_recording`` takes: frames of any one size, colour, gray or thresholded, in contact or not.
+    out : Path
+        The ``.toml`` file to write.
+    layout : PinsSpec, optional
+        The layout, if it is known. Otherwise it is identified.
+    radius_mm : float, optional
+        Radius of the tip's dome. By default that of a printed TacTip, 20 mm. All other lengths are in proportion to it (`of_radius`).
+    no_contact : Path, optional
+        A frame without contact. By default a file ``init_*`` beside the frames, else a frame that shows no contact, else an estimate from
+        the contacts.
+    table : Path, optional
+        A table of labels that also gives the frames' order.
+    form : Form, optional
+        Thresholded (recording) or not (raw); recognised by the frames' content if not given.
+    limit : int
+        Most frames from which the specification is made.
+
+    Raises
+    ------
+    FrameError
+        There are no frames, they show no layout, or ``out`` is not the name of a ``.toml`` file.
+    OptionError
+        No dome has this radius.
+    """
+    if radius_mm is not None:
+        require_radius(radius_mm)
+    folder = sibling_folder(out, "new")
+    with output(folder, "index.html", "overlay-*.png"):
+        recording = open_recording(frames_at(frames, table, no_contact), None, form)
+        looked = evenly_read(recording, limit)
+        odd = recording.notes()
+        images = [gray_levels(frame.image) for frame in looked]
+        with stage(progress, "layout") as step:
+            found = identify(images, progress=step) if layout is None else _compare_layout(layout, images)
+        best, polarity = found.best, found.polarity
+        images = [pin_levels(image, polarity) for image in images]
+        if (enough := int((best.there >= STEADY).sum())) < LEAST_PINS:
+            raise FrameError(
+                f"{enough} pins are seen in most frames, as {best.pins.in_words()}: too few, a camera is fitted to {LEAST_PINS} or more; "
+                "give frames in which more pins stand out, not thresholded if the light fades towards the rim"
+            )
+        given, names = recording.reference, [frame.name for frame in looked]
+        known_name, known_gray = (given.name, pin_levels(given.image, polarity)) if given is not None else ("", None)
+        try:
+            rest = rest_of(best, names, known_gray, known_name)
+        except FrameError as error:
+            if found.sure:
+                raise
+            raise FrameError(
+                f"the layout is not recognised: the likeliest, {best.line()}, and {known_name} does not show it. If {known_name} shows no "
+                "contact, give the layout with `layout`; one of no known kind as `layout` positions:FILE.csv"
+            ) from error
+        start = _start_specification(out.stem, looked[0], best.pins, rest, frames.name, polarity)
+        start = start if radius_mm is None else of_radius(start, radius_mm)
+        with stage(progress, "camera"):
+            sizes_px = _sizes(best, images) if looked[0].form == Form.RAW else None
+            fitted, camera, others = _camera(start, np.where((best.there >= STEADY)[:, None], rest.pins_px, np.nan), rest.source, sizes_px)
+        with stage(progress, "pins") as step:
+            tuned = tune(looked, fitted, known=best, rest=rest, progress=step)
+        sensor = _with_usual_caps(_with_pipeline(fitted, tuned.detector), looked)
+        judged = looked if limit >= min(JUDGED, len(recording)) else evenly_read(recording, JUDGED)
+        odd = list(dict.fromkeys([*odd, *recording.notes(), *_doubtful(camera, rest, len(looked))]))
+        health, pictures = _health(sensor, looked[0].form, judged, folder)
+        size = _size(sensor, given=radius_mm is not None)
+        known, assumed, steps = _describe_result(sensor, found, rest, camera, others, tuned, health, recording, out)
+        known, assumed = ((*known, size), assumed) if radius_mm is not None else (known, (size, *assumed))
+        write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
+        page = _page(folder, sensor, found, health, pictures, known, assumed, steps, odd)
+        return NewSensor(sensor, found, rest, camera, tuned, health, size, known, assumed, steps, tuple(odd), [out, page])
+
+
+def _holds_its_axis(places: np.ndarray) -> bool:
+    """Whether the axis of the sensor, at 0,0, lies among places (N, 2), which do not lie on one line."""
+    return bool(Delaunay(places).find_simplex(np.zeros(2)) >= 0)
+
+
+def _compare_layout(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
+    """The user's layout, compared with the frames."""
+    alone = not isinstance(layout.shape, LatticeLayout)  # none of those that are searched for in frames
+    if alone and not _holds_its_axis(layout.shape.places()):
+        raise FrameError(
+            f"the sensor's axis, 0,0, lies outside of the {layout.in_words()} that were given; x,y count from the axis: "
+            "subtract the place of the middle pin, or of the middle of all pins"
+        )
+    polarity: Polarity = "bright"
+    shown = score_layout(layout, images)
+    if shown is None or shown.explained < GIVEN_SHOWN:
+        dark = score_layout(layout, [pin_levels(image, "dark") for image in images])
+        if dark is not None and (shown is None or dark.explained > shown.explained):
+            shown, polarity = dark, "dark"
+    if shown is not None and shown.explained >= GIVEN_SHOWN:
+        forgotten = unnamed_spots(shown.rest_px, shown.seen) if alone else []
+        doubts = tuple(
+            f"a pin-like spot at ({x:.0f}, {y:.0f}) px is none of the {layout.in_words()}: does the file lack its place?"
+            for x, y in forgotten
+        )
+        return Identified((shown,), not doubts, doubts, 0.0, polarity)
+    try:
+        other = identify(images).best
+    except FrameError:
+        other = None
+    if shown is None or shown.explained < LEAST_SHOWN:
+        instead = f"; they show {other.pins.in_words()}" if other is not None else ""
+        places = (
+            "compare the places with the picture: one that is missing or wrong hides the others"
+            if alone
+            else "give each pin's place, `layout` positions:FILE.csv"
+        )
+        raise FrameError(
+            f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave `layout` out to have it identified, or {places}"
+        )
+    doubt = f"{layout.in_words()} were given, and explain only {100 * shown.explained:.1f} % of what is there"
+    if other is None or other.explained <= shown.explained:
+        return Identified((shown,), False, (f"{doubt}; look at the overlay: are these all pins?",), 0.0, polarity)
+    doubt += f"; {other.pins.in_words()} explain {100 * other.explained:.1f} %: leave `layout` out, or correct it"
+    return Identified((shown, other), False, (doubt,), 0.0, polarity)
+
+
+def _start_specification(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str, polarity: Polarity) -> SensorSpec:
+    """A specification with the right layout and frame size, and with a camera that sees the pins at about the right places."""
+    height, width = frame.image.shape[:2]
+    color = frame.image.ndim == 3 and frame.image.shape[2] == 3 and bool(np.ptp(frame.image.astype(int), axis=2).max() > 0)
+    seen = rest.pins_px[np.isfinite(rest.pins_px[:, 0])]
+    x, y = ((seen.max(axis=0) + seen.min(axis=0)) / 2).tolist()
+    radius = float(np.linalg.norm(seen - [x, y], axis=1).max())
+    turned = pins.model_copy(update={"phase_deg": round(turn_of(pins, rest.pins_px), 2)})
+    focal = radius * PINHOLE_MM / 17.0  # the outermost caps of a TacTip are about 17 mm from the axis
+    camera = CameraSpec(
+        width_px=width,
+        height_px=height,
+        channels="color" if color else "mono",
+        fx_px=focal,
+        fy_px=focal,
+        cx_px=x,
+        cy_px=y,
+        distance_mm=PINHOLE_MM,
+    )
+    anywhere = BlobSpec(
+        polarity=polarity,
+        threshold=UNKNOWN_OFFSET,
+        threshold_block_px=UNKNOWN_BLOCK_PX,
+        mask_center_px=(x, y),
+        mask_radius_px=1.1 * radius,
+    )
+    thresholded = frame.form == Form.PROCESSED
+    return SensorSpec(
+        name=name,
+        description=f"Made by 'twin new' from frames of {source}",
+        source="Layout, camera and pin detection: the frames. All else: the defaults of a printed TacTip",
+        pins=turned,
+        camera=camera,
+        appearance=DARK_CAPS if polarity == "dark" else AppearanceSpec(),
+        recording=_whole(width, height, polarity) if thresholded else None,
+        pipeline=PipelineSpec(raw=anywhere, recording=anywhere if thresholded else None),
+    )
+
+
+def _whole(width: int, height: int, polarity: Polarity) -> RecordingSpec:
+    """A recorder that keeps the whole frame. The frames do not show how they were thresholded."""
+    return RecordingSpec(
+        crop_px=(0, 0, width, height),
+        width_px=width,
+        height_px=height,
+        threshold_block_px=UNKNOWN_BLOCK_PX,
+        threshold_offset=UNKNOWN_OFFSET if polarity == "bright" else -UNKNOWN_OFFSET,
+    )
+
+
+def _sizes(layout: Candidate, images: list[np.ndarray]) -> np.ndarray:
+    """Diameters (N,) px of the caps: the median over some of the raw frames; NaN for a cap that is never measured."""
+    chosen = spread_indices(len(images), CAPS_MEASURED)
+    found = np.stack([measure_caps(images[k], layout.seen[k].pins_px).diameter_px for k in chosen])
+    some = np.isfinite(found).any(axis=0)
+    return np.where(some, np.nanmedian(np.where(some, found, 0.0), axis=0), np.nan)
+
+
+def _camera(
+    start: SensorSpec, pins_px: np.ndarray, source: str, sizes_px: np.ndarray | None
+) -> tuple[SensorSpec, CameraReport, tuple[str, ...]]:
+    """The camera model and the pin spacing that explain the pins at rest and the caps' sizes best.
+
+    Pinhole and fisheye lenses and both spacings are tried, and a simpler model is preferred (see ``BETTER``). Pins at rest alone hardly
+    distinguish rings evenly spaced on the dome from rings evenly spaced in plan under another lens. The two differ in how the size of the
+    caps changes from the middle to the rim. The caps' diameter in mm follows from their median size.
+
+    Parameters
+    ----------
+    pins_px : (N, 2) float
+        Pins at rest, NaN where unknown.
+    source : str
+        Origin of these pins: ``Rest.source``.
+    sizes_px : (N,) float, optional
+        Diameters of the caps, NaN where unknown.
+
+    Returns
+    -------
+    fitted : SensorSpec
+    report : CameraReport
+    others : tuple of str
+        Other cameras that explain the pins about as well, in words.
+    """
+    sd_px = MODEL_PX if source != "made" else max(MODEL_PX, MADE_SD * usual_spacing(pins_px))
+    tried: list[tuple[float, SensorSpec, CameraReport]] = []
+    best = 0
+    for projection, spacing in (("perspective", "polar"), ("perspective", "plan"), ("fisheye", "polar"), ("fisheye", "plan")):
+        pins = start.pins.model_copy(update={"spacing": spacing})
+        camera = start.camera
+        if projection == "fisheye":
+            focal = camera.fx_px * FISHEYE_MM / PINHOLE_MM
+            camera = camera.model_copy(
+                update={
+                    "projection": projection,
+                    "fx_px": focal,
+                    "fy_px": focal,
+                    "distance_mm": camera.distance_mm * FISHEYE_MM / PINHOLE_MM,
+                }
+            )
+        trial = _scale_camera(start.model_copy(update={"pins": pins, "camera": camera}), pins_px)
+        fitted, report = fit_camera(trial, pins_px, free=FITTED_FISHEYE if projection == "fisheye" else FITTED_PINHOLE, named=True)
+        fitted, uneven = _with_sizes(fitted, sizes_px)
+        misfit = float(np.hypot(report.rms_px / sd_px, uneven / SIZE_SD))
+        tried.append((misfit, fitted, report))
+        if misfit < BETTER * tried[best][0]:
+            best = len(tried) - 1
+    least = min(misfit for misfit, _, _ in tried)
+    others = [each for k, (misfit, each, _) in enumerate(tried) if k != best and misfit * BETTER <= least]
+    return tried[best][1], tried[best][2], tuple(_camera_words(each) for each in others)
+
+
+def _camera_words(sensor: SensorSpec) -> str:
+    """Kind of lens and focal length of a sensor's camera."""
+    lens = "fisheye" if sensor.camera.projection == "fisheye" else "pinhole"
+    return f"{lens}, focal length {sensor.camera.fx_px:.0f} px"
+
+
+def _with_sizes(sensor: SensorSpec, sizes_px: np.ndarray | None) -> tuple[SensorSpec, float]:
+    """The sensor with caps and pins scaled to the median measured size, and the relative spread of the measured sizes about the model's."""
+    if sizes_px is None:
+        return sensor, 0.0
+    _, plane = cap_planes(sensor.view, sensor.pins, rest_pins(sensor.geometry))
+    share = sizes_px / (2 * np.sqrt(np.abs(np.linalg.det(plane))))
+    known = np.log(share[np.isfinite(share)])
+    if len(known) < LEAST_PINS:
+        return sensor, 0.0
+    scale = float(np.exp(np.median(known)))
+    cap_mm, pin_mm = (round(scale * value, 3) for value in (sensor.pins.cap_diameter_mm, sensor.pins.diameter_mm))
+    pins = sensor.pins.model_copy(update={"cap_diameter_mm": cap_mm, "diameter_mm": pin_mm})
+    return sensor.model_copy(update={"pins": pins}), float(np.std(known))
+
+
+def _scale_camera(sensor: SensorSpec, pins_px: np.ndarray) -> SensorSpec:
+    """The sensor with a camera that sees the pins at the place and in the size of pins (N, 2); NaN where unknown."""
+    known = np.flatnonzero(np.isfinite(pins_px[:, 0]))
+    return sensor.model_copy(update={"camera": camera_seeing(sensor, pins_px, known)})
+
+
+def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
+    """The specification with its pin detection. If only thresholded frames were given, raw frames get the threshold ``UNTUNED_OFFSET``."""
+    tuned = with_detector(sensor, detector)
+    if detector.form == Form.RAW:
+        return tuned
+    usual = detector.blob.model_copy(
+        update={
+            "threshold": UNTUNED_OFFSET,
+            "threshold_block_px": UNKNOWN_BLOCK_PX,
+            "rest_px": (),
+            "rest_origin": "measured",
+            "spot_sigma_px": 0.0,
+        }
+    )
+    return tuned.model_copy(update={"pipeline": tuned.pipeline.model_copy(update={"raw": usual})})
+
+
+def _with_usual_caps(sensor: SensorSpec, frames: list[Frame]) -> SensorSpec:
+    """The specification with the usual light and focus of its caps, measured in raw frames."""
+    form = frames[0].form
+    if form != Form.RAW:
+        return sensor
+    pipeline = Pipeline(sensor, form)
+    seen = [(frame, pipeline(frame)) for frame in (frames[k] for k in spread_indices(len(frames), CAPS_MEASURED))]
+    polarity = sensor.pipeline.raw.polarity
+    usual = usual_caps([measure_caps(gray_levels(frame.image), o.pins_px, polarity=polarity) for frame, o in seen if o.valid])
+    return sensor.model_copy(update={"pipeline": sensor.pipeline.model_copy(update={"usual_caps": usual})})
+
+
+def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -> tuple[Health, list[Path]]:
+    """How well a specification finds pins in frames, and overlay pictures of some of them."""
+    pipeline = Pipeline(sensor, form)
+    seen = [pipeline(frame) for frame in frames]
+    steadily = np.flatnonzero(lost_in_view(seen, pipeline)[0].mean(axis=0) >= STEADILY_LOST)
+    reasons = list(dict.fromkeys(o.reason.split(":")[0] for o in seen if not o.valid))
+    first = [next(f"{f.name}: {o.reason}" for f, o in zip(frames, seen, strict=True) if o.reason.startswith(r)) for r in reasons]
+    health = Health(
+        len(seen),
+        float(np.mean([o.complete for o in seen])),
+        float(np.mean([o.found / max(o.expected, 1) for o in seen])),
+        float(np.mean([o.valid for o in seen])),
+        float(np.median([len(o.extra_px) for o in seen])),
+        tuple(steadily.tolist()),
+        tuple(first[:3]),
+    )
+    worst = np.argsort([o.found / max(o.expected, 1) for o in seen], kind="stable")
+    chosen = dict.fromkeys([int(worst[-1]), int(worst[0]), *worst[:: max(len(worst) // SHOWN_FRAMES, 1)].tolist()])
+    pictures: list[Path] = []
+    for k in list(chosen)[:SHOWN_FRAMES]:
+        path = folder / f"overlay-{len(pictures) + 1}.png"
+        write_image(path, draw_overlay(frames[k], seen[k], scale=_enlarge(pipeline.size_px)))
+        pictures.append(path)
+    return health, pictures
+
+
+def _enlarge(size_px: tuple[int, int]) -> int:
+    """Factor by which a frame is enlarged so that its pins can be seen well."""
+    return int(np.clip(round(900 / max(size_px)), 1, 6))
+
+
+def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
+    """Doubts about a camera that was fitted to the pins at rest, and what to do."""
+    notes = []
+    seen = rest.pins_px[np.isfinite(rest.pins_px[:, 0])]
+    away = camera.rms_px / usual_spacing(seen)
+    if away > MOST_AWAY:
+        notes.append(
+            f"no camera sees this layout as the frames show it: the best one misses the pins at rest by {camera.rms_px:.1f} px (rms), "
+            f"{away:.2f} of their spacing; were the frames stretched? Give them as the camera wrote them"
+        )
+    elif away > USUALLY_AWAY and rest.source == "given":
+        notes.append(
+            f"the camera misses the pins at rest by {camera.rms_px:.1f} px (rms), {away:.2f} of their spacing, which is much for a frame "
+            "without contact: look whether the layout's places are right, and whether that frame shows a contact"
+        )
+    if frames < FEW_FRAMES:
+        notes.append(f"{frames} frames are few: kind and focal length of the camera are unsure; give about {LIMIT}, of different contacts")
+    return notes
+
+
+def _describe_result(
+    sensor: SensorSpec,
+    found: Identified,
+    rest: Rest,
+    camera: CameraReport,
+    other_cameras: tuple[str, ...],
+    tuned: Tuned,
+    health: Health,
+    recording: Recording,
+    out: Path,
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """What the frames determine, what is assumed, and how to learn more. The specification is written to ``out``."""
+    evidence = tuned.detector.evidence
+    known = (
+        f"Layout: {found.best.line()}",
+        rest.line(),
+        *([] if found.polarity == "bright" else ["polarity: the pins are darker than the skin"]),
+        f"camera: {_camera_words(sensor)}, middle ({sensor.camera.cx_px:.0f}, {sensor.camera.cy_px:.0f}) px; "
+        f"it sees the {camera.pins} pins at rest within {camera.rms_px:.2f} px (rms)"
+        + (f"; about as well: {', or '.join(dict.fromkeys(other_cameras))}" if other_cameras else ""),
+        f"pin detection: {evidence.sure if evidence else 'unsure'}; "
+        + (
+            f"spots of {sensor_blob(sensor, tuned).spot_sigma_px:g} px"
+            if sensor_blob(sensor, tuned).spot_sigma_px
+            else f"threshold {sensor_blob(sensor, tuned).threshold:g}, which may change by "
+            f"{evidence.threshold_slack if evidence else 0:g} gray levels"
+        ),
+    )
+    assumed = [
+        f"Outermost pins at {sensor.pins.max_polar_deg:g} deg from the axis, and the camera's distance {sensor.camera.distance_mm:.1f} mm: "
+        "pins at rest fit many pairs of them.",
+        "Stiffness of skin and gel: Shore A 26 to 30 rubber and a soft gel.",
+        "Light, colours, noise: those of another TacTip, until 'twin calibrate optics' has found this sensor's."
+        if found.polarity == "bright"
+        else "Light, noise: those of another TacTip; a gray skin and black caps ([appearance]).",
+        *camera.held.values(),
+    ]
+    steps = []
+    if not found.sure and len(found.candidates) > 1:
+        steps.append(
+            f"decide between the layouts: {found.best.pins.in_words()}, or {found.candidates[1].pins.in_words()}; count them in the overlay"
+        )
+    if rest.source != "given":
+        steps.append("record a frame without contact and run this again with `no_contact` FRAME")
+    if health.all_pins < FAIR_SHARE:
+        steps.append("look at the overlay pictures: better light, focus or exposure helps most; then run this again")
+    files = f"--sensor {out} --frames {recording.path} --out {out.with_stem(f'{out.stem}-2')}"
+    if any(name.startswith("pose_") for name in recording.labels):
+        steps.append(f"fit the contact to the labels: twin calibrate contact {files}")
+    else:
+        steps.append("record labelled contacts (a table targets.csv beside the frames), then 'twin calibrate contact' and 'twin train'")
+    if sensor.camera.channels == "color" and recording.form is Form.RAW and found.polarity == "bright":
+        steps.append(f"fit light and colours: twin calibrate optics {files}")
+    return known, tuple(assumed), tuple(steps)
+
+
+def _size(sensor: SensorSpec, *, given: bool) -> str:
+    """Where the tip's size comes from."""
+    size = f"tip of radius {sensor.skin.outer_radius_mm:g} mm, skin {sensor.skin.thickness_mm:g} mm"
+    if given:
+        return f"{size}: the radius as given, all other lengths in proportion to a printed TacTip's"
+    return (
+        f"assumed: {size}, as a printed TacTip. Frames do not determine lengths in mm. If your tip differs, give its radius (`radius_mm`): "
+        "otherwise lengths, forces and poses are wrong"
+    )
+
+
+def sensor_blob(sensor: SensorSpec, tuned: Tuned) -> BlobSpec:
+    """The pin detection's settings for the form of frames on which they were tuned."""
+    form = tuned.detector.form
+    return sensor.pipeline.recording if form == Form.PROCESSED and sensor.pipeline.recording else sensor.pipeline.raw
+
+
+def _comment(source: str, found: Identified, rest: Rest) -> str:
+    """Lines above the specification."""
+    return "\n".join(
+        (
+            f"Made by 'twin new' from frames of {source}. Sections and keys that are not here have their defaults: a printed TacTip",
+            "(docs/your-own-sensor.md). The page beside this file says what is known, what is assumed, and what to do to know more.",
+            f"Layout: {'sure' if found.sure else 'UNSURE'}. {rest.line()}.",
+        )
+    )
+
+
+def _notes(found: Identified, rest: Rest, camera: CameraReport) -> dict[str, str]:
+    """Comments behind the values of a specification."""
+    sure = "seen in the frames" if found.sure else "unsure: see the page"
+    met = f"fitted: pins at rest within {camera.rms_px:.2f} px"
+    return {
+        "pins.layout": sure,
+        **{f"pins.{key}": sure for key in type(found.best.pins.shape).model_fields},
+        "pins.missing": "not seen in any frame, though in view",
+        "pins.phase_deg": "turn of the first pin of each ring",
+        "pins.spacing": "decided by the caps' sizes",
+        "pins.cap_diameter_mm": "seen: the caps' mean size, for a dome of this radius",
+        "pins.diameter_mm": "assumed: as wide relative to the caps as a usual pin",
+        "camera.fx_px": met,
+        "camera.distance_mm": "assumed: pins at rest do not determine it",
+        "recording.crop_px": "assumed: how the frames were made is not known",
+        "recording.threshold_block_px": "assumed",
+    }
+
+
+def _page(
+    folder: Path,
+    sensor: SensorSpec,
+    found: Identified,
+    health: Health,
+    pictures: list[Path],
+    known: tuple[str, ...],
+    assumed: tuple[str, ...],
+    steps: tuple[str, ...],
+    problems: list[str],
+) -> Path:
+    """The page: what is known, what is assumed, what to do; overlay pictures; candidates."""
+    page = Page(f"New sensor {sensor.name}", "twin new", topic="TacTip twin: a new sensor", lead=" ".join(health.lines()[:1]))
+    page.notice("Unsure", list(found.doubts), tone="bad")
+    page.notice("Noted", problems + list(health.lines()[1:]))
+    page.section("Pins in the frames", "Green: found. Red: a lost pin's expected place. Yellow: spots that are no pins.")
+    page.figures(*(PagePicture(path, f"Frame with its pins, {path.stem}", "", kind="frame") for path in pictures))
+    page.section("What is known")
+    page.items(known)
+    page.section("What is assumed")
+    page.items(assumed)
+    page.section("What to do to know more")
+    page.items(steps)
+    page.section("Layouts that were considered")
+    page.table(
+        [
+            {
+                "layout": candidate.pins.in_words(),
+                "explained": f"{100 * candidate.explained:.1f} %",
+                "agreeing": f"{100 * candidate.agreeing:.0f} %",
+                "not_seen": number(candidate.not_seen, 3),
+                "left_over": number(candidate.left_over, 3),
+                "misfit": number(candidate.misfit, 2),
+            }
+            for candidate in found.candidates
+        ],
+        ["layout", "explained", "agreeing", "not_seen", "left_over", "misfit"],
+        caption="Explained: of the pins in view and the pin-like spots, the share that belong together (median). Misfit: distance of the "
+        "pins at rest from a smooth view of the layout, in spacings.",
+    )
+    return page.write(folder / "index.html")

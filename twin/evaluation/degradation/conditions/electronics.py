@@ -1,0 +1,98 @@
+"""Degradations of the camera's chip, the stream and the recorder."""
+
+import cv2
+import numpy as np
+
+from scenes.sensor import ResponseSpec
+from twin.camera.capture import compressed
+from twin.evaluation.degradation.condition import Condition, OnSection, PictureView, choose_share
+
+
+def darker(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
+    """Less exposure."""
+    return response.model_copy(update={"exposure": response.exposure * 2.0**-value})
+
+
+def brighter(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
+    """More exposure."""
+    return response.model_copy(update={"exposure": response.exposure * 2.0**value})
+
+
+def noisier(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
+    """More read and shot noise."""
+    return response.model_copy(update={"read_noise": float(np.hypot(response.read_noise, value))}) if value else response
+
+
+def jpeg(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """Stronger JPEG compression."""
+    return compressed(image, max(100 - round(value), 1)) if value else image
+
+
+def coarser(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """A lower resolution. The picture is enlarged to the frame's size again, because the pipeline expects that size."""
+    if value == 1:
+        return image
+    height, width = image.shape[:2]
+    small = cv2.resize(image, (max(round(width / value), 8), max(round(height / value), 8)), interpolation=cv2.INTER_AREA)
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def rows_lost(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """Lost rows: each shows the last row that arrived before it."""
+    lost = choose_share(len(image), value, rng)
+    last = np.maximum.accumulate(np.where(lost, 0, np.arange(len(image))))
+    return image[last] if value else image
+
+
+def hot(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """Pixels that are stuck at white."""
+    if not value:
+        return image
+    image = image.copy()
+    image[rng.random(image.shape[:2]) < value] = 255
+    return image
+
+
+def posterised(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """Loss of the lowest bits. With a fraction of a bit the steps between levels are wider by that power of two."""
+    step = 2.0**value
+    return np.clip(np.floor(image / step) * step, 0, 255).astype(np.uint8) if value else image
+
+
+CONDITIONS = (
+    Condition(
+        "exposure-low",
+        "exposure or gain too low",
+        "electronics",
+        "light lost",
+        "stops",
+        9.0,
+        spec=OnSection("response", darker),
+        image_level=True,
+    ),
+    Condition(
+        "exposure-high",
+        "exposure or gain too high",
+        "electronics",
+        "light gained",
+        "stops",
+        9.0,
+        spec=OnSection("response", brighter),
+        image_level=True,
+    ),
+    Condition(
+        "noise",
+        "sensor noise",
+        "electronics",
+        "sd of the light, in saturations",
+        "",
+        0.4,
+        spec=OnSection("response", noisier),
+        image_level=True,
+    ),
+    Condition("jpeg", "JPEG compression", "electronics", "100 less the quality", "", 99.0, frame=jpeg, image_level=True),
+    Condition("resolution", "low resolution", "electronics", "pixels merged, each way", "px", 9.0, 1.0, frame=coarser, image_level=True),
+    Condition("rows-dropped", "dropped rows", "electronics", "share of the rows", "", 0.9, frame=rows_lost, image_level=True),
+    Condition("hot-pixels", "hot pixels", "electronics", "share of the pixels", "", 0.1, frame=hot, image_level=True),
+    Condition("posterised", "posterised levels", "electronics", "bits lost", "bit", 7.5, frame=posterised, image_level=True),
+)

@@ -1,0 +1,71 @@
+"""Degradations of the whole picture: a stream that lost its place, and a camera that was mounted otherwise."""
+
+import cv2
+import numpy as np
+
+from twin.evaluation.degradation.condition import Condition, PictureView
+from twin.evaluation.degradation.conditions.placement import mapped, warped
+
+FARTHEST_PX = 64.0
+"""Most severe displacement of rows, px."""
+
+
+def rolled(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """A picture that begins at the wrong column; what leaves at the right comes back at the left."""
+    return np.roll(image, round(value), axis=1)
+
+
+def rolled_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
+    """Positions in a rolled picture."""
+    return px + [round(value), 0]
+
+
+def torn(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """A picture whose lower half is rolled."""
+    middle = len(image) // 2
+    return np.concatenate([image[:middle], rolled(image[middle:], value, view, rng)])
+
+
+def torn_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
+    """Positions in a torn picture."""
+    return px + np.where(px[:, 1:] >= int(view.size_px[1]) // 2, [round(value), 0.0], 0.0)
+
+
+def turned(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """A picture that is turned about its middle."""
+    return warped(image, _turn(value, image.shape)) if value else image
+
+
+def turned_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
+    """Positions in a turned picture."""
+    return mapped(px, _turn(value, view.size_px[::-1])) if value else px
+
+
+def _turn(degrees: float, shape: tuple[int, ...]) -> np.ndarray:
+    matrix: np.ndarray = cv2.getRotationMatrix2D(((shape[1] - 1) / 2, (shape[0] - 1) / 2), -degrees, 1.0)
+    return matrix
+
+
+def mirrored(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """A picture with left and right exchanged."""
+    return np.ascontiguousarray(image[:, ::-1]) if value else image
+
+
+def mirrored_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
+    """Positions in a mirrored picture."""
+    return np.column_stack([view.size_px[0] - 1 - px[:, 0], px[:, 1]]) if value else px
+
+
+CONDITIONS = (
+    Condition(
+        "picture-rolled", "rolled picture", "picture", "columns", "px", FARTHEST_PX, frame=rolled, moves=rolled_points, image_level=True
+    ),
+    Condition(
+        "picture-torn", "torn picture", "picture", "columns of the lower half", "px", FARTHEST_PX, frame=torn, moves=torn_points,
+        image_level=True,
+    ),
+    Condition("picture-turned", "turned picture", "picture", "angle", "deg", 180.0, frame=turned, moves=turned_points, image_level=True),
+    Condition(
+        "picture-mirrored", "mirrored picture", "picture", "mirrored", "", 1.0, frame=mirrored, moves=mirrored_points, image_level=True
+    ),
+)  # fmt: skip

@@ -1,0 +1,242 @@
+"""A complete robustness study on rendered or on real frames, with its results in one folder.
+
+The true places of the pins in real frames are unknown. The places on which several detectors agree are used instead.
+"""
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError, OptionError, TwinError
+from twin.evaluation.degradation.condition import DegradedCase
+from twin.evaluation.degradation.envelope import Envelope, evaluate_sweep
+from twin.evaluation.degradation.report import write_report
+from twin.evaluation.degradation.shots import CONTACTS, RealSource, RenderedSource
+from twin.evaluation.degradation.sweep import Models, SweepSettings
+from twin.frames import evenly_read, open_recording
+from twin.pins import METHODS, DetectorSpec, load_detector, make_detector, shipped_detector, tune, write_detector
+from twin.pins.detector_spec import OWN
+from twin.pins.own_finder import is_own, own_detector, own_name, own_places
+from twin.progress import Progress, Step, silent, stage
+from twin.store import Item, inputs_digest
+from twin.types import Form, Frame
+
+AGREE = 0.15
+"""Distance of two detectors' places, as a share of the pins' median spacing, below which they agree on a pin. Chosen."""
+LEAST_KNOWN = 0.97
+"""Smallest fraction of a frame's pins on which detectors must agree. Frames with a smaller fraction are refused."""
+LEAST_AGREEING = 2
+"""Number of detectors that must agree on a pin."""
+
+
+def rendered_study(
+    spec: SensorSpec,
+    pipelines: list[str],
+    cases: tuple[DegradedCase, ...],
+    severities: tuple[float, ...],
+    out: Path,
+    *,
+    jobs: int = 1,
+    models: Models | None = None,
+    model_digests: dict[str, str] | None = None,
+    progress: Progress = silent,
+) -> tuple[list[Envelope], list[Path]]:
+    """A study on rendered frames. Models are as in `Plan`, other options and results as in `study`."""
+    source, bar = RenderedSource(spec, CONTACTS), partial(stage, progress)
+    with bar("contacts, undegraded"):
+        frames = [shot.frame for shot in source.render(cases[0], 0.0)]
+    with bar("tuning") as step:
+        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
+    plan = SweepSettings(source, detectors, cases, severities, models, model_digests or {})
+    return study(plan, "rendered", out, jobs=jobs, progress=progress)
+
+
+def real_study(
+    spec: SensorSpec,
+    path: Path,
+    limit: int,
+    pipelines: list[str],
+    cases: tuple[DegradedCase, ...],
+    severities: tuple[float, ...],
+    out: Path,
+    *,
+    beside: bool = True,
+    jobs: int = 1,
+    models: Models | None = None,
+    model_digests: dict[str, str] | None = None,
+    progress: Progress = silent,
+) -> tuple[list[Envelope], list[Path]]:
+    """A study on a folder of real frames, with image-level conditions only.
+
+    Models are as in `Plan`, other options and results as in `study`. With ``beside`` and raw frames, rendered frames are also swept, and
+    the envelopes of both are compared.
+    """
+    recording = open_recording(path, spec)
+    frames, bar = evenly_read(recording, limit), partial(stage, progress)
+    with bar("tuning") as step:
+        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
+        judges = choose_pipelines(["twin", "adaptive"], spec, frames, out / "pipelines", step)
+    built_in = [each for each in detectors if each.method != OWN]  # what is evaluated must not say what is true
+    source, notes = consensus(spec, frames, list(dict.fromkeys((*built_in, *judges))))
+    notes += recording.notes()
+    usable = tuple(c for c in cases if c.image_level and (recording.form == Form.RAW or _on_frames(c)))
+    if not usable:
+        raise TwinError("none of the conditions can be applied to frames that are already there; without `frames` they are rendered")
+    if left := [c.name for c in cases if c not in usable]:
+        notes.append(f"left out, because they cannot be applied to frames that are already there: {', '.join(left)}")
+    rendered = RenderedSource(spec, CONTACTS) if beside and recording.form == Form.RAW else None
+    source = replace(source, rest_frame=recording.reference)
+    plan = SweepSettings(source, detectors, usable, severities, models, model_digests or {})
+    return study(plan, path.name, out, jobs=jobs, notes=notes, rendered=rendered, progress=progress)
+
+
+def study(
+    plan: SweepSettings,
+    source: str,
+    out: Path,
+    *,
+    progress: Progress = silent,
+    jobs: int = 1,
+    notes: list[str] | None = None,
+    rendered: RenderedSource | None = None,
+) -> tuple[list[Envelope], list[Path]]:
+    """Sweep, evaluate and write. Returns the envelopes and the written files, the page first.
+
+    Parameters
+    ----------
+    plan : Plan
+    source : str
+        Name of the frames for the page.
+    out : Path
+    progress : Progress
+    jobs : int
+        Number of processes.
+    notes : list of str, optional
+        Remarks for the page.
+    rendered : RenderedSource, optional
+        Rendered frames of the same sensor. They are also swept (in ``out/rendered``), and the plan's frames are compared with them.
+    """
+    with stage(progress, "conditions x steps") as step:
+        judged = evaluate_sweep(plan, out, jobs=jobs, progress=step)
+    beside = None
+    if rendered is not None:
+        with stage(progress, "the same, rendered") as step:
+            beside = evaluate_sweep(replace(plan, source=rendered), out / "rendered", jobs=jobs, progress=step)
+    return judged.envelopes, write_report(out, judged, source=source, notes=notes or [], rendered=beside)
+
+
+def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
+    """Check names before any work is done.
+
+    Parameters
+    ----------
+    names : list of str
+        Methods, files of detectors, or functions of the user (``FILE.py:FUNCTION``).
+    models : tuple of str
+        Names of the models, whose rows are in the same tables as those of the pipelines.
+
+    Raises
+    ------
+    TwinError
+        A name is neither a method nor a readable file or function, or two names are the same.
+    """
+    for name in names:
+        if name not in METHODS and Path(name).suffix != ".toml" and not is_own(name):
+            raise OptionError(
+                f"`pipeline` {name}: give one of {', '.join(METHODS)}, a .toml file written by 'twin tune', or a function of yours as "
+                "FILE.py:FUNCTION"
+            )
+    called = [_name_of(name) for name in names]
+    if len(set(called)) < len(called):
+        raise OptionError(f"`pipeline`: each needs a name of its own, got {', '.join(called)}; rename the files or functions")
+    if len({*called, *models}) < len(called) + len(models):
+        raise OptionError(f"`model`: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
+
+
+def _name_of(name: str) -> str:
+    """How a pipeline is called in the tables."""
+    if is_own(name):
+        return own_name(name)
+    return name if name in METHODS else load_detector(Path(name)).name
+
+
+def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], folder: Path, progress: Step) -> tuple[DetectorSpec, ...]:
+    """Detectors by file, by method or by function. Ours is that of the specification; others are tuned on undegraded frames and stored in
+    ``folder``.
+
+    Raises
+    ------
+    TwinError
+        A file cannot be read (`check_pipelines` finds this before any work is done), or a function fails on the first undegraded frame.
+    """
+    chosen, inputs = [], inputs_digest(spec, [frame.image for frame in frames])
+    for k, name in enumerate(names):
+        progress(k, len(names))
+        method = next((known for known in METHODS if known == name), None)
+        if is_own(name):
+            chosen.append(_check_detector(own_detector(name, spec, frames[0].form), frames[0]))
+        elif method is None:
+            chosen.append(load_detector(Path(name)))
+        elif method == "twin":
+            chosen.append(shipped_detector(spec, frames[0].form))
+        else:
+            item = Item(f"{method}-{spec.name}", (tune,), [method, inputs])
+            kept = folder / f"{item.file}.toml"
+            if not kept.is_file():
+                folder.mkdir(parents=True, exist_ok=True)
+                tuned = tune(frames, spec, method).detector
+                write_detector(kept, tuned, f"Tuned on undegraded frames.\nmade_by = {json.dumps(item.made_by)}")
+            chosen.append(load_detector(kept).model_copy(update={"name": method}))
+        progress(k + 1, len(names))
+    return tuple(chosen)
+
+
+def _check_detector(detector: DetectorSpec, frame: Frame) -> DetectorSpec:
+    """A detector whose function works on an undegraded frame. On degraded frames its failure is a result."""
+    try:
+        own_places(detector, frame)
+    except FrameError as error:
+        raise OptionError(f"`pipeline` {detector.finder}, on the undegraded frame {frame.name}: {error}") from error
+    return detector
+
+
+def consensus(spec: SensorSpec, frames: list[Frame], detectors: list[DetectorSpec]) -> tuple[RealSource, list[str]]:
+    """Frames in which at least two detectors find the pins at the same places, and the reasons why other frames were refused.
+
+    Raises
+    ------
+    FrameError
+        No frame is left.
+    """
+    finders = [make_detector(spec, detector) for detector in detectors]
+    kept, truth, refused = [], [], []
+    for frame in frames:
+        seen = np.stack([found.pins_px for found in (find(frame) for find in finders) if found.pins_px is not None])
+        middle, agreeing = _consensus(seen)
+        known = agreeing >= LEAST_AGREEING
+        if known.mean() < LEAST_KNOWN:
+            refused.append(f"{frame.name}: the detectors agree on {int(known.sum())} of {len(known)} pins only")
+            continue
+        kept.append(frame)
+        truth.append(np.where(known[:, None], middle, np.nan))
+    if not kept:
+        raise FrameError(
+            f"none of {len(frames)} frames is good enough to start from; the first: {refused[0]}; try 'twin tune', then 'twin check'"
+        )
+    return RealSource(spec, tuple(kept), np.stack(truth)), refused
+
+
+def _consensus(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N, 2) of the pins by the first of D detectors (D, N, 2), and number (N,) of detectors that agree, including the first."""
+    pitch = np.nanmedian(np.sort(np.linalg.norm(seen[0][:, None] - seen[0][None], axis=2), axis=1)[:, 1])
+    near = np.linalg.norm(seen - seen[0], axis=2) < AGREE * pitch
+    return np.where(np.isfinite(seen[0]), seen[0], np.nan), near.sum(axis=0)
+
+
+def _on_frames(case: DegradedCase) -> bool:
+    """Whether a case acts on gray levels or settings alone. Only such cases can be applied to thresholded frames."""
+    return all(c.light is None and c.spec is None for c in case.conditions)

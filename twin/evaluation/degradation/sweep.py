@@ -1,0 +1,186 @@
+"""Sweep: every case at every severity is a cell. Cells are computed in parallel and stored, and finished cells are not computed again."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scenes import load_object
+from twin.evaluation.degradation.condition import Condition, DegradedCase
+from twin.evaluation.degradation.measures import measure_frame
+from twin.evaluation.degradation.shots import DegradedFrame, RealSource, RenderedSource
+from twin.pins import DetectorSpec, Found, make_detector
+from twin.store import Item, find_json, inputs_digest, keep_json, write_bytes
+from twin.types import Frame
+from twin.workers import in_processes
+
+SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+CELLS = "cells"
+"""Name of the folder with the finished cells."""
+
+
+@dataclass(frozen=True)
+class ModelAnswer:
+    """A model's answer for a frame.
+
+    Attributes
+    ----------
+    value, low, high : (K,) float
+        The pose, and the ends of its 90 % intervals.
+    units : tuple of str
+        "mm" or "deg".
+    range : (K,) float
+        Extent of the labels that the model was trained on. An interval wider than a third of it says nothing.
+    valid : bool
+    """
+
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    units: tuple[str, ...]
+    range: np.ndarray
+    valid: bool
+
+
+Models = Callable[[RenderedSource | RealSource], dict[str, Callable[[Frame], ModelAnswer]]]
+"""Function that returns models of a source's sensor by their names; each process calls it once."""
+
+
+@dataclass(frozen=True)
+class SweepSettings:
+    """Settings of a sweep.
+
+    Attributes
+    ----------
+    source : RenderedSource or RealSource
+    detectors : tuple of DetectorSpec
+        The detectors to compare. The pictures show the results of the first one.
+    cases : tuple of Case
+    severities : tuple of float
+        Increasing; the first is 0.
+    models : callable, optional
+        Returns models by name; each process calls it once.
+    model_digests : dict of str to str
+        Digest of everything that a model's estimates depend on, by the model's name.
+    """
+
+    source: RenderedSource | RealSource
+    detectors: tuple[DetectorSpec, ...]
+    cases: tuple[DegradedCase, ...]
+    severities: tuple[float, ...] = SEVERITIES
+    models: Models | None = None
+    model_digests: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SweepCell:
+    """One case at one severity."""
+
+    case: DegradedCase
+    severity: float
+    item: Item
+
+    @property
+    def file(self) -> str:
+        """Name of the cell's files, without suffix."""
+        return self.item.file
+
+
+def cells_of(plan: SweepSettings) -> list[SweepCell]:
+    """All cells. For severity 0 there is one cell for all cases; its case is the first one."""
+    base = inputs_digest(_inputs(plan))
+    cells = []
+    for case in plan.cases:
+        for severity in plan.severities:
+            degrading = () if severity == 0 else case.conditions
+            name = case.name if degrading else "nominal"
+            values = [[c.name, c.value(severity)] for c in degrading]
+            item = Item(f"{name}-{round(1000 * severity):04d}", (__name__, *_hooks(degrading)), [base, values])
+            cells.append(SweepCell(case, severity, item))
+    return cells
+
+
+def run_sweep(plan: SweepSettings, folder: Path, *, jobs: int, progress: Callable[[int, int], None]) -> list[dict]:
+    """All rows of a sweep: one for each case, severity, frame and detector (or model).
+
+    Finished cells are stored in ``folder/cells``. Those that were computed with the same sensor, pipelines, models and code are used
+    again.
+    """
+    cells = cells_of(plan)
+    (folder / "pictures").mkdir(parents=True, exist_ok=True)
+    open_cells = {cell.file: cell for cell in cells if find_json(folder / CELLS, cell.item) is None}
+    total = len({cell.file for cell in cells})
+    progress(total - len(open_cells), total)
+    for done, _ in enumerate(in_processes(_begin, (plan, folder), list(open_cells.values()), processes=jobs)):
+        progress(total - len(open_cells) + done + 1, total)
+    return [
+        row | {"case": cell.case.name, "severity": cell.severity} for cell in cells for row in find_json(folder / CELLS, cell.item) or []
+    ]
+
+
+def _begin(plan: SweepSettings, folder: Path) -> Callable[[SweepCell], None]:
+    """Function that computes and stores a cell."""
+    cv2.setNumThreads(1)
+    return partial(_run_cell, plan, folder, plan.models(plan.source) if plan.models else {})
+
+
+def _run_cell(plan: SweepSettings, folder: Path, models: dict[str, Callable[[Frame], ModelAnswer]], cell: SweepCell) -> None:
+    rows: list[dict] = []
+    worst: tuple[float, DegradedFrame, Found] | None = None
+    detectors = [make_detector(plan.source.spec, cell.case.on_setting(spec, cell.severity)) for spec in plan.detectors]
+    for shot in plan.source.render(cell.case, cell.severity):
+        for place, detector in enumerate(detectors):
+            found = detector(shot.frame)
+            rows.append({"pipeline": detector.spec.name, "frame": shot.name, "reason": found.reason} | measure_frame(detector, found, shot))
+            if place == 0 and (worst is None or rows[-1]["recall"] < worst[0]):
+                worst = rows[-1]["recall"], shot, found
+        rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot)} for name, model in models.items()]
+    if worst is not None:
+        picture = cv2.imencode(".jpg", overlay(worst[1], worst[2]))[1].tobytes()
+        write_bytes(folder / "pictures" / f"{cell.file}.jpg", picture)
+    keep_json(folder / CELLS, cell.item, rows, default=_plain_number)
+
+
+def _plain_number(value: object) -> float:
+    """A number of NumPy as a number that JSON can represent."""
+    if isinstance(value, np.number | np.bool_):
+        return float(value)
+    raise TypeError(f"expected a number, got {type(value).__name__}")
+
+
+def _pose(estimate: Callable[[Frame], ModelAnswer], degraded: DegradedFrame) -> dict:
+    answer = estimate(degraded.frame)
+    numbers = {name: np.asarray(getattr(answer, name), float).tolist() for name in ("value", "low", "high", "range")}
+    return {**numbers, "units": list(answer.units), "valid": bool(answer.valid), "touched": degraded.touched}
+
+
+def overlay(degraded: DegradedFrame, found: Found) -> np.ndarray:
+    """Picture (H, W, 3) uint8 BGR of a frame: true pins that were found in green, missed ones in red, detections as dots."""
+    image = degraded.frame.image
+    picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
+    claims = found.claims_px
+    for px, visible in zip(degraded.caps_px, degraded.visible, strict=True):
+        if visible:
+            near = len(claims) and np.linalg.norm(claims - px, axis=1).min() < 3
+            cv2.circle(picture, tuple(int(round(v)) for v in px), 6, (90, 200, 90) if near else (60, 60, 255), 1, cv2.LINE_AA)
+    for px in claims:
+        cv2.circle(picture, tuple(int(round(v)) for v in px), 1, (0, 220, 255), -1)
+    return picture
+
+
+def _hooks(conditions: tuple[Condition, ...]) -> list[Callable]:
+    """The functions of the given conditions. A cell depends on the code of its own conditions, not on that of all conditions."""
+    return [hook for c in conditions for hook in (c.spec, c.light, c.frame, c.moves, c.hides, c.setting) if hook is not None]
+
+
+def _inputs(plan: SweepSettings) -> list[object]:
+    """All inputs that the cells have in common."""
+    source = plan.source
+    shared = [source.spec, plan.detectors, plan.model_digests]
+    if isinstance(source, RenderedSource):
+        return [*shared, [[c.name, load_object(c.object_name), c.pose] for c in source.contacts]]
+    rest = () if source.rest_frame is None or not plan.model_digests else (source.rest_frame.image,)
+    return [*shared, [[frame.name, frame.image] for frame in source.frames], source.caps_px, *rest]

@@ -1,0 +1,145 @@
+"""Page, table and figures of a comparison with real frames."""
+
+import csv
+import io
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from twin.evaluation.labelled.compare import MEASURES, Comparison, table_of
+from twin.report.charts import new_figure, write_chart
+from twin.report.numbers import number
+from twin.report.page import Page, PagePicture
+from twin.report.plots import draw_displacement, enlargement
+from twin.report.table import Column
+from twin.store import made_by, write_json, write_text
+
+
+def summary_of(found: Comparison, sensor: str) -> dict:
+    """All figures of a comparison, as ``validation.json`` holds them; ``sensor`` is the sensor's name."""
+    moved = np.linalg.norm(found.measured.pins_px - found.measured.no_contact_px, axis=-1)
+    sought = np.isfinite(found.friction_error_px)
+    friction = {}
+    if sought.any():
+        friction = {
+            "frames": int(sought.sum()),
+            "error_px": float(found.friction_error_px[sought].mean()),
+            "error_with_common_friction_px": float(np.nanmean(found.error_px[sought])),
+            "median": float(np.median(found.friction[sought])),
+        }
+    return {
+        "sensor": sensor,
+        "form": str(found.measured.form),
+        "frames": len(found.measured),
+        "mean_displacement_px": float(np.nanmean(moved)),
+        "table": table_of(found),
+        "one_friction_a_frame": friction,
+        "failed": found.failures,
+        "problems": found.measured.problems,
+    }
+
+
+def write_validation(out: Path, found: Comparison, description: str, summary: dict) -> list[Path]:
+    """Write ``index.html`` with its charts, ``frames.csv`` and ``validation.json``.
+
+    Parameters
+    ----------
+    out : Path
+        Existing folder.
+    found : Comparison
+    description : str
+        Description of the sensor, with which the page begins.
+    summary : dict
+        As ``summary_of`` gives it.
+
+    Returns
+    -------
+    list of Path
+        The files, the page first.
+    """
+    table = write_text(out / "frames.csv", _frames_csv(found))
+    figures = write_json(out / "validation.json", summary | {"made_by": made_by("twin.evaluation.labelled.compare")})
+    errors = write_chart(out / "errors.png", lambda: _draw_errors(found))
+    frames = write_chart(out / "frames.png", lambda: _draw_worst(found))
+    page = Page(
+        f"Pins of {summary['sensor']} against real frames",
+        "twin validate",
+        topic="TacTip twin: validation",
+        lead=f"{description}. Each frame's contact is simulated along the arm's own way, from its label alone, and the simulated "
+        "displacement is added to the recorded no-contact pins. Error: mean over pins and frames, px of the "
+        f"{summary['form']} frames. {summary['frames']} frames, in which pins move by "
+        f"{number(summary['mean_displacement_px'], decimals=2)} px on average.",
+    )
+    page.notice("Contacts that failed", [f"{name}: {reason}" for name, reason in summary["failed"].items()], tone="bad")
+    page.notice("Noted", summary["problems"])
+    page.section("With nothing free")
+    page.table(
+        summary["table"],
+        [Column("group", "frames whose move was"), Column("frames", "frames"), Column("error_px", "error", "px", decimals=2)],
+    )
+    for key, title in MEASURES.items():
+        _binned_table(page, summary["table"], key, title)
+    page.figures(PagePicture(errors, "Error of each frame by depth, turn and shear"))
+    if own := summary["one_friction_a_frame"]:
+        page.section(
+            "With one friction a frame",
+            f"{own['frames']} frames with an executed move: {number(own['error_px'], decimals=2)} px, each with the friction that suits it "
+            f"best (median {number(own['median'], 2)}); the same frames with the common friction: "
+            f"{number(own['error_with_common_friction_px'], decimals=2)} px.",
+        )
+    page.section("Pin by pin")
+    page.figures(PagePicture(frames, "Error of each pin in the median and in the worst frame"))
+    page.download(table, "error of each frame")
+    page.download(figures, "all figures of this page")
+    return [page.write(out / "index.html"), table, figures]
+
+
+def _binned_table(page: Page, rows: list[dict], key: str, title: str) -> None:
+    binned = [row for row in rows if key in row["by"]]
+    if not binned:
+        return
+    name, _, unit = title.partition(", ")
+    edges = binned[0]["by"][key]["edges"]
+    bins = [
+        Column(f"bin_{k}", f"{number(low, decimals=1)} to {number(high, decimals=1)}", unit, decimals=2)
+        for k, (low, high) in enumerate(pairwise(edges))
+    ]
+    shown = [{"group": row["group"]} | {f"bin_{k}": mean for k, mean in enumerate(row["by"][key]["means"])} for row in binned]
+    page.table(shown, [Column("group", "error in px"), *bins], caption=f"By {name}")
+
+
+def _frames_csv(found: Comparison) -> str:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["image_name", "executed", *MEASURES, "error_px", "own_friction", "error_own_friction_px", "failure"])
+    for k, name in enumerate(found.measured.names):
+        values = [found.by[key][k] for key in MEASURES]
+        own = [found.error_px[k], found.friction[k], found.friction_error_px[k]]
+        numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*values, *own)]
+        writer.writerow([name, int(found.executed[k]), *numbers, found.failures.get(name, "")])
+    return text.getvalue()
+
+
+def _draw_errors(found: Comparison) -> Figure:
+    figure, axes = new_figure(len(MEASURES))
+    for ax, (key, title) in zip(axes, MEASURES.items(), strict=True):
+        for label, chosen, mark in (("executed", found.executed, "o"), ("not executed", ~found.executed, "x")):
+            ax.plot(found.by[key][chosen], found.error_px[chosen], mark, markersize=4, label=label)
+        ax.set(xlabel=title, ylabel="mean pin error, px", ylim=(0, None))
+    axes[0].legend()
+    return figure
+
+
+def _draw_worst(found: Comparison) -> Figure:
+    """Draw the error of each pin in the frame with the median error and in the worst frame."""
+    order = np.argsort(np.where(np.isfinite(found.error_px), found.error_px, -1.0))[-np.isfinite(found.error_px).sum() :]
+    figure, axes = new_figure(2, panel_inch=5.0)
+    for ax, k, title in ((axes[0], order[len(order) // 2], "median frame"), (axes[1], order[-1], "worst frame")):
+        measured, simulated = found.measured.pins_px[k], found.simulated_px[k]
+        seen = np.isfinite(measured[:, 0])
+        real, made = measured[seen], simulated[seen]
+        text = f"{title}: real pin to simulated\n{found.measured.names[k]}"
+        draw_displacement(ax, real, made, text, enlarged=enlargement(real, made))
+    return figure

@@ -1,0 +1,302 @@
+"""The output of the comparison: metrics.json, tables, pictures and the page."""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from scenes.sensor import SensorSpec
+from twin.evaluation.pictures.compare import Pair, PoseAligned
+from twin.evaluation.pictures.images import difference_picture
+from twin.evaluation.pictures.spectra import RadialRow
+from twin.evaluation.pictures.statistics import RADIAL_MEASURES, TARGET, TARGET_MEASURES, Statistics
+from twin.frames import distinct_stems
+from twin.frames.images import write_image
+from twin.report.charts import sized_figure, write_chart
+from twin.report.numbers import number
+from twin.report.page import Page, PagePicture
+from twin.report.table import Cell, Column, write_rows
+from twin.store import made_by, write_json
+
+NAMES = {
+    "level": "cap level, gray",
+    "contrast": "cap contrast, gray",
+    "skin": "skin around a cap, gray",
+    "diameter_px": "cap diameter, px",
+    "eccentricity": "cap eccentricity",
+    "edge_px": "edge width 10-90 %, px",
+    "skin_level": "bare skin, gray",
+    "noise_sd": "noise, sd in gray levels",
+}
+
+
+def write_pictures(folder: Path, pairs: list[Pair], kind: str) -> list[dict]:
+    """Write the real, the rendered and the difference picture of every pair. Returns rows for the page."""
+    folder.mkdir(exist_ok=True)
+    rows = []
+    for pair, stem in zip(pairs, distinct_stems([pair.real.frame.name for pair in pairs]), strict=True):
+        row, real = _frame_row(pair, kind), pair.real.like(pair.image)
+        images = {"real": real, kind: pair.image, f"{kind}-difference": difference_picture(real, pair.image)}
+        for key, image in images.items():
+            path = folder / f"{stem}-{key}.png"
+            write_image(path, image)
+            row[key.removeprefix(f"{kind}-").replace(kind, "rendered")] = f"{folder.name}/{path.name}"
+        rows.append(row)
+    return rows
+
+
+def image_summary(pairs: list[Pair]) -> dict:
+    """Mean, median, smallest and largest value of each figure over the pairs, and fraction of renders with exactly all pins found."""
+    out = {}
+    for name in pairs[0].figures.as_dict():
+        values = np.array([getattr(pair.figures, name) for pair in pairs])
+        out[name] = {"mean": values.mean(), "median": np.median(values), "min": values.min(), "max": values.max()}
+    remainder = np.array([pair.remainder_px for pair in pairs])
+    return out | {
+        "exact_fraction": float(np.mean([pair.exact for pair in pairs])),
+        "pin_px": {"mean": remainder.mean(), "max": remainder.max()},
+    }
+
+
+def statistics_summary(found: Statistics) -> dict:
+    """Statistics as a dict of numbers."""
+    worst = {measure: found.worst(measure) for measure in RADIAL_MEASURES}
+    return {
+        "worst_relative_difference": worst,
+        "target": {"relative": TARGET, "met": {measure: worst[measure] <= TARGET for measure in TARGET_MEASURES}},
+        "scalars": {name: {"real": real, "rendered": rendered} for name, (real, rendered) in found.scalars.items()},
+        "spectrum_db": found.spectrum_db,
+        "spots": {
+            "real": len(found.real_spots.px),
+            "rendered": len(found.rendered_spots.px),
+            "paired": len(found.spots_apart_px),
+            "apart_px_median": float(np.median(found.spots_apart_px)) if len(found.spots_apart_px) else None,
+        },
+    }
+
+
+def pose_summary(found: PoseAligned) -> dict:
+    """The fitted rig, the pins' errors on both halves, and the image figures on the half that was not used for the fit."""
+    error = np.array([pair.remainder_px for pair in found.pairs])
+    test = [pair for pair, fitted in zip(found.pairs, found.fitted, strict=True) if not fitted]
+    return {
+        "rig": found.rig.model_dump(),
+        "pin_error_px": {"fitted": error[found.fitted].mean(), "test": error[~found.fitted].mean(), "test_max": error[~found.fitted].max()},
+        "test_images": image_summary(test),
+    }
+
+
+def write_tables(out: Path, pairs: list[Pair], found: Statistics, poses: PoseAligned | None) -> list[Path]:
+    """Write CSV files: figures by frame, measures by radius, spectra, spots."""
+    frames = [_frame_row(pair, "pins") for pair in pairs] + [_frame_row(pair, "pose") for pair in (poses.pairs if poses else [])]
+    radial = [vars(row) | {"relative_difference": row.difference} for row in found.radial]
+    spectrum = [
+        {"cycles_per_px": f, "real": a, "rendered": b}
+        for f, a, b in zip(found.frequency, found.real_power, found.rendered_power, strict=True)
+    ]
+    spots = [
+        {"set": kind, "x_px": x, "y_px": y, "peak": peak}
+        for kind, s in (("real", found.real_spots), ("rendered", found.rendered_spots))
+        for (x, y), peak in zip(s.px, s.peak, strict=True)
+    ]
+    tables = {"frames": frames, "radial": radial, "spectrum": spectrum, "spots": spots}
+    return [write_rows(out / f"{name}.csv", rows) for name, rows in tables.items() if rows]
+
+
+def _frame_row(pair: Pair, alignment: str) -> dict:
+    pins = {"pin_px": pair.remainder_px, "exact": pair.exact}
+    return {"image_name": pair.real.frame.name, "alignment": alignment, **pair.figures.as_dict(), **pins}
+
+
+def write_plots(folder: Path, found: Statistics) -> dict[str, Path]:
+    """Draw radial profiles and spectra. Returns the charts' paths by the keys ``radial`` and ``spectrum``."""
+    return {
+        "radial": write_chart(folder / "radial.png", lambda: _radial_figure(found)),
+        "spectrum": write_chart(folder / "spectrum.png", lambda: _spectrum_figure(found)),
+    }
+
+
+def _radial_figure(found: Statistics) -> Figure:
+    figure, axes = sized_figure((12, 6.4), 3, 2)
+    for ax, measure in zip(axes, RADIAL_MEASURES, strict=True):
+        rows = [row for row in found.radial if row.measure == measure]
+        middle = [(row.inner_px + row.outer_px) / 2 for row in rows]
+        ax.plot(middle, [row.real for row in rows], "o-", label="real")
+        ax.plot(middle, [row.rendered for row in rows], "s--", label="rendered")
+        ax.set(xlabel="distance from the disc's centre, px", ylabel=NAMES[measure])
+    axes[-1].legend()
+    return figure
+
+
+def _spectrum_figure(found: Statistics) -> Figure:
+    figure, (ax,) = sized_figure((7, 4))
+    ax.loglog(found.frequency, found.real_power, "o-", label="real")
+    ax.loglog(found.frequency, found.rendered_power, "s--", label="rendered")
+    ax.set(xlabel="cycles per px", ylabel="power, squared gray levels")
+    ax.legend()
+    return figure
+
+
+def _plain_number(value: object) -> object:
+    """A number of NumPy as a number that JSON can hold."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"expected a number, got {type(value).__name__}")
+
+
+def write_metrics(path: Path, metrics: dict) -> Path:
+    """Write ``metrics.json``; numbers of NumPy are allowed in the metrics."""
+    return write_json(path, metrics | {"made_by": made_by(__name__)}, default=_plain_number)
+
+
+def image_columns(*, mark_best: bool = False) -> list[Column]:
+    """Columns of a table of image figures."""
+    return [
+        Column("psnr_db", "PSNR, colour", "dB", decimals=2, best="most" if mark_best else ""),
+        Column("psnr_gray_db", "PSNR, gray", "dB", decimals=2, best="most" if mark_best else ""),
+        Column("ssim", "SSIM, colour", decimals=3, best="most" if mark_best else ""),
+        Column("ssim_gray", "SSIM, gray", decimals=3, best="most" if mark_best else ""),
+        Column("flip", "FLIP", "0: none", decimals=3, best="least" if mark_best else ""),
+        Column("psnr_whole_db", "PSNR, whole frame", "dB", decimals=2, best="most" if mark_best else ""),
+    ]
+
+
+def write_page(
+    path: Path, spec: SensorSpec, metrics: dict, plots: dict[str, Path], pairs: list[dict], poses: list[dict], found: Statistics
+) -> Path:
+    """Write index.html, whose pictures are files beside it.
+
+    Parameters
+    ----------
+    path : Path
+    spec : SensorSpec
+    metrics : dict
+        Content of metrics.json.
+    plots : dict of str to Path
+        As `write_plots` gives them.
+    pairs, poses : list of dict
+        Rows of `write_pictures`, pin-aligned and pose-aligned.
+    found : Statistics
+    """
+    disc = metrics["disc"]
+    center = ", ".join(number(v, decimals=1) for v in disc["center_px"])
+    page = Page(
+        f"Realism of {spec.name}",
+        "twin realism",
+        topic="TacTip twin: realism",
+        lead=f"{spec.description}. {metrics['frames']} real frames beside their renders ({metrics['quality']} quality), over the lens disc "
+        f"of radius {number(disc['radius_px'], decimals=1)} px about ({center}) px.",
+    )
+    page.notice("Frames refused", [f"{row['image_name']}: {row['reason']}" for row in metrics["refused"]], tone="bad")
+    page.section(
+        "Pin-aligned: camera and light on trial",
+        "The skin is fitted to the pins of each real frame, so the render shows the same caps in the same places, without the mechanics.",
+    )
+    _image_table(page, metrics["pin_aligned"])
+    page.text(_detector_text(spec.pins.count, metrics))
+    if fixed := metrics["fixed_residual"]:
+        page.text(
+            f"On the caps and their edges the renders miss {number(fixed['levels'], decimals=1)} gray levels (rms), of whose power "
+            f"{number(100 * fixed['share'], decimals=1)} % is a picture fixed to each cap, which a better relief could hold."
+        )
+    _statistics_section(page, metrics["statistics"], plots, found)
+    if metrics["pose_aligned"]:
+        error = metrics["pose_aligned"]["pin_error_px"]
+        page.section(
+            "Pose-aligned: the whole twin from the label",
+            "Depth and two turns of each label become a contact; the arm's kinematics were fitted to the pins of one half of the frames. "
+            f"Mean pin error: {number(error['fitted'], decimals=2)} px on that half, {number(error['test'], decimals=2)} px on the other "
+            f"(at most {number(error['test_max'], decimals=2)} px in a frame). The figures below are those of the other half.",
+        )
+        _image_table(page, metrics["pose_aligned"]["test_images"])
+    page.section("Frame by frame, pin-aligned")
+    _frame_figures(page, pairs, "skin misses the pins by")
+    if poses:
+        page.section("Frame by frame, pose-aligned")
+        _frame_figures(page, poses, "mean pin error")
+    page.download(path.with_name("metrics.json"), "all figures of this page")
+    page.download(path.with_name("frames.csv"), "figures of each frame")
+    page.download(path.with_name("radial.csv"), "measures by distance from the centre")
+    page.download(path.with_name("spectrum.csv"), "radial power spectra")
+    if metrics["statistics"]["spots"]["real"] or metrics["statistics"]["spots"]["rendered"]:
+        page.download(path.with_name("spots.csv"), "bright spots")
+    return page.write(path)
+
+
+def _image_table(page: Page, summary: dict) -> None:
+    parts = {"mean": "mean", "median": "median", "min": "least", "max": "largest"}
+    columns = [Column("of", "over the lens disc"), *image_columns()]
+    page.table([{"of": said} | {c.key: summary[c.key][part] for c in columns[1:]} for part, said in parts.items()], columns)
+
+
+def _detector_text(count: int, metrics: dict) -> str:
+    def percent(share: float) -> str:
+        return number(100 * share, decimals=1)
+
+    said = (
+        f"The detector, with the parameters of the real frames, finds exactly all {count} pins in "
+        f"{percent(metrics['pin_aligned']['exact_fraction'])} % of the renders."
+    )
+    told = metrics["two_sample"]
+    if not told:
+        return said
+    shares = "; ".join(
+        f"{name}: {percent(test['accuracy'])} % (95 % interval {percent(test['low'])} to {percent(test['high'])} %)"
+        for name, test in told.items()
+    )
+    return (
+        f"{said} Networks assign these shares of the patches of unseen frames to the right set, where 50 % would mean that they cannot "
+        f"distinguish real frames from renders: {shares}."
+    )
+
+
+def _statistics_section(page: Page, summary: dict, plots: dict[str, Path], found: Statistics) -> None:
+    bins = [row for row in found.radial if row.measure == RADIAL_MEASURES[0]]
+    page.section(
+        "Statistics by distance from the disc's centre",
+        f"Means over {len(bins)} bins with equally many caps. Target for cap level, diameter and edge width: within {100 * TARGET:.0f} % "
+        "in each bin (green: met, red: missed).",
+    )
+    page.figures(PagePicture(plots["radial"], "Six measures of caps against the distance from the disc's centre, real and rendered"))
+    columns = [Column(f"bin_{k}", f"{row.inner_px:.0f} to {row.outer_px:.0f}", "px", decimals=1, signed=True) for k, row in enumerate(bins)]
+    rows = []
+    for measure in RADIAL_MEASURES:
+        of_measure = [row for row in found.radial if row.measure == measure]
+        rows.append({"measure": NAMES[measure]} | {f"bin_{k}": _difference(row) for k, row in enumerate(of_measure)})
+    page.table(rows, [Column("measure", "rendered against real, %"), *columns])
+    scalars = [{"measure": NAMES[key], **pair} for key, pair in summary["scalars"].items()]
+    page.table(
+        scalars, [Column("measure", "over all frames"), Column("real", "real", decimals=2), Column("rendered", "rendered", decimals=2)]
+    )
+    spots = summary["spots"]
+    away = spots["apart_px_median"]
+    page.text(
+        f"Steady bright spots: {spots['real']} in the real frames, {spots['rendered']} in the rendered ones; {spots['paired']} have a "
+        f"counterpart{'' if away is None else f', {number(away, decimals=2)} px away in the median'}. The radial power spectra differ by "
+        f"{number(summary['spectrum_db'], decimals=2)} dB (rms over log frequency)."
+    )
+    page.figures(PagePicture(plots["spectrum"], "Radial power spectra of real and rendered frames", width_px=760))
+
+
+def _difference(row: RadialRow) -> Cell:
+    tone: Literal["", "good", "bad"] = "good" if abs(row.difference) <= TARGET else "bad"
+    return Cell(100 * row.difference, tone if row.measure in TARGET_MEASURES else "")
+
+
+def _frame_figures(page: Page, rows: list[dict], what: str) -> None:
+    for row in rows:
+        name = row["image_name"]
+        said = (
+            f"rendered: PSNR {number(row['psnr_db'], decimals=1)} dB, SSIM {number(row['ssim'], decimals=3)}, "
+            f"FLIP {number(row['flip'], decimals=3)}; {what} {number(row['pin_px'], decimals=2)} px"
+            f"{'' if row['exact'] else '; the detector loses pins'}"
+        )
+        page.figures(
+            PagePicture(Path(row["real"]), f"Real frame {name}", f"{name}, real", "frame"),
+            PagePicture(Path(row["rendered"]), f"Render of {name}", said, "frame"),
+            PagePicture(
+                Path(row["difference"]), f"Difference for {name}", "rendered less real, twice amplified about middle gray", "frame"
+            ),
+            layout="row",
+        )

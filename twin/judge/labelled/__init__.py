@@ -1,6 +1,0 @@
-"""Comparison of the twin's pins with those of labelled real frames."""
-
-from twin.judge.labelled.compare import Comparison, compare, table_of
-from twin.judge.labelled.model import ContactModel, MeasuredFrames, measure_frames
-
-__all__ = ["Comparison", "ContactModel", "MeasuredFrames", "compare", "measure_frames", "table_of"]

@@ -150,7 +150,7 @@ class ExperimentSpec(Section):
         """Largest coordinate along the approach before the move, mm. The tap is deepest at this coordinate."""
         return self.ranges()[f"pose_{self.axis + 1}"][1] - self.ranges()[f"move_{self.axis + 1}"][0]
 
-    def widened(self) -> "ExperimentSpec":
+    def widen(self) -> "ExperimentSpec":
         """The experiment in its wide form; itself if it has none."""
         if self.wide is None:
             return self
@@ -175,7 +175,7 @@ class ExperimentSpec(Section):
         if start_mm > 0:
             raise ValueError(f"the deepest tap would begin {start_mm:g} mm inside the object; give a longer tap and as much more clear")
         try:
-            self.widened()
+            self.widen()
         except ValidationError as error:
             raise ValueError(f"wide: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
         return self

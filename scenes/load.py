@@ -136,7 +136,7 @@ def load_experiment(name_or_path: str | Path | ExperimentSpec, *, wide: bool = F
         return load_experiment(spec.wider)
     if wide and spec.wide is None:
         raise SpecError(f"experiment '{spec.name}' has no larger ranges; leave `wide` out, or give its file a section [wide]")
-    return spec.widened() if wide else spec
+    return spec.widen() if wide else spec
 
 
 def load_randomisation(name_or_path: str | Path | RandomisationSpec) -> RandomisationSpec:

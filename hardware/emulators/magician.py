@@ -17,7 +17,7 @@ import numpy as np
 
 from hardware.arms.magician_wire import Message, take_message
 from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Faults, Range
-from hardware.emulators.magician_controller import START_JOINTS_DEG, MagicianController
+from hardware.emulators.magician_controller import START_JOINTS_DEG, EmulatedController
 from twin.errors import TwinError
 
 LOG = logging.getLogger(__name__)
@@ -72,7 +72,7 @@ class MagicianEmulator(Emulator):
         time_scale: float = 1.0,
     ) -> None:
         self.faults = Faults(FAULTS, RANGES, faults)
-        self.arm = MagicianController(self.faults, joints_deg=joints_deg, time_scale=time_scale)
+        self.arm = EmulatedController(self.faults, joints_deg=joints_deg, time_scale=time_scale)
         self.device = ""
         self._link = link
         self._ends: tuple[int, int] | None = None  # file descriptors: our end, the client's end

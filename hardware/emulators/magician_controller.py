@@ -94,7 +94,7 @@ class Queued:
     time_s: float
 
 
-class MagicianController:
+class EmulatedController:
     """Executes the commands of the arm. Every method may be called from any thread."""
 
     def __init__(self, faults: Faults, *, joints_deg: Sequence[float] = START_JOINTS_DEG, time_scale: float = 1.0) -> None:
@@ -244,10 +244,10 @@ class MagicianController:
             here = self.track.pose(np.inf)
             end = np.array([x, y, z, 0, 0, 0]) if absolute else here + [x, y, z, 0, 0, 0]
             end[5] = here[5]
-            acceleration, speed, *_ = self._stored(Id.CP_PARAMS)
+            acceleration, speed, *_ = self._parameters_of(Id.CP_PARAMS)
             return self._go(end, Speeds(speed, speed, acceleration, acceleration), begins_s, linear=True)
         elif message.id == Id.HOME:
-            x, y, z, r = self._stored(Id.HOME_PARAMS)
+            x, y, z, r = self._parameters_of(Id.HOME_PARAMS)
             return self._go_to(np.array([x, y, z, 0, 0, r]), Speeds(HOME_SPEED_DEG_S, HOME_SPEED_DEG_S), begins_s)
         elif message.id == Id.WAIT:
             return begins_s + struct.unpack("<I", params)[0] / 1000.0
@@ -271,7 +271,7 @@ class MagicianController:
         if mode in (Ptp.MOVJ_XYZ, Ptp.MOVJ_XYZ_INC):
             return self._go_to(target, turn, begins_s)
         if mode in (Ptp.JUMP_XYZ, Ptp.JUMP_ANGLE, Ptp.JUMP_MOVL_XYZ):
-            height, limit = self._stored(Id.PTP_JUMP_PARAMS)
+            height, limit = self._parameters_of(Id.PTP_JUMP_PARAMS)
             top = min(max(here[2], target[2]) + height, limit)
             over, above = here.copy(), target.copy()
             over[2] = above[2] = top
@@ -286,7 +286,7 @@ class MagicianController:
         lines = circle(self.track.pose(np.inf), via, end)
         if len(lines) == 2:  # on one straight line
             return self._alarm(ARC_PLACES, begins_s)
-        speed, turn, _, _ = self._stored(Id.ARC_PARAMS)
+        speed, turn, _, _ = self._parameters_of(Id.ARC_PARAMS)
         for pose in lines:
             begins_s = self._go(pose, Speeds(speed, turn), begins_s, linear=True)
         return begins_s
@@ -296,8 +296,8 @@ class MagicianController:
         if not 1 <= command <= 8:
             return
         axis, sign = (command - 1) // 2, 1 if command % 2 else -1
-        speed = self._stored(Id.JOG_JOINT_PARAMS if joints else Id.JOG_COORDINATE_PARAMS)[axis]
-        speed *= self._stored(Id.JOG_COMMON_PARAMS)[0] / 100.0 * self._time_scale
+        speed = self._parameters_of(Id.JOG_JOINT_PARAMS if joints else Id.JOG_COORDINATE_PARAMS)[axis]
+        speed *= self._parameters_of(Id.JOG_COMMON_PARAMS)[0] / 100.0 * self._time_scale
         start = self.track.joints_deg(begins_s) if joints else self.track.pose(begins_s)
         at, length = (axis if joints or axis < 3 else 5), JOG_DEG if joints or axis == 3 else JOG_MM
         while length > 0.5 and speed > 0:  # the target is the last place within the limits
@@ -336,13 +336,13 @@ class MagicianController:
         return begins_s
 
     def _ptp_speeds(self) -> tuple[Speeds, Speeds]:
-        speed, acceleration = np.clip(self._stored(Id.PTP_COMMON_PARAMS), 0.01, 100.0) / 100.0
-        xyz, r, xyz2, r2 = self._stored(Id.PTP_COORDINATE_PARAMS)
-        joints = self._stored(Id.PTP_JOINT_PARAMS)
+        speed, acceleration = np.clip(self._parameters_of(Id.PTP_COMMON_PARAMS), 0.01, 100.0) / 100.0
+        xyz, r, xyz2, r2 = self._parameters_of(Id.PTP_COORDINATE_PARAMS)
+        joints = self._parameters_of(Id.PTP_JOINT_PARAMS)
         line = Speeds(speed * xyz, speed * r, acceleration * xyz2, acceleration * r2)
         return line, Speeds(speed * joints[0], speed * min(joints[:4]), acceleration * joints[4], acceleration * min(joints[4:]))
 
-    def _stored(self, id: Id) -> tuple:
+    def _parameters_of(self, id: Id) -> tuple:
         return struct.unpack(STORED[id][0], self._params[id])
 
     def _set_tool(self, x_mm: float, time_s: float) -> None:

@@ -52,7 +52,7 @@ class Layout(Section, ABC):
         """
         raise ValueError("this layout has no size; write its keys into a specification")
 
-    def resized(self, by: int) -> str:
+    def resize(self, by: int) -> str:
         """Text for ``from_text`` of a layout that is larger by ``by`` rings, or rows and columns.
 
         Raises
@@ -88,7 +88,7 @@ class LatticeLayout(Layout):
 
     @classmethod
     @abstractmethod
-    def seen(cls, labelled: NDArray[np.bool_], shown: NDArray[np.bool_]) -> tuple[Self, NDArray[np.intp]] | None:
+    def find(cls, labelled: NDArray[np.bool_], shown: NDArray[np.bool_]) -> tuple[Self, NDArray[np.intp]] | None:
         """The layout with the most labels and the fewest empty places in view, and its places (N,) in the lattice.
 
         Parameters
@@ -136,7 +136,7 @@ class RingedLayout(LatticeLayout):
             raise ValueError("the number of rings is missing or no number")
         return cls(rings=int(size))
 
-    def resized(self, by: int) -> str:
+    def resize(self, by: int) -> str:
         return str(self.rings + by)
 
     @classmethod

@@ -56,7 +56,7 @@ class Grid(LatticeLayout):
             raise ValueError("the numbers of columns and rows are missing or no numbers")
         return cls(columns=int(columns), rows=int(rows))
 
-    def resized(self, by: int) -> str:
+    def resize(self, by: int) -> str:
         return f"{self.columns + by}x{self.rows + by}"
 
     @classmethod
@@ -69,7 +69,7 @@ class Grid(LatticeLayout):
         return middle, middle + np.array([1, SIDE, -1, -SIDE])
 
     @classmethod
-    def seen(cls, labelled: NDArray[np.bool_], shown: NDArray[np.bool_]) -> tuple[Self, NDArray[np.intp]] | None:
+    def find(cls, labelled: NDArray[np.bool_], shown: NDArray[np.bool_]) -> tuple[Self, NDArray[np.intp]] | None:
         there = labelled.reshape(SIDE, SIDE)
         gain = np.where(there, 1, np.where(shown.reshape(SIDE, SIDE), -1, 0))
         sums = np.pad(gain.cumsum(axis=0), ((1, 0), (0, 0)))

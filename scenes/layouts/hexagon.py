@@ -42,7 +42,7 @@ class Hexagon(RingedLayout):
         return np.round(np.column_stack([x - r / 2, r])).astype(int)
 
     @classmethod
-    def seen(cls, labelled: NDArray[np.bool_], shown: NDArray[np.bool_]) -> tuple[Self, NDArray[np.intp]] | None:
+    def find(cls, labelled: NDArray[np.bool_], shown: NDArray[np.bool_]) -> tuple[Self, NDArray[np.intp]] | None:
         q, taken = cls.axial(), np.flatnonzero(labelled)
         best, most, rings = 0, -np.inf, 0
         for middle in taken:

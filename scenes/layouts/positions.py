@@ -50,7 +50,7 @@ class Positions(Layout):
     def from_text(cls, size: str) -> Self:
         return cls(positions=_places_in(Path(size)))
 
-    def resized(self, by: int) -> str:
+    def resize(self, by: int) -> str:
         raise SpecError("a layout of given positions has no rings; correct its CSV file")
 
     @model_validator(mode="after")

@@ -31,7 +31,7 @@ class Rings(RingedLayout):
         return f"in {self.rings} rings"
 
     @classmethod
-    def seen(cls, labelled: NDArray[np.bool_], shown: NDArray[np.bool_]) -> tuple[Self, NDArray[np.intp]] | None:
+    def find(cls, labelled: NDArray[np.bool_], shown: NDArray[np.bool_]) -> tuple[Self, NDArray[np.intp]] | None:
         ring_of_place, rings = cls.ring_of_place(), 0
         for ring in range(1, MOST_RINGS + 1):  # from the middle outwards, as far as they are seen
             there = labelled & (ring_of_place == ring)

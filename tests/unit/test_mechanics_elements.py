@@ -327,7 +327,7 @@ def test_no_volumetric_locking_in_bending(kind):
 def test_kept_stiffness_is_made_anew_where_the_body_has_changed_and_nowhere_else(body):
     elements, rest = elements_of(body, material()), body[0]
     kept, none = KeptStiffness(elements, 0.01), np.zeros((0, 8, 3, 3))
-    kept.update(elements, rest, none, 0.0, anew=False)
+    kept.update(elements, rest, none, 0.0, fresh=False)
     first = kept.blocks.copy()
     near = {"rtol": 1e-5, "atol": 1e-6 * np.abs(first).max()}
     assert np.allclose(first, stiffness_blocks(elements, rest), **near)
@@ -336,15 +336,15 @@ def test_kept_stiffness_is_made_anew_where_the_body_has_changed_and_nowhere_else
     moved = rest.copy()
     moved[corner] += 0.2 * np.ptp(rest[elements.cells.controls[one]], axis=0).min()
     touched = (elements.cells.controls == corner).any(axis=1)
-    kept.update(elements, moved, none, 0.0, anew=False)
+    kept.update(elements, moved, none, 0.0, fresh=False)
     exact = stiffness_blocks(elements, moved)
     assert np.array_equal(kept.blocks[~touched], first[~touched])
     assert np.allclose(kept.blocks[one], exact[one], **near) and not np.allclose(kept.blocks[one], first[one], **near)
     slightly = rest + 1e-3 * (moved - rest)
-    kept.update(elements, rest, none, 0.0, anew=True)
-    kept.update(elements, slightly, none, 0.0, anew=False)
+    kept.update(elements, rest, none, 0.0, fresh=True)
+    kept.update(elements, slightly, none, 0.0, fresh=False)
     assert np.array_equal(kept.blocks, first)
-    kept.update(elements, slightly, none, 0.0, anew=True)
+    kept.update(elements, slightly, none, 0.0, fresh=True)
     assert not np.array_equal(kept.blocks[one], first[one])
 
 
@@ -353,6 +353,6 @@ def test_kept_stiffness_follows_a_changed_pressure_law_or_stress(body):
     other = elements_of(body, material(young_mpa=1.4))
     kept, none, given = KeptStiffness(elements, 0.01), np.zeros((0, 8, 3, 3)), given_stress(elements.cells)
     for kind, stress, pressure in ((elements, none, 0.0), (elements, none, 0.2), (other, none, 0.2), (other, given, 0.2)):
-        kept.update(kind, rest, stress, pressure, anew=False)
+        kept.update(kind, rest, stress, pressure, fresh=False)
         exact = stiffness_blocks(kind, rest, given=stress, pressure_mpa=pressure)
         assert np.allclose(kept.blocks, exact, rtol=1e-5, atol=1e-6 * np.abs(exact).max())

@@ -120,7 +120,7 @@ class ContactEstimator:
         nodes_px = self._any.at_known_rest().nodes_in(frames)
         best = max(self.parts.values(), key=lambda part: part.rest.usual_share(nodes_px))
         rest, undecided = best.rest.of_contacts(nodes_px, "these contacts")
-        return self._with({name: part.counted_from_told(rest).noting(undecided) for name, part in self.parts.items()}), rest is not None
+        return self._with({name: part.with_rest_pins(rest).noting(undecided) for name, part in self.parts.items()}), rest is not None
 
     def _with(self, parts: dict[str, PoseEstimator]) -> "ContactEstimator":
         found = copy(self)

@@ -263,9 +263,9 @@ class PoseEstimator:
     def rest_from_contacts(self, nodes_px: np.ndarray, name: str) -> tuple["PoseEstimator", bool]:
         """As ``at_rest_of``, from the pins (M, N, 2), px, of contacts; errors call them ``name``."""
         rest, undecided = self.rest.of_contacts(nodes_px, name)
-        return self.counted_from_told(rest).noting(undecided), rest is not None
+        return self.with_rest_pins(rest).noting(undecided), rest is not None
 
-    def counted_from_told(self, rest: Reference | None) -> "PoseEstimator":
+    def with_rest_pins(self, rest: Reference | None) -> "PoseEstimator":
         """The same model with the rest places that contacts told, or with the known ones."""
         return self.at_known_rest() if rest is None else self.counted_from(rest)
 

@@ -78,7 +78,7 @@ class Widening:
         lost = 1.0 + LOST_WIDENS * lost_share if lost_share > LOST_USUAL else 1.0
         if verdict.notes and self.domain is not None:
             half = np.maximum(half, self.domain.least) * verdict.factor + verdict.added
-        half = half * lost * self.unmeasured + excess + self._assumed(value)
+        half = half * lost * self.unmeasured + excess + self._assumption_widths(value)
         stiffness = self.sensor.skin.stiffness_factor  # the true forces may be larger or smaller by this factor
         more, less = value * (stiffness - 1), value * (1 / stiffness - 1)
         low = value - half + np.where(self._force, np.minimum(more, less), 0.0)
@@ -91,7 +91,7 @@ class Widening:
         """Whether the model was trained on simulated contacts of a sensor whose contacts were never calibrated."""
         return self.domain is not None and self.domain.simulated and self.sensor.rig is None
 
-    def _assumed(self, value: np.ndarray) -> np.ndarray:
+    def _assumption_widths(self, value: np.ndarray) -> np.ndarray:
         """Half widths (K,) that are due to what is only assumed of the sensor, for estimates (K,)."""
         lengths = ASSUMED_MM * self.sensor.skin.outer_radius_mm + ASSUMED_RADIUS * np.abs(value)
         angles = np.where(self._force, 0.0, ASSUMED_DEG)

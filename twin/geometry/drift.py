@@ -38,7 +38,7 @@ def drift(points: np.ndarray, others: np.ndarray, motions: np.ndarray, stiffness
     outliers = max(OUTLIERS, 1 - n / count)
     for _ in range(ROUNDS):
         uniform = 2 * np.pi * variance * outliers / (1 - outliers) * n / count
-        mass, drawn, square = _expected(places, others, variance, uniform)
+        mass, drawn, square = _expect_masses(places, others, variance, uniform)
         inner = motions.T @ (mass[:, None] * motions) + stiffness * variance * unit
         places = points + motions @ np.linalg.solve(inner, motions.T @ (drawn - mass[:, None] * points))
         moved = square - 2 * (drawn * places).sum() + (mass * (places**2).sum(axis=1)).sum()
@@ -49,7 +49,7 @@ def drift(points: np.ndarray, others: np.ndarray, motions: np.ndarray, stiffness
 
 
 @compiled()
-def _expected(places: np.ndarray, others: np.ndarray, variance: float, uniform: float) -> tuple[np.ndarray, np.ndarray, float]:
+def _expect_masses(places: np.ndarray, others: np.ndarray, variance: float, uniform: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Mass (N,) of the others that each point draws, their sum (N, 2), and the sum of their squared distances from the origin."""
     n = len(places)
     mass, drawn, share, square = np.zeros(n), np.zeros((n, 2)), np.zeros(n), 0.0

@@ -275,7 +275,7 @@ class Problem:
     def stiffness(self, control: FloatArray, border: FloatArray, kept: list[KeptStiffness], *, fresh: bool) -> None:
         """Update the elements' tangents to a state; ``fresh`` recomputes all of them."""
         for number, (kind, given, blocks) in enumerate(zip(self.body.kinds, self._given, kept, strict=True)):
-            blocks.update(kind, control, given, border[1] if number else 0.0, anew=fresh)
+            blocks.update(kind, control, given, border[1] if number else 0.0, fresh=fresh)
 
     def volume(self, control: FloatArray, out: FloatArray) -> float:
         """Increase of the gel's volume, mm^3; adds its gradient to ``out``."""

@@ -331,7 +331,7 @@ def _with_larger(candidates: list[Candidate], spots: list[Bumps]) -> list[Candid
     shape = first.shape
     if not isinstance(shape, LatticeLayout) or len(shape.sides()) != 1:  # of several sides it is not known which has more pins
         return candidates
-    pins = layout_from(f"{first.layout}:{shape.resized(1)}")
+    pins = layout_from(f"{first.layout}:{shape.resize(1)}")
     if any((c.pins.layout, c.pins.complete_count) == (pins.layout, pins.count) for c in candidates[1:2]):
         return candidates
     seen = [shown for one in spots if (shown := _layout_look(pins, family(type(shape)), one)) is not None]
@@ -435,11 +435,11 @@ def _first_guesses(by: Family, spots: list[Bumps]) -> list[tuple[PinsSpec, list[
 
 def _part(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[PinsSpec, LayoutInFrame] | None:
     """The part of a lattice in a frame: the layout, and its pins in the frame."""
-    part = by.kind.seen(spot >= 0, _family_in_view(by, spots, spot)) if by.kind else None
-    return None if part is None else (_named(part[0]), _place_lattice(spots, spot, by, part[1]))
+    part = by.kind.find(spot >= 0, _family_in_view(by, spots, spot)) if by.kind else None
+    return None if part is None else (_pins_of(part[0]), _place_lattice(spots, spot, by, part[1]))
 
 
-def _named(shape: LatticeLayout) -> PinsSpec:
+def _pins_of(shape: LatticeLayout) -> PinsSpec:
     """Pins of a layout."""
     name = next(name for name, kind in PinsSpec.parts().items() if kind is type(shape))
     return PinsSpec.model_validate({"layout": name, **shape.model_dump()})

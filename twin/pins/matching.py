@@ -112,7 +112,7 @@ Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
 """Blobs by square cell: first blob of each cell, next blob in the same cell, x0, y0, columns, rows (see ``_buckets``)."""
 
 
-class Layout(NamedTuple):
+class LayoutArrays(NamedTuple):
     """The reference's arrays that matching needs: rest (N, 2) px, neighbours (N, k), spacing (N,) px, slots (S,), ring_ends (R + 1,).
 
     Ring i's pins are ``slots[ring_ends[i - 1]:ring_ends[i]]``, in order around the layout, -1 where one is missing.
@@ -170,7 +170,7 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray, *, second_
     Match
         The best labelling that was found. Its score states how good it is.
     """
-    found = _grown(reference, px, area_px2)
+    found = _grow_labelling(reference, px, area_px2)
     return found if not second_look or proven(reference, px, found.blob) else look_again(reference, px, area_px2, found)
 
 
@@ -245,7 +245,7 @@ def _assign_drifted(places: np.ndarray, blobs: np.ndarray) -> np.ndarray:
     return found
 
 
-def _grown(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
+def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
     """The best labelling that is grown from pairs."""
     n = len(reference.pins_px)
     nothing = Match(np.full(n, -1), np.full((n, 2), np.nan), -1.0)
@@ -681,7 +681,7 @@ def _assign(n: int, blob_count: int, pins_list: list[int], blobs_list: list[int]
     return blob
 
 
-def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: Buckets, cell: float) -> Match:
+def _refine(layout: LayoutArrays, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: Buckets, cell: float) -> Match:
     """Re-assign every pin to the blobs near where its neighbours predict it, until nothing changes."""
     rest, neighbours, spacing, slots, ring_ends = layout
     for _ in range(REFINE_ROUNDS):
@@ -699,7 +699,7 @@ def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, 
     return Match(blob, predicted, float(found.sum() - residual2.sum() - TURN_WEIGHT * len(rest) * turned))
 
 
-def _adopt(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+def _adopt(layout: LayoutArrays, px: np.ndarray, area: np.ndarray, blob: np.ndarray, predicted: np.ndarray) -> np.ndarray:
     """Give lost pins free blobs of a cap's size slightly outside the gate. Predictions at the rim are extrapolated and less precise."""
     neighbours, spacing = layout.neighbours, layout.spacing
     lost = np.flatnonzero((blob < 0) & np.isfinite(predicted[:, 0]))
@@ -747,5 +747,5 @@ def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
                     yield pair
 
 
-def _layout(reference: Reference) -> Layout:
-    return Layout(reference.pins_px, reference.neighbours, reference.spacing_px, reference.slots, reference.ring_ends)
+def _layout(reference: Reference) -> LayoutArrays:
+    return LayoutArrays(reference.pins_px, reference.neighbours, reference.spacing_px, reference.slots, reference.ring_ends)

@@ -50,7 +50,7 @@ def enlarge_layout(pins: PinsSpec, by: int) -> str:
     SpecError
         The layout is a list of positions, or would become too small.
     """
-    text = f"{pins.layout}:{pins.shape.resized(by)}"
+    text = f"{pins.layout}:{pins.shape.resize(by)}"
     layout_from(text)  # raises an error if there is no such layout
     return text
 

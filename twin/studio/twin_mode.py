@@ -261,7 +261,7 @@ class TwinMode(PageMode):
                 for key, sign in zip(keys, (-1, +1), strict=True):
                     label = f"{readable_name(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
                     command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # viser defines it as a literal
-                    command.on_trigger(partial(self._keyed, name, sign))
+                    command.on_trigger(partial(self._handle_key, name, sign))
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
         gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(lambda: self.play(tap_and_shear(self._wish))))
 
@@ -272,7 +272,7 @@ class TwinMode(PageMode):
 
         return moved
 
-    def _keyed(self, name: str, sign: int, event: object) -> None:
+    def _handle_key(self, name: str, sign: int, event: object) -> None:
         self.nudge(name, sign)
 
     def _own_friction(self) -> float:

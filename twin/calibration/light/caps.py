@@ -33,18 +33,18 @@ DAMPING = 0.8
 # Weight of the prior of contrast and skin level. Both are free, so the weight is only large enough to make the equations solvable.
 FREE = 1e-6
 
-# shoot(spec, frames) gives the captured renders (H, W[, 3]) uint8 of the frames' states, without noise.
-Shoot = Callable[[SensorSpec, list[Aligned]], Sequence[np.ndarray]]
+# render(spec, frames) gives the captured renders (H, W[, 3]) uint8 of the frames' states, without noise.
+RenderCaps = Callable[[SensorSpec, list[Aligned]], Sequence[np.ndarray]]
 
 
-def fit_caps(spec: SensorSpec, frames: list[Aligned], shoot: Shoot) -> SensorSpec:
+def fit_caps(spec: SensorSpec, frames: list[Aligned], render: RenderCaps) -> SensorSpec:
     """Correct the reflectance and the outline of every cap once.
 
     Parameters
     ----------
     spec : SensorSpec
     frames : list of Aligned
-    shoot : callable
+    render : callable
         Renders the frames' states under a specification.
 
     Returns
@@ -52,7 +52,7 @@ def fit_caps(spec: SensorSpec, frames: list[Aligned], shoot: Shoot) -> SensorSpe
     SensorSpec
         The specification with new ``appearance.cap_levels``, ``cap_shapes`` and ``cap_offsets``.
     """
-    rendered, look, count = shoot(spec, frames), spec.appearance, spec.pins.count
+    rendered, look, count = render(spec, frames), spec.appearance, spec.pins.count
     level = np.array([_levels(spec.response, f, f.image) / _levels(spec.response, f, r) for f, r in zip(frames, rendered, strict=True)])
     level = np.nan_to_num(_median(level), nan=1.0)
     levels = np.clip(np.array(look.cap_levels or np.ones(count)) * level**DAMPING, *LEVEL_BOUNDS)

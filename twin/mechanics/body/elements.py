@@ -102,7 +102,7 @@ class Elements:
     def find_changed(self, control_mm: FloatArray, at: FloatArray, strain: float) -> IntArray:
         """Elements (k,) in which an entry of F differs from ``at`` (m, 8, 3, 3) by more than ``strain``; ``at`` receives their new F."""
         cells = self.cells
-        return np.flatnonzero(_changed(cells.controls, cells.gradients, np.ascontiguousarray(control_mm), strain, at))
+        return np.flatnonzero(_find_changed(cells.controls, cells.gradients, np.ascontiguousarray(control_mm), strain, at))
 
     @property
     def _arrays(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -139,10 +139,10 @@ class KeptStiffness:
         self._at = np.empty((count, 8, 3, 3))
         self._made_of: tuple[Elements, float] | None = None
 
-    def update(self, kind: Elements, control_mm: FloatArray, stress: FloatArray, pressure_mpa: float, *, anew: bool) -> None:
-        """Update the blocks to a state; with ``anew`` all of them are computed. The other arguments are as in ``Elements.stiffness``."""
+    def update(self, kind: Elements, control_mm: FloatArray, stress: FloatArray, pressure_mpa: float, *, fresh: bool) -> None:
+        """Update the blocks to a state; with ``fresh`` all of them are computed. The other arguments are as in ``Elements.stiffness``."""
         same = self._made_of is not None and self._made_of[0] is kind and self._made_of[1] == pressure_mpa
-        if anew or len(stress) or not same:
+        if fresh or len(stress) or not same:
             self._at[:] = _FAR_STRAIN
         self._made_of = kind, pressure_mpa
         which = kind.find_changed(control_mm, self._at, self._kept_strain)
@@ -164,7 +164,7 @@ def _gradient(x: FloatArray, grad: FloatArray, f: FloatArray) -> None:
 
 
 @compiled(fastmath=True)
-def _changed(elements: IntArray, gradients: FloatArray, control: FloatArray, strain: float, at: FloatArray) -> BoolArray:
+def _find_changed(elements: IntArray, gradients: FloatArray, control: FloatArray, strain: float, at: FloatArray) -> BoolArray:
     x, f = np.zeros((3, elements.shape[1])), np.zeros((8, 3, 3))
     out = np.zeros(len(elements), np.bool_)
     for m in range(len(elements)):

@@ -39,9 +39,9 @@ class Window:
             Transmittance for radiance, without the factor n^2 of the denser medium.
         """
         place = origin + direction * ((self.back - origin.z) / direction.z)
-        in_window = _bent(dr, mi, direction, 1 / self.window_index)
+        in_window = _refract(dr, mi, direction, 1 / self.window_index)
         place = place + in_window * ((self.front - self.back) / in_window.z)
-        in_gel = _bent(dr, mi, in_window, self.window_index / self.gel_index)
+        in_gel = _refract(dr, mi, in_window, self.window_index / self.gel_index)
         return place, in_gel, self.transmittance(dr, direction.z, in_window.z, in_gel.z)
 
     def connect(self, dr: ModuleType, mi: ModuleType, point: DrJit, light: DrJit) -> tuple[DrJit, DrJit, DrJit]:
@@ -113,7 +113,7 @@ class Window:
         return fresnel(self.gel_index / self.window_index, cos_gel, cos_window)
 
 
-def _bent(dr: ModuleType, mi: ModuleType, direction: DrJit, ratio: float) -> DrJit:
+def _refract(dr: ModuleType, mi: ModuleType, direction: DrJit, ratio: float) -> DrJit:
     x, y = direction.x * ratio, direction.y * ratio
     return mi.Vector3f(x, y, dr.sqrt(dr.maximum(1 - x * x - y * y, 1e-8)))
 

@@ -10,6 +10,7 @@ detectors     Detector DetectorSpec
 sensors       PinsSpec Layout LatticeLayout MaterialLaw
 mechanics     SkinSolver
 optics        Preview project rest_pins
+contracts     ArmContract CameraContract LayoutContract MaterialContract ConditionContract ModelContract TaskContract
 
 The pages below `docs/how-to` show how to add each of them. Each name is imported when it is first used.
 """
@@ -20,9 +21,12 @@ from twin.lazy import offered_name
 
 _PLACES = {
     "Arm": "hardware.arms.arm",
+    "ArmContract": "twin.contracts",
     "ArmState": "hardware.arms.arm",
     "BaseArm": "hardware.arms.arm",
+    "CameraContract": "twin.contracts",
     "Condition": "twin.evaluation.degradation.condition",
+    "ConditionContract": "twin.contracts",
     "Connection": "hardware.errors",
     "Detector": "twin.pins.detector",
     "DetectorSpec": "twin.pins.detector_spec",
@@ -33,12 +37,15 @@ _PLACES = {
     "FrameSource": "hardware.cameras.source",
     "LatticeLayout": "scenes.layouts.base",
     "Layout": "scenes.layouts.base",
+    "LayoutContract": "twin.contracts",
     "LiveSource": "hardware.cameras.reader",
     "MG400": "hardware.arms.mg400",
+    "MaterialContract": "twin.contracts",
     "MaterialLaw": "scenes.materials.base",
     "Mg400Emulator": "hardware.emulators.mg400",
     "Mg400Ports": "hardware.arms.mg400",
     "Model": "training.models.part",
+    "ModelContract": "twin.contracts",
     "PictureView": "twin.evaluation.degradation.condition",
     "PinModel": "training.models.part",
     "PinsSpec": "scenes.pins",
@@ -48,6 +55,7 @@ _PLACES = {
     "SensorModel": "twin.estimate",
     "SkinSolver": "twin.mechanics",
     "Task": "training.environments.tasks",
+    "TaskContract": "twin.contracts",
     "capture": "hardware.cameras.reader",
     "over_channels": "twin.evaluation.degradation.condition",
     "project": "twin.camera.projection",

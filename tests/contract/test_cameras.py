@@ -2,6 +2,7 @@
 
 import re
 import socket
+import tempfile
 import threading
 import time
 import urllib.request
@@ -30,6 +31,7 @@ from hardware.live.examining import frames_of
 from hardware.live.lerobot import LeRobotCamera
 from hardware.rig.geometry import PlacedObject
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
+from twin.contracts import CameraContract
 from twin.errors import FrameError
 from twin.frames.images import write_image
 from twin.records.session import SessionWriter
@@ -108,28 +110,38 @@ def source(request, tmp_path):
     yield open_camera(make(tmp_path / "recorded"))
 
 
-def test_it_opens_once_and_closes_for_good(source: FrameSource):
-    assert not source.is_connected
-    with pytest.raises((DeviceNotConnectedError, DeviceError)):
-        source.read(timeout_s=0.01)
-    with source:
-        assert source.is_connected
-        with pytest.raises(DeviceAlreadyConnectedError):
-            source.connect()
-        assert source.read(timeout_s=WAIT_S).image.dtype == np.uint8
-    assert not source.is_connected
-    source.disconnect()  # without effect
+class OfRecording(CameraContract):
+    """The contract on pictures that were recorded."""
+
+    def open(self, stack):
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        return open_camera(self.make(Path(folder) / "recorded"))
 
 
-def test_read_gives_each_frame_once_and_in_order(source: FrameSource):
-    with source:
-        frames = [source.read(timeout_s=WAIT_S) for _ in range(4)]
-    numbers, times = [f.sequence for f in frames], [f.time_s for f in frames]
-    assert all(a < b for a, b in zip(numbers[:-1], numbers[1:], strict=True))
-    assert all(a <= b for a, b in zip(times[:-1], times[1:], strict=True))
-    assert all(f.form == source.form and f.image.shape == frames[0].image.shape for f in frames)
-    if source.is_live:
-        assert abs(frames[-1].time_s - time.monotonic()) < WAIT_S
+class TestFolder(OfRecording):
+    make = staticmethod(make_folder)
+
+
+class TestVideo(OfRecording):
+    make = staticmethod(make_video)
+
+
+class TestSession(OfRecording):
+    make = staticmethod(make_session)
+
+
+class TestHttp(CameraContract):
+    def open(self, stack):
+        return open_camera(stack.enter_context(CameraEmulator(NoisyCamera())).url)
+
+
+class TestTwin(CameraContract):
+    wait_s = WAIT_S
+
+    def open(self, stack):
+        arm, camera = twin_camera()
+        stack.callback(arm.disconnect)
+        return camera
 
 
 def test_the_latest_may_be_read_again_and_a_recording_ends(source: FrameSource):

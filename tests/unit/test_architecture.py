@@ -53,6 +53,7 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "demo",
     "studio",
     "cli",
+    "contracts",
     "extend",
     "__main__",
 )
@@ -60,7 +61,7 @@ EXTRAS = ("cluster", "models", "records", "rl", "studio")  # what the extra `all
 BY_HAND = {"pyoidn"}  # installed by hand for the one measurement that needs it, as its head says
 NAMED_OTHERWISE = {"rerun": "rerun-sdk"}  # imported under another name than it is installed by, and not installed everywhere
 # The outermost layer may join everything, and nothing joins it: the command line (test_command_line), and the names that Python offers.
-COMPOSITION_ROOTS = ("twin/cli/", "twin/__init__.py", "twin/__main__.py", "twin/extend.py")
+COMPOSITION_ROOTS = ("twin/cli/", "twin/__init__.py", "twin/__main__.py", "twin/extend.py", "twin/contracts.py")
 
 
 @cache

@@ -49,7 +49,7 @@ class Counted(SkinSolver):
 
 def sealed_contact(monkeypatch, per_mm3):
     """State and contact of one press, the gel's volume in another unit."""
-    monkeypatch.setattr("twin.mechanics.solver.Elements", lambda *args, **options: Rescaled(*args, per_mm3=per_mm3, **options))
+    monkeypatch.setattr("twin.mechanics.body.elements.Elements", lambda *args, **options: Rescaled(*args, per_mm3=per_mm3, **options))
     spec = load_sensor("mg400-127")
     spec = spec.model_copy(update={"gel": spec.gel.model_copy(update={"sealed": True, "poisson_ratio": 0.45})})
     solver = Counted(spec, resolution=Resolution(10))

@@ -94,7 +94,7 @@ PREDICTED_WEIGHT = 0.1
 Stiffnesses = tuple[tuple[float, float], ...]
 STIFFNESS: Stiffnesses = ((2.0, 2.0), (1.5, 1.0), (3.0, 3.0), (1.0, 0.5))
 """Widths beta, in spacings, and weights lambda of coherence that are tried in turn until a labelling proves itself. Where the grown
-labelling turns nothing over, only the first is."""
+labelling turns nothing over and loses few pins, only the first is."""
 DRIFT_REACH = 0.6
 """Largest distance from a pin to its blob after the drift, in spacings."""
 DRIFT_SPECK = 0.2
@@ -186,7 +186,8 @@ def look_again(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found
     """The labelling to which the pins drift, or ``found`` if that holds as many pins without turning a triangle over."""
     before = found.blob >= 0
     folded = not before.any() or turned_over(reference, px[found.blob], before).any()
-    labelled = _drift_labelling(reference, px, area_px2, STIFFNESS if folded else STIFFNESS[:1])
+    doubtful = folded or before.mean() < 1 - MOST_LOST
+    labelled = _drift_labelling(reference, px, area_px2, STIFFNESS if doubtful else STIFFNESS[:1])
     if labelled is None:
         return found
     blob, places_px = labelled

@@ -311,12 +311,9 @@ class ModelContract:
         made = {"experiment": "surface-2d", "sensor": "mg400-127", "count": 12, "states": "all", "elements": 6, "workers": 1}
         twin.make_dataset(**made, images="recording", quality="drawn", out=tmp_path / "sim")
         twin.train(model=self.name, sensor="mg400-127", data=tmp_path / "sim", split=-1, out=tmp_path / "run", **self.options)
-        (estimates, again) = (
-            twin.predict(model=tmp_path / "run", frames=tmp_path / "sim", out=tmp_path / f"{k}.csv").to_table() for k in range(2)
-        )
-        assert estimates.keys() == again.keys()
-        for column, values in estimates.items():
-            assert np.array_equal(values, again[column], equal_nan=np.asarray(values).dtype.kind == "f"), column
+        first, again = ([estimate for _, estimate in twin.predict(tmp_path / "run", tmp_path / "sim")] for _ in range(2))
+        assert first and [each.reason for each in first] == [each.reason for each in again]
+        assert all(np.array_equal(one.value, other.value, equal_nan=True) for one, other in zip(first, again, strict=True))
 
 
 class TaskContract:

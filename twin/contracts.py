@@ -22,17 +22,20 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-import twin
 from hardware.arms.arm import Arm
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
+from scenes import load_sensor
 from scenes.layouts.base import Layout
 from scenes.materials.base import MaterialLaw
 from scenes.pins import PinsSpec
 from twin.camera.projection import project
+from twin.cli.learning import make_dataset, predict, train
 from twin.evaluation.degradation.condition import Condition, DegradedCase, PictureView
 from twin.geometry.pins import rest_pins
 from twin.optics.preview import Preview
+from twin.pins import Pipeline
+from twin.simulator import Simulator
 
 BAD_TARGETS = (np.zeros(3), "home", None, [np.nan] * 6, [[0.0] * 6], [10**400] * 6, np.ones(6) * 1j, ["1"] * 6, [2e4, 0, 0, 0, 0, 0])
 SEVERITIES = (0.0, 0.3, 1.0)
@@ -252,12 +255,12 @@ class LayoutContract:
         assert apart.min() > 0.05 * np.abs(places).max() / np.sqrt(len(places))
 
     def test_the_pipeline_finds_all_its_pins_in_a_rasterised_frame(self) -> None:
-        sensor = twin.load_sensor("ur5-331")
+        sensor = load_sensor("ur5-331")
         plain = sensor.appearance.model_copy(update={"cap_levels": (), "cap_shapes": (), "cap_offsets": (), "relief": None})
         pins = PinsSpec(layout=self.name, cap_diameter_mm=1.0, **self.layout.model_dump())
         spec = sensor.model_copy(update={"pins": pins, "appearance": plain})
-        rendered = twin.Simulator(spec, quality="drawn").render_rest()
-        observation = twin.Pipeline(spec, rendered.frame.form)(rendered.frame)
+        rendered = Simulator(spec, quality="drawn").render_rest()
+        observation = Pipeline(spec, rendered.frame.form)(rendered.frame)
         assert observation.valid and observation.found == self.layout.count, observation.reason
 
 
@@ -285,7 +288,7 @@ class ConditionContract:
     sensor = "mg400-127"
 
     def test_severity_0_changes_nothing_and_severity_1_does(self) -> None:
-        spec, case = twin.load_sensor(self.sensor), DegradedCase((self.condition,))
+        spec, case = load_sensor(self.sensor), DegradedCase((self.condition,))
         view = PictureView.of(spec, project(spec.view, rest_pins(spec.geometry).caps_mm))
         assert case.on_spec(spec, 0.0) == spec and case.on_spec(spec, 1.0) is not None
         light = Preview(spec).render()
@@ -309,9 +312,9 @@ class ModelContract:
 
     def test_it_trains_estimates_and_is_loaded_again(self, tmp_path: Path) -> None:
         made = {"experiment": "surface-2d", "sensor": "mg400-127", "count": 12, "states": "all", "elements": 6, "workers": 1}
-        twin.make_dataset(**made, images="recording", quality="drawn", out=tmp_path / "sim")
-        twin.train(model=self.name, sensor="mg400-127", data=tmp_path / "sim", split=-1, out=tmp_path / "run", **self.options)
-        first, again = ([estimate for _, estimate in twin.predict(tmp_path / "run", tmp_path / "sim")] for _ in range(2))
+        make_dataset(**made, images="recording", quality="drawn", out=tmp_path / "sim")
+        train(model=self.name, sensor="mg400-127", data=tmp_path / "sim", split=-1, out=tmp_path / "run", **self.options)
+        first, again = ([estimate for _, estimate in predict(tmp_path / "run", tmp_path / "sim")] for _ in range(2))
         assert first and [each.reason for each in first] == [each.reason for each in again]
         assert all(np.array_equal(one.value, other.value, equal_nan=True) for one, other in zip(first, again, strict=True))
 

@@ -4,7 +4,7 @@ arms          Arm ArmState BaseArm FEEDBACK_AGE_S MG400 Mg400Ports Mg400Emulator
 cameras       FrameSource LiveSource DevicePicture ReadFailed capture
 devices       DeviceError Connection
 models        Estimate SensorModel Model PinModel Recipe register_model refuse_sizes
-tasks         Task
+tasks         Task Start StepOutcome WorldState standing_on
 degradations  Condition PictureView over_channels
 detectors     Detector DetectorSpec
 sensors       PinsSpec Layout LatticeLayout MaterialLaw
@@ -54,14 +54,18 @@ _PLACES = {
     "Recipe": "training.models.recipes",
     "SensorModel": "twin.estimate",
     "SkinSolver": "twin.mechanics",
+    "Start": "training.environments.tasks",
+    "StepOutcome": "training.environments.tasks",
     "Task": "training.environments.tasks",
     "TaskContract": "twin.contracts",
+    "WorldState": "training.environments.tasks",
     "capture": "hardware.cameras.reader",
     "over_channels": "twin.evaluation.degradation.condition",
     "project": "twin.camera.projection",
     "refuse_sizes": "training.models.part",
     "register_model": "training.models:register",
     "rest_pins": "twin.geometry.pins",
+    "standing_on": "training.environments.world",
 }
 """By public name: its module, and its name there if that is another."""
 __all__ = sorted(_PLACES)

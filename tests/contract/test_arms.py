@@ -7,7 +7,7 @@ import pytest
 from arms import ARMS, bench
 
 from hardware.arms.open_arm import open_arm
-from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
+from hardware.errors import DeviceError, DeviceNotConnectedError
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 from twin.contracts import ArmContract

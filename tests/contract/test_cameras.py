@@ -25,7 +25,7 @@ from hardware.cameras.source import FrameSource
 from hardware.cameras.twin import TwinCamera
 from hardware.cameras.uvc import UvcCamera, UvcSettings, apply_settings, exposed_s
 from hardware.emulators.camera import CameraEmulator
-from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.errors import DeviceError, StaleDataError
 from hardware.live.doctor import cameras
 from hardware.live.examining import frames_of
 from hardware.live.lerobot import LeRobotCamera

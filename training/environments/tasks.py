@@ -51,7 +51,7 @@ class WorldState:
     ----------
     touch : Touch
         Contact of the tools if the sensors were rigid.
-    reading : Felt
+    reading : ContactReading
     T_work, T_object : (B, 4, 4) float
     goal : (B, G) float
     action : (B, A) float

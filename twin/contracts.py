@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+import twin
 from hardware.arms.arm import Arm
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
@@ -30,7 +31,6 @@ from scenes.layouts.base import Layout
 from scenes.materials.base import MaterialLaw
 from scenes.pins import PinsSpec
 from twin.camera.projection import project
-from twin.cli.learning import make_dataset, predict, train
 from twin.evaluation.degradation.condition import Condition, DegradedCase, PictureView
 from twin.geometry.pins import rest_pins
 from twin.optics.preview import Preview
@@ -259,7 +259,7 @@ class LayoutContract:
         plain = sensor.appearance.model_copy(update={"cap_levels": (), "cap_shapes": (), "cap_offsets": (), "relief": None})
         pins = PinsSpec(layout=self.name, cap_diameter_mm=1.0, **self.layout.model_dump())
         spec = sensor.model_copy(update={"pins": pins, "appearance": plain})
-        rendered = Simulator(spec, quality="drawn").render_rest()
+        rendered = Simulator(spec, quality="rasterised").render_rest()
         observation = Pipeline(spec, rendered.frame.form)(rendered.frame)
         assert observation.valid and observation.found == self.layout.count, observation.reason
 
@@ -312,9 +312,9 @@ class ModelContract:
 
     def test_it_trains_estimates_and_is_loaded_again(self, tmp_path: Path) -> None:
         made = {"experiment": "surface-2d", "sensor": "mg400-127", "count": 12, "states": "all", "elements": 6, "workers": 1}
-        make_dataset(**made, images="recording", quality="drawn", out=tmp_path / "sim")
-        train(model=self.name, sensor="mg400-127", data=tmp_path / "sim", split=-1, out=tmp_path / "run", **self.options)
-        first, again = ([estimate for _, estimate in predict(tmp_path / "run", tmp_path / "sim")] for _ in range(2))
+        twin.make_dataset(**made, images="recording", quality="rasterised", out=tmp_path / "sim")
+        twin.train(model=self.name, sensor="mg400-127", data=tmp_path / "sim", split=-1, out=tmp_path / "run", **self.options)
+        first, again = ([estimate for _, estimate in twin.predict(tmp_path / "run", tmp_path / "sim")] for _ in range(2))
         assert first and [each.reason for each in first] == [each.reason for each in again]
         assert all(np.array_equal(one.value, other.value, equal_nan=True) for one, other in zip(first, again, strict=True))
 

@@ -77,7 +77,7 @@ def render_contact(
         Output folder; it is created if missing.
     form : Form
         Form of the frame: the camera's own, or that of the sensor's recordings.
-    quality : {"drawn", "preview", "standard", "high"}
+    quality : {"rasterised", "preview", "standard", "high"}
         Samples per pixel.
     seed : int
         Seed of the renderer and of the camera's noise.

@@ -25,7 +25,7 @@ from twin.optics.preview import Shading
 from twin.optics.render import Renderer
 from twin.progress import Progress, silent, stage
 from twin.store import write_npz
-from twin.types import ContactState, FloatArray, Form, Frame, Quality
+from twin.types import ContactState, FloatArray, Form, Frame, Quality, present_value
 
 _SAME_MM = 1e-6
 """Largest distance between the same place of two states of one sensor, where nothing moves, mm: rounding."""
@@ -76,7 +76,7 @@ class Simulator:
     Parameters
     ----------
     spec : SensorSpec
-    quality : {"drawn", "preview", "standard", "high"}
+    quality : {"rasterised", "preview", "standard", "high"}
         Quality of the renderer.
     solver : SkinSolver, optional
         A solver of the same sensor. Default: a new one with the usual resolution.
@@ -96,6 +96,7 @@ class Simulator:
     ) -> None:
         if not isinstance(spec, SensorSpec):
             raise SpecError(f"a SensorSpec is expected, got {spec!r}; give load_sensor({str(spec)!r})")
+        quality = present_value(quality)
         if quality not in get_args(Quality):
             raise OptionError(f"`quality`: expected {', '.join(get_args(Quality))}, got {quality!r}")
         self.spec = spec

@@ -9,6 +9,8 @@ from typing import Any, Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.errors import warn_once
+
 FloatArray: TypeAlias = NDArray[np.floating]
 IntArray: TypeAlias = NDArray[np.integer]
 BoolArray: TypeAlias = NDArray[np.bool_]
@@ -16,8 +18,20 @@ ComplexArray: TypeAlias = NDArray[np.complexfloating]
 ImageArray: TypeAlias = NDArray[np.uint8]
 """Gray or RGB levels of a frame."""
 
-Quality = Literal["drawn", "preview", "standard", "high"]
-"""Quality of a render: drawn with exact edges and without noise, or path-traced with an increasing number of samples."""
+Quality = Literal["rasterised", "preview", "standard", "high"]
+"""Quality of a render: rasterised with exact edges and without noise, or path-traced with an increasing number of samples."""
+FORMER_VALUES = {"drawn": "rasterised"}
+"""Present names of values of options, by their names in version 1."""
+
+
+def present_value(value: Any) -> Any:
+    """The present name of a value of an option; any other value is returned as it is."""
+    if not isinstance(value, str) or value not in FORMER_VALUES:
+        return value
+    warn_once(f"the value {value!r} is now called {FORMER_VALUES[value]!r}; the old name still works")
+    return FORMER_VALUES[value]
+
+
 FINE = 20
 """Number of elements across the skin for calibrations and data sets. In the deepest contacts the displacements of the outer pins differ by
 1 % from those with 32 elements."""

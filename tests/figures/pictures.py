@@ -80,7 +80,7 @@ def residual(work: Path) -> Measured:
 
 @job(
     "render.details",
-    "twin realism DIR --sensor ur5-331 --fitted 6 --quality drawn --without DETAIL --out OUT",
+    "twin realism DIR --sensor ur5-331 --fitted 6 --quality rasterised --without DETAIL --out OUT",
     sensors=("ur5-331",),
     code=("training.studies.realism",),
     recordings=("ur5-331-raw",),
@@ -92,7 +92,7 @@ def details(work: Path) -> Measured:
     found: Measured = {}
     for name in ("all", *DETAILS):
         left_out = [] if name == "all" else ["--without", name]
-        metrics = judged(work, work / name, "--quality", "drawn", *left_out)
+        metrics = judged(work, work / name, "--quality", "rasterised", *left_out)
         found |= {f"{name}_{key}": Value(metrics["pin_aligned"][key]["mean"], unit) for key, unit in RENDERED.items()}
         found[f"{name}_told_apart"] = Value(metrics["two_sample"]["small"]["accuracy"])
     return found

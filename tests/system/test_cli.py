@@ -82,7 +82,7 @@ def test_graph_of_a_frame_and_of_its_pins(rendered, pins, tmp_path, kind, edges)
 
 @pytest.mark.slow
 def test_the_releases_method_on_a_frame_in_the_recordings_form(tmp_path):
-    drawn = ("--form", "recording", "--quality", "drawn")
+    drawn = ("--form", "recording", "--quality", "rasterised")
     done = twin("render", "--sensor", "mg400-127", "--object", "plane", "--indent-mm", 0, *drawn, "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     assert cv2.imread(str(tmp_path / "frame.png"), cv2.IMREAD_UNCHANGED).shape == (256, 256)

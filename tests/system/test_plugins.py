@@ -36,7 +36,7 @@ def run(installed: Path, *arguments: str, cwd: Path) -> subprocess.CompletedProc
 
 CODE = """
 import numpy as np, twin
-simulator = twin.Simulator(twin.load_sensor("example-tip"), quality="drawn")
+simulator = twin.Simulator(twin.load_sensor("example-tip"), quality="rasterised")
 state = simulator.press(twin.load_object("example-ball"), twin.ContactPose(1.0))
 simulator.render(state).save("frames")
 print("force", state.force_n[2] > 0)

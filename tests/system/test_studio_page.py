@@ -78,7 +78,7 @@ def test_a_drag_moves_skin_picture_numbers_and_estimate_together(client):
     client.wait(lambda u: "90 % interval" in u.html, WAIT_S)
     update = drag(client, 2.5)
     assert update.pictures >= 2 and {"/sensor/skin", "/sensor/pins", "/object"} <= update.nodes
-    assert "127 of 127" in update.html and "usual mesh" in update.html and "drawn" in update.html
+    assert "127 of 127" in update.html and "usual mesh" in update.html and "rasterised" in update.html
 
 
 def test_answers_come_in_order_and_each_shows_its_own_pose(client):

@@ -121,7 +121,7 @@ def test_a_picture_in_which_the_pipeline_finds_no_pins_is_said():
     spec = load_sensor("mg400-127")
     aside = spec.pipeline.raw.model_copy(update={"mask_center_px": (60.0, 60.0), "mask_radius_px": 50.0})
     blind = spec.model_copy(update={"pipeline": spec.pipeline.model_copy(update={"raw": aside})})
-    simulator = Simulator(blind, quality="drawn")
+    simulator = Simulator(blind, quality="rasterised")
     rendered = simulator.render(simulator.rest)
     said = RenderedContact(simulator.rest, rendered, look_at(simulator, rendered), []).lines()
     assert "note: the pipeline can't use the picture: too few pins" in said[1]

@@ -167,7 +167,10 @@ def test_the_command_line_computes_nothing(path):
 
 
 def test_nothing_takes_the_command_line_for_a_library():
-    own = {CLI, *(ROOT / "tests" / "unit" / f"test_{name}.py" for name in ("progress", "door"))}  # what is no command is tested apart
+    own = {
+        CLI,
+        *(ROOT / "tests" / "unit" / f"test_{name}.py" for name in ("progress", "door", "former_names")),
+    }  # what is no command is tested apart
     for package in (*OURS, "tests"):
         for path in sorted((ROOT / package).rglob("*.py")):
             source = path.read_text()

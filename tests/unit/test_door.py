@@ -155,7 +155,7 @@ def test_pairs_of_a_pose_may_be_arrays():
 
 @pytest.fixture(scope="module")
 def simulator():
-    return twin.Simulator(twin.load_sensor("mg400-127"), quality="drawn")
+    return twin.Simulator(twin.load_sensor("mg400-127"), quality="rasterised")
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +168,7 @@ def test_no_contact_moves_nothing_and_less_is_refused(simulator):
     assert np.array_equal(simulator.press(plane, twin.ContactPose(0.0)).nodes_mm, simulator.rest.nodes_mm)
     with pytest.raises(ContactError, match="would not touch"):
         simulator.press(plane, twin.ContactPose(-1.0))
-    with pytest.raises(OptionError, match="`quality`: expected drawn"):
+    with pytest.raises(OptionError, match="`quality`: expected rasterised"):
         twin.Simulator(simulator.spec, quality="best")
 
 
@@ -187,7 +187,7 @@ def test_many_contacts_are_those_of_one_after_the_other(simulator, pressed):
 @pytest.mark.parametrize("other", ["mg400-331", "ur5-331", "pad-round"])
 def test_the_state_of_another_sensor_is_not_rendered(other, pressed):
     with pytest.raises(ContactError, match=f"not one of {other}"):
-        twin.Simulator(twin.load_sensor(other), quality="drawn").render(pressed)
+        twin.Simulator(twin.load_sensor(other), quality="rasterised").render(pressed)
 
 
 def test_results_are_one_line_a_table_and_files(simulator, pressed, tmp_path):

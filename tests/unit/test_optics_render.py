@@ -194,7 +194,7 @@ def test_a_drawn_picture_is_the_traced_one(small, aperture_mm):
     rest = rest_pins(spec.geometry)
     moved = rest.base_mm * [0.02, 0.03, 0.0] - [0.0, 0.0, 0.5]
     state = PinRest(rest.base_mm + moved, rest.axis, rest.caps_mm + moved)
-    traced, drawn = Renderer(spec, spp=128).render(state), Renderer(spec, quality="drawn").render(state)
+    traced, drawn = Renderer(spec, spp=128).render(state), Renderer(spec, quality="rasterised").render(state)
     places = project(spec.view, state.caps_mm)
     apart_px = np.linalg.norm(centroids(drawn, places) - centroids(traced, places), axis=1)
     light, within_px = 0.015, 0.06  # of the caps' light; measured: 0.0123, 0.052
@@ -204,7 +204,7 @@ def test_a_drawn_picture_is_the_traced_one(small, aperture_mm):
 
 def test_what_cannot_be_rendered_is_refused(small):
     with pytest.raises(RenderError, match="spp=4"):
-        Renderer(small, quality="drawn", spp=4)
+        Renderer(small, quality="rasterised", spp=4)
     with pytest.raises(RenderError, match="quality"):
         Renderer(small, quality="best")
     with pytest.raises(RenderError, match="window_px"):

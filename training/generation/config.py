@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError
 
 from scenes.base import NonNegative, Section
 from scenes.experiment import ExperimentSpec
@@ -16,7 +16,7 @@ from twin.errors import ContactError, DatasetError
 from twin.frames.folders import pictures_folder
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
-from twin.types import FINE, Form, Quality
+from twin.types import FINE, Form, Quality, present_value
 
 Images = Literal["raw", "gray", "recording", "none"]
 States = Literal["end", "all"]
@@ -54,7 +54,7 @@ class GenerationConfig(Section):
     seed: Annotated[int, Field(ge=0)] = 0
     images: Images = "raw"
     states: States = "end"
-    quality: Quality = "standard"
+    quality: Annotated[Quality, BeforeValidator(present_value)] = "standard"
     across: Annotated[int, Field(ge=6, le=64, multiple_of=2)] = FINE
 
     @property

@@ -148,7 +148,7 @@ def _simulator(config: GenerationConfig, sensor: SensorSpec, shading: Shading | 
 
 def _shading(config: GenerationConfig, text: str, sensor: SensorSpec) -> Shading | None:
     """The shading of the nominal sensor. It is used for the drawn sensor, too, for which nothing is path-traced."""
-    if config.quality != "drawn" or config.images == "none":
+    if config.quality != "rasterised" or config.images == "none":
         return None
     shading = _nominal(text).renderer.preview.shading
     return shading if sensor.geometry == config.sensor.geometry else replace(shading, skin=np.ones((1, 1)))

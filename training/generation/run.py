@@ -127,8 +127,8 @@ def config_for(
         The object; the experiment's own by default. For its friction on this sensor see ``friction_between``.
     seed : int, optional
         Seed of all random numbers; the experiment's own by default.
-    quality : {"drawn", "preview", "standard", "high"}, optional
-        By default ``drawn``, which is nearer to a converged picture than the few samples for which a data set has time.
+    quality : {"rasterised", "preview", "standard", "high"}, optional
+        By default ``rasterised``, which is nearer to a converged picture than the few samples for which a data set has time.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def config_for(
         seed=experiment.seed if seed is None else seed,
         images=images,
         states=states,
-        quality=quality or "drawn",
+        quality=quality or "rasterised",
         across=across,
     )
     frame_size(sensor, config.form)

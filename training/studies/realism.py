@@ -89,7 +89,7 @@ def compare_with_renders(
         Most frames that are used; they are spread evenly over the folder.
     fitted, without
         As in ``run_realism``.
-    quality : {"drawn", "preview", "standard", "high"}
+    quality : {"rasterised", "preview", "standard", "high"}
     test : bool
         Train the two-sample test (minutes).
     thorough : bool

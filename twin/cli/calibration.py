@@ -368,7 +368,8 @@ def realism(
     How to read it: no render can do better than PSNR and SSIM of two real frames
     with the same contact. Two-sample accuracy is the share of patches of unseen
     frames that a small network puts into the right set: at 100 % it always
-    distinguishes real from rendered, at 50 % never. --thorough trains a stronger network, too,
+    distinguishes real from rendered, at 50 % never. --thorough trains a
+    stronger network, too,
     and both on two halves of the real frames, which should give 50 %. What is
     missed on the caps and fixed to each of them is what a better relief could
     hold. --without removes a measured detail (ablation): the caps' relief, the

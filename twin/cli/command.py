@@ -26,6 +26,7 @@ from typer.models import ArgumentInfo, ParameterInfo
 from twin.cli.options import Force, Formerly, print_result
 from twin.errors import OptionError, extras_named, warn_once
 from twin.progress import Progress, silent
+from twin.types import FORMER_VALUES, present_value
 
 Made = TypeVar("Made")
 
@@ -54,7 +55,7 @@ class App(typer.Typer):
             options = inspect.signature(work).parameters
             forced = [Parameter("force", Parameter.KEYWORD_ONLY, default=False, annotation=Force)] if writes(options) else []
             former = former_names(options)
-            known = [*(each for each in options.values() if each.name != "progress"), *forced]
+            known = [*(_with_former_values(each) for each in options.values() if each.name != "progress"), *forced]
             known += [_hidden(old, options[name]) for old, name in former.items()]
 
             @wraps(work)
@@ -158,8 +159,24 @@ def _hidden(old: str, option: Parameter) -> Parameter:
     mark = copy(next(each for each in option.annotation.__metadata__ if isinstance(each, ParameterInfo)))
     prefixes = ("", "no-") if _plain(option) is bool else ("",)
     mark.param_decls = ("/".join(f"--{prefix}{old.replace('_', '-')}" for prefix in prefixes),)
-    mark.hidden = True
+    mark.default, mark.hidden = ..., True  # in ``Annotated`` the default holds the option's first name
     return Parameter(old, Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[_plain(option) | None, mark])
+
+
+def _with_former_values(option: Parameter) -> Parameter:
+    """The option; a choice also takes the names that its values had in version 1."""
+    values = [value for part in (_plain(option), *get_args(_plain(option))) if get_origin(part) is Literal for value in get_args(part)]
+    if not set(values) & set(FORMER_VALUES.values()):
+        return option
+
+    def parse(value: str) -> str:
+        if (chosen := present_value(value)) not in values:
+            raise typer.BadParameter(f"{value!r} is not one of {', '.join(map(repr, values))}.")
+        return chosen
+
+    (mark,) = (copy(each) for each in option.annotation.__metadata__)
+    mark.parser, mark.metavar, mark.autocompletion = parse, f"<{'|'.join(values)}>", lambda: values
+    return option.replace(annotation=Annotated[_plain(option), mark])
 
 
 def _plain(option: Parameter) -> Any:
@@ -223,7 +240,7 @@ def convert_option(name: str, kind: Any, value: Any) -> Any:
             raise OptionError(f"`{name}`: expected {len(parts)} numbers, got {value!r}")
         return tuple(convert_option(name, part, each) for part, each in zip(parts, value, strict=True))
     if get_origin(kind) is Literal or isinstance(kind, type) and issubclass(kind, Enum):
-        allowed = parts or list(kind)
+        allowed, value = parts or list(kind), present_value(value)
         if value not in allowed:
             raise OptionError(f"`{name}`: expected {' or '.join(map(str, allowed))}, got {value!r}")
         return value if parts else kind(value)

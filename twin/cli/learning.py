@@ -73,7 +73,7 @@ def make_dataset(
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of all draws; the experiment's own if not given")] = None,
     workers: Workers = CORES,
     scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
-    quality: Annotated[Quality | None, typer.Option(help=QUALITY, show_default="drawn")] = None,
+    quality: Annotated[Quality | None, typer.Option(help=QUALITY, show_default="rasterised")] = None,
     residual: Residual = False,
     elements: Elements = FINE,
     also: Also = None,

@@ -26,9 +26,9 @@ from twin.optics.variants.variant import DrJit, VariantChoice, choose_variant, u
 from twin.store import cached_arrays, write_bytes
 from twin.types import FloatArray, IntArray, PinState, Quality
 
-SAMPLES = {"drawn": 0, "preview": 4, "standard": 16, "high": 64}
+SAMPLES = {"rasterised": 0, "preview": 4, "standard": 16, "high": 64}
 """Number of samples per pixel, by quality."""
-SCALAR_SAMPLES = {"drawn": 0, "preview": 1, "standard": 4, "high": 16}
+SCALAR_SAMPLES = {"rasterised": 0, "preview": 1, "standard": 4, "high": 16}
 """Number of samples per pixel of the scalar variant, which is several times slower."""
 SHADING_QUALITY: Quality = "standard"
 """Quality of the path-traced frame to which a stored shading is fitted."""
@@ -50,7 +50,7 @@ class Renderer:
     spec : SensorSpec
     variant : str or VariantChoice, optional
         Variant for `twin.optics.variants.variant.choose_variant`. Default: the fastest variant that works.
-    quality : {"drawn", "preview", "standard", "high"}
+    quality : {"rasterised", "preview", "standard", "high"}
         A rasterised picture costs a small part of a traced one. Its light is the lamps' direct light, with the shading of a traced frame.
     mesh : SensorMesh, optional
         The mechanics' mesh (``nodes_mm``, ``inner_quads``). With a mesh the skin follows the nodes on its inside, without one it follows
@@ -92,7 +92,7 @@ class Renderer:
             raise RenderError(f"window_px={window} must lie within the {camera.width_px} x {camera.height_px} px frame, end exclusive")
         self.spec = spec
         self.window_px = window
-        self.drawn = quality == "drawn"
+        self.drawn = quality == "rasterised"
         if self.drawn and spp:
             raise RenderError(f"spp={spp}: a rasterised picture has no samples; use another quality, or leave spp out")
         self._variant, self._shading = variant, shading
@@ -111,7 +111,7 @@ class Renderer:
 
     @cached_property
     def preview(self) -> Preview:
-        """The `Preview` that draws pictures of the quality ``drawn``."""
+        """The `Preview` that draws pictures of the quality ``rasterised``."""
         preview = Preview(self.spec, window_px=self.window_px)
         preview.shading = traced_shading(preview) if self._shading is None else self._shading
         return preview

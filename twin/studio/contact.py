@@ -56,7 +56,7 @@ KEPT_WAY = 2000
 class Light(StrEnum):
     """The method by which a picture was made."""
 
-    DRAWN = "drawn"
+    RASTERISED = "rasterised"
     ROUGH = "path-traced, first pass"
     TRACED = "path-traced"
 

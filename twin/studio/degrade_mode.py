@@ -179,7 +179,7 @@ class DegradeMode(PageMode):
         cells = crop(cell_picture(frame, judged.seen, judge.reference.area_px2), Form.RAW)
         words = "; ".join(f"{case.title} {case.label(severity)}" for case, severity in cases if severity) or "nothing is wrong"
         numbers = [
-            badge("degraded" if any(severity for _, severity in cases) else "as it is") + badge("drawn"),
+            badge("degraded" if any(severity for _, severity in cases) else "as it is") + badge("rasterised"),
             paragraph(words, "note"),
             _measures(judged, judge.limits),
             paragraph("" if judged.seen.valid else f"The pipeline refuses the frame: {judged.seen.reason}", "stop"),

@@ -75,7 +75,7 @@ def run_realism(
         Limit with which ``calibrate_optics`` was run. The frames to which it fitted are omitted.
     without : collection of str
         Details that are not rendered (`twin.optics.relief.without`).
-    quality : {"drawn", "preview", "standard", "high"}
+    quality : {"rasterised", "preview", "standard", "high"}
     test : callable, optional
         The two-sample tests.
     progress : Progress

@@ -1,0 +1,84 @@
+"""Options and values of version 1 still work: with a warning, and under their present name."""
+
+import warnings
+from typing import Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import twin
+from training.generation.config import GenerationConfig
+from twin.cli import command_line
+from twin.cli.command import App, as_function
+from twin.cli.options import Formerly
+from twin.errors import OptionError, warn_once
+from twin.types import Quality
+
+
+@pytest.fixture(autouse=True)
+def each_warning_anew():
+    warn_once.cache_clear()
+
+
+def work(
+    elements: Annotated[int, typer.Option("--elements", help="elements", min=6), Formerly("across")] = 20,
+    quality: Annotated[Quality, typer.Option(help="quality")] = "standard",
+) -> None:
+    """Work."""
+    print(elements, quality)
+
+
+def run(*arguments):
+    app = App()
+    app.command("work")(work)
+    app.callback()(lambda: None)
+    return CliRunner().invoke(app, ["work", *arguments])
+
+
+@pytest.mark.parametrize(
+    ("former", "present", "shown"),
+    [
+        (["--across", "8"], "`elements`", "8 standard"),
+        (["--quality", "drawn"], "'rasterised'", "20 rasterised"),
+    ],
+)
+def test_a_former_name_works_with_a_warning(former, present, shown):
+    with pytest.warns(RuntimeWarning, match=f"is now called {present}; the old name still works"):
+        ended = run(*former)
+    assert ended.exit_code == 0 and ended.output.strip() == shown
+    assert former[0] not in run("--help").output or former[0] == "--quality"
+
+
+def test_present_names_give_no_warning_and_others_are_refused():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        assert run("--elements", "8", "--quality", "rasterised").output.strip() == "8 rasterised"
+    assert run("--quality", "nice").exit_code == 2 and run("--across", "2").exit_code == 2
+
+
+def test_functions_of_python_take_former_names(capsys):
+    function = as_function(work, "Work.")
+    with pytest.warns(RuntimeWarning, match="still works"):
+        function(across=8, quality="drawn")
+    assert capsys.readouterr().out.strip() == "8 rasterised"
+    with pytest.raises(OptionError, match="expected rasterised or preview"):
+        function(quality="nice")
+
+
+def test_a_data_set_of_version_1_has_the_present_quality():
+    made = {"sensor": twin.load_sensor("mg400-127"), "object": twin.load_object("plane"), "friction": 0.3}
+    made |= {"experiment": twin.load_experiment("surface-2d"), "quality": "drawn"}
+    with pytest.warns(RuntimeWarning, match="'rasterised'"):
+        assert GenerationConfig(**made).quality == "rasterised"
+
+
+def test_no_former_name_is_a_present_one_of_the_same_command():
+    def options(command):
+        for below in getattr(command, "commands", {}).values():
+            yield from options(below)
+        named = [(each, option) for option in command.params for each in option.opts]
+        yield [each for each, _ in named], [each for each, option in named if getattr(option, "hidden", False)]
+
+    assert sum(len(hidden) for _, hidden in options(typer.main.get_command(command_line()))) > 10
+    assert all(len(names) == len(set(names)) for names, _ in options(typer.main.get_command(command_line())))

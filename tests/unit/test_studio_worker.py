@@ -25,7 +25,7 @@ WAIT_S = 20.0
 class Stand:
     """Stands in for an answer."""
 
-    def __init__(self, number, pose, arrived, lit=Light.DRAWN, mesh=SolvedMesh.USUAL):
+    def __init__(self, number, pose, arrived, lit=Light.RASTERISED, mesh=SolvedMesh.USUAL):
         self.number, self.pose, self.arrived, self.lit, self.mesh, self.state = number, pose, arrived, lit, mesh, None
         self.solved = number
 
@@ -121,7 +121,7 @@ def test_what_stands_still_is_traced_then_refined_and_shown_with_its_own_picture
         worker.ask(ObjectPose(depth_mm=2.0))
         wait(lambda a: a.lit is Light.TRACED and a.mesh is SolvedMesh.FINE)
     kinds = [(a.lit, a.mesh) for a in answers if a.arrived]
-    usual = [(lit, SolvedMesh.USUAL) for lit in (Light.DRAWN, Light.ROUGH, Light.TRACED)]
+    usual = [(lit, SolvedMesh.USUAL) for lit in (Light.RASTERISED, Light.ROUGH, Light.TRACED)]
     assert kinds == [*usual, (Light.TRACED, SolvedMesh.FINE)]  # the fine mesh's picture comes when it is as good as the one before
     assert len(tracer.goals_for_agents) == 2
     assert tracer.started >= 1
@@ -133,7 +133,7 @@ def test_without_a_tracer_the_fine_answer_comes_drawn():
     with worker:
         worker.ask(ObjectPose(depth_mm=1.0))
         wait(lambda a: a.mesh is SolvedMesh.FINE)
-    assert said == ["no path tracing here"] and answers[-1].lit is Light.DRAWN
+    assert said == ["no path tracing here"] and answers[-1].lit is Light.RASTERISED
 
 
 def test_an_error_is_told_and_the_next_wish_is_served():

@@ -372,7 +372,7 @@ class MovingContact:
         last = self._last
         if last is None:
             return None
-        traced = None if last.lit is Light.DRAWN else (last.light, last.lit)
+        traced = None if last.lit is Light.RASTERISED else (last.light, last.lit)
         T = last.pose.matrix(self._apex_mm)
         return self._answer(T, last.state, last.mesh, traced, arrived=last.arrived, stopped=last.stopped, ms=last.ms)
 
@@ -402,7 +402,7 @@ class MovingContact:
     ) -> ContactAnswer:
         self._count += 1
         started = time.perf_counter()
-        light, lit = traced or (self.camera.draw(state), Light.DRAWN)
+        light, lit = traced or (self.camera.draw(state), Light.RASTERISED)
         raw = self.camera.raw(light, seed=self._count)
         now = time.perf_counter()
         needs_recorded = self.setup.form is Form.PROCESSED or (self.model is not None and self.model.form is Form.PROCESSED)

@@ -420,7 +420,7 @@ class TwinMode(PageMode):
             if self._film is not None:
                 self._film.add(np.hstack([camera, cells]))
         numbers = self._numbers(answer)
-        smooth = answer.lit is Light.DRAWN and contact.setup.sensor.appearance.relief is not None
+        smooth = answer.lit is Light.RASTERISED and contact.setup.sensor.appearance.relief is not None
         lacking = " without relief" if smooth else ""
 
         def change() -> None:

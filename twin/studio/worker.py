@@ -205,7 +205,7 @@ class Worker(_OwnThread):
         if newest is None or not self._traces or self._tracer is None or self._way:
             return
         still = time.monotonic() - self._moved_s > STILL_S
-        if still and newest.lit is Light.DRAWN and newest.solved != self._asked_trace:
+        if still and newest.lit is Light.RASTERISED and newest.solved != self._asked_trace:
             self._asked_trace = newest.solved
             self._tracer.trace(newest.solved, newest.state)
 

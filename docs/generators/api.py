@@ -160,7 +160,7 @@ def plain(text: str) -> str:
 
 
 def _list_exports(tree: ast.Module) -> dict[str, str]:
-    """Names in ``__all__`` and where they are defined."""
+    """Names that a module offers of others (``__all__``; all, if it does nothing but import them), and where they are defined."""
     places = {
         alias.asname or alias.name: f"{node.module}.{alias.name}"
         for node in tree.body
@@ -170,7 +170,8 @@ def _list_exports(tree: ast.Module) -> dict[str, str]:
     assigned = {ast.unparse(target): node.value for node in tree.body if isinstance(node, ast.Assign) for target in node.targets}
     if "_PLACES" in assigned:  # names that are imported when they are first used
         return {name: place.replace(":", ".") for name, place in ast.literal_eval(assigned["_PLACES"]).items()}
-    names = ast.literal_eval(assigned["__all__"]) if "__all__" in assigned else []
+    only_imports = all(isinstance(node, ast.Expr | ast.ImportFrom) for node in tree.body)
+    names = ast.literal_eval(assigned["__all__"]) if "__all__" in assigned else list(places) if only_imports else []
     return {name: places[name] for name in names if name in places}
 
 

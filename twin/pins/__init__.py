@@ -12,29 +12,3 @@ from twin.pins.pipeline import Pipeline, measure_reference
 from twin.pins.reference import Reference, make_reference, nominal_reference
 from twin.pins.tune import Tuned, tune
 from twin.pins.view import PinView, view_of
-
-__all__ = [
-    "Detector",
-    "DetectorSpec",
-    "Finding",
-    "Found",
-    "Grade",
-    "METHODS",
-    "Pipeline",
-    "Reference",
-    "Tuned",
-    "PinView",
-    "examine",
-    "load_detector",
-    "make_detector",
-    "make_graph",
-    "make_reference",
-    "measure_reference",
-    "node_features",
-    "nominal_reference",
-    "shipped_detector",
-    "tune",
-    "view_of",
-    "with_detector",
-    "write_detector",
-]

@@ -102,12 +102,7 @@ class Options:
     steps: int | None = None
 
     def __post_init__(self) -> None:
-        known: list[tuple[str, tuple[str, ...]]] = [
-            ("observation", KINDS),
-            ("backend", BACKENDS),
-            ("pictures", PICTURES),
-        ]
-        for name, values in known:
+        for name, values in (("observation", KINDS), ("backend", BACKENDS), ("pictures", PICTURES)):
             if getattr(self, name) not in values:
                 raise OptionError(f"{name}={getattr(self, name)!r}: expected one of {', '.join(values)}")
         require_whole("stack", self.stack, 1)

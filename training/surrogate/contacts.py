@@ -50,7 +50,7 @@ class SurrogateContacts:
         self._turns = turns.reshape(-1, 6)
         self._cap_modes = np.ascontiguousarray((modes[:, :, 0] + self._cap_mm * modes[:, :, 1]).reshape(flat), np.float32)
         self._caps_rest = self._rest[:, 0] + self._cap_mm * self._rest[:, 1]
-        self._linear = LinearContacts.at_rest(surrogate.node_mm, surrogate.answer, count, bending=surrogate.bending.kernel(surrogate.read))
+        self._linear = LinearContacts(surrogate.node_mm, surrogate.answer, count, bending=surrogate.bending.kernel(surrogate.read))
         self._before = np.tile(np.eye(4), (count, 1, 1))  # the poses commanded last
         self._known = np.zeros(count, bool)
         self._gap = np.full((count, len(surrogate.node_mm)), np.inf)

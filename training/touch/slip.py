@@ -354,8 +354,7 @@ def resample_path(drag: Drag, at: np.ndarray, eyes: CapView, rng: np.random.Gene
     part = at - low
 
     def between(values: np.ndarray) -> np.ndarray:
-        mixed: np.ndarray = (values[low].T * (1 - part) + values[low + 1].T * part).T
-        return mixed
+        return (values[low].T * (1 - part) + values[low + 1].T * part).T
 
     drag_mm, share, limit = between(drag.drag_mm), between(drag.share), drag.whole_mm
     whole = drag_mm >= limit if np.isfinite(limit) else np.zeros(len(at), bool)

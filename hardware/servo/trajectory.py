@@ -238,7 +238,7 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
         if outline_mm is not None:
             ax.plot(*outline_mm.T, color=muted_colour(), lw=3, alpha=0.5, label="object")
         ax.plot(*path.tool_mm.T, color=TOOL, lw=1, label="tool")
-        ax.plot(*path.surface_mm.T, ".", color=FELT, ms=3, label="surface as felt")
+        ax.plot(*path.surface_mm.T, ".", color=FELT, ms=3, label="estimated surface")
         ax.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
     whole.set_title("trajectory")
     whole.legend(loc="best", fontsize=8)

@@ -281,7 +281,7 @@ def test_the_plan_is_checked_before_anything_moves(kind, servo, refused):
                 check()
         else:
             lines = check()
-            assert [line.split(":")[0] for line in lines] == ["camera", "sensor", "way", "limits", "time"] and "frames/s" in lines[0]
+            assert [line.split(":")[0] for line in lines] == ["camera", "sensor", "path", "limits", "time"] and "frames/s" in lines[0]
             assert "331 of 331 pins of mg400-331" in lines[1]
         np.testing.assert_array_equal(at.reads(), before)
 

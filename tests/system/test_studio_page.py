@@ -225,7 +225,7 @@ def test_degrade_shows_the_same_contact_with_its_limits(client):
     html = wait_html(client, "class='bad'")
     assert since < len(client.updates)
     client.set("Find breaking point", True)
-    assert re.search(r"Edge for this contact: .* is borne up to", wait_html(client, "Edge for this contact"))
+    assert re.search(r"Breaking point of this contact: .* is tolerated up to", wait_html(client, "Breaking point of this contact"))
     client.set("Reset", True)
     client.set("mode", "Twin")
 
@@ -337,7 +337,7 @@ def test_a_specification_is_proposed_corrected_and_used(studio, client, tmp_path
     client.set("Propose a specification", True)
     html = wait_html(client, "127 pins in a hexagon of 6 rings")
     assert "UNSURE" not in html and "mine_0.png (1 of 4)" in html and "127 of 127" in html
-    client.set("layout is", "one smaller")
+    client.set("make the layout", "one smaller")
     assert "UNSURE" in wait_html(client, "91 pins in a hexagon of 5 rings")
     client.set("Use this sensor", True)
     client.wait(lambda update: update.number > 0 and "my-sensor" in str(client.value("sensor")), 2 * WAIT_S)

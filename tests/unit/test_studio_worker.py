@@ -257,7 +257,7 @@ def test_a_way_is_written_and_read(tmp_path):
         (b"x_mm\n1\n", "expected the columns"),
         (b"time_s,up\n1,2\n", "expected the columns"),
         (b"time_s,x_mm\n0,a\n", "not readable as a trajectory"),
-        (b"time_s,x_mm\n0,1\n0,2\n", "time_s does not rise"),
+        (b"time_s,x_mm\n0,1\n0,2\n", "time_s does not increase"),
         (b"time_s,x_mm\n", "0 rows"),
         (b"time_s,x_mm\n0,nan\n", "no finite number"),
         (b"time_s,x_mm\n0,1,2\n", "not readable as a trajectory"),
@@ -284,7 +284,7 @@ def test_a_video_shows_each_picture_for_its_time(tmp_path):
 
 
 def test_nothing_shown_makes_no_video(tmp_path: Path):
-    assert "nothing was shown" in FilmWriter(tmp_path / "video.mp4").close()
+    assert "no picture was shown" in FilmWriter(tmp_path / "video.mp4").close()
     assert not (tmp_path / "video.mp4").exists()
 
 

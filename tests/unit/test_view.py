@@ -173,7 +173,10 @@ def test_a_pressed_or_foreign_frame_at_rest_is_an_error_of_every_reader(tmp_path
     away = (known - known.mean(axis=0)) / np.abs(known - known.mean(axis=0)).max()
     cv2.imwrite(str(tmp_path / "frame_1_0.png"), drawn(model, known).image)
     pressed = known + 15.0 * away * np.exp(-4 * (away**2).sum(axis=1))[:, None]
-    for image, words in ((drawn(model, pressed).image, "seems pressed"), (np.zeros((256, 256), np.uint8), "no use as no-contact frame")):
+    for image, words in (
+        (drawn(model, pressed).image, "seems pressed"),
+        (np.zeros((256, 256), np.uint8), "not usable as a no-contact frame"),
+    ):
         cv2.imwrite(str(tmp_path / "init_0.png"), image)
         with pytest.raises(FrameError, match=f"init_0.png: .*{words}.*`no_contact` FRAME"):
             predict_frames("mg400-127", tmp_path)
@@ -273,7 +276,7 @@ def test_a_turn_at_the_limit_is_measured(tmp_path):
 
 def test_a_dark_frame_is_no_frame_at_rest():
     spec = load_sensor("mg400-127")
-    with pytest.raises(FrameError, match="no use as no-contact frame, no pins"):
+    with pytest.raises(FrameError, match="not usable as a no-contact frame: no pins"):
         measure_reference(spec, Form.PROCESSED, Frame(np.zeros((256, 256), np.uint8), Form.PROCESSED, "init_0.png"))
 
 

@@ -316,7 +316,7 @@ def open_recording(
 def _open_with_table(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
     """The recording at ``path``, with the table and the other files that lie beside its frames."""
     if not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
-        link = "a link to nothing" if os.path.islink(path) else "no such file or folder"
+        link = "a broken link" if os.path.islink(path) else "no such file or folder"
         raise FrameError(f"{quote(path, LONGEST_PATH)}: {link}; give a picture, a folder of frames, a recording or a video")
     if path.is_dir() and is_lerobot(path):
         return _open_dataset(path, known, form, table)

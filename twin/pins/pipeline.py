@@ -146,13 +146,13 @@ class Pipeline:
         reason = self._reason(blobs, int(paired.sum()), expected, nodes_px, extra_px) or self._rim_lost(paired, nodes_px)
         if not reason and found.lead < LEAST_LEAD * np.sqrt(len(paired)):
             reason = (
-                "ambiguous pins: two ways to name them, a row apart, explain the frame nearly alike; press or shear less, uncover "
-                "hidden pins, and hide what looks like pins beside them"
+                "ambiguous pins: two labellings, a row apart, explain the frame nearly equally well; press or shear less, uncover "
+                "hidden pins, and cover what looks like pins beside them"
             )
         if not reason and (unnamed := self._count_unnamed(blobs, found, nodes_px)) >= LEAST_UNNAMED <= lost:
             reason = (
                 f"ambiguous pins: {unnamed} blobs continue the rows of pins, and {lost} pins are lost: the picture is torn, or part is "
-                "named a row apart; grab the frame again, or hide what looks like pins"
+                "labelled a row apart; take the frame again, or cover what looks like pins"
             )
         if not reason and between > MOST_BETWEEN:
             reason = f"wrong pins: {between:.0%} of them stand between caps; stray light, a wrong threshold, or another sensor's frame"
@@ -283,7 +283,7 @@ class Pipeline:
         if lost <= MOST_RIM_LOST * len(rim):
             return ""
         return (
-            f"the rim is not seen: {lost} of the {len(rim)} outermost pins are lost; light that fades, too high a threshold, or a sensor "
+            f"the rim is not visible: {lost} of the {len(rim)} outermost pins are lost; fading light, too high a threshold, or a sensor "
             "of fewer pins: run 'twin tune' on these frames, or 'twin new'"
         )
 
@@ -325,7 +325,7 @@ class Pipeline:
             return f"too few pins: {found} of {n} found among {len(blobs.px)} blobs, {MIN_FOUND:.0%} needed"
         folded = folded_fraction(self.reference, nodes_px)
         if folded > MAX_FOLDED:
-            return f"inconsistent pins: the labelling turns {folded:.1%} of the layout over"
+            return f"inconsistent pins: the labelling inverts {folded:.1%} of the layout"
         shift = np.linalg.norm(np.median(nodes_px, axis=0) - self._center_px)
         if shift > MAX_SHIFT * self._radius_px:
             return f"inconsistent pins: the layout is displaced by {shift:.0f} px"
@@ -383,7 +383,7 @@ def measure_reference(spec: SensorSpec, form: Form, frame: Frame, *, known: Refe
     """
     name, expected, modes = frame.name or "frame", known or nominal_reference(spec, form), camera_modes(spec, form)
     seen = Pipeline(spec, form, expected, graph="delaunay")(frame)
-    refused = FrameError(f"{name}: no use as no-contact frame, {seen.reason}; {NO_CONTACT_REMEDY}")
+    refused = FrameError(f"{name}: not usable as a no-contact frame: {seen.reason}; {NO_CONTACT_REMEDY}")
     if seen.graph is not None:
         try:
             if known is None and blob_spec(spec.pipeline, form).rest_origin == "contacts":  # such places are dented themselves

@@ -386,7 +386,7 @@ class MovingContact:
         self._way.append(T)
         if len(self._way) > KEPT_WAY:
             self._way.clear()
-            self._fine_lost = f"the way in contact is longer than {KEPT_WAY} poses; lift the object off, and the fine mesh follows again"
+            self._fine_lost = f"the path in contact is longer than {KEPT_WAY} poses; lift the object off to use the fine mesh again"
         self._T, self.pose = T, ObjectPose.of(T, self._apex_mm)
 
     def _answer(

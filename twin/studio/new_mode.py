@@ -83,8 +83,8 @@ class NewMode(PageMode):
             self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
             self._layout = gui.add_text("layout", "", hint="empty: found; or rings:10, hexagon:6, grid:9x7, positions:FILE.csv")
             propose = gui.add_button("Propose a specification")
-            correct = gui.add_button_group("layout is", (SMALLER, LARGER))
-            self._number = gui.add_slider("frame to look at", 0, 1, 1, 0, disabled=True)
+            correct = gui.add_button_group("make the layout", (SMALLER, LARGER))
+            self._number = gui.add_slider("frame shown", 0, 1, 1, 0, disabled=True)
             use = gui.add_button("Use this sensor")
         propose.on_click(guarded(self.propose))
         correct.on_click(guarded(lambda: self.correct(+1 if correct.value == LARGER else -1)))
@@ -145,7 +145,7 @@ class NewMode(PageMode):
     def _make(self, wish: Wish) -> None:
         def report(stage: str, done: float, total: float, note: str = "") -> None:
             share = f", {100 * done / total:.0f} %" if total else ""
-            self._page.say(f"looking at the frames: {stage}{share}")
+            self._page.say(f"processing the frames: {stage}{share}")
 
         no_contact = Path(wish.no_contact) if wish.no_contact else None
         try:

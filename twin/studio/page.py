@@ -81,7 +81,7 @@ def value_of(control: viser.GuiInputHandle[str], kind: Callable[[str], Value], n
         return kind(given)
     except ValueError:
         put(control, now)
-        raise TwinError(f"'{quote(given)}' is no value of this control; choose one that the page offers") from None
+        raise TwinError(f"'{quote(given)}' is not a value of this control; choose one that the page offers") from None
 
 
 def put(control: viser.GuiInputHandle[Any], value: object) -> None:
@@ -132,7 +132,7 @@ def guarded_server(hosts: Sequence[str], report: Callable[[str], None]) -> Itera
     def serving(*args: Any, process_request: Callable[[ServerConnection, Request], Response | None] | None = None, **more: Any) -> Any:
         def answer_request(connection: ServerConnection, request: Request) -> Response | None:
             if not from_own_page(request, hosts):
-                return connection.respond(HTTPStatus.FORBIDDEN, "only the studio's own page may connect\n")
+                return connection.respond(HTTPStatus.FORBIDDEN, "only the page of the studio may connect\n")
             address = urlsplit(request.path)
             if address.path == "/" and address.query and request.headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin"):
                 report(request.path)

@@ -24,7 +24,7 @@ class OverlayChoices(StrEnum):
 
     NOTHING = "picture alone"
     GRAPH = "pins and graph"
-    WAYS = "ways of the pins"
+    WAYS = "trajectories of the pins"
 
 
 def camera_picture(frame: Frame, seen: Observation, rest_px: FloatArray, drawn: OverlayChoices) -> ImageArray:

@@ -75,7 +75,7 @@ class RecordingView:
         self.notes: list[str] = []
         self.reference, name = recording_reference(sensor, self.recording, self.notes)
         self._pipeline = Pipeline(sensor, self.recording.form, self.reference)
-        self.notes.append(f"pins are counted from {name}")
+        self.notes.append(f"displacements of pins are relative to {name}")
         self._labels: list[ArmLabel] = []
         try:
             self._labels = read_arm_labels(self.recording)
@@ -117,10 +117,10 @@ class RecordingView:
         seen = pins_in(frame, estimate, self._pipeline)
         label = self._labels[index] if self._labels else None
         told = {} if label is None else _label_values(label)
-        doubts = [] if label is None or label.executed else ["the audit says that the move was not executed"]
+        doubts = [] if label is None or label.executed else ["audit: the move was not executed"]
         executed = float(getattr(estimate, "executed", np.nan))
         if label is not None and np.abs(label.move).max() > 0 and executed < UNSURE:
-            doubts.append(f"the model gives the move's execution {100 * executed:.0f} %")
+            doubts.append(f"model: the move was executed with a probability of {100 * executed:.0f} %")
         if estimate is not None and estimate.valid:
             values = zip(estimate.names, estimate.low, estimate.high, strict=True)
             outside = [name for name, low, high in values if name in told and not low <= told[name] <= high]
@@ -252,7 +252,7 @@ class RecordingMode(PageMode):
             if looked.doubts:
                 put(self._number, looked.index)
                 return looked
-        self._page.say("No label of this recording is doubted.")
+        self._page.say("No label of this recording is doubtful.")
         return None
 
     def _show_frame(self, view: RecordingView, looked: Looked, beside: np.ndarray, *, label: str = CELLS, note: str = "") -> None:
@@ -268,7 +268,7 @@ class RecordingMode(PageMode):
             paragraph("" if looked.seen.valid else f"The pipeline refuses the frame: {looked.seen.reason}", "stop"),
             number_table(rows),
             estimate_table(looked.estimate, looked.values, missing=next((n for n in view.notes if n.startswith("no estimates")), "")),
-            paragraph("Here the truth is the label." if looked.values else "", "note"),
+            paragraph("The label is used as ground truth." if looked.values else "", "note"),
             paragraph(note, "said"),
             *(paragraph(text, "note") for text in [*view.recording.problems, *view.notes][:4]),
         ]

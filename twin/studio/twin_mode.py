@@ -87,7 +87,7 @@ class TwinMode(PageMode):
         page.on_address = self._links.give
         self._build_controls()
         self._forces, self._estimates, self._depths = (
-            LineChart(page, title) for title in ("force on the object, N", "estimates less truth", "indentation, mm")
+            LineChart(page, title) for title in ("force on the object, N", "error of the estimates", "indentation, mm")
         )
 
     # start and end
@@ -141,7 +141,7 @@ class TwinMode(PageMode):
                 self.contact.use(model)
                 self.worker.show_again()
 
-        self._model_note = "no model goes with this sensor; give one with --model"
+        self._model_note = "there is no model of this sensor; give one with --model"
         self.worker.do(use)
 
     def show(self) -> None:
@@ -219,7 +219,7 @@ class TwinMode(PageMode):
                 self._sensor = gui.add_dropdown("sensor", sensors, initial_value=self._state.sensor)
                 self._object = gui.add_dropdown("object", objects, initial_value=self._state.object)
                 self._friction = gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction())
-                anew = gui.add_button("Restart contact", hint="clear the history of friction and press straight down")
+                anew = gui.add_button("Restart contact", hint="clear the friction history and press straight down")
             with gui.add_folder("Show"):
                 forms = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
                 self._form = gui.add_dropdown("frame", forms, initial_value=str(setup.form))
@@ -228,7 +228,7 @@ class TwinMode(PageMode):
             with gui.add_folder("Move", expand_by_default=False):
                 tap = gui.add_button("Tap and shear")
                 upload = gui.add_upload_button("Play trajectory (CSV)", mime_type=".csv", hint="columns time_s, x_mm, y_mm, depth_mm, ...")
-                self._record_way = gui.add_checkbox("record the way", False)
+                self._record_way = gui.add_checkbox("record the trajectory", False)
                 undo = gui.add_button("Undo")
             with gui.add_folder("Save", expand_by_default=False):
                 buttons = {
@@ -457,7 +457,7 @@ class TwinMode(PageMode):
         across, into = float(np.hypot(*state.force_n[:2])), float(state.force_n[2])
         rows = {
             "force x, y, z": f"{force[0]:+.2f}  {force[1]:+.2f}  {force[2]:+.2f} N",
-            "across, friction used": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
+            "lateral force, ratio to normal": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
             "torque about z": f"{torque:+.1f} N mm",
             "indentation": f"{answer.indent_mm:+.2f} mm",
             "contact area, slipping": f"{state.area_mm2:.0f} mm2, {100 * state.slip_share:.0f} %",
@@ -471,7 +471,7 @@ class TwinMode(PageMode):
             number_table(rows),
             estimate_table(answer.estimate, answer.labels, missing=self._model_note)
             if len(state.contact_mm)
-            else paragraph("No contact: an estimate would mean nothing.", "note"),
+            else paragraph("No contact, therefore no estimate.", "note"),
             paragraph(self.contact.fine_lost, "note"),
             paragraph(f"pins coloured by {self._shown}: dark 0, bright {full:g} {unit}; {sum(answer.ms.values()):.0f} ms latency", "note"),
         ]

@@ -356,8 +356,8 @@ def realism(
     \b
     Writes:
       index.html      pictures side by side, all figures, plots
-      metrics.json    every figure: PSNR, SSIM, FLIP over the lens disc; the error on
-                      the caps, and its share that is the same for a cap;
+      metrics.json    every figure: PSNR, SSIM, FLIP over the lens disc; the error
+                      on the caps, and its share that is the same for a cap;
                       differences by radius; spots; spectra; two-sample accuracy;
                       pin errors
       frames.csv      figures of each frame

@@ -105,8 +105,8 @@ def make_dataset(
       move_executed.csv   whether the move of each frame was executed
       truth.zarr          caps (mm, px), pins with noise, forces, torque, areas in
                           contact and sliding, the object's pose: one row a frame
-      draws.csv           sampled parameters of each contact; failures.csv: samples
-                          that failed
+      draws.csv           sampled parameters of each contact; failures.csv:
+                          samples that failed
       generation.json     all resolved specifications and options
       made_by.json        the code that made it; a version with other code for
                           contacts does not resume the data set, because its

@@ -284,7 +284,7 @@ def collect(
         raise DeviceError(f"{rig.source.name}: a recording shows nothing of this arm; give a live `camera`")
     timeout_s = rig.frame_timeout_s if frame_timeout_s is None else frame_timeout_s
     stops = _Stops(Mover(rig, speed, clear_mm=CLEAR_MM, patience_s=timeout_s), WorkFrame(experiment, rig.placed), timeout_s)
-    with output(collection.folder), stops.mover.watched():
+    with output(collection.folder), stops.mover.watching():
         at_object = False
         try:
             with stops.mover.watch.alert():

@@ -109,7 +109,7 @@ class ServoLoop:
             No usable frame or estimate for ``give_up_s``, or the arm failed.
         """
         touching = False
-        with self.mover.watched():
+        with self.mover.watching():
             try:
                 with self._watch.alert():
                     self._approach(start_pose)

@@ -65,7 +65,7 @@ class Mover:
         self._came: list[np.ndarray] = []  # the poses (6,) at which the arm was since it stood clear of the object
 
     @contextmanager
-    def watched(self) -> Iterator[None]:
+    def watching(self) -> Iterator[None]:
         """Context in which the threads look at arm and camera."""
         with self.watch.watching(), self.eyes.watching():
             yield

@@ -106,7 +106,7 @@ def test_an_impossible_place_stops_the_object_and_says_why(client):
 def test_nonsense_from_a_browser_is_told_and_changes_nothing(client):
     drag(client, 1.0)
     client.drag((float("nan"), 0.0, 19.0))
-    assert "no finite number" in wait_html(client, "no finite number")
+    assert "not a finite number" in wait_html(client, "not a finite number")
     client.drag((0.0, 0.0, 19.0), (0.0, 0.0, 0.0, 0.0))
     client.set("mode", "No such mode")
     drag(client, 1.5)
@@ -207,9 +207,9 @@ def test_an_object_that_is_chosen_while_a_sensor_opens_is_kept(studio, client):
     client.set("object", "cylinder")
     client.wait(lambda u: "of 331" in u.html, WAIT_S, since=since)
     end = time.monotonic() + WAIT_S
-    while studio.twin.contact.setup.touched.name != "cylinder" and time.monotonic() < end:
+    while studio.twin.contact.setup.obj.name != "cylinder" and time.monotonic() < end:
         time.sleep(0.02)
-    assert studio.twin.contact.setup.touched.name == client.value("object") == "cylinder"
+    assert studio.twin.contact.setup.obj.name == client.value("object") == "cylinder"
     since = len(client.updates)
     studio.twin.open(StudioState(sensor=SENSOR, object="sphere", pose={"depth_mm": 1.0}))
     client.wait(lambda u: "of 127" in u.html, WAIT_S, since=since)
@@ -257,7 +257,7 @@ def test_a_recording_is_shown_with_labels_doubts_and_the_twins_picture(client, t
     client.set("Open", True)
     html = wait_html(client, "1 of 3")
     assert "nothing: " not in html, "the earlier error is gone"
-    assert "pose_2 is outside the 90 % interval" in html or "No estimate" in html
+    assert "depth is outside the 90 % interval" in html or "No estimate" in html
     client.set("frame number", 2)
     wait_html(client, "3 of 3")
     for beyond, shown in ((-3, "1 of 3"), (7, "3 of 3")):
@@ -377,8 +377,8 @@ def test_values_that_no_browser_gives_are_refused_and_put_back(client):
         ("friction", -1.0, "friction -1: give a number from 0 to"),
         ("friction", float("nan"), "friction nan"),
         ("object", "../../x", "../../x"),
-        ("frame", "cooked", "cooked&#x27; is no value"),
-        ("colour pins by", "smell", "smell&#x27; is no value"),
+        ("frame", "cooked", "cooked&#x27; is not a value"),
+        ("colour pins by", "smell", "smell&#x27; is not a value"),
     ):
         client.set(label, value)
         wait_html(client, reason)

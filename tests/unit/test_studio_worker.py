@@ -123,7 +123,7 @@ def test_what_stands_still_is_traced_then_refined_and_shown_with_its_own_picture
     kinds = [(a.lit, a.mesh) for a in answers if a.arrived]
     usual = [(lit, SolvedMesh.USUAL) for lit in (Light.RASTERISED, Light.ROUGH, Light.TRACED)]
     assert kinds == [*usual, (Light.TRACED, SolvedMesh.FINE)]  # the fine mesh's picture comes when it is as good as the one before
-    assert len(tracer.goals_for_agents) == 2
+    assert len(tracer.asked) == 2
     assert tracer.started >= 1
 
 
@@ -259,7 +259,7 @@ def test_a_way_is_written_and_read(tmp_path):
         (b"time_s,x_mm\n0,a\n", "not readable as a trajectory"),
         (b"time_s,x_mm\n0,1\n0,2\n", "time_s does not increase"),
         (b"time_s,x_mm\n", "0 rows"),
-        (b"time_s,x_mm\n0,nan\n", "no finite number"),
+        (b"time_s,x_mm\n0,nan\n", "not a finite number"),
         (b"time_s,x_mm\n0,1,2\n", "not readable as a trajectory"),
         (b"\xff\xfe", "not readable as a trajectory"),
     ],

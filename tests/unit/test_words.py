@@ -45,7 +45,6 @@ NAMES_ALLOWED = {
 # A participle alone is no name of a function, except where it returns its argument changed, as ``sorted`` does.
 PARTICIPLES_ALLOWED = {
     ("hardware/safety/safe_arm.py", "_ungated"),
-    ("hardware/workcell/mover.py", "watched"),
     ("scenes/plugins.py", "offered"),
     ("training/environments/baselines.py", "seen"),
     ("training/environments/learn.py", "seen"),

@@ -24,6 +24,7 @@ from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
 from training.runs.assemble import conformal_quantile
 from training.runs.identity import rows_named
+from twin.estimate import readable_labels
 from twin.frames import open_recording
 from twin.progress import Step
 from twin.report.charts import new_figure, save_figure
@@ -222,7 +223,7 @@ def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, lab
     figure, axes = new_figure(count, 2, panel_inch=3.6)
     undone = np.nan_to_num(targets.executed, nan=1.0) < 0.5
     errors = label_error(np.clip(made.mean, *limits_of(targets.names)), truth, targets.units)
-    for k, (name, unit) in enumerate(zip(targets.names, targets.units, strict=True)):
+    for k, (name, unit) in enumerate(zip(readable_labels(targets.names), targets.units, strict=True)):
         error = errors[:, k]
         for chosen, colour, label in ((~undone, "#1f77b4", "move executed"), (undone, "#ff7f0e", "not executed")):
             near = truth[chosen, k] + error[chosen]  # a direction is drawn within half a turn of the truth

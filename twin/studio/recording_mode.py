@@ -8,7 +8,7 @@ import numpy as np
 from scenes import load_object
 from scenes.experiment import ExperimentSpec
 from twin.errors import ContactError, FrameError, TwinError
-from twin.estimate import Estimate, SensorModel, pins_in
+from twin.estimate import Estimate, SensorModel, pins_in, readable_labels
 from twin.frames import Recording, open_recording
 from twin.pins.batch import recording_reference
 from twin.pins.pipeline import Pipeline
@@ -122,8 +122,8 @@ class RecordingView:
         if label is not None and np.abs(label.move).max() > 0 and executed < UNSURE:
             doubts.append(f"model: the move was executed with a probability of {100 * executed:.0f} %")
         if estimate is not None and estimate.valid:
-            values = zip(estimate.names, estimate.low, estimate.high, strict=True)
-            outside = [name for name, low, high in values if name in told and not low <= told[name] <= high]
+            values = zip(estimate.names, readable_labels(estimate.names), estimate.low, estimate.high, strict=True)
+            outside = [title for name, title, low, high in values if name in told and not low <= told[name] <= high]
             doubts += [f"{name} is outside the 90 % interval" for name in outside]
         return Looked(index, frame, seen, estimate, label, told, tuple(doubts))
 

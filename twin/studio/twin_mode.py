@@ -13,13 +13,13 @@ import viser
 from scenes import list_objects, list_sensors, load_object, load_sensor
 from scenes.base import SpecError
 from twin.errors import TwinError
-from twin.estimate import SensorModel
+from twin.estimate import SensorModel, readable_labels
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
 from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
 from twin.studio.mode import PageMode
 from twin.studio.page import LineChart, StudioPage, put, value_of
-from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, label_name, number_table, paragraph
+from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of
 from twin.studio.scene import FULL_SCALE, PinColour, Scene
 from twin.studio.state import StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
@@ -481,8 +481,8 @@ class TwinMode(PageMode):
         self._depths.add({"indentation": answer.indent_mm})
         estimate = answer.estimate
         if estimate is not None and estimate.valid:
-            known = zip(estimate.names, estimate.value, strict=True)
-            self._estimates.add({label_name(name)[0]: float(value) - answer.labels[name] for name, value in known if name in answer.labels})
+            known = zip(readable_labels(estimate.names), estimate.names, estimate.value, strict=True)
+            self._estimates.add({title: float(value) - answer.labels[name] for title, name, value in known if name in answer.labels})
 
     # saving
 

@@ -123,7 +123,7 @@ def test_what_stands_still_is_traced_then_refined_and_shown_with_its_own_picture
     kinds = [(a.lit, a.mesh) for a in answers if a.arrived]
     usual = [(lit, SolvedMesh.USUAL) for lit in (Light.DRAWN, Light.ROUGH, Light.TRACED)]
     assert kinds == [*usual, (Light.TRACED, SolvedMesh.FINE)]  # the fine mesh's picture comes when it is as good as the one before
-    assert len(tracer.goals_for_agents) == 2
+    assert len(tracer.asked) == 2
     assert tracer.started >= 1
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from twin.cli import app
-from twin.cli.options import Formerly, FormOrAuto, NoContact, Out, Sensor, Table, Tuning, load_if_named, sensor_with
+from twin.cli.options import FormOrAuto, MaxFrames, NoContact, Out, Sensor, Table, Tuning, load_if_named, sensor_with
 from twin.progress import Progress
 
 if TYPE_CHECKING:
@@ -124,9 +124,7 @@ def tune(
         Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"], typer.Option("--method", help="whose parameters")
     ] = "twin",
     form: FormOrAuto = None,
-    max_frames: Annotated[
-        int, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")
-    ] = 12,
+    max_frames: MaxFrames = 12,
     table: Table = None,
     no_contact: NoContact = None,
     *,
@@ -167,9 +165,7 @@ def check(
     sensor: Sensor,
     form: FormOrAuto = None,
     pipeline: Annotated[Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="what 'twin tune' wrote")] = None,
-    max_frames: Annotated[
-        int, typer.Option("--max-frames", min=1, metavar="N", help="look at no more than N frames, evenly spread"), Formerly("limit")
-    ] = 20,
+    max_frames: MaxFrames = 20,
     no_contact: Annotated[Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, for --push")] = None,
     push: Annotated[
         list[str] | None,

@@ -19,8 +19,10 @@ from twin.cli.options import (
     CORES,
     QUALITY,
     Elements,
+    Experiment,
     Formerly,
     FormOrAuto,
+    MaxFrames,
     NoContact,
     Out,
     Residual,
@@ -67,9 +69,7 @@ def new_sensor(
     no_contact: NoContact = None,
     table: Table = None,
     form: FormOrAuto = None,
-    max_frames: Annotated[
-        int, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")
-    ] = 40,
+    max_frames: MaxFrames = 40,
     *,
     progress: Progress,
 ) -> "WholeSensor":
@@ -149,9 +149,7 @@ def calibrate_optics(
     no_contact: Annotated[
         Path | None, typer.Option("--no-contact", metavar="FRAME", help="a raw frame without contact: fits the camera")
     ] = None,
-    max_frames: Annotated[
-        int, typer.Option("--max-frames", min=1, metavar="N", help="fit at most N frames, evenly spread"), Formerly("limit")
-    ] = 6,
+    max_frames: MaxFrames = 6,
     pipeline: Tuning = None,
     *,
     progress: Progress,
@@ -194,9 +192,7 @@ def calibrate_contact(
         int, typer.Option("--num-labelled", min=4, metavar="N", help="frames to fit to, chosen at random"), Formerly("labels")
     ] = 20,
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the choice of frames")] = 0,
-    experiment: Annotated[
-        str, typer.Option("--experiment", metavar="E", help="experiment of the recording ('twin experiments')")
-    ] = "surface-2d",
+    experiment: Experiment = "surface-2d",
     obj: Annotated[
         str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
     ] = None,
@@ -262,9 +258,7 @@ def validate(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording")],
     out: Out,
-    experiment: Annotated[
-        str, typer.Option("--experiment", metavar="E", help="experiment of the recording ('twin experiments')")
-    ] = "surface-2d",
+    experiment: Experiment = "surface-2d",
     obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the touched object; the experiment's own if not given")] = None,
     max_frames: Annotated[
         int | None, typer.Option("--max-frames", min=1, metavar="N", help="N frames, chosen at random"), Formerly("limit")

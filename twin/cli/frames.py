@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from twin.cli import app
-from twin.cli.options import Formerly, FormOrAuto, NoContact, Out, Sensor, Table, Tuning, load_if_named, sensor_with
+from twin.cli.options import FormOrAuto, MaxFrames, NoContact, Out, Sensor, Table, Tuning, load_if_named, sensor_with
 from twin.progress import Progress
 
 if TYPE_CHECKING:
@@ -123,9 +123,7 @@ def tune(
         Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"], typer.Option("--method", help="method to tune")
     ] = "twin",
     form: FormOrAuto = None,
-    max_frames: Annotated[
-        int, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")
-    ] = 12,
+    max_frames: MaxFrames = 12,
     table: Table = None,
     no_contact: NoContact = None,
     *,
@@ -166,9 +164,7 @@ def check(
     sensor: Sensor,
     form: FormOrAuto = None,
     pipeline: Annotated[Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="file of 'twin tune'")] = None,
-    max_frames: Annotated[
-        int, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")
-    ] = 20,
+    max_frames: MaxFrames = 20,
     no_contact: Annotated[Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, for --push")] = None,
     push: Annotated[
         list[str] | None,

@@ -22,6 +22,7 @@ from twin.cli.options import (
     Also,
     Device,
     Elements,
+    Experiment,
     Formerly,
     FormOrAuto,
     NoContact,
@@ -57,7 +58,7 @@ if TYPE_CHECKING:
 
 @app.command("dataset", goes_on=True)
 def make_dataset(
-    experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="experiment name ('twin experiments') or file")],
+    experiment: Experiment,
     sensor: Sensor,
     count: Annotated[int, typer.Option("--count", min=1, metavar="N", help="contacts")],
     out: Out,

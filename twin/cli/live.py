@@ -24,6 +24,7 @@ from twin.cli.options import (
     AtRest,
     Camera,
     DryRun,
+    Experiment,
     FormOrAuto,
     KnownPlace,
     Limits,
@@ -116,9 +117,7 @@ def collect(
     arm: ArmOption,
     sensor: Sensor,
     out: Out,
-    experiment: Annotated[
-        str, typer.Option("--experiment", metavar="E", help="experiment name ('twin experiments') or file")
-    ] = "surface-2d",
+    experiment: Experiment = "surface-2d",
     count: Annotated[int, typer.Option("--count", min=1, help="contacts in the folder at the end")] = 100,
     obj: Annotated[str | None, typer.Option("--object", metavar="O", help="object; the experiment's own if not given")] = None,
     servo: ServoName = "surface",

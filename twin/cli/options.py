@@ -46,6 +46,8 @@ Object = Annotated[str, typer.Option("--object", metavar="O", help="object name 
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder to write to; made if missing")]
 Force = Annotated[bool, typer.Option("--force", help="overwrite files that this program did not write")]
 FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; found from size and content if not given")]
+Experiment = Annotated[str, typer.Option("--experiment", metavar="E", help="how contacts are made: a name ('twin experiments') or a file")]
+MaxFrames = Annotated[int, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")]
 Residual = Annotated[bool, typer.Option("--residual", help="add the sensor's residual network")]
 Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch finds one), cpu or cuda")]
 

@@ -24,7 +24,7 @@ from twin.pins.pipeline import Pipeline
 from twin.pins.reference import Reference, nominal_reference, project_rest
 from twin.pins.tune import other_layout
 from twin.pins.view import MOST_STRETCH, view_of
-from twin.progress import Step
+from twin.progress import Step, unheard
 from twin.types import Form, Frame, Observation
 
 LEAST_RIM = 0.5
@@ -89,7 +89,7 @@ class Finding:
     remedy: str
 
 
-def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None = None, *, progress: Step | None = None) -> list[Finding]:
+def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None = None, *, progress: Step = unheard) -> list[Finding]:
     """Check a sensor by frames of one form, with or without contact.
 
     Parameters
@@ -115,8 +115,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
     seen = []
     for k, frame in enumerate(frames):
         seen.append(pipeline(frame))
-        if progress:
-            progress(k + 1, len(frames))
+        progress(k + 1, len(frames))
     nominal = nominal_reference(spec, form)
     findings = [
         _layout(frames, spec, pipeline.blob_spec.polarity),

@@ -19,7 +19,7 @@ from twin.pins.legacy import legacy_parameters
 from twin.pins.reference import Reference, make_reference, nominal_reference, together
 from twin.pins.rest import Rest, rest_of
 from twin.pins.view import camera_modes, view_of
-from twin.progress import Step
+from twin.progress import Step, unheard
 from twin.types import Form, Frame
 
 # Number of frames that are used, spread evenly. With more frames the parameters hardly change.
@@ -104,7 +104,7 @@ def tune(
     known: Candidate | None = None,
     rest: Rest | None = None,
     given: Frame | None = None,
-    progress: Step | None = None,
+    progress: Step = unheard,
 ) -> Tuned:
     """Find mask, threshold and blob parameters from frames of one size and form.
 
@@ -161,8 +161,7 @@ def tune(
     for k, detector in enumerate(tried):
         if sum(rates[k]) >= hopeful:
             rates[k] = _rate(make_detector(sensor, detector, second_look=False), judged)
-        if progress:
-            progress(k + 1, len(tried))
+        progress(k + 1, len(tried))
     best = _middle_of_plateau(tried, rates)
     evidence = _evidence(tried, rates, best, judged, reference, start)
     if doubts:

@@ -122,12 +122,8 @@ class DegradeMode(PageMode):
                     control.on_update(lambda event: self._restart())
                 self._choices.append(choice)
                 self._severities.append(slider)
-            edge = page.gui.add_button(
-                "Find breaking point", hint="raise the severity of condition 1 until something fails; the others stay"
-            )
-            none = page.gui.add_button("Reset")
-        edge.on_click(lambda event: self._find())
-        none.on_click(lambda event: self._reset())
+            page.button("Find breaking point", self._find, hint="raise the severity of condition 1 until something fails; the others stay")
+            page.button("Reset", self._reset)
 
     def show(self) -> None:
         """Show the twin's contact, degraded."""

@@ -77,18 +77,16 @@ class NewMode(PageMode):
         self._pipeline: Pipeline | None = None
         self._making = self.newest(self._make, "new")
         self._looking = self.newest(self._look, "new-frame")
-        gui, guarded = page.gui, page.guard
+        gui = page.gui
         with self.folder:
             self._frames = gui.add_text("frames", "", hint="folder, video or recording on the studio's machine")
             self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
             self._layout = gui.add_text("layout", "", hint="empty: found; or rings:10, hexagon:6, grid:9x7, positions:FILE.csv")
-            propose = gui.add_button("Propose a specification")
+            page.button("Propose a specification", self.propose)
             correct = gui.add_button_group("make the layout", (SMALLER, LARGER))
             self._number = gui.add_slider("frame shown", 0, 1, 1, 0, disabled=True)
-            use = gui.add_button("Use this sensor")
-        propose.on_click(guarded(self.propose))
-        correct.on_click(guarded(lambda: self.correct(+1 if correct.value == LARGER else -1)))
-        use.on_click(guarded(self.use))
+            page.button("Use this sensor", self.use)
+        correct.on_click(page.guard(lambda: self.correct(+1 if correct.value == LARGER else -1)))
         self._number.on_update(self._follow_slider)
 
     def show(self) -> None:

@@ -349,7 +349,7 @@ class StudioPage:
         done.result(CHANGE_S)
         self.server.flush()
 
-    def guard(self, action: Callable[[], None]) -> Callable[[object], None]:
+    def guard(self, action: Callable[[], object]) -> Callable[[object], None]:
         """A callback of a control that calls ``action`` and shows the user's errors. Changes that this program makes do nothing."""
 
         def call_action(event: object) -> None:
@@ -362,6 +362,10 @@ class StudioPage:
                 self.say(str(error), bad=True)
 
         return call_action
+
+    def button(self, label: str, action: Callable[[], object], **options: Any) -> None:
+        """Add a button that calls an action (see ``guard``)."""
+        self.gui.add_button(label, **options).on_click(self.guard(action))
 
     def say(self, text: str, *, bad: bool = False) -> None:
         """Show a message for some seconds."""

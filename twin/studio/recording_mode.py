@@ -180,15 +180,13 @@ class RecordingMode(PageMode):
         gui = page.gui
         with self.folder:
             self._path = gui.add_text("folder or video", first, hint="any recording that 'twin preprocess' reads, on the studio's machine")
-            opened = gui.add_button("Open")
+            page.button("Open", lambda: self.open(self._path.value))
             self._number = gui.add_slider("frame number", 0, 1, 1, 0, disabled=True)
             steps = gui.add_button_group("step", ("-10", "-1", "+1", "+10"))
-            doubt = gui.add_button("Next doubtful label", hint="the next frame whose label is doubtful")
+            page.button("Next doubtful label", lambda: self._wanted.give(-1), hint="the next frame whose label is doubtful")
             self._against = gui.add_checkbox("the twin's picture beside it", True)
-        opened.on_click(lambda event: self.open(self._path.value))
         self._number.on_update(page.guard(lambda: self._go(int(self._number.value))))
         steps.on_click(lambda event: self._go(int(self._number.value) + int(event.target.value)))
-        doubt.on_click(lambda event: self._wanted.give(-1))
         self._against.on_update(lambda event: self._wanted.give(int(self._number.value)))
 
     def show(self) -> None:

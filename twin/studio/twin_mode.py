@@ -103,7 +103,7 @@ class TwinMode(PageMode):
         setup = contact.setup
         with self._showing:
             self.contact, self._tracer = contact, tracer
-            self.worker = Worker(contact, tracer, self._publish_answer, self._show_message)
+            self.worker = Worker(contact, tracer, self._publish_answer, self._page.say)
             self._rest = nominal_reference(setup.sensor, setup.form)
             self._scene = Scene(self._page.server, setup.sensor, contact.solver.mesh, contact.solver.rest())
             if self._loading:  # otherwise ``_load_rest`` shows the object
@@ -191,6 +191,10 @@ class TwinMode(PageMode):
         self._wish = way[-1][1]
         self.worker.play(way)
 
+    def tap_and_shear(self) -> None:
+        """Play a tap and a shear with the present tilts and twist."""
+        self.play(tap_and_shear(self._wish))
+
     def _follow_drag(self, T: np.ndarray, ended: bool) -> None:
         self.ask(ObjectPose.of(T, self.contact.setup.sensor.skin.apex_mm))
         if ended and self.worker.newest is not None:
@@ -199,7 +203,7 @@ class TwinMode(PageMode):
     # controls
 
     def _build_controls(self) -> None:
-        gui, guarded, setup = self._page.gui, self._page.guard, self.contact.setup
+        gui, guarded, button, setup = self._page.gui, self._page.guard, self._page.button, self.contact.setup
         with self.folder:
             self._sliders = {}
             for name in NAMES:
@@ -219,25 +223,21 @@ class TwinMode(PageMode):
                 self._sensor = gui.add_dropdown("sensor", sensors, initial_value=self._state.sensor)
                 self._object = gui.add_dropdown("object", objects, initial_value=self._state.object)
                 self._friction = gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction())
-                anew = gui.add_button("Restart contact", hint="clear the friction history and press straight down")
+                button("Restart contact", self.restart_contact, hint="clear the friction history and press straight down")
             with gui.add_folder("Show"):
                 forms = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
                 self._form = gui.add_dropdown("frame", forms, initial_value=str(setup.form))
                 self._drawing = gui.add_dropdown("overlay", tuple(map(str, OverlayChoices)), initial_value=str(self._drawn))
                 self._colour = gui.add_dropdown("colour pins by", tuple(map(str, PinColour)), initial_value=str(self._shown))
             with gui.add_folder("Move", expand_by_default=False):
-                tap = gui.add_button("Tap and shear")
+                button("Tap and shear", self.tap_and_shear)
                 upload = gui.add_upload_button("Play trajectory (CSV)", mime_type=".csv", hint="columns time_s, x_mm, y_mm, depth_mm, ...")
                 self._record_way = gui.add_checkbox("record the trajectory", False)
-                undo = gui.add_button("Undo")
+                button("Undo", self.undo)
             with gui.add_folder("Save", expand_by_default=False):
-                buttons = {
-                    "Save picture": self.save_picture,
-                    "Save contact files": self.save_contact,
-                    "Save state": self.save_state,
-                }
-                for label, save in buttons.items():
-                    gui.add_button(label).on_click(guarded(save))
+                button("Save picture", self.save_picture)
+                button("Save contact files", self.save_contact)
+                button("Save state", self.save_state)
                 opened = gui.add_upload_button("Open a state", mime_type=".json")
                 link = self.state.link(self._page.url)
                 self._link = gui.add_text("link", link, hint="opens this state again; paste another one to open it")
@@ -248,9 +248,6 @@ class TwinMode(PageMode):
         self._friction.on_update(guarded(self._change_friction))
         self._object.on_update(guarded(self._change_object))
         self._sensor.on_update(guarded(self._change_sensor))
-        anew.on_click(guarded(self.restart_contact))
-        tap.on_click(guarded(lambda: self.play(tap_and_shear(self._wish))))
-        undo.on_click(guarded(self.undo))
         upload.on_upload(guarded(lambda: self.play(read_trajectory(upload.value.content, upload.value.name))))
         opened.on_upload(guarded(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
         self._link.on_update(guarded(lambda: self._links.give(self._link.value)))
@@ -261,9 +258,9 @@ class TwinMode(PageMode):
                 for key, sign in zip(keys, (-1, +1), strict=True):
                     label = f"{readable_name(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
                     command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # viser defines it as a literal
-                    command.on_trigger(partial(self._handle_key, name, sign))
+                    command.on_trigger(guarded(partial(self.nudge, name, sign)))
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
-        gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(lambda: self.play(tap_and_shear(self._wish))))
+        gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(self.tap_and_shear))
 
     def _slider_callback(self, name: str) -> Callable[[viser.GuiEvent[viser.GuiSliderHandle[float]]], None]:
         def moved(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
@@ -271,9 +268,6 @@ class TwinMode(PageMode):
                 self.ask(replace(self._wish, **{name: float(event.target.value)}))
 
         return moved
-
-    def _handle_key(self, name: str, sign: int, event: object) -> None:
-        self.nudge(name, sign)
 
     def _own_friction(self) -> float:
         setup = self.contact.setup
@@ -380,9 +374,6 @@ class TwinMode(PageMode):
 
     # answers
 
-    def _show_message(self, text: str) -> None:
-        self._page.say(text)
-
     def _publish_answer(self, answer: ContactAnswer) -> None:
         if self._path is not None:
             self._path.append((time.monotonic() - self._path_s, answer.pose))
@@ -426,7 +417,7 @@ class TwinMode(PageMode):
         def change() -> None:
             self._scene.show(answer.state, self._shown)
             if answer.arrived:
-                self._scene.place_gizmo(self._gizmo_pose(answer))
+                self._scene.place_gizmo(answer.pose.matrix(contact.setup.sensor.skin.apex_mm))
                 self._follow_sliders(answer)
                 put(self._link, self.state.link(self._page.url))
             if self._active:
@@ -435,9 +426,6 @@ class TwinMode(PageMode):
             self._draw_charts(answer)
 
         self._page.together(change)
-
-    def _gizmo_pose(self, answer: ContactAnswer) -> np.ndarray:
-        return answer.pose.matrix(self.contact.setup.sensor.skin.apex_mm)
 
     def _follow_sliders(self, answer: ContactAnswer) -> None:
         """Set the sliders to the object's final pose, unless the user has made a new wish."""

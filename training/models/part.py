@@ -42,6 +42,25 @@ class Inputs(Protocol):
         ...
 
 
+class ArrayInputs:
+    """Inputs that are one array: ``batch`` gives some of its rows.
+
+    Parameters
+    ----------
+    values : (M, ...) array
+    """
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = torch.from_numpy(values)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """See ``Inputs``."""
+        return (self.values[rows],)
+
+
 @dataclass(frozen=True)
 class Prepared:
     """Inputs for training on M frames.

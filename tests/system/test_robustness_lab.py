@@ -14,7 +14,7 @@ from twin.evaluation.degradation.sweep import SweepSettings, run_sweep
 from twin.frames import open_recording
 from twin.frames.images import write_image
 from twin.pins import make_detector, shipped_detector, tune
-from twin.pins.reference import nominal_reference
+from twin.pins.labelling.reference import nominal_reference
 from twin.types import Form
 
 SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127", "ur5-331-raw": "ur5-331"}

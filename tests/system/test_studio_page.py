@@ -189,7 +189,7 @@ def test_an_answer_of_the_sensor_that_is_being_replaced_does_no_harm(studio, cli
         threads[0].join(0.3)
         return made
 
-    monkeypatch.setattr("twin.studio.twin_mode.Scene", scene)
+    monkeypatch.setattr("twin.studio.modes.twin_mode.Scene", scene)
     studio.twin.open(StudioState(sensor="mg400-331", object="sphere", pose={"depth_mm": 1.0}))
     threads[0].join(WAIT_S)
     assert not failed

@@ -17,13 +17,13 @@ from twin.frames.forms import is_two_level
 from twin.optics.preview import Preview
 from twin.optics.surfaces import cap_albedo
 from twin.pins import Grade, Pipeline, examine, tune
-from twin.pins.caps import measure_caps
-from twin.pins.identify import LayoutInFrame, _at_likelier_spots, identify, score_layout
-from twin.pins.legacy import LegacyPipeline
-from twin.pins.matching import match
-from twin.pins.reference import make_reference
-from twin.pins.rest import Rest
-from twin.pins.tune import _at_rest
+from twin.pins.detectors.legacy import LegacyPipeline
+from twin.pins.detectors.tune import _at_rest
+from twin.pins.finding.caps import measure_caps
+from twin.pins.labelling.identify import LayoutInFrame, _at_likelier_spots, identify, score_layout
+from twin.pins.labelling.matching import match
+from twin.pins.labelling.reference import make_reference
+from twin.pins.labelling.rest import Rest
 from twin.types import Form, Frame
 
 GRID = PinsSpec(layout="grid", columns=7, rows=9)

@@ -20,7 +20,7 @@ from twin.geometry.pins import rest_pins
 from twin.mechanics.path import ContactPose
 from twin.pins import DetectorSpec, Grade, examine
 from twin.pins.check import drift_of
-from twin.pins.reference import nominal_reference
+from twin.pins.labelling.reference import nominal_reference
 from twin.types import Form, Frame
 
 

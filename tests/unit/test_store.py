@@ -54,7 +54,7 @@ KEEPERS = (  # the module of every function whose results are kept between runs
     "training.generation.make",
     "training.models.cnn.inputs",
     "twin.calibration.optics",
-    "twin.pins.tune",
+    "twin.pins.detectors.tune",
     "twin.mechanics.skin_fit",
     "twin.geometry.solid",
     "twin.optics.preview",
@@ -107,7 +107,13 @@ def test_a_changed_line_of_the_solver_is_other_code_for_all_that_was_solved(tree
         tree(("twin/mechanics/newton.py", "raise NoConvergence(balance.relative)", "raise NoConvergence(2 * balance.relative)"))
     )
     assert all(before[name] != carried[name] for name in SOLVED), "the solver decides by the number that the error carries"
-    untouched = ("twin.geometry.solid", "twin.mechanics.skin_fit", "twin.optics.render", "twin.objects.mesh_field", "twin.pins.tune")
+    untouched = (
+        "twin.geometry.solid",
+        "twin.mechanics.skin_fit",
+        "twin.optics.render",
+        "twin.objects.mesh_field",
+        "twin.pins.detectors.tune",
+    )
     assert all(before[name] == after[name] for name in untouched), "these compute nothing with the solver"
 
 

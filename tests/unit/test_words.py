@@ -90,8 +90,8 @@ PARTICIPLES_ALLOWED = {
     ("twin/evaluation/degradation/conditions/skin.py", "swollen"),
     ("twin/evaluation/degradation/conditions/skin.py", "torn"),
     ("twin/optics/defocus.py", "defocused"),
-    ("twin/pins/matching.py", "proven"),
-    ("twin/studio/twin_mode.py", "moved"),
+    ("twin/pins/labelling/matching.py", "proven"),
+    ("twin/studio/modes/twin_mode.py", "moved"),
     ("twin/types.py", "undeformed"),
 }
 IRREGULAR = {

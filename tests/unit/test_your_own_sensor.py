@@ -24,11 +24,11 @@ from twin.geometry.pins import pin_lattice, rest_pins, usual_spacing
 from twin.optics.relief import cap_planes
 from twin.pins import Grade, Pipeline, examine, nominal_reference, tune, with_detector
 from twin.pins.batch import recording_reference
-from twin.pins.detector_spec import shipped_detector
-from twin.pins.identify import Candidate, LayoutInFrame
-from twin.pins.rest import Rest, rest_from_contacts
-from twin.pins.rest import rest_of as rest_found
-from twin.pins.tune import _at_rest
+from twin.pins.detectors.detector_spec import shipped_detector
+from twin.pins.detectors.tune import _at_rest
+from twin.pins.labelling.identify import Candidate, LayoutInFrame
+from twin.pins.labelling.rest import Rest, rest_from_contacts
+from twin.pins.labelling.rest import rest_of as rest_found
 from twin.types import Form, Frame
 
 DOCS = Path(__file__).parents[2] / "docs" / "your-own-sensor.md"

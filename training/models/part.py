@@ -23,7 +23,7 @@ from training.data.pins import PinTable, cap_light
 from training.errors import TrainingError
 from training.models.recipes import Recipe
 from twin.pins import Pipeline
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 from twin.types import Frame, Observation
 
 LIKELY = 0.5  # least probability of a contact for which a frame gets an estimate

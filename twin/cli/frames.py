@@ -19,8 +19,8 @@ from twin.progress import Progress
 if TYPE_CHECKING:
     from hardware.live.examining import Examination
     from twin.pins.batch import Preprocessed
+    from twin.pins.detectors.tune_files import TunedOnFrames
     from twin.pins.graph_files import Graphs
-    from twin.pins.tune_files import TunedOnFrames
 
 
 @app.command("preprocess")
@@ -146,7 +146,7 @@ def tune(
     """
     from scenes import load_sensor
     from twin.frames import frames_at
-    from twin.pins.tune_files import tune_on_frames
+    from twin.pins.detectors.tune_files import tune_on_frames
 
     at = frames_at(frames, table, no_contact)
     return tune_on_frames(at, load_sensor(sensor), out=out, method=method, form=form, limit=max_frames, progress=progress)

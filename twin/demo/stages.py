@@ -13,7 +13,7 @@ from twin.frames.forms import form_named
 from twin.mechanics.path import ContactPose
 from twin.one_contact import look_at
 from twin.pins.graph import make_graph
-from twin.pins.reference import nominal_reference
+from twin.pins.labelling.reference import nominal_reference
 from twin.progress import Step, unheard
 from twin.report.plots import ObservedFrame
 from twin.simulator import RenderedFrame, Simulator

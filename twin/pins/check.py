@@ -17,13 +17,13 @@ from twin.camera.capture import expose
 from twin.frames import spread_indices
 from twin.frames.forms import blob_spec, gray_levels, known_frames, pin_levels
 from twin.optics.preview import Preview
-from twin.pins.caps import Caps, measure_caps
-from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
-from twin.pins.identify import score_layout
+from twin.pins.detectors.detector_spec import DetectorSpec, shipped_detector, with_detector
+from twin.pins.detectors.tune import other_layout
+from twin.pins.finding.caps import Caps, measure_caps
+from twin.pins.labelling.identify import score_layout
+from twin.pins.labelling.reference import Reference, nominal_reference, project_rest
+from twin.pins.labelling.view import MOST_STRETCH, view_of
 from twin.pins.pipeline import Pipeline
-from twin.pins.reference import Reference, nominal_reference, project_rest
-from twin.pins.tune import other_layout
-from twin.pins.view import MOST_STRETCH, view_of
 from twin.progress import Step, unheard
 from twin.types import Form, Frame, Observation
 

@@ -1,7 +1,7 @@
 """The pipeline: observation of the pins in a frame, the same for rendered, recorded and live frames.
 
 The limits of an observation were chosen, not derived. A frame that is meant to show no contact is refused if its pins are displaced in a
-way that no displacement of the camera explains (`measure_reference`, `twin.pins.view`).
+way that no displacement of the camera explains (`measure_reference`, `twin.pins.labelling.view`).
 """
 
 from dataclasses import replace
@@ -14,14 +14,14 @@ from scipy.spatial import cKDTree
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
 from twin.frames.forms import blob_spec, form_named, frame_size, levels_at, pin_levels
-from twin.pins.blobs import Blobs, Mask, circular_mask, despeckle, find_blobs, find_spots, own_threshold
+from twin.pins.finding.blobs import Blobs, Mask, circular_mask, despeckle, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
-from twin.pins.identify import SHOWN, score_layout
-from twin.pins.matching import Match, complete, confirm, look_again, match, proven, rematch
-from twin.pins.reference import Reference, folded_fraction, make_reference, nominal_reference
-from twin.pins.rest import require_even
-from twin.pins.split import split_chains, split_merged
-from twin.pins.view import NO_CONTACT_REMEDY, camera_modes, view_of
+from twin.pins.labelling.identify import SHOWN, score_layout
+from twin.pins.labelling.matching import Match, complete, confirm, look_again, match, proven, rematch
+from twin.pins.labelling.reference import Reference, folded_fraction, make_reference, nominal_reference
+from twin.pins.labelling.rest import require_even
+from twin.pins.labelling.split import split_chains, split_merged
+from twin.pins.labelling.view import NO_CONTACT_REMEDY, camera_modes, view_of
 from twin.types import Form, Frame, Observation
 
 MOST_RIM_LOST = 0.75

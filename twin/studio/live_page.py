@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from scenes.sensor import SensorSpec
 from twin.estimate import Estimate, readable_labels
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 from twin.studio.camera import dome_part
 from twin.studio.page import LineChart, StudioPage
 from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, paragraph

@@ -13,7 +13,7 @@ from training.models.cnn.inputs import image_inputs, small_image
 from training.models.cnn.network import Cnn
 from training.models.part import ArrayInputs, Model, Prediction, Prepared, Trained, refuse_sizes
 from training.models.recipes import Recipe
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 from twin.types import Frame
 
 

@@ -15,7 +15,7 @@ from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, W
 from training.models.recipes import Recipe
 from training.models.steered.field import waves_of
 from training.models.steered.network import Steered, SteeredSize
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 
 # Buffers that a small copy leaves out, because they follow from the pins at rest.
 DERIVED = ("fit", "order")

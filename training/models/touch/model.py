@@ -19,7 +19,7 @@ from training.models.recipes import Recipe
 from training.models.touch.features import Bases
 from training.models.touch.network import TouchNetwork
 from training.models.vgnn.registration import Registration, align, fit_registration
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 
 SIZES = {"modes": 40, "light_modes": 20, "width": 256, "depth": 3}
 """Numbers of modes of displacements (and of relative modes) and of modes of light; width and depth of the network."""
@@ -43,7 +43,7 @@ LIGHT_DECIMALS = 4
 """Decimals of the caps' light (logarithms of levels) that are compared between frames."""
 
 
-def _scaled(features: np.ndarray) -> ArrayInputs:
+def _scale(features: np.ndarray) -> ArrayInputs:
     """Inputs from features (M, D)."""
     return ArrayInputs((GAIN * features).astype(np.float32))
 
@@ -76,7 +76,7 @@ class TouchModel(PinModel):
         moved = _remove_camera_motion(registration, pins, pins.reference, lost, together=False)
         bases = Bases.learn_bases(moved[train], pins.light[train], lost[train], modes=SIZES["modes"], light_modes=SIZES["light_modes"])
         learnt = {"registration": registration.arrays(), "bases": bases.arrays()}
-        return Prepared(_scaled(bases(moved, pins.light)), learnt)
+        return Prepared(_scale(bases(moved, pins.light)), learnt)
 
     def inputs_seen(self, data: Dataset) -> object:
         """See ``Model``: the pins, their places at rest, and the light of the caps."""
@@ -89,7 +89,7 @@ class TouchModel(PinModel):
         if bases.light_mean.any() and not pins.light.any():
             raise TrainingError("the model was trained on the light on the caps as well, and these pins come without it; give it frames")
         moved = _remove_camera_motion(registration, pins, reference, _find_untrusted(registration, pins, reference), together=together)
-        return _scaled(bases(moved, _as_bright(pins.light, bases)))
+        return _scale(bases(moved, _as_bright(pins.light, bases)))
 
     def initialise(self, network: torch.nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
         """See ``Model``. Sets the largest size of each feature in training."""

@@ -8,7 +8,7 @@ were chosen, not derived.
 import numpy as np
 
 from twin.compiled import compiled
-from twin.pins.buckets import fill_buckets, nearest_free
+from twin.pins.labelling.buckets import fill_buckets, nearest_free
 
 NEIGHBOURS = 18
 """Number of neighbours that predict the position of a place: two rings of a triangular lattice."""

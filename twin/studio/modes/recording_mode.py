@@ -15,10 +15,10 @@ from twin.pins.pipeline import Pipeline
 from twin.rig.contact import RigContact
 from twin.rig.labels import ArmLabel, poses_and_moves, read_arm_labels
 from twin.studio.contact import MovingContact, experiment_of
-from twin.studio.mode import PageMode
+from twin.studio.modes.mode import PageMode
+from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import CELLS, StudioPage, put
 from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
-from twin.studio.twin_mode import TwinMode
 from twin.types import FloatArray, Form, Frame, Observation
 
 UNSURE = 0.5

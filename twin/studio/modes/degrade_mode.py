@@ -16,11 +16,11 @@ from twin.optics.preview import Shading
 from twin.pins import make_detector, nominal_reference, shipped_detector
 from twin.pins.pipeline import Pipeline
 from twin.studio.contact import ContactAnswer
-from twin.studio.mode import PageMode
+from twin.studio.modes.mode import PageMode
+from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import StudioPage, put
 from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, paragraph
 from twin.studio.pose import ObjectPose
-from twin.studio.twin_mode import TwinMode
 from twin.types import Form, Frame, Observation
 
 SLIDERS = 3

@@ -13,11 +13,11 @@ from twin.calibration.new_sensor import NewSensor, new_sensor
 from twin.errors import TwinError
 from twin.frames import Recording, frames_at, open_recording
 from twin.pins.pipeline import Pipeline
-from twin.studio.mode import PageMode
+from twin.studio.modes.mode import PageMode
+from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import StudioPage, put
 from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, number_table, paragraph
 from twin.studio.state import next_path
-from twin.studio.twin_mode import TwinMode
 
 LARGER, SMALLER = "one larger", "one smaller"
 """Corrections of a layout: one ring more or less, or for a grid one row and one column."""

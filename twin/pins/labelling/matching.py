@@ -27,8 +27,8 @@ from scipy.spatial import cKDTree
 
 from twin.compiled import compiled
 from twin.geometry.drift import drift
-from twin.pins.buckets import Buckets, fill_buckets, nearest_free
-from twin.pins.reference import Reference, turned_over
+from twin.pins.labelling.buckets import Buckets, fill_buckets, nearest_free
+from twin.pins.labelling.reference import Reference, turned_over
 
 RIDGE = 0.25
 """Penalty of the local gradient, which draws it towards zero. It is equivalent to this many neighbours at a distance of one spacing."""

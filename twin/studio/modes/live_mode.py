@@ -14,10 +14,10 @@ from twin.estimate import SensorModel, pins_in
 from twin.pins.check import Grade, examine
 from twin.pins.pipeline import Pipeline
 from twin.studio.live_page import LiveFrame, chart_values, frame_numbers, frame_pictures
-from twin.studio.mode import PageMode
+from twin.studio.modes.mode import PageMode
+from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import LineChart, StudioPage, put
 from twin.studio.pictures import badge, paragraph
-from twin.studio.twin_mode import TwinMode
 
 NUDGES = ("x -1", "x +1", "y -1", "y +1", "z -1", "z +1")
 """Moves that an armed arm can be given, mm in its base frame."""

@@ -1,9 +1,9 @@
 """Identification of the pin layout of an unknown sensor from its frames alone.
 
-Each family of layouts (rings, hexagon, grid) labels the pin-like spots of each frame by its lattice (`twin.pins.families`). The part of
-the lattice that holds the spots is a candidate. A candidate is evaluated by what it does not explain: pins that should be in view but are
-not seen, and pin-like spots that belong to none of its pins, also at its rim and just outside it. Therefore a layout with one ring too few
-or too many explains less than the right layout, and is not chosen.
+Each family of layouts (rings, hexagon, grid) labels the pin-like spots of each frame by its lattice (`twin.pins.labelling.families`). The
+part of the lattice that holds the spots is a candidate. A candidate is evaluated by what it does not explain: pins that should be in view
+but are not seen, and pin-like spots that belong to none of its pins, also at its rim and just outside it. Therefore a layout with one ring
+too few or too many explains less than the right layout, and is not chosen.
 
 Pins may be brighter or darker than the skin. The gaps between dark pins are bright spots, too, and often form a lattice that explains all
 of them. But pins have skin on all sides, while gaps have skin on some sides and pins on others (`stand_out`).
@@ -24,12 +24,12 @@ from twin.errors import FrameError
 from twin.frames import spread_indices
 from twin.frames.forms import is_two_level, levels_at, pin_levels
 from twin.geometry.pins import namings, pin_lattice, usual_spacing
-from twin.pins.bumps import Bumps, find_bumps
-from twin.pins.extent import filled_area, find_beyond, in_view, open_sides, with_view
-from twin.pins.families import Family, families, family, family_of_positions, label_spots
-from twin.pins.growth import locate_places
-from twin.pins.matching import match
-from twin.pins.reference import make_reference, spread_out, together
+from twin.pins.finding.bumps import Bumps, find_bumps
+from twin.pins.labelling.extent import filled_area, find_beyond, in_view, open_sides, with_view
+from twin.pins.labelling.families import Family, families, family, family_of_positions, label_spots
+from twin.pins.labelling.growth import locate_places
+from twin.pins.labelling.matching import match
+from twin.pins.labelling.reference import make_reference, spread_out, together
 from twin.progress import Step, unheard
 
 SIZES = tuple(0.003 * 1.4**k for k in range(8))

@@ -17,7 +17,7 @@ from twin.estimate import SensorModel, readable_labels
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
 from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
-from twin.studio.mode import PageMode
+from twin.studio.modes.mode import PageMode
 from twin.studio.page import LineChart, StudioPage, put, value_of
 from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of

@@ -12,13 +12,23 @@ from twin.errors import FrameError
 from twin.frames import spread_indices
 from twin.frames.forms import pin_levels, polarity_of
 from twin.geometry.pins import pin_lattice
-from twin.pins.detector import Found, make_detector
-from twin.pins.detector_spec import DetectorSpec, Evidence, Method, with_detector
-from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, Identified, identify, score_layout, smooth_view, symmetries
-from twin.pins.legacy import legacy_parameters
-from twin.pins.reference import Reference, make_reference, nominal_reference, together
-from twin.pins.rest import Rest, rest_of
-from twin.pins.view import camera_modes, view_of
+from twin.pins.detectors.detector import Found, make_detector
+from twin.pins.detectors.detector_spec import DetectorSpec, Evidence, Method, with_detector
+from twin.pins.detectors.legacy import legacy_parameters
+from twin.pins.labelling.identify import (
+    SAME_SHAPE,
+    SHOWN,
+    SURE_EXPLAINED,
+    Candidate,
+    Identified,
+    identify,
+    score_layout,
+    smooth_view,
+    symmetries,
+)
+from twin.pins.labelling.reference import Reference, make_reference, nominal_reference, together
+from twin.pins.labelling.rest import Rest, rest_of
+from twin.pins.labelling.view import camera_modes, view_of
 from twin.progress import Step, unheard
 from twin.types import Form, Frame
 

@@ -180,7 +180,7 @@ def test_the_window_holds_mask_and_recording(name):
 def test_depth_and_both_tilts_are_the_inverse_of_the_arms_way():
     sensor, experiment, rng = load_sensor("ur5-331"), load_experiment("surface-3d"), np.random.default_rng(0)
     radius, surface = sensor.skin.outer_radius_mm, SmoothSurface(PLANE)
-    odd = rig_of(sensor).model_copy(update={"turn_offset_deg": (0.3, -0.5, 2.0), "plate_tilt_deg": 3.0, "tcp_aside_mm": 0.4})
+    odd = rig_of(sensor).model_copy(update={"turn_offset_deg": (0.3, -0.5, 2.0), "plate_tilt_deg": 3.0, "tcp_binormal_mm": 0.4})
     for rig in (rig_of(sensor), odd):
         for _ in range(20):
             pose = np.array([0, 0, rng.uniform(0, 5), *rng.uniform(-20, 20, 2), 0])

@@ -229,7 +229,7 @@ def test_the_written_copy_is_a_sensor_and_wrong_sides_are_refused(tmp_path):
         again.camera.turn_deg == pytest.approx(made.camera.turn_deg) and again.pipeline.recording.rest_px == made.pipeline.recording.rest_px
     )
     found = {each.name: each for each in examine([frames["rest"]], again)}
-    assert all(found[name].verdict is Grade.GOOD for name in ("shift", "turn", "scale", "stretch", "mirror"))
+    assert all(found[name].verdict is Grade.HEALTHY for name in ("shift", "turn", "scale", "stretch", "mirror"))
     with pytest.raises(FrameError, match="need two pushes, or one and a twist"):
         registered_view(spec, frames["rest"], {"x": frames["x"]})
     with pytest.raises(FrameError, match="hardly moves the pins"):
@@ -246,9 +246,9 @@ def test_check_names_stretch_and_mirror():
     found = {
         f.name: f for f in examine([drawn(model_of("mg400-127"), carried(known_of("mg400-127"), mirrored=True, scale=(1.1, 1)))], spec)
     }
-    assert found["mirror"].verdict is Grade.BAD and found["stretch"].verdict is Grade.BAD and "10" in found["stretch"].text
+    assert found["mirror"].verdict is Grade.FAILED and found["stretch"].verdict is Grade.FAILED and "10" in found["stretch"].text
     plain = {f.name: f for f in examine([drawn(model_of("mg400-127"), known_of("mg400-127"))], load_sensor("mg400-127"))}
-    assert plain["mirror"].verdict is Grade.GOOD and "can't be seen" in plain["mirror"].text
+    assert plain["mirror"].verdict is Grade.HEALTHY and "can't be seen" in plain["mirror"].text
 
 
 @pytest.mark.parametrize(("turn_deg", "mirrored"), [(30.0, False), (-100.0, True), (0.0, True)])

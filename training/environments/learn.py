@@ -197,8 +197,8 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
     success: dict[str, float] = {
         str(plan.options.backend): evaluate_policy(made, plan.task, plan.options, plan.episodes, seed=10_000 + plan.seed)
     }
-    if not plan.options.friction_memory:
-        remembering = replace(plan.options, friction_memory=True)
+    if not plan.options.friction_history:
+        remembering = replace(plan.options, friction_history=True)
         success["surrogate, friction remembers"] = evaluate_policy(made, plan.task, remembering, plan.episodes, seed=10_000 + plan.seed)
     if plan.fem_episodes:
         true = on_finite_elements(plan.options, tuple(vector.batch.objects))
@@ -212,7 +212,7 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
 def on_finite_elements(options: Options, objects: tuple[str, ...]) -> Options:
     """The same environment and objects on finite elements, with rasterised frames and the real pipeline."""
     seen: Pictures = "preview" if options.observation != "oracle" else "none"
-    return replace(options, backend="fem", surrogate=None, friction_memory=True, pictures=seen, objects=objects)
+    return replace(options, backend="fem", surrogate=None, friction_history=True, pictures=seen, objects=objects)
 
 
 def _write_curve(curve: Sequence[tuple[int, float, float, float]], table: Path, picture: Path) -> None:

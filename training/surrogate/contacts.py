@@ -32,12 +32,12 @@ class SurrogateContacts:
         A sensor with the surrogate's mechanics. ``felt`` begins with its pins at rest.
     count : int
         Number of sensors.
-    friction_memory : bool
+    friction_history : bool
         False: at every pose the contact begins again.
     """
 
-    def __init__(self, surrogate: Surrogate, sensor: SensorSpec, count: int, *, friction_memory: bool = True) -> None:
-        self._surrogate, self._sensor, self._memory = surrogate, sensor, friction_memory
+    def __init__(self, surrogate: Surrogate, sensor: SensorSpec, count: int, *, friction_history: bool = True) -> None:
+        self._surrogate, self._sensor, self._memory = surrogate, sensor, friction_history
         self._rest = rest_of(sensor)
         self._cap_mm = sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
         modes = surrogate.modes

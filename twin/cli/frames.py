@@ -152,11 +152,11 @@ def tune(
     return tune_on_frames(at, load_sensor(sensor), out=out, method=method, form=form, limit=max_frames, progress=progress)
 
 
-# Exit code of 'twin check' if the sensor's condition is bad. It differs from those of a failure (1) and of a wrong command line (2).
-BAD = 3
+# Exit code of 'twin check' if the sensor has failed. It differs from those of a failure (1) and of a wrong command line (2).
+FAILED = 3
 
 
-@app.command("check", exit_code=lambda found: BAD if found.bad else 0)
+@app.command("check", exit_code=lambda found: FAILED if found.failed else 0)
 def check(
     source: Annotated[
         str, typer.Argument(metavar="FRAME", help="image, folder of frames, video, recording, or a camera: 0, /dev/video2, http://...")
@@ -190,7 +190,7 @@ def check(
     frames show it, so give frames of several contacts. If there are weights of the sensor, it lists frames outside their domain (torn,
     displaced, unknown contact) with the reason.
 
-    The exit code is 3 if something is bad, otherwise 0.
+    The exit code is 3 if something has failed, otherwise 0.
 
     On a symmetric layout, the pins of an unknown unit do not show a turn by a symmetry, or a mirror. Contacts that push the pins in known
     directions determine both. With --push and --no-contact it determines turn, mirror, size and position of the picture and the pins at

@@ -424,7 +424,7 @@ def learn(
         "sensor": sensor,
         "observation": observation,
         "randomise": randomise,
-        "friction_memory": friction_history,
+        "friction_history": friction_history,
         "surrogate": surrogate,
         "objects": names_in(objects) if objects else None,
     }

@@ -61,9 +61,9 @@ GLARE_CAPS = 2
 class Grade(StrEnum):
     """Grade of a finding."""
 
-    GOOD = "good"
-    WATCH = "watch"
-    BAD = "bad"
+    HEALTHY = "healthy"
+    DEGRADED = "degraded"
+    FAILED = "failed"
 
 
 @dataclass(frozen=True)
@@ -174,18 +174,18 @@ def drift_of(pins_px: np.ndarray, rest_px: np.ndarray, outmost: np.ndarray, *, b
     return Drift(np.array([shift.real, shift.imag]), float(np.degrees(np.angle(a))), float(abs(a)), float(contact), bulge)
 
 
-def _verdict(value: float, watch: float, bad: float) -> Grade:
-    """Grade of a value by two limits. If ``bad`` is larger than ``watch``, large values are bad, else small ones. NaN is bad."""
-    sign = 1 if bad > watch else -1
-    if not np.isfinite(value) or sign * value > sign * bad:
-        return Grade.BAD
-    return Grade.WATCH if sign * value > sign * watch else Grade.GOOD
+def _verdict(value: float, degraded: float, failed: float) -> Grade:
+    """Grade of a value by two limits. If ``failed`` is larger than ``degraded``, large values have failed, else small ones. So has NaN."""
+    sign = 1 if failed > degraded else -1
+    if not np.isfinite(value) or sign * value > sign * failed:
+        return Grade.FAILED
+    return Grade.DEGRADED if sign * value > sign * degraded else Grade.HEALTHY
 
 
 def _finding(name: str, value: float, limits: tuple[float, float], text: str, remedy: str) -> Finding:
     """A finding with its verdict by the limits (watch, bad). If the verdict is good, there is no remedy."""
     verdict = _verdict(value, *limits)
-    return Finding(name, verdict, float(value), text, "" if verdict is Grade.GOOD else remedy)
+    return Finding(name, verdict, float(value), text, "" if verdict is Grade.HEALTHY else remedy)
 
 
 def _layout(frames: list[Frame], spec: SensorSpec, polarity: Polarity) -> Finding:
@@ -254,7 +254,7 @@ def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> lis
         return [
             Finding(
                 "place",
-                Grade.BAD,
+                Grade.FAILED,
                 np.nan,
                 "the camera's place can't be determined: too few pins at the rim",
                 "see the other findings first",

@@ -209,7 +209,7 @@ def _with_parameters(rig: RigSpec, experiment: ExperimentSpec, x: np.ndarray) ->
             "contact_offset_mm": rig.contact_offset_mm + float(x[0]),
             "tcp_to_dome_mm": rig.tcp_to_dome_mm + 10 * float(x[1]),
             "tcp_lateral_mm": rig.tcp_lateral_mm + float(x[2]),
-            "tcp_aside_mm": rig.tcp_aside_mm + float(x[3]),
+            "tcp_binormal_mm": rig.tcp_binormal_mm + float(x[3]),
             "image_turn_deg": (rig.image_turn_deg + 90 * float(x[4])) % 360,
             "turn_offset_deg": tuple(offsets.tolist()),
         }

@@ -186,7 +186,7 @@ class LiveMode(PageMode):
         if self._last is None or self._feed is None:
             raise TwinError("there is no frame yet; connect a camera first")
         findings = examine([self._last.frame], self._feed.model.sensor)
-        ill = [f"{finding.text} {finding.remedy}".strip() for finding in findings if finding.verdict is not Grade.GOOD]
+        ill = [f"{finding.text} {finding.remedy}".strip() for finding in findings if finding.verdict is not Grade.HEALTHY]
         self._health = ill or [f"All {len(findings)} checks are good."]
 
     def _toggle_record(self) -> None:

@@ -211,7 +211,9 @@ def follow(
             session.keep_rest(rest)
         take_rest = partial(_take_rest, session, model) if takes_rest else None
         hooks = LoopHooks(law, take_rest, partial(_note_step, session, step, steps))
-        loop = ServoLoop(rig, plan.servo, model, _settings(plan, rig, steps), hooks)
+        period_s = 1.0 / (plan.stream_hz or STREAM_HZ)
+        settings = LoopSettings(steps, plan.stream_hz is None, period_s, rig.frame_timeout_s, GIVE_UP_S)
+        loop = ServoLoop(rig, plan.servo, model, settings, hooks)
         try:
             loop.run(rig.placed.start_pose(plan.servo.indent_mm))
         except TwinError as error:
@@ -256,16 +258,6 @@ def _rig_of(plan: FollowPlan, model: SensorModel) -> Rig:
         seed=plan.seed,
         plain_light=plan.plain_light,
         at_once=plan.stream_hz is None,
-    )
-
-
-def _settings(plan: FollowPlan, rig: Rig, steps: int) -> LoopSettings:
-    return LoopSettings(
-        steps,
-        blocking=plan.stream_hz is None,
-        period_s=1.0 / (plan.stream_hz or STREAM_HZ),
-        frame_timeout_s=rig.frame_timeout_s,
-        give_up_s=GIVE_UP_S,
     )
 
 

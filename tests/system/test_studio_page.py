@@ -215,6 +215,26 @@ def test_an_object_that_is_chosen_while_a_sensor_opens_is_kept(studio, client):
     client.wait(lambda u: "of 127" in u.html, WAIT_S, since=since)
 
 
+def test_a_choice_whose_callback_comes_late_is_kept_and_every_browser_shows_it(studio, client, monkeypatch):
+    """The page has the new value before the callback runs; and a browser may get an older value of the program after its own choice."""
+    drag(client, 1.5)
+    control = studio.twin._object
+
+    def scene(*arguments):
+        control._impl.value = "cylinder"  # the choice has come, and its callback waits for a thread
+        return Scene(*arguments)
+
+    monkeypatch.setattr("twin.studio.modes.twin_mode.Scene", scene)
+    studio.twin.open(StudioState(sensor=SENSOR, object="sphere", pose={"depth_mm": 1.0}))
+    assert control.value == "cylinder"
+    client.gui[client.uuid("object")]["value"] = "sphere"
+    studio.twin._change_object()
+    until(lambda: studio.twin.contact.setup.obj.name == client.value("object") == "cylinder")
+    monkeypatch.undo()
+    studio.twin.open(StudioState(sensor=SENSOR, object="sphere", pose={"depth_mm": 1.0}))
+    until(lambda: client.value("object") == "sphere")
+
+
 def test_degrade_shows_the_same_contact_with_its_limits(client):
     drag(client, 2.0)
     since = len(client.updates)

@@ -17,6 +17,7 @@ import numpy as np
 import viser
 import websockets.asyncio.server
 from viser import uplot
+from viser._messages import GuiUpdateMessage
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
@@ -84,8 +85,17 @@ def value_of(control: viser.GuiInputHandle[str], kind: Callable[[str], Value], n
         raise TwinError(f"'{quote(given)}' is not a value of this control; choose one that the page offers") from None
 
 
-def put(control: viser.GuiInputHandle[Any], value: object) -> None:
-    """Set a control's value in all browsers."""
+def put(control: viser.GuiInputHandle[Any], value: object, *, send: bool = False) -> None:
+    """Set a control's value in all browsers.
+
+    Parameters
+    ----------
+    send : bool
+        Send the value although the control has it. A browser may show another one: its own change and a change by this program can
+        cross on their way.
+    """
+    if send and control.value == value:
+        control._impl.gui_api._websock_interface.queue_message(GuiUpdateMessage(control._impl.uuid, {"value": value}))
     setattr(control, "value", value)  # noqa: B010  # by its annotations the value can't be set
 
 

@@ -311,9 +311,9 @@ class TwinMode(PageMode):
         try:
             obj = load_object(name)
         except SpecError:
-            put(self._object, self._state.object)
+            put(self._object, self._state.object, send=True)
             raise
-        put(self._object, name)
+        put(self._object, name, send=True)
         self._state = self._state.model_copy(update={"object": name})
 
         def change() -> None:
@@ -331,7 +331,7 @@ class TwinMode(PageMode):
             try:
                 self.open(self.state.model_copy(update={"sensor": chosen, "form": str(Form.RAW)}))
             except (TwinError, SpecError):
-                put(self._sensor, self._state.sensor)
+                put(self._sensor, self._state.sensor, send=True)
                 raise
 
     def open(self, state: StudioState) -> None:
@@ -349,6 +349,7 @@ class TwinMode(PageMode):
             if self._tracer is not None:
                 self._tracer.__exit__(None, None, None)
             self._page.gui.set_panel_label(heading(state))
+            before, friction = self._choices(), self._own_friction()
             self._state, self._wish = state, state.object_pose()
             self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
             self._model_note = "the model is being loaded"
@@ -356,12 +357,17 @@ class TwinMode(PageMode):
             setup = self.contact.setup
             self._form.options = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
             self._sensor.options = tuple(sorted({*self._sensor.options, state.sensor}))
-            chosen = [(self._form, setup.form), (self._drawing, self._drawn), (self._colour, self._shown)]
-            for control, value in [*chosen, (self._sensor, state.sensor), (self._object, state.object)]:
-                if str(value) in control.options:
-                    put(control, str(value))
-            put(self._friction, self._own_friction())
+            for (control, old), (_, new) in zip(before, self._choices(), strict=True):
+                if control.value == old and new in control.options:  # otherwise the user has just chosen another one; its callback follows
+                    put(control, new)
+            if self._friction.value == friction:
+                put(self._friction, self._own_friction())
             self._begin()
+
+    def _choices(self) -> list[tuple[viser.GuiDropdownHandle[str], str]]:
+        """The page's dropdowns, each with the value that is in use."""
+        used = (self.contact.setup.form, self._drawn, self._shown, self._state.sensor, self._state.object)
+        return list(zip((self._form, self._drawing, self._colour, self._sensor, self._object), map(str, used), strict=True))
 
     def _open_link(self, link: str) -> None:
         """Show the state of a link, unless the page shows it already."""

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from twin.compiled import compiled
+from twin.pins.flips import Net, flipped
 
 # Factor by which the outline is enlarged about its centroid: half way to the release's additional sites, which lie at 1.1.
 BOUNDARY_SCALE = 1.05
@@ -42,10 +43,15 @@ class Tessellation:
     region_px: np.ndarray
 
 
-def triangulate(nodes_px: np.ndarray) -> np.ndarray | None:
-    """Delaunay triangles (t, 3) of the nodes (N, 2); None if there are none (nodes are collinear, coincide, or are fewer than 3)."""
+def triangulate(nodes_px: np.ndarray, net: Net | None = None) -> np.ndarray | None:
+    """Delaunay triangles (t, 3) of the nodes (N, 2); None if there are none (nodes are collinear, coincide, or are fewer than 3).
+
+    They are found from a ``net`` of the nodes at rest, if it is given and the nodes turn none of its triangles over.
+    """
     if len(nodes_px) < 3:
         return None
+    if net is not None and len(triangles := flipped(nodes_px, *net)):
+        return triangles
     try:
         mesh = Delaunay(nodes_px)
     except QhullError:

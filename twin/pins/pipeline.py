@@ -18,7 +18,7 @@ from twin.pins.finding.blobs import Blobs, Mask, circular_mask, despeckle, find_
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.labelling.identify import SHOWN, score_layout
 from twin.pins.labelling.matching import Match, complete, confirm, look_again, match, proven, rematch
-from twin.pins.labelling.reference import Reference, folded_fraction, make_reference, mean_radius, nominal_reference
+from twin.pins.labelling.reference import Reference, folded_fraction, make_reference, mean_radius, median_px, nominal_reference
 from twin.pins.labelling.rest import require_even
 from twin.pins.labelling.split import split_chains, split_merged
 from twin.pins.labelling.view import NO_CONTACT_REMEDY, camera_modes, view_of
@@ -240,7 +240,7 @@ class Pipeline:
         away = np.linalg.norm(found.predicted_px - self.blob_spec.mask_center_px, axis=1)
         if not len(rim) or not (away > self.blob_spec.mask_radius_px - MASK_MARGIN * self.reference.spacing_px).any():
             return blobs, found
-        shift = np.median(blobs.px[found.blob[rim]] - self.reference.pins_px[rim], axis=0)
+        shift = median_px(blobs.px[found.blob[rim]] - self.reference.pins_px[rim])
         if np.linalg.norm(shift) < REMASK_PX:
             return blobs, found
         center = np.asarray(self.blob_spec.mask_center_px) + shift
@@ -322,7 +322,7 @@ class Pipeline:
         folded = folded_fraction(self.reference, nodes_px)
         if folded > MAX_FOLDED:
             return f"inconsistent pins: the labelling inverts {folded:.1%} of the layout"
-        shift = np.linalg.norm(np.median(nodes_px, axis=0) - self._center_px)
+        shift = np.linalg.norm(median_px(nodes_px) - self._center_px)
         if shift > MAX_SHIFT * self._radius_px:
             return f"inconsistent pins: the layout is displaced by {shift:.0f} px"
         rim = self.reference.outmost

@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 from twin.compiled import compiled
 from twin.geometry.drift import drift
 from twin.pins.labelling.buckets import Buckets, fill_buckets, nearest_free
-from twin.pins.labelling.reference import Reference, turned_over
+from twin.pins.labelling.reference import Reference, median_px, turned_over
 
 RIDGE = 0.25
 """Penalty of the local gradient, which draws it towards zero. It is equivalent to this many neighbours at a distance of one spacing."""
@@ -296,7 +296,7 @@ def _rim_displacement(reference: Reference, px: np.ndarray, blob: np.ndarray) ->
     rim = reference.outmost[blob[reference.outmost] >= 0]
     if not len(rim):
         return 0.0
-    away = np.median(px[blob[rim]] - reference.pins_px[rim], axis=0)
+    away = median_px(px[blob[rim]] - reference.pins_px[rim])
     return float(np.hypot(*away) / reference.pitch_px)
 
 
@@ -700,7 +700,7 @@ def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
     for rank in range(SEED_RANKS):
         for place in range(3):
             if place == len(offsets):
-                offsets += [np.zeros(2), np.median(px, axis=0) - np.median(reference.pins_px, axis=0)]
+                offsets += [np.zeros(2), median_px(px) - median_px(reference.pins_px)]
             for pin in reference.starts:
                 distance2 = ((px - (reference.pins_px[pin] + offsets[place])) ** 2).sum(axis=1)
                 pair = pin, int(np.argpartition(distance2, rank)[rank])

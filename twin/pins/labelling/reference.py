@@ -9,6 +9,7 @@ from scipy.spatial import Delaunay, cKDTree
 from scenes.pins import PinsSpec
 from scenes.sensor import SensorSpec
 from twin.camera.projection import project
+from twin.compiled import compiled
 from twin.errors import FrameError
 from twin.frames.forms import form_named, from_raw
 from twin.geometry.drift import coherent_motions
@@ -104,6 +105,13 @@ def mean_radius(px: np.ndarray) -> float:
     return float(np.linalg.norm(px - px.mean(axis=0), axis=1).mean())
 
 
+def median_px(px: np.ndarray) -> np.ndarray:
+    """Medians (2,) of points (n, 2): ``np.median``, in a tenth of its time for a few points."""
+    ordered, n = np.sort(px, axis=0), len(px)
+    median: np.ndarray = (ordered[(n - 1) // 2] + ordered[n // 2]) / 2
+    return median
+
+
 def spread_out(pins_px: np.ndarray) -> bool:
     """Whether pins (N, 2) spread over an area, as in every real frame. They do not if they lie at one place, on a line, or too far away."""
     if not np.isfinite(pins_px).all() or np.abs(pins_px).max() > FARTHEST_PX:
@@ -172,10 +180,14 @@ def _turned_alike(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return np.where(_double_areas(px, triangles)[:, None] < 0, triangles[:, ::-1], triangles)
 
 
+@compiled()
 def _double_areas(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Twice the signed area (t,) of triangles (t, 3) over points (N, 2)."""
-    a, b, c = px[triangles[:, 0]], px[triangles[:, 1]], px[triangles[:, 2]]
-    return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    areas = np.empty(len(triangles))
+    for t in range(len(triangles)):
+        (ax, ay), (bx, by), (cx, cy) = px[triangles[t, 0]], px[triangles[t, 1]], px[triangles[t, 2]]
+        areas[t] = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    return areas
 
 
 def turned_over(reference: Reference, nodes_px: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:

@@ -272,7 +272,7 @@ def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) 
                 best = found
                 break
         grown[labels.tobytes()] = labels
-        if count > MIN_SETTLED * n:
+        if count >= NEARLY_ALL * n:
             large.append(labels)
     if best is None:
         likely = sorted(grown.values(), key=lambda labels: -int((labels >= 0).sum()))[:REFINED]

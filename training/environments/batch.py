@@ -30,8 +30,6 @@ PERIOD_S = 0.1
 """Duration of a step, s: an agent decides ten times per second."""
 LARGEST_MM, LARGEST_DEG = 1.0, 5.0
 """Motion of a step, along and about each axis, by an action of 1."""
-MOST_TRIALS = 2
-"""Most iterations in a step by which the place of a pushed object is found. A block's force is then within some 0.05 N of its friction."""
 MOST_STACK = 16
 """Most observations that can be stacked."""
 MOST_ORACLE = 100.0
@@ -320,10 +318,8 @@ class Batch:
         self.T_object[rows] = carried[rows]
         self.steps_done[rows] += 1
         self._move(rows)
-        for _ in range(MOST_TRIALS):
-            pushed = self.task.push_object(self.backend.felt, self.T_work, self.T_object, self.tool)
-            if pushed is None:
-                break
+        pushed = self.task.push_object(self.backend.felt, self.T_work, self.T_object, self.tool)
+        if pushed is not None:
             self.T_object[rows] = pushed[rows]
             self._move(rows)
         self._look(rows, first=False)

@@ -33,7 +33,7 @@ FAULTS = {
     "stall": (0.5, "each move stops after this share of its time, and its command never ends"),
     "ignore-moves": (None, "moves are accepted and not executed"),
     "slow": (0.1, "moves at this share of the speed"),
-    "wide-queue-space": (None, "the queue's space is told in 8 bytes instead of 4"),
+    "wide-queue-space": (None, "the queue's space is reported in 8 bytes instead of 4"),
 }
 # The values that the faults may have.
 RANGES = {

@@ -131,7 +131,7 @@ def test_sliders_undo_and_what_is_shown(client):
     since = len(client.updates)
     client.set("Undo", True)
     client.wait(lambda u: abs(u.depth_mm - 1.0) < 1e-4, WAIT_S, since=since)
-    for label, value, word in (("colour pins by", "pressure", "MPa"), ("frame", "recording", "mm"), ("frame", "raw", "mm")):
+    for label, value, word in (("colour pins by", "pressure", "MPa"), ("frame", "processed", "mm"), ("frame", "raw", "mm")):
         since = len(client.updates)
         client.set(label, value)
         client.wait(lambda u, word=word: word in u.html, WAIT_S, since=since)

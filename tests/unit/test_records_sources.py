@@ -140,7 +140,7 @@ def test_a_data_sets_truth_goes_with_it(tmp_path):
     rng = np.random.default_rng(0)
     arrays = {"pins_px": rng.normal(size=(3, 127, 2)), "force_n": rng.normal(size=(3, 3)), "torque_nmm": rng.normal(size=(3, 3))}
     truth.append(arrays | {"pose": rng.normal(size=(3, 6)), "path_id": np.array([0, 0, 1])})
-    truth.close({"sensor": "mg400-127", "form": "recording"})
+    truth.close({"sensor": "mg400-127", "form": "processed"})
     experiment = load_experiment("surface-2d")
     made = {"sensor": SENSOR.model_dump(mode="json"), "experiment": experiment.model_dump(mode="json")}
     (folder / "generation.json").write_text(json.dumps(made))

@@ -32,7 +32,7 @@ class BaselinesVecEnv(VecEnv):
         inner = vector.unwrapped
         if not isinstance(inner, TactileVectorEnv):
             raise OptionError(
-                f"{inner!r} is no vector of this program's environments; give gymnasium.make_vec('twin:tactip/EdgeFollow-v0')"
+                f"{inner!r} is not a vector environment of this program; give gymnasium.make_vec('twin:tactip/EdgeFollow-v0')"
             )
         self.vector = inner
         self._actions: FloatArray = np.zeros(0)

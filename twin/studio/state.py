@@ -195,7 +195,7 @@ def read_trajectory(content: bytes, name: str) -> Way:
 
 
 def tap_and_shear(pose: ObjectPose, *, depth_mm: float = 3.0, shear_mm: float = 3.0) -> Way:
-    """A tap from 2 mm above the tip down to a depth, a shear along x and back, and the way up. Tilts and twist are not changed."""
+    """A tap from 2 mm above the tip down to a depth, a shear along x and back, and the lift. Tilts and twist are not changed."""
     knots = [
         (0.0, -2.0, 0.0),
         (1.5, depth_mm, 0.0),

@@ -64,9 +64,7 @@ class UvcCamera(LiveSource):
         with quiet():
             device = cv2.VideoCapture(self._node, cv2.CAP_V4L2)
         if not device.isOpened():
-            raise DeviceError(
-                f"{self.name}: can't be opened; see 'twin doctor' for the cameras there are, and whether another program uses it"
-            )
+            raise DeviceError(f"{self.name}: can't be opened; 'twin doctor' lists the cameras; check whether another program uses it")
         self.report = apply_settings(device, self.settings)
         reported = next(reported for name, _, reported in self.report if name == "fps")
         self.fps = reported if reported > 0 else self.settings.fps  # a camera may be slower than requested

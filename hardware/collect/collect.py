@@ -279,9 +279,7 @@ def collect(
         Another run collects into the folder, or the folder can't be written to.
     """
     if experiment.tap_frame != "work":
-        raise DeviceError(
-            f"{experiment.name}: its tap follows the tool's axes, but 'twin collect' taps along the work frame's; give another"
-        )
+        raise DeviceError(f"{experiment.name}: its tap follows the tool's axes, but a collection taps along the work frame's; give another")
     if not rig.source.is_live:
         raise DeviceError(f"{rig.source.name}: a recording does not show this arm; give a live `camera`")
     timeout_s = rig.frame_timeout_s if frame_timeout_s is None else frame_timeout_s

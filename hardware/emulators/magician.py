@@ -102,9 +102,7 @@ class MagicianEmulator(Emulator):
                 self._link.symlink_to(self.device)
             except OSError as error:
                 self.unplug()
-                raise TwinError(
-                    f"{self._link}: can't make the link ({error.strerror}); remove what is there or give another `link`"
-                ) from error
+                raise TwinError(f"{self._link}: can't make the link ({error.strerror}); remove it or give another `link`") from error
         self._thread = Thread(target=self._serve, daemon=True, name="magician-emulator")
         self._thread.start()
         self.faults.after("unplugged", self.unplug)

@@ -105,7 +105,7 @@ def test_what_a_new_model_does_not_provide_it_says(data, toy, tmp_path):
     train_run(RunConfig(toy, recipe_of(toy, epochs=1)), data, tmp_path)
     with pytest.raises(TrainingError, match="line has no small copy"):
         pack(tmp_path, tmp_path / "small")
-    with pytest.raises(FrameError, match="counts pins from rest, line does not"):
+    with pytest.raises(FrameError, match="line does not measure displacements from rest"):
         PoseEstimator.load(tmp_path).at_rest(Frame(np.zeros((256, 256), np.uint8), Form.PROCESSED))
 
 

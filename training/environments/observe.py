@@ -106,9 +106,7 @@ class Eye:
                 raise OptionError(f"observation 'pose' needs shipped weights; {sensor.name} has none (there are those of {known} have)")
             self._estimator = PoseEstimator.load(sensor.name)
             if self._sees_light and pictures == "none":
-                raise OptionError(
-                    f"observation 'pose': the weights of {sensor.name} also need the light on the caps; give pictures='preview'"
-                )
+                raise OptionError(f"observation 'pose': the weights of {sensor.name} also need the light on caps; give pictures='preview'")
         self.form = self._estimator.form if self._estimator else Form.PROCESSED if sensor.recording else Form.RAW
         self.reference = nominal_reference(sensor, self.form)
         self._spacing = float(self.reference.spacing_px.mean())

@@ -165,9 +165,7 @@ class ContactEstimator:
         fitting = {name: len(part.names) for name, part in self.parts.items() if set(part.names) <= varied}
         if not fitting:
             needed = "; ".join(f"{name}: {', '.join(part.names)}" for name, part in self.parts.items())
-            raise TrainingError(
-                f"{recording.path}: its varying labels fit no kind of contact that the weights know ({needed}); give another"
-            )
+            raise TrainingError(f"{recording.path}: its varying labels fit no kind of contact of the weights ({needed}); give another")
         first = max(fitting, key=lambda name: fitting[name])
         return [name for name in fitting if self.parts[name].names == self.parts[first].names]
 

@@ -72,7 +72,7 @@ class SurrogateContacts:
             raise outside(f"a friction of {friction.static:g}, at most {self._domain['friction']:g} was trained")
         if contact.sensor is not self._sensor and unlike_parts(self._surrogate.about["mechanics"], contact.sensor):
             raise outside(
-                "the skin, gel, lens or pins of the sensor are sampled again; randomise friction, camera and noise only ('moves')"
+                "the skin, gel, lens or pins of the sensor are sampled again; randomise only friction, camera and noise ('moves')"
             )
 
     def begin(self, row: int, contact: EpisodeContact) -> None:

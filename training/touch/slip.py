@@ -546,9 +546,7 @@ def compare_slip(model: SlipModel, paths: Sequence[DragPath]) -> SlipErrors:
         slips = [tracker(modes) for modes in path.modes]
         found["whole_accuracy"] += [(slip.whole > 0.5) == whole for slip, whole in zip(slips, path.whole.tolist(), strict=True)]
         found["share"] += [abs(slip.share - share) for slip, share in zip(slips, path.share.tolist(), strict=True)]
-        found["share_covered"] += [
-            slip.share_low <= share <= slip.share_high for slip, share in zip(slips, path.share.tolist(), strict=True)
-        ]
+        found["share_covered"] += [s.share_low <= share <= s.share_high for s, share in zip(slips, path.share.tolist(), strict=True)]
         found["false_alarms"] += [slip.alarm for slip, begins in zip(slips, path.begins.tolist(), strict=True) if not begins]
         if path.whole.any():
             at = next((k for k, slip in enumerate(slips) if slip.alarm and path.drag_mm[k] > 0), len(slips) - 1)

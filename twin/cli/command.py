@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from copy import copy
-from enum import Enum, EnumType
+from enum import Enum
 from functools import wraps
 from inspect import Parameter
 from numbers import Integral, Real
@@ -166,8 +166,7 @@ def _hidden(old: str, option: Parameter) -> Parameter:
 def _with_former_values(option: Parameter) -> Parameter:
     """The option; a choice also takes the names that its values had in version 1."""
     kinds = (_plain(option), *get_args(_plain(option)))
-    choices = [list(kind) if isinstance(kind, EnumType) else get_args(kind) if get_origin(kind) is Literal else () for kind in kinds]
-    values = [value for each in choices for value in each]
+    values = [v for kind in kinds for v in (get_args(kind) if get_origin(kind) is Literal else getattr(kind, "__members__", {}).values())]
     if not set(values) & set(FORMER_VALUES.values()):
         return option
 

@@ -108,9 +108,7 @@ def table(plan: ObjectsPlan, runs: dict[str, Path], sets: dict[str, Dataset]) ->
             data = sets[f"tests/{obj.name}"]
             chosen = rows_in_range(data, plan.experiment)
             if not len(chosen):
-                raise TrainingError(
-                    f"{obj.name}: none of its contacts has labels within the ranges of {plan.experiment.name}; give more `tests`"
-                )
+                raise TrainingError(f"{obj.name}: no contact has labels within the ranges of {plan.experiment.name}; give more `tests`")
             off = label_error(estimator.predict_rows(data, chosen).mean, data.targets.corrected[chosen], data.targets.units)
             error, bias = np.abs(off).mean(axis=0), off.mean(axis=0)
             flat = error if flat is None else flat

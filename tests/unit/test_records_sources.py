@@ -178,7 +178,7 @@ def test_a_collection_is_kept_in_further_formats_while_it_grows(tmp_path):
     for each in formats:
         steps = [step for episode in open_records(folder / each).episodes for step in episode.steps()]
         assert [step.values["action"].tolist() for step in steps] == [[k] * 6 for k in range(3)]
-    with pytest.raises(RecordError, match="no format bag"):
+    with pytest.raises(RecordError, match="no further format bag"):
         KeptAlso(folder, ("bag",), SENSOR)
 
 

@@ -32,7 +32,7 @@ class Start:
     Attributes
     ----------
     T_work : (4, 4) float
-        Work frame of the tool in the world; the object's frame is the world's at the start, unless ``T_object`` says otherwise.
+        Work frame of the tool in the world; the object's frame is the world's at the start, unless ``T_object`` is given.
     goal : tuple of float
         The goal, by the task's ``goal_names``.
     T_object : (4, 4) float
@@ -149,7 +149,7 @@ class Task(ABC):
         return None
 
     def carry_object(self, reading: ContactReading, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
-        """The object's poses (B, 4, 4) after tools that felt ``reading`` moved from ``before`` to ``T_work``. Held objects do not move."""
+        """The object's poses (B, 4, 4) after tools with this ``reading`` moved from ``before`` to ``T_work``. Held objects do not move."""
         return T_object
 
     def goals_for_agents(self, goal: FloatArray, T_work: FloatArray) -> FloatArray:
@@ -426,7 +426,7 @@ class ObjectPush(Task):
         return Start(T, (float(goal[0]), float(goal[1])), np.eye(4))
 
     def goals_for_agents(self, goal: FloatArray, T_work: FloatArray) -> FloatArray:
-        """The goals' places relative to the tools, whose own poses a robot knows."""
+        """The goals' places relative to the tools, whose own poses a robot reports."""
         return _shift_in_plane(goal - T_work[:, [0, 2], 3], T_work)
 
     def carry_object(self, reading: ContactReading, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:

@@ -150,7 +150,7 @@ def fit_camera(
         rings = len(spec.pins.shape.ring_ends()) - 1
         rings = rings if rings > 1 else np.sqrt(len(pins_px) / 3)  # as many as rings of so many pins
         alike = np.sqrt(len(pins_px) / rings)  # the pins of a ring share one error
-        doubtful = _list_undetermined(_values(spec, names), sd * alike * max(MODEL_PX / _rms(residual), 1), correlation)
+        doubtful = _list_undetermined(_values(spec, names), sd * alike * max(MODEL_PX / max(_rms(residual), 1e-9), 1), correlation)
         name = next((name for name in names if name in doubtful and name not in needed), None)
         if name is None:
             break

@@ -50,7 +50,7 @@ def _inside(px: np.ndarray, p: int, q: int, r: int, s: int) -> float:
 
 
 @compiled()
-def flipped(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray) -> np.ndarray:
+def delaunay_by_flips(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray) -> np.ndarray:
     """Delaunay triangles (t, 3) of nodes (n, 2) from a ``Net``.
 
     Empty if one of its triangles is turned over, or if four nodes on a circle or three on the outline make the triangles ambiguous.

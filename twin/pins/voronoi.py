@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from twin.compiled import compiled
-from twin.pins.flips import Net, flipped
+from twin.pins.flips import Net, delaunay_by_flips
 
 # Factor by which the outline is enlarged about its centroid: half way to the release's additional sites, which lie at 1.1.
 BOUNDARY_SCALE = 1.05
@@ -50,7 +50,7 @@ def triangulate(nodes_px: np.ndarray, net: Net | None = None) -> np.ndarray | No
     """
     if len(nodes_px) < 3:
         return None
-    if net is not None and len(triangles := flipped(nodes_px, *net)):
+    if net is not None and len(triangles := delaunay_by_flips(nodes_px, *net)):
         return triangles
     try:
         mesh = Delaunay(nodes_px)

@@ -77,7 +77,10 @@ class Reference:
 
     @cached_property
     def net(self) -> Net | None:
-        """The triangles as a net for ``flipped``; None if they make none. An outmost pin in none of them makes one with those beside it."""
+        """The triangles as a net for ``delaunay_by_flips``; None if they make none.
+
+        An outmost pin that is in none of them makes one with those beside it.
+        """
         ears = np.column_stack([np.roll(self.outmost, 1), self.outmost, np.roll(self.outmost, -1)])
         ears = ears[~np.isin(self.outmost, self.triangles)]
         return net_of(_turned_alike(self.pins_px, np.concatenate([self.triangles, ears])), len(self.pins_px))

@@ -43,8 +43,11 @@ if TYPE_CHECKING:
     from training.studies.realism import Realism
     from training.studies.validation import Validation
     from twin.calibration.contact.calibrate import ContactCalibration
+    from twin.calibration.contact.forces import ForceComparison
     from twin.calibration.go_on import WholeSensor
     from twin.calibration.optics import OpticsCalibration
+
+Columns = Annotated[list[str] | None, typer.Option("--column", metavar="KEY=NAME", help="a table's name of a column: Fz=normal; repeated")]
 
 
 @app.command("new")
@@ -188,7 +191,7 @@ def calibrate_optics(
 @calibrate_app.command("contact", goes_on=True)
 def calibrate_contact(
     sensor: Sensor,
-    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording with its no-contact frame")],
+    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording with init_0.png, or TABLE.csv of forces")],
     out: Annotated[Path, typer.Option("--out", metavar="SPEC.toml", help="the specification to write")],
     num_labelled: Annotated[
         int, typer.Option("--num-labelled", min=4, metavar="N", help="frames to fit to, chosen at random"), Formerly("labels")
@@ -207,10 +210,11 @@ def calibrate_contact(
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
+    column: Columns = None,
     *,
     progress: Progress,
-) -> "ContactCalibration":
-    """Fit the contact to labelled frames of the real sensor.
+) -> "ContactCalibration | ForceComparison":
+    """Fit the contact to labelled frames of the real sensor, or to a table of forces.
 
     From the no-contact frame (init_0.png) and N labelled frames: contact offset, tool point, angle offset and sign, tilt of the
     surface, direction of the robot's axes in the image, friction, how far the arm gives way and turns, stiffness of the gel relative to
@@ -221,6 +225,10 @@ def calibrate_contact(
     Pins do not determine newtons. Where the table has a column of forces along the approach (N; Fz, or the one that rig.force_sensor names)
     with 3 presses or more, weighed with a kitchen scale for example, the stiffness of skin and gel is scaled to them; other rows may be
     empty. It says how far forces may still be off (skin.stiffness_factor), or which stiffness is assumed.
+
+    With --frames TABLE.csv, a table of poses and forces of a load cell without frames, N rows are fitted (stiffness, friction, zero of the
+    depth, tool point, what gives way, zero and turn of the cell), each parameter only if they determine it, and all other rows judge. It
+    says which conventions of the table it found. The experiment must approach along z (surface-3d-sheared).
 
     \b
     Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/
@@ -253,6 +261,7 @@ def calibrate_contact(
         workers=workers,
         across=elements,
         form=form,
+        columns=dict(pair.partition("=")[::2] for pair in column or ()),
         progress=progress,
     )
 
@@ -260,7 +269,7 @@ def calibrate_contact(
 @app.command("validate")
 def validate(
     sensor: Sensor,
-    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording")],
+    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording, or TABLE.csv of forces")],
     out: Out,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how it was recorded ('twin experiments')")] = "surface-2d",
     obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the touched object; the experiment's own if not given")] = None,
@@ -276,9 +285,10 @@ def validate(
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
+    column: Columns = None,
     *,
     progress: Progress,
-) -> "Validation":
+) -> "Validation | ForceComparison":
     """Compare the twin's pins with those of real frames.
 
     The contact of each labelled frame is simulated along the arm's way, from the frame's label and the sensor's [rig] alone ('twin
@@ -287,8 +297,11 @@ def validate(
     stated separately for executed and not executed moves, by depth, angle and shear. For some frames with an executed move the errors
     are also stated with the friction that fits the frame best.
 
+    With --frames TABLE.csv, a table of poses and forces without frames, the simulated forces are compared with the measured ones.
+
     \b
-    Writes index.html, frames.csv (a row a frame), validation.json.
+    Writes index.html, frames.csv (a row a frame), validation.json; for a table
+    rows.csv and forces.json.
 
     \b
     Example:
@@ -310,6 +323,7 @@ def validate(
         seed=seed,
         across=elements,
         form=form,
+        columns=dict(pair.partition("=")[::2] for pair in column or ()),
         progress=progress,
     )
 

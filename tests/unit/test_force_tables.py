@@ -1,0 +1,187 @@
+"""Tables of poses and forces: what a fit finds again on forces of the twin itself, what it leaves, and which tables are refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes import load_experiment, load_object, load_sensor
+from scenes.rig import ForceSensorSpec, RigSpec
+from twin.calibration.contact import forces as module
+from twin.calibration.contact.calibrate import calibrate_to_file
+from twin.calibration.contact.forces import (
+    FORCE_PARAMETERS,
+    ForceSetup,
+    find_conventions,
+    fit_forces,
+    noise_of,
+    read_by,
+    read_forces,
+)
+from twin.errors import FrameError, OptionError
+from twin.rig.contact import SideYield
+from twin.rig.labels import ArmLabel
+
+ACROSS = 4  # coarse, for both sides
+NOISE_N = 0.004
+FORCES = ForceSensorSpec().columns
+EXPERIMENT, PLANE = load_experiment("surface-3d-sheared"), load_object("plane")
+TURN_DEG, OFFSET_N = 150.0, (0.05, -0.03, 0.02)
+TRUTH = {"rig.contact_offset_mm": -0.2, "rig.friction": 0.6}
+SLACK_SD = 4.0  # standard deviations by which a value may be off
+
+
+def setup_of(**changes):
+    """A sensor on an arm whose tool point is 7 mm behind the tip."""
+    rig = RigSpec(tcp_to_dome_mm=-13.0, **changes)
+    parameters = tuple(p for p in FORCE_PARAMETERS if p.name in TRUTH)
+    return ForceSetup(load_sensor("mg400-127").model_copy(update={"rig": rig}), EXPERIMENT, PLANE, ACROSS, parameters=parameters)
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Labels of eight tilted and sheared presses, forces of a sensor on the plate, and what a turned force sensor reads of them."""
+    random = np.random.default_rng(3)
+    depth, angles, moves = random.uniform(1, 2, 8), random.uniform(-20, 20, (8, 2)), random.uniform(-1.5, 1.5, (8, 2))
+    labels = [ArmLabel(np.array([0, 0, d, *a, 0]), np.array([*m, 0, 0, 0, 0])) for d, a, m in zip(depth, angles, moves, strict=True)]
+    true = setup_of(contact_offset_mm=TRUTH["rig.contact_offset_mm"], friction=TRUTH["rig.friction"], turn_sign=-1)
+    found = true.forces([(true.start, -1)], labels)[0]
+    readings = read_by(ForceSensorSpec(gain=(1, 1, -1)), found, np.array([*OFFSET_N, TURN_DEG]))
+    return labels, found, readings + random.normal(scale=NOISE_N, size=readings.shape)
+
+
+@pytest.fixture(scope="module")
+def found(made):
+    labels, _, readings = made
+    return find_conventions(setup_of(), labels, readings, FORCES)
+
+
+def test_the_sign_of_the_angles_and_the_axes_of_the_force_sensor_are_found_and_said(found):
+    setup, notes = found
+    rig = setup.sensor.rig
+    assert rig.turn_sign == -1 and rig.force_sensor.frame == "work" and rig.force_sensor.gain == (1, 1, -1)
+    assert rig.force_sensor.turn_deg == pytest.approx(TURN_DEG, abs=8.0)
+    assert notes[0].startswith("found") and "left-handed" in notes[1] and "z reversed" in notes[2]
+    given, said = find_conventions(setup, [], np.zeros((0, 3)), FORCES)
+    assert given is setup and said[0].startswith("given")
+
+
+def test_known_parameters_are_found_again_within_their_uncertainty(made, found):
+    labels, _, readings = made
+    fit = fit_forces(found[0], labels, readings)
+    truth = [parameter.fitted_quantity(TRUTH[parameter.name]) for parameter in found[0].parameters] + [*OFFSET_N, TURN_DEG]
+    assert (np.abs(fit.value - truth) < SLACK_SD * fit.sd).all() and fit.free == len(truth)
+    assert fit.sensor.rig.friction == pytest.approx(TRUTH["rig.friction"], rel=0.05)
+    assert fit.sensor.rig.contact_offset_mm == pytest.approx(TRUTH["rig.contact_offset_mm"], abs=0.05)
+    assert fit.sensor.rig.force_sensor.turn_deg == pytest.approx(TURN_DEG, abs=2.0)
+
+
+def test_a_parameter_that_the_rows_do_not_determine_is_left_at_its_start(monkeypatch, made, found):
+    """Forces that depend on the depth's zero alone say nothing about friction."""
+    labels, forces, _ = made
+
+    def by_depth(self, jobs, labels, step=None):
+        values = np.array([job[0] for job in jobs])
+        return forces * (1 + values[:, [p.name for p in self.parameters].index("rig.contact_offset_mm"), None, None])
+
+    monkeypatch.setattr(ForceSetup, "forces", by_depth)
+    setup = found[0]
+    reads = setup.sensor.rig.force_sensor
+    fit = fit_forces(setup, labels, read_by(reads, 1.3 * forces, np.array([0, 0, 0, reads.turn_deg])))
+    at = {p.name: k for k, p in enumerate(setup.parameters)}
+    friction, zero = at["rig.friction"], at["rig.contact_offset_mm"]
+    assert fit.value[friction] == fit.start[friction] and fit.told[friction] == 0 and fit.free < len(fit.value)
+    assert fit.value[zero] == pytest.approx(0.3, abs=0.01)
+
+
+def test_columns_that_are_no_forces_are_refused(monkeypatch, made):
+    labels, forces, readings = made
+    monkeypatch.setattr(ForceSetup, "forces", lambda self, jobs, labels, step=None: np.stack([forces] * len(jobs)))
+    other = np.column_stack([readings[:, :2], np.arange(len(readings))[::-1] % 3])
+    with pytest.raises(FrameError, match="Fz: does not follow the simulated force .* by `column`"):
+        find_conventions(setup_of(), labels, other, FORCES)
+    with pytest.raises(FrameError, match="Fx, Fy: does not follow"):
+        find_conventions(setup_of(), labels, np.column_stack([readings[::-1, :2] ** 2, readings[:, 2]]), FORCES)
+
+
+def table(path, rows=9, **changes):
+    lines = ["name,depth,pose_Rx,shear_x,Fx,Fy,Fz"] + [f"p{k},{1 + 0.1 * k:.1f},{k},0.5,0.1,0,{0.2 * k:.1f}" for k in range(rows)]
+    for number, line in changes.get("lines", {}).items():
+        lines[number] = line
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_table_needs_no_frames_and_its_columns_may_be_named(tmp_path):
+    labels, forces = read_forces(table(tmp_path / "t.csv"), EXPERIMENT, {"pose_3": "depth"}, FORCES)
+    assert len(labels) == 9 and labels[3].pose.tolist() == [0, 0, 1.3, 3, 0, 0] and labels[3].move[0] == 0.5
+    np.testing.assert_allclose(forces[:, 2], 0.2 * np.arange(9))
+
+
+@pytest.mark.parametrize(
+    ("columns", "changes", "says"),
+    [
+        ({}, {}, r"no column pose_3; name it by `column` \(pose_3=NAME\); the table has name, depth"),
+        ({"pose_3": "deep"}, {}, "no column deep"),
+        ({"pose_3": "depth"}, {"lines": {2: "p1,1.1,1,0.5,0.1,0,-"}}, "column Fz, row 2: no number; repair or remove the row"),
+        ({"pose_3": "depth"}, {"lines": {2: "p1,1.1,1,0.5"}}, "row 2 has 4 cells, the header 7"),
+        ({"pose_3": "depth"}, {"rows": 5}, "column depth has 5 rows or is constant; give 8 presses or more"),
+        ({"pose_3": "shear_x"}, {}, "column shear_x has 9 rows or is constant"),
+    ],
+)
+def test_a_bad_table_is_refused_with_its_column_and_row(tmp_path, columns, changes, says):
+    with pytest.raises(FrameError, match=says):
+        read_forces(table(tmp_path / "t.csv", **changes), EXPERIMENT, columns, FORCES)
+
+
+def test_the_experiment_must_approach_along_z(tmp_path):
+    with pytest.raises(FrameError, match="depth along z"):
+        read_forces(table(tmp_path / "t.csv"), load_experiment("surface-2d"), {"pose_3": "depth"}, FORCES)
+
+
+def test_a_calibration_writes_a_specification_with_the_conventions_and_a_page(monkeypatch, tmp_path, made):
+    """One function for both: frames or a table. Here forces do not depend on parameters, so that nothing is simulated."""
+    labels, forces, readings = made
+    labels, forces, readings = labels * 2, np.concatenate([forces, forces]), np.concatenate([readings, readings])
+    lines = ["pose_z,pose_Rx,pose_Ry,shear_x,shear_y,Fx,Fy,normal"]
+    lines += [",".join(map(str, [*label.pose[2:5], *label.move[:2], *reading])) for label, reading in zip(labels, readings, strict=True)]
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    at = {tuple(label.pose): force for label, force in zip(labels, forces, strict=True)}
+    monkeypatch.setattr(
+        ForceSetup, "forces", lambda self, jobs, labels, step=None: np.stack([[at[tuple(label.pose)] for label in labels]] * len(jobs))
+    )
+    sensor = setup_of().sensor
+    made_of = calibrate_to_file(
+        tmp_path / "t.csv", sensor, EXPERIMENT, tmp_path / "fit.toml", columns={"Fz": "normal"}, labels=8, hold=["rig.friction"]
+    )
+    assert load_sensor(str(tmp_path / "fit.toml")).rig.force_sensor == made_of.sensor.rig.force_sensor
+    assert {path.name for path in made_of.written} == {"fit.toml", "index.html"} and (tmp_path / "fit-contact" / "rows.csv").is_file()
+    assert made_of.summary["parts"]["judged"]["rows"] == 8 and max(made_of.summary["parts"]["judged"]["error_n"]) < 5 * NOISE_N
+    said = "\n".join(made_of.lines())
+    assert "convention: found" in said and "rig.contact_offset_mm" in said and "these rows do not determine it" in said
+    assert "rig.friction" not in said
+    with pytest.raises(OptionError, match="no such parameter"):
+        calibrate_to_file(tmp_path / "t.csv", sensor, EXPERIMENT, tmp_path / "b.toml", hold=["rig.fricton"])
+
+
+def test_an_arm_that_gives_way_sideways_moves_the_object_with_the_side_force():
+    there = SideYield(0.5)(np.eye(4), np.array([0.2, -0.4, 3.0]))
+    assert there[:3, 3].tolist() == [0.1, -0.2, 0.0] and np.array_equal(there[:3, :3], np.eye(3))
+    turned = SideYield(0.5, lambda T, force: 2 * T)(np.eye(4), np.zeros(3))
+    assert np.array_equal(turned, 2 * np.eye(4))
+
+
+def test_a_softer_mount_lowers_the_side_force_of_a_sheared_press():
+    label = [ArmLabel(np.array([0, 0, 1.5, 0, 0, 0]), np.array([0.5, 0, 0, 0, 0, 0]))]
+    setup = replace(setup_of(friction=0.9), parameters=())
+    stiff, soft = (
+        np.hypot(
+            *replace(setup, sensor=setup_of(friction=0.9, side_compliance_mm_per_n=c).sensor).forces([(np.zeros(0), 1)], label)[0, 0, :2]
+        )
+        for c in (0.0, 0.5)
+    )
+    assert 0.4 * stiff < soft < 0.9 * stiff
+
+
+def test_the_error_of_a_force_grows_with_it():
+    assert noise_of(np.zeros((1, 3)))[0, 0] == module.NOISE_N and noise_of(np.array([[0.0, 0, 4]]))[0, 0] > module.NOISE_N

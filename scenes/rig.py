@@ -108,10 +108,6 @@ class RigSpec(Section):
     compliance_mm_per_n : float
         Displacement of the arm and its mount along the sensor's axis per N. It is needed because labels are commanded poses, not reached
         poses. An object's own compliance is added to it.
-    side_compliance_mm_per_n : float
-        Displacement of the sensor perpendicular to its axis per N of side force, beyond that of the twin's skin and gel: the mount, or a
-        tip that is softer sideways than the twin's. The displacement follows from the force of the load step before, so it must stay below
-        that of the tip itself, about 1 mm/N for a dome of 20 mm.
     turn_compliance_deg_per_n : float
         Rotation of the arm about its tool point per N of the force of the sensor on the object along the direction across, in the sensor
         frame. Its sign is that of the label in the plane of approach and across.
@@ -134,7 +130,6 @@ class RigSpec(Section):
     image_turn_deg: float = 0.0
     friction: NonNegative = 0.5
     compliance_mm_per_n: NonNegative = 0.0
-    side_compliance_mm_per_n: NonNegative = 0.0
     turn_compliance_deg_per_n: float = 0.0
     force_sensor: ForceSensorSpec | None = None
     placed: tuple[PlacedSpec, ...] = ()

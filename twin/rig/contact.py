@@ -3,12 +3,11 @@
 All parts of the program take their contacts from this module: simulated data sets, the validation against labelled frames, the calibration
 of contacts, renders from labels, and the twin in which a servo follows a surface.
 
-When an arm presses a sensor against an object with the force F (on the object, sensor frame), the model contains four effects:
+When an arm presses a sensor against an object with the force F (on the object, sensor frame), the model contains three effects:
 
 - Friction. A rig's coefficient of friction was fitted to frames of this sensor's skin, so it applies to every object that the rig's arm
   touches. An object's own friction applies if the sensor has no rig. A friction that the caller gives takes precedence over both.
 - Displacement along the sensor's z by (object's + rig's ``compliance_mm_per_n``) F_z. The solver finds it together with the contact.
-- Displacement perpendicular to the sensor's axis by ``side_compliance_mm_per_n`` times the side force (see ``SideYield``).
 - Rotation of the arm about its tool point, in the plane of its approach and the direction across, by ``turn_compliance_deg_per_n`` times
   the force along the direction across (see ``ArmTurning``).
 """
@@ -72,28 +71,6 @@ class ArmTurning:
         return there
 
 
-@dataclass(frozen=True)
-class SideYield:
-    """Displacement of the object perpendicular to the sensor's axis under the side force, and the arm's rotation; a ``GivenWay``.
-
-    Attributes
-    ----------
-    mm_per_n : float
-        Displacement per N.
-    turning : ArmTurning or None
-        Rotation of the arm, which comes first.
-    """
-
-    mm_per_n: float
-    turning: ArmTurning | None = None
-
-    def __call__(self, T: np.ndarray, force_n: np.ndarray) -> np.ndarray:
-        """The object's pose (4, 4) under a force (3,), N."""
-        there = (T if self.turning is None else self.turning(T, force_n)).copy()
-        there[:2, 3] += self.mm_per_n * force_n[:2]
-        return there
-
-
 def friction_between(rig: RigSpec | None, obj: ObjectSpec) -> Friction:
     """Friction between sensor and object: the rig's single coefficient, or the object's own friction if there is no rig."""
     return Friction(rig.friction, rig.friction) if rig else friction_of(obj)
@@ -115,8 +92,7 @@ def contact_law(rig: RigSpec | None, mounting: Mounting, obj: ObjectSpec, *, fri
     if rig and rig.turn_compliance_deg_per_n:
         turning = ArmTurning(mounting.across_in_sensor, mounting.label_turn, mounting.tool_point_mm, rig.turn_compliance_deg_per_n)
     compliance = obj.compliance_mm_per_n + (rig.compliance_mm_per_n if rig else 0.0)
-    side = rig.side_compliance_mm_per_n if rig else 0.0
-    return ContactLaw(friction_between(rig, obj), compliance, SideYield(side, turning) if side else turning).override(friction=friction)
+    return ContactLaw(friction_between(rig, obj), compliance, turning).override(friction=friction)
 
 
 class RigContact:

@@ -152,7 +152,7 @@ def test_a_calibration_writes_a_specification_with_the_conventions_and_a_page(mo
     )
     assert load_sensor(str(tmp_path / "fit.toml")).rig.force_sensor == made_of.sensor.rig.force_sensor
     assert {path.name for path in made_of.written} == {"fit.toml", "index.html"} and (tmp_path / "fit-contact" / "rows.csv").is_file()
-    assert made_of.summary["parts"]["judged"]["rows"] == 8 and max(made_of.summary["parts"]["judged"]["error_n"]) < 5 * NOISE_N
+    assert made_of.summary["parts"]["evaluated"]["rows"] == 8 and max(made_of.summary["parts"]["evaluated"]["error_n"]) < 5 * NOISE_N
     said = "\n".join(made_of.lines())
     assert "convention: found" in said and "rig.contact_offset_mm" in said and "these rows do not determine it" in said
     assert "rig.friction" not in said

@@ -226,15 +226,15 @@ def calibrate_contact(
     with 3 presses or more, weighed with a kitchen scale for example, the stiffness of skin and gel is scaled to them; other rows may be
     empty. It says how far forces may still be off (skin.stiffness_factor), or which stiffness is assumed.
 
-    With --frames TABLE.csv, a table of poses and forces of a load cell without frames, N rows are fitted (stiffness, friction, zero of the
-    depth, tool point, what gives way, zero and turn of the cell), each parameter only if they determine it, and all other rows judge. It
-    says which conventions of the table it found. The experiment must approach along z (surface-3d-sheared).
+    With --frames TABLE.csv, a table of poses and forces of a load cell without frames, N rows are fitted (radius of the dome, stiffness,
+    friction, zero of the depth, tool point, zero and turn of the cell), each parameter only if they determine it, and all other rows are
+    evaluated. It says which conventions of the table it found. The experiment must approach along z (surface-3d-sheared).
 
     \b
     Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/
-    with index.html (parameters with their uncertainty and what the frames determine of
-    them, frames with their probabilities, before and after), calibration.json and
-    contacts/. An interrupted run resumes.
+    with index.html (parameters with their uncertainty and what the frames
+    determine of them, frames with their probabilities, before and after),
+    calibration.json and contacts/. An interrupted run resumes.
 
     \b
     It simulates about 50 + 60 N contacts. Each takes 1 to 3 s on one core;

@@ -117,7 +117,7 @@ def calibrate_to_file(
     ----------
     frames : Path
         A labelled recording with its no-contact frame, or a table of poses and forces alone (``.csv``): parameters on which forces
-        depend are then fitted to ``labels`` of its rows, and all others judge (see ``twin.calibration.contact.forces``).
+        depend are then fitted to ``labels`` of its rows, and evaluated on all others (see ``twin.calibration.contact.forces``).
     out : Path
         The ``.toml`` file to write.
     obj : ObjectSpec, optional

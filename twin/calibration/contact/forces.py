@@ -1,4 +1,4 @@
-"""The twin's forces against a table of poses and forces alone: a fit to some of its rows, a judgement by the others, and a page.
+"""The twin's forces against a table of poses and forces alone: a fit to some of its rows, an evaluation on the others, and a page.
 
 For the force f of the sensor on the object, the force sensor's reading is ``r = offset + gain * Rz(-turn) f`` (``ForceSensorSpec``). The
 sign of the arm's angles, the axes and the turn of the readings are found before the fit, unless the specification has a force sensor.
@@ -310,9 +310,9 @@ def fit_forces(setup: ForceSetup, labels: Sequence[ArmLabel], measured: np.ndarr
 def compare_table(
     table: Path, setup: ForceSetup, folder: Path, columns: Mapping[str, str] | None, labels: int, seed: int, progress: Progress
 ) -> ForceComparison:
-    """Fit to ``labels`` rows of a table, chosen at random, judge by the others, and write the page to an existing folder.
+    """Fit to ``labels`` rows of a table, chosen at random, evaluate on the others, and write the page to an existing folder.
 
-    Without ``labels`` nothing is fitted, and all rows judge. For ``columns`` and errors see ``read_forces`` and ``find_conventions``.
+    Without ``labels`` nothing is fitted, and all rows are evaluated. See ``read_forces`` and ``find_conventions`` for columns and errors.
     """
     own = setup.sensor.model_copy(update={"rig": rig_of(setup.sensor, setup.obj.name)})
     setup = replace(setup, sensor=own, parameters=setup.parameters if labels else ())
@@ -338,7 +338,7 @@ def compare_table(
     for key, of in (("measured", measured), ("simulated", simulated), ("half", half)):
         by |= {f"{key}_{axis}": of[:, k] for k, axis in enumerate("xyz")}
     parts: dict[str, dict[str, Any]] = {}
-    for part, mine in (("fitted", fitted), ("judged", ~fitted)):
+    for part, mine in (("fitted", fitted), ("evaluated", ~fitted)):
         if mine.any():
             errors = {
                 key: np.nanmean(abs(of - measured)[mine], axis=0).tolist() for key, of in (("before_n", first), ("error_n", simulated))
@@ -384,7 +384,7 @@ def draw_forces(rows: list[dict[str, Any]]) -> Figure:
     of = {key: np.array([row[key] for row in rows]) for key in rows[0]}
     figure, axes = new_figure(4, 2, panel_inch=3.2)
     for axis, ax, below, (label, unit) in zip("xyz", axes[:3], axes[4:7], (("depth", "mm"), ("tilt", "deg"), ("shear", "mm")), strict=True):
-        for part, mine in (("fitted", of["fitted"]), ("judged", ~of["fitted"])):
+        for part, mine in (("fitted", of["fitted"]), ("evaluated", ~of["fitted"])):
             ax.errorbar(*(of[f"{key}_{axis}"][mine] for key in ("measured", "simulated", "half")), fmt="o", ms=3, lw=0.6, label=part)
             below.plot(of[label][mine], (of["simulated_z"] - of["measured_z"])[mine], "o", ms=3)
         ax.axline((0, 0), slope=1, lw=0.6)

@@ -238,7 +238,9 @@ def find_conventions(
             f"{odd}: does not follow the simulated force (correlation of the normal force {r:.2f}, {left:.0%} of the side force left); "
             "is it newtons, and pose_3 the depth? Name the right columns by `column`, or state rig.turn_sign and rig.force_sensor"
         )
-    reads = ForceSensorSpec(columns=columns, frame=frame, gain=(1.0, 1.0, float(np.sign(r))), turn_deg=turn_deg)
+    reads = ForceSensorSpec.model_validate(
+        {"columns": columns, "frame": frame, "gain": (1.0, 1.0, float(np.sign(r))), "turn_deg": turn_deg}
+    )
     notes = [f"found, as the specification has no rig.force_sensor: {_in_words(reads, sign)}"]
     if min(each[0] for each in tried if each[3] != sign) < CLEARER * total:
         notes.append("the rows hardly show the sign of the angles: state rig.turn_sign and rig.force_sensor if you know them")

@@ -75,7 +75,7 @@ def test_numbers_and_sign_are_found_again_within_their_uncertainty(calibrated):
     truth = np.array([TRUTH[p.name.split(".")[1]] for p in FITTED])
     assert fit.sensor.rig.turn_sign == TRUTH["turn_sign"]
     assert (np.abs(fit.value - truth) < 3 * fit.sd).all() and (np.abs(fit.value - truth) < 0.2 * np.abs(fit.start - truth)).all()
-    assert fit.sensor.rig.contact_offset_mm == fit.value[0] and (fit.told > 0.9).all()
+    assert fit.sensor.rig.contact_offset_mm == fit.value[0] and (fit.determined > 0.9).all()
 
 
 @pytest.mark.slow
@@ -148,7 +148,7 @@ def test_without_enough_weighed_presses_it_says_which_stiffness_is_assumed(tmp_p
     sensor = small_config(tmp_path).sensor
     for found in (assume_stiffness(sensor, "none was measured"), compare_forces([1.0, 2.0, 0.01], [1.0, 2.0, 0.01], sensor)):
         assert (found.presses, found.scale, found.factor) == (0, 1.0, ASSUMED_FACTOR)
-        assert f"skin {sensor.skin.young_modulus_mpa:.3g} MPa" in found.said and "weigh 3 presses" in found.said
+        assert f"skin {sensor.skin.young_modulus_mpa:.3g} MPa" in found.explanation and "weigh 3 presses" in found.explanation
     wide, narrow = (compare_forces(np.exp(spread * np.linspace(-1, 1, 5)), np.ones(5), sensor).factor for spread in (0.3, 0.03))
     assert wide > 1.2 > narrow > 1.0
 

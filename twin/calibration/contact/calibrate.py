@@ -84,7 +84,7 @@ class ContactCalibration(ReadableResult):
         for title, key in (("fitted frames", "fitted_px"), ("frames kept out", "held_out_px")):
             if part := self.summary[key]:
                 lines.append(f"{title}: {part['before']:.2f} -> {part['after']:.2f} px over {part['frames']}")
-        lines.append(self.summary["newtons"]["said"])
+        lines.append(self.summary["newtons"]["explanation"])
         lines += self.summary["warnings"]
         if self.summary["distrusted"]:
             lines.append(f"not trusted: {', '.join(self.summary['distrusted'])}")
@@ -165,5 +165,5 @@ def calibrate_to_file(
         page = write_calibration(folder, replace(fitted, no_contact_px=fit.rest_px), moved, fit, summary)
     found = newtons.of(fit.sensor)
     said = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."
-    write_sensor(out, found, "\n".join([said, summary["newtons"]["said"], *summary["warnings"]]))
+    write_sensor(out, found, "\n".join([said, summary["newtons"]["explanation"], *summary["warnings"]]))
     return ContactCalibration(found, summary, [out, page])

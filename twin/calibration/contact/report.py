@@ -96,7 +96,7 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
         "Not trusted, as neither hypothesis fits them", [", ".join(summary["distrusted"])] if summary["distrusted"] else [], tone="bad"
     )
     page.notice("Warnings", summary["warnings"], tone="bad")
-    page.notice("Noted", [summary["newtons"]["said"], *summary["problems"]])
+    page.notice("Noted", [summary["newtons"]["explanation"], *summary["problems"]])
     _parameters_section(page, summary)
     page.section("Frames")
     page.table(

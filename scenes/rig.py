@@ -1,6 +1,6 @@
 """Specification of a rig: how a robot holds a sensor, and where the object is. It relates labels in robot coordinates to contacts."""
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import model_validator
 
@@ -75,7 +75,7 @@ class RigSpec(Section):
         is in front of the centre. For a tool point at the tip it is minus the dome's radius.
     tcp_lateral_mm : float
         Distance from the tool point to the dome's centre along the direction across.
-    tcp_aside_mm : float
+    tcp_binormal_mm : float
         Distance from the tool point to the dome's centre along approach x across (the cross product). It matters only if the sensor is
         rotated out of the plane of approach and across.
     turn_offset_deg : three numbers
@@ -120,7 +120,7 @@ class RigSpec(Section):
     contact_offset_mm: float = 0.0
     tcp_to_dome_mm: float
     tcp_lateral_mm: float = 0.0
-    tcp_aside_mm: float = 0.0
+    tcp_binormal_mm: float = 0.0
     turn_offset_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_sign: Annotated[Literal[1, -1], NotTruth] = 1
     plate_tilt_deg: float = 0.0
@@ -133,6 +133,14 @@ class RigSpec(Section):
     turn_compliance_deg_per_n: float = 0.0
     force_sensor: ForceSensorSpec | None = None
     placed: tuple[PlacedSpec, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_former_keys(cls, keys: Any) -> Any:
+        """The keys; files of version 1 call ``tcp_binormal_mm`` ``tcp_aside_mm``."""
+        return (
+            {"tcp_binormal_mm" if key == "tcp_aside_mm" else key: value for key, value in keys.items()} if isinstance(keys, dict) else keys
+        )
 
     def for_object(self, name: str) -> "RigSpec":
         """The rig in front of the object with this name, without ``placed``."""

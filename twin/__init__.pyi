@@ -36,9 +36,9 @@ from twin.calibration.go_on import WholeSensor as WholeSensor
 from twin.calibration.optics import OpticsCalibration as OpticsCalibration
 from twin.mechanics.path import ContactPose as ContactPose
 from twin.pins.batch import Preprocessed as Preprocessed
+from twin.pins.detectors.tune_files import TunedOnFrames as TunedOnFrames
 from twin.pins.graph import node_features as node_features
 from twin.pins.pipeline import Pipeline as Pipeline
-from twin.pins.tune_files import TunedOnFrames as TunedOnFrames
 from twin.progress import Progress as Progress
 from twin.simulator import Simulator as Simulator
 from twin.types import Form as Form

@@ -1,6 +1,6 @@
 """Interface of a trained model: it takes a frame, and returns an estimate with its interval."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -9,12 +9,29 @@ from scenes.sensor import SensorSpec
 from twin.pins.pipeline import Pipeline
 from twin.types import Form, Frame, Observation
 
+LEVEL = {"pose_1": "offset", "pose_2": "depth", "pose_6": "angle", "move_1": "shear", "move_6": "twist"}
+"""Roles of labels of an arm that holds the sensor level."""
+UPRIGHT = {"pose_1": "offset x", "pose_2": "offset y", "pose_3": "depth", "pose_4": "tilt x", "pose_5": "tilt y", "pose_6": "angle"}
+UPRIGHT |= {"move_1": "shear x", "move_2": "shear y", "move_6": "twist"}
+"""Roles of labels of an arm that holds the sensor upright: these have the depth in ``pose_3``."""
+NAMED = {"pose_z": "depth", "pose_Rx": "tilt x", "pose_Ry": "tilt y", "Fx": "force x", "Fy": "force y", "Fz": "force z"}
+"""Roles of labels that name their axis."""
+
+
+def readable_labels(names: Sequence[str]) -> list[str]:
+    """Readable names of a model's labels, by their role: ``pose_2`` and ``pose_6`` of an MG400 are 'depth' and 'angle'."""
+    roles = NAMED | (UPRIGHT if "pose_3" in names else LEVEL)
+    return [roles.get(name, name.replace("_", " ")) for name in names]
+
 
 class Estimate(Protocol):
     """An estimator's result on a frame (``training.estimate.estimator.PoseEstimate``)."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def units(self) -> tuple[str, ...]: ...
 
     @property
     def value(self) -> np.ndarray: ...

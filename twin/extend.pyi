@@ -44,7 +44,7 @@ from twin.evaluation.degradation.condition import over_channels as over_channels
 from twin.geometry.pins import rest_pins as rest_pins
 from twin.mechanics import SkinSolver as SkinSolver
 from twin.optics.preview import Preview as Preview
-from twin.pins.detector import Detector as Detector
-from twin.pins.detector_spec import DetectorSpec as DetectorSpec
+from twin.pins.detectors.detector import Detector as Detector
+from twin.pins.detectors.detector_spec import DetectorSpec as DetectorSpec
 
 register_model = register

@@ -151,6 +151,11 @@ class PolicyAction:
         return np.full(len(self.names), np.nan)
 
     @property
+    def units(self) -> tuple[str, ...]:
+        """An action's numbers are shares of their ranges."""
+        return ("",) * len(self.names)
+
+    @property
     def high(self) -> FloatArray:
         """NaN, because a policy has no intervals."""
         return self.low

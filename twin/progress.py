@@ -46,6 +46,10 @@ def silent(stage: str, done: float, total: float, note: str = "") -> None:
     """The ``Progress`` that reports nothing."""
 
 
+def unheard(done: float, total: float = 1.0, note: str = "") -> None:
+    """The ``Step`` that reports nothing."""
+
+
 @contextmanager
 def stage(progress: Progress, title: str) -> Iterator[Step]:
     """Context of one stage: yields the ``Step`` that reports its progress.

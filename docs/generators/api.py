@@ -160,7 +160,7 @@ def plain(text: str) -> str:
 
 
 def _list_exports(tree: ast.Module) -> dict[str, str]:
-    """Names in ``__all__`` and where they are defined."""
+    """Names that a module offers of others (``__all__``; all, if it does nothing but import them), and where they are defined."""
     places = {
         alias.asname or alias.name: f"{node.module}.{alias.name}"
         for node in tree.body
@@ -170,7 +170,8 @@ def _list_exports(tree: ast.Module) -> dict[str, str]:
     assigned = {ast.unparse(target): node.value for node in tree.body if isinstance(node, ast.Assign) for target in node.targets}
     if "_PLACES" in assigned:  # names that are imported when they are first used
         return {name: place.replace(":", ".") for name, place in ast.literal_eval(assigned["_PLACES"]).items()}
-    names = ast.literal_eval(assigned["__all__"]) if "__all__" in assigned else []
+    only_imports = all(isinstance(node, ast.Expr | ast.ImportFrom) for node in tree.body)
+    names = ast.literal_eval(assigned["__all__"]) if "__all__" in assigned else list(places) if only_imports else []
     return {name: places[name] for name in names if name in places}
 
 
@@ -178,7 +179,7 @@ def list_undocumented() -> list[str]:
     """Public functions, classes and methods that neither have a docstring nor stand for one that has.
 
     A method needs none where another class of the packages explains the method of that name: a protocol or base class that it fills.
-    A setter needs none beside its property.
+    A setter needs none beside its property, and a test of a contract says by its name what it tests.
     """
     parsed = [(module, module.tree) for module in modules()]
     said = {name for _, tree in parsed for name, node in _methods(tree) if ast.get_docstring(node)}
@@ -191,7 +192,11 @@ def list_undocumented() -> list[str]:
                 found.append(f"{module.name}.{node.name}")
             if isinstance(node, ast.ClassDef):
                 silent = [each for each in _public(node.body) if not ast.get_docstring(each)]
-                found += [f"{module.name}.{node.name}.{each.name}" for each in silent if each.name not in said]
+                found += [
+                    f"{module.name}.{node.name}.{each.name}"
+                    for each in silent
+                    if each.name not in said and not each.name.startswith("test_")
+                ]
     return found
 
 

@@ -13,7 +13,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from hardware.arms.kinematics import FARTHEST
+from hardware.arms.kinematics import FARTHEST, LinkageKinematics, joint_target, linear_target
 from hardware.arms.motion import turn_between_deg
 from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError, also
 
@@ -252,3 +252,26 @@ class BaseArm(Connection):
     def _require_disconnected(self) -> None:
         if self.is_connected:
             raise DeviceAlreadyConnectedError(f"{self.name}: connected already; disconnect() first")
+
+
+class LinkageArm(BaseArm):
+    """Base class of the Dobots, whose targets are checked by their linkage's kinematics before they are sent."""
+
+    axes = 4
+    kinematics: LinkageKinematics
+
+    def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
+        with self._watch_move():
+            sent, joints = linear_target(self.name, self.kinematics, pose)
+            self._move(sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
+        return sent
+
+    def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
+        with self._watch_move():
+            sent = joint_target(self.name, joints_deg)
+            self._move(sent, sent, None, wait=wait, timeout_s=timeout_s)
+        return sent
+
+    @abstractmethod
+    def _move(self, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
+        """Send four numbers as the target of a linear move to ``pose`` (6,), or of a move of the joints (4,) if there is no pose."""

@@ -11,10 +11,10 @@ import numpy as np
 import serial
 from serial.tools import list_ports
 
-from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm
+from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, LinkageArm
 from hardware.arms.awake import awake_s
 from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, require_possible
+from hardware.arms.kinematics import MAGICIAN, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
 from hardware.arms.supervisor import Supervisor
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
@@ -37,7 +37,7 @@ INDEX_BYTES = 8
 ACCELERATION = 4.0
 
 
-class Magician(BaseArm):
+class Magician(LinkageArm):
     """A Dobot Magician.
 
     The arm has no command that switches its motors. ``enable`` allows moves; ``disable`` stops the arm and refuses further moves.
@@ -51,8 +51,6 @@ class Magician(BaseArm):
     supervised : bool
         Whether a further process stops the arm if this program dies while the arm is enabled.
     """
-
-    axes = 4
 
     def __init__(self, port: str, *, tool_x_mm: float = 0.0, supervised: bool = True) -> None:
         self._supervised = supervised
@@ -162,29 +160,18 @@ class Magician(BaseArm):
         self._request(Id.PTP_COORDINATE_PARAMS, struct.pack("<4f", *line), ctrl=WRITE)
         self._request(Id.PTP_JOINT_PARAMS, struct.pack("<8f", *joints), ctrl=WRITE)
 
-    def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watch_move():
-            sent, joints = linear_target(self.name, self.kinematics, pose)
-            self._move(Ptp.MOVL_XYZ, sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
-        return sent
-
-    def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watch_move():
-            sent = joint_target(self.name, joints_deg)
-            self._move(Ptp.MOVJ_ANGLE, sent, sent, self.kinematics.forward(sent), wait=wait, timeout_s=timeout_s)
-        return sent
-
-    def _move(self, mode: Ptp, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray, *, wait: bool, timeout_s: float) -> None:
+    def _move(self, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
         self._require_enabled()
         require_possible(self.name, self.kinematics, joints)
         if alarms := self._alarms():
             raise DeviceError(f"{self.name}: {explain(alarms)}")
-        begun_s = time.monotonic()
+        begun_s, mode = time.monotonic(), Ptp.MOVJ_ANGLE if pose is None else Ptp.MOVL_XYZ
         self._last_index = self._index_of(self._request(Id.PTP, struct.pack("<B4f", mode, *numbers), ctrl=WRITE | QUEUED))
         if not wait:
             return
         self._await_queue(timeout_s)
-        self._wait_until_settled(pose, timeout_s=max(begun_s + timeout_s - time.monotonic(), 0.2))
+        settled = self.kinematics.forward(joints) if pose is None else pose
+        self._wait_until_settled(settled, timeout_s=max(begun_s + timeout_s - time.monotonic(), 0.2))
 
     def _await_queue(self, timeout_s: float) -> None:
         deadline = time.monotonic() + timeout_s

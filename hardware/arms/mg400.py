@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hardware.arms import kinematics as arms
-from hardware.arms.arm import POLL_S, ArmState, BaseArm
+from hardware.arms.arm import POLL_S, ArmState, LinkageArm
 from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import LinkageKinematics, joint_target, linear_target, require_possible
+from hardware.arms.kinematics import LinkageKinematics, require_possible
 from hardware.arms.mg400_link import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback
 from hardware.arms.mg400_wire import (
     DASHBOARD_PORT,
@@ -73,7 +73,7 @@ class Mg400Ports:
         return Mg400Ports(self.dashboard + offset, self.motion + offset, tuple(port + offset for port in self.feedback))
 
 
-class MG400(BaseArm):
+class MG400(LinkageArm):
     """A Dobot MG400.
 
     Its pose is that of the tool in the user frame that are selected in the arm (0 and 0 after ``enable``).
@@ -91,8 +91,6 @@ class MG400(BaseArm):
     supervised : bool
         Whether a further process stops and disables the arm if this program dies while the arm is enabled.
     """
-
-    axes = 4
 
     def __init__(
         self,
@@ -258,12 +256,6 @@ class MG400(BaseArm):
         self._require_connected()
         return float(self._feedback.newest(SILENCE_S)[0]["speed_scaling"])
 
-    def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watch_move():
-            sent, joints = linear_target(self.name, self.kinematics, pose)
-            self._move("MovL", sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
-        return sent
-
     def _turning_option(self, pose: np.ndarray) -> str:
         """``SpeedL`` of a short move that mainly turns. The slower part, line or turn, determines the speed.
 
@@ -280,15 +272,7 @@ class MG400(BaseArm):
         wanted_s = max(length_mm / self._speed[0], turn_deg / self._speed[1])
         return f",SpeedL={int(np.clip(np.floor(100 * turn_deg / MAX_JOINT_DEG_S / wanted_s + 1e-9), 1, 100))}"
 
-    def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watch_move():
-            sent = joint_target(self.name, joints_deg)
-            self._move("JointMovJ", sent, sent, None, wait=wait, timeout_s=timeout_s)
-        return sent
-
-    def _move(
-        self, command: str, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float
-    ) -> None:
+    def _move(self, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
         self._require_connected()
         require_possible(self.name, self.kinematics, joints)
         packet, _ = self._feedback.newest(SILENCE_S)  # checked here, because old firmware does not report a refusal
@@ -296,7 +280,8 @@ class MG400(BaseArm):
             raise DeviceError(f"{self.name}: {self._alarm()}")
         if int(packet["mode"]) not in ENABLED_MODES:
             raise DeviceError(f"{self.name}: {DISABLED if self._enabled else 'not enabled; call enable() first'}")
-        begun_s, options = time.monotonic(), "" if pose is None else self._turning_option(pose)
+        begun_s = time.monotonic()
+        command, options = ("JointMovJ", "") if pose is None else ("MovL", self._turning_option(pose))
         self._send_motion(f"{command}({','.join(f'{number:.4f}' for number in numbers)}{options})")
         self._sent = pose
         if not wait:
@@ -305,8 +290,8 @@ class MG400(BaseArm):
         left_s = max(begun_s + timeout_s - time.monotonic(), SETTLE_S)
         if pose is not None:
             self._wait_until_settled(pose, timeout_s=left_s)
-        else:
-            self._await_joints(joints, left_s)
+        else:  # our link lengths are not exactly this arm's
+            self._wait_until_settled(self.kinematics.forward(joints), tolerance_mm=1.0, timeout_s=left_s)
         self._under_way = False
 
     def _send_motion(self, text: str) -> None:
@@ -345,11 +330,6 @@ class MG400(BaseArm):
                 raise self._too_long(timeout_s)
             if not syncs:
                 time.sleep(POLL_S)
-
-    def _await_joints(self, joints: np.ndarray, timeout_s: float) -> None:
-        self._wait_until_settled(
-            self.kinematics.forward(joints), tolerance_mm=1.0, timeout_s=timeout_s
-        )  # our link lengths are not exactly this arm's
 
     def _may_move(self) -> bool:
         return self._in_use and self._under_way

@@ -78,8 +78,8 @@ class NewestTarget:
                 error, self._error, self._sent = self._error, None, None
                 raise error
             target = self._kinematics.nearest_pose(target)
-            clipped = getattr(self._arm, "clipped", None)  # of a ``SafeArm``
-            self._target = target if clipped is None else clipped(target)
+            clip = getattr(self._arm, "clip_pose", None)  # of a ``SafeArm``
+            self._target = target if clip is None else clip(target)
             try:
                 self._step()
             except BaseException:

@@ -4,7 +4,7 @@ import contextlib
 import http.client
 import socket
 import time
-from typing import Protocol
+from io import BufferedIOBase
 from urllib.parse import urlsplit
 
 import cv2
@@ -41,13 +41,7 @@ def jpeg_of(image: np.ndarray) -> bytes:
     return coded.tobytes()
 
 
-class Writable(Protocol):
-    """An object to which bytes can be written."""
-
-    def write(self, data: bytes, /) -> int | None: ...
-
-
-def write_part(out: Writable, jpeg: bytes, headers: dict[str, object] | None = None) -> None:
+def write_part(out: BufferedIOBase, jpeg: bytes, headers: dict[str, object] | None = None) -> None:
     """Write one picture of a stream; raises ``OSError`` if the client is gone."""
     more = "".join(f"{name}: {value}\r\n" for name, value in (headers or {}).items())
     head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n{more}\r\n"
@@ -57,16 +51,6 @@ def write_part(out: Writable, jpeg: bytes, headers: dict[str, object] | None = N
 def hold_little(connection: socket.socket) -> None:
     """Limit a connection's buffer to few pictures, so that a client that pauses gets few old pictures, and then the newest."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, HELD_BYTES)
-
-
-class Readable(Protocol):
-    """A stream of bytes."""
-
-    def readline(self, limit: int, /) -> bytes:
-        """The next line, of at most ``limit`` bytes."""
-
-    def read(self, amount: int, /) -> bytes:
-        """The next ``amount`` bytes."""
 
 
 class MjpegCamera(LiveSource):
@@ -153,7 +137,7 @@ class MjpegCamera(LiveSource):
         return DevicePicture(image, stamped_s(headers), lost, note, again)
 
 
-def next_part(stream: Readable) -> tuple[dict[str, str], bytes]:
+def next_part(stream: BufferedIOBase) -> tuple[dict[str, str], bytes]:
     """Headers (lower case) and body of the next part of a multipart stream; ``EOFError`` at its end."""
     headers: dict[str, str] = {}
     while True:  # skip lines up to the next part's boundary and headers

@@ -89,6 +89,15 @@ class LiveSource(Connection):
     name : str
     form : Form
         Form of its frames.
+
+    Attributes
+    ----------
+    arrived : int
+        Number of frames from the device so far, including lost ones.
+    delivered, dropped : int
+        Number of frames that were read, and that nobody read, including those that the device lost.
+    fault : str
+        The fault of the pictures, in words: frozen, black or late; "" if there is none.
     """
 
     is_live = True
@@ -97,9 +106,6 @@ class LiveSource(Connection):
     streams = True  # whether pictures come unasked
     _spec: SensorSpec | None = None
     _read_last: int  # sequence number of the frame that was read last
-    _sequence: int
-    _dropped: int
-    _delivered: int
     fps = 5.0  # frame rate; if the device does not report one, the slowest useful rate
 
     def __init__(self, name: str, form: Form) -> None:
@@ -138,21 +144,6 @@ class LiveSource(Connection):
     def is_connected(self) -> bool:
         return self._thread is not None
 
-    @property
-    def dropped(self) -> int:
-        """Number of frames that nobody read, including those that the device lost."""
-        return self._dropped
-
-    @property
-    def delivered(self) -> int:
-        """Number of frames that were read."""
-        return self._delivered
-
-    @property
-    def arrived(self) -> int:
-        """Number of frames from the device so far, including lost ones."""
-        return self._sequence
-
     def notes(self) -> list[str]:
         """Outages, torn and repeated pictures, and irregular files so far, one line each."""
         with self._new:
@@ -163,13 +154,8 @@ class LiveSource(Connection):
         if torn:
             found.append(f"{len(torn)} pictures came torn or damaged and were left out; the last: {torn[-1]}")
         if self._repeated:
-            found.append(f"{self._repeated} of {self._sequence} pictures repeat the one before them")
+            found.append(f"{self._repeated} of {self.arrived} pictures repeat the one before them")
         return found
-
-    @property
-    def fault(self) -> str:
-        """The fault of the pictures, in words: frozen, black or late; "" if there is none."""
-        return self._fault
 
     @property
     def same_s(self) -> tuple[float, float] | None:
@@ -181,8 +167,8 @@ class LiveSource(Connection):
 
     def blind(self) -> str:
         with self._new:
-            if self._error is not None or self._fault:
-                return str(self._error or self._fault)
+            if self._error is not None or self.fault:
+                return str(self._error or self.fault)
             if not self.streams:
                 return ""
             quiet_s = awake_s() - self._fresh_s
@@ -229,13 +215,13 @@ class LiveSource(Connection):
                     raise DeviceError(f"{self.name}: {self._error}") from self._error
                 if self._thread is None:
                     raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
-                if self._fault:
-                    raise DeviceError(f"{self.name}: {self._fault}")
+                if self.fault:
+                    raise DeviceError(f"{self.name}: {self.fault}")
                 if self._frame is not None and wanted(self._frame):
                     if self._frame.sequence != self._read_last:
                         self._read_last = self._frame.sequence
-                        self._dropped -= 1
-                        self._delivered += 1
+                        self.dropped -= 1
+                        self.delivered += 1
                     return self._frame
                 left_s = deadline - time.monotonic()
                 if left_s <= 0:
@@ -245,8 +231,8 @@ class LiveSource(Connection):
     def _reset(self) -> None:
         self._frame: Frame | None = None
         self._error: Exception | None = None
-        self._fault = ""
-        self._read_last, self._sequence, self._dropped, self._delivered = -1, 0, 0, 0
+        self.fault = ""
+        self._read_last, self.arrived, self.dropped, self.delivered = -1, 0, 0, 0
         self._still: tuple[np.ndarray, float, int] | None = None  # picture, since when, how often
         self._came_s, self._fresh_s, self._stamp_s = 0.0, awake_s(), -np.inf
         self._periods_s: deque[float] = deque(maxlen=KEPT_PERIODS)
@@ -278,14 +264,14 @@ class LiveSource(Connection):
             else:
                 in_a_row = 0
                 with self._new:
-                    self._fault = self._look_at(picture)
+                    self.fault = self._look_at(picture)
                     self._look_back(picture)
-                    self._sequence += 1 + picture.lost
-                    self._dropped += 1 + picture.lost
+                    self.arrived += 1 + picture.lost
+                    self.dropped += 1 + picture.lost
                     if self._is_new(picture):
-                        name = f"frame_{self._sequence:06d}.png"
-                        self._frame = Frame(image, self.form, name, picture.time_s, self._sequence)
-                        if not self._fault:
+                        name = f"frame_{self.arrived:06d}.png"
+                        self._frame = Frame(image, self.form, name, picture.time_s, self.arrived)
+                        if not self.fault:
                             self._fresh_s = awake_s()
                     self._new.notify_all()
 
@@ -323,7 +309,7 @@ class LiveSource(Connection):
         if self._still is None or self._still[2] == 1 or self._may_repeat(picture.image):
             period_s, self._came_s = time.monotonic() - self._came_s, time.monotonic()
             outage = period_s > max(OUTAGE_S, OUTAGE_PERIODS * self._usual_s())
-            if self._sequence:  # the first picture comes when the device is ready
+            if self.arrived:  # the first picture comes when the device is ready
                 (self._outages_s if outage else self._periods_s).append(period_s)
         self._notes |= {picture.note} - {""}
 

@@ -284,7 +284,7 @@ def collect(
         raise DeviceError(f"{rig.source.name}: a recording shows nothing of this arm; give a live `camera`")
     timeout_s = rig.frame_timeout_s if frame_timeout_s is None else frame_timeout_s
     stops = _Stops(Mover(rig, speed, clear_mm=CLEAR_MM, patience_s=timeout_s), WorkFrame(experiment, rig.placed), timeout_s)
-    with output(collection.folder), stops.mover.watched():
+    with output(collection.folder), stops.mover.watching():
         at_object = False
         try:
             with stops.mover.watch.alert():
@@ -468,37 +468,20 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
         except FrameError as error:
             raise FrameError(f"{error}; remove {collection.rest} and give the same command again, which takes it again") from error
 
+    def report_contact(done: float, total: float = 1.0, note: str = "") -> None:
+        kept.catch_up()  # each contact is kept in the further formats before the next one is made
+        step(done, total, note)
+
     with kept:
         if before < plan.count:
-            _collect_on_rig(plan, rig, collection, kept, require_rest, progress)
+            with rig, stage(progress, "contacts") as step:
+                _say_plan(plan, rig, before)
+                if not plan.dry_run:
+                    speed = plan.servo.linear_mm_s, plan.servo.angular_deg_s
+                    options: dict[str, Any] = {"seed": plan.sampling_seed, "design": plan.design, "speed": speed}
+                    collect(rig, plan.experiment, collection, plan.count, **options, on_rest=require_rest, progress=report_contact)
         kept.catch_up()
     return Collected(out, collection.count, before)
-
-
-def _collect_on_rig(
-    plan: CollectPlan, rig: Rig, collection: Collection, kept: KeptAlso, require_rest: Callable[[Frame], None], progress: Progress
-) -> None:
-    """Make the missing contacts. Each is kept in the further formats before the next one is made."""
-    with rig, stage(progress, "contacts") as step:
-
-        def report_contact(done: float, total: float = 1.0, note: str = "") -> None:
-            kept.catch_up()
-            step(done, total, note)
-
-        _say_plan(plan, rig, collection.count)
-        if plan.dry_run:
-            return
-        collect(
-            rig,
-            plan.experiment,
-            collection,
-            plan.count,
-            seed=plan.sampling_seed,
-            design=plan.design,
-            speed=(plan.servo.linear_mm_s, plan.servo.angular_deg_s),
-            on_rest=require_rest,
-            progress=report_contact,
-        )
 
 
 def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:

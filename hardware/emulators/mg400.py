@@ -290,7 +290,7 @@ class Mg400Emulator(Emulator):
         if request.name not in commands:
             raise RefusedError(ErrorId.NO_SUCH_COMMAND)
         with self.arm.lock:
-            return commands[request.name](request)
+            return commands[request.name](request) or ""
 
     @property
     def _frozen(self) -> bool:

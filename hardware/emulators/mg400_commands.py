@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -40,7 +41,8 @@ AXES = {f"{axis}{sign}" for axis in ("j1", "j2", "j3", "j4", "x", "y", "z", "r")
 # Number of servos. GetErrorID replies with the controller's alarms, followed by those of each servo.
 SERVOS_N = 4
 
-Command = Callable[[Request], str]
+Command = Callable[[Request], str | None]
+"""A command, which returns the values of its reply; None if it has none."""
 
 
 class Mg400Commands:
@@ -77,8 +79,8 @@ class Mg400Commands:
             "dogroup": self._outputs,
             "tooldo": self._tool_output,
             "tooldoexecute": self._tool_output,
-            "di": lambda request: self._input(request, INPUT),
-            "tooldi": lambda request: self._input(request, TOOL_PORT),
+            "di": lambda request: self._only_check(request, INPUT, "0"),  # nothing is attached, so no input has a signal
+            "tooldi": lambda request: self._only_check(request, TOOL_PORT, "0"),
             "setpayload": self._payload,
             "payload": self._payload,
             "arch": lambda request: self._only_check(request, INDEX),
@@ -105,41 +107,38 @@ class Mg400Commands:
             "reljointmovj": lambda request: self._to_joints(request, relative=True),
             "movejog": self._jog,
             **{f"relmov{kind}{frame}": self._relative for kind in "jl" for frame in ("user", "tool", "")},
-            "sync": self._plain(lambda: ""),  # the server sends the reply when the queue is empty
-            "syncall": self._plain(lambda: ""),
+            "sync": self._plain(lambda: None),  # the server sends the reply when the queue is empty
+            "syncall": self._plain(lambda: None),
         }
 
     def _plain(self, action: Callable[[], str | None]) -> Command:
-        def run(request: Request) -> str:
+        def run(request: Request) -> str | None:
             read_numbers(request, (), (0,))
-            return action() or ""
+            return action()
 
         return run
 
-    def _enable(self, request: Request) -> str:
+    def _enable(self, request: Request) -> None:
         load = read_numbers(request, (LOAD_KG, CENTRE_MM, CENTRE_MM, CENTRE_MM), (0, 1, 4))
         self.arm.enable()
         kg, x_mm, y_mm, z_mm = load + [0.0] * (4 - len(load))
         self.arm.load = kg, x_mm, y_mm, z_mm
-        return ""
 
-    def _percentage(self, request: Request) -> str:
+    def _percentage(self, request: Request) -> None:
         (percent,) = read_numbers(request, (RATIO if request.name == "cp" else PERCENT,), (1,))
         if request.name == "speedfactor":
             self.arm.set_speed_factor(percent)
         else:
             self.arm.percent[request.name] = percent
-        return ""
 
-    def _only_check(self, request: Request, parameter: Parameter) -> str:
+    def _only_check(self, request: Request, parameter: Parameter, reply: str = "") -> str:
         read_numbers(request, (parameter,), (1,))
-        return ""
+        return reply
 
-    def _select(self, request: Request, attribute: str, frames: dict) -> str:
+    def _select(self, request: Request, attribute: str, frames: dict) -> None:
         (index,) = read_numbers(request, (INDEX,), (1,))
         self._frame(frames, index)
         setattr(self.arm, attribute, int(index))
-        return ""
 
     def _frame_of(self, request: Request, first: int) -> PlanarFrame:
         """The frame ``{x,y,z,r}`` that begins at a parameter; its braces may be missing."""
@@ -148,12 +147,11 @@ class Mg400Commands:
         x, y, z = values[:3]
         return PlanarFrame(x, y, z, values[3] if len(values) == 4 else values[5])
 
-    def _define(self, request: Request, frames: dict) -> str:
+    def _define(self, request: Request, frames: dict) -> None:
         if len(request.values) not in (2, 5, 7):
             raise RefusedError(ErrorId.PARAMETER_COUNT)
         frame = self._frame_of(request, 1)
         frames[self._whole(request, 0, INDEX)] = frame
-        return ""
 
     def _calculate(self, request: Request, frames: dict) -> str:
         """A frame after an offset along the base's axes (1) or along its own (0)."""
@@ -173,43 +171,33 @@ class Mg400Commands:
         values = Request(request.name, (*["0"] * n, request.values[n]), {}, request.text)
         return int(read_numbers(values, (*ahead, parameter), (n + 1,))[n])
 
-    def _payload(self, request: Request) -> str:
+    def _payload(self, request: Request) -> None:
         kg = read_numbers(request, (LOAD_KG, NUMBER), (1, 2))[0]
         self.arm.load = kg, *self.arm.load[1:]
-        return ""
 
-    def _wait(self, request: Request) -> str:
+    def _wait(self, request: Request) -> None:
         times_ms = read_numbers(request, (WAIT_MS,), (0, 1))
         self.arm.order(Order(np.zeros(6), True, self.arm.speeds(100.0, 100.0), wait_s=(times_ms[0] if times_ms else 0.0) / 1000.0))
-        return ""
 
-    def _output(self, request: Request, *, queued: bool) -> str:
+    def _output(self, request: Request, *, queued: bool) -> None:
         index, level = (int(value) for value in read_numbers(request, (OUTPUT, BIT), (2,)))
         if queued and self.arm.busy():
             self.arm.order(Order(np.zeros(6), True, self.arm.speeds(100.0, 100.0), outputs=((0.0, index, level),), wait_s=0.0))
         else:
             self.arm.set_output(index, level)
-        return ""
 
-    def _outputs(self, request: Request) -> str:
+    def _outputs(self, request: Request) -> None:
         if not request.values or len(request.values) % 2:
             raise RefusedError(ErrorId.PARAMETER_COUNT)
         count = len(request.values)
         values = [int(value) for value in read_numbers(request, (OUTPUT, BIT) * (count // 2), (count,))]
         for index, level in zip(values[::2], values[1::2], strict=True):
             self.arm.set_output(index, level)
-        return ""
 
-    def _tool_output(self, request: Request) -> str:
+    def _tool_output(self, request: Request) -> None:
         index, level = (int(value) for value in read_numbers(request, (TOOL_PORT, BIT), (2,)))
         bit = 1 << (index - 1)
         self.arm.tool_out = self.arm.tool_out | bit if level else self.arm.tool_out & ~bit
-        return ""
-
-    def _input(self, request: Request, parameter: Parameter) -> str:
-        """Read an input. Nothing is attached, so no input has a signal."""
-        read_numbers(request, (parameter,), (1,))
-        return "0"
 
     def _error_ids(self) -> str:
         self.arm.update()
@@ -242,14 +230,13 @@ class Mg400Commands:
             raise RefusedError(ErrorId.FAILED)
         return _text(joints)
 
-    def _to_pose(self, request: Request, *, linear: bool) -> str:
+    def _to_pose(self, request: Request, *, linear: bool) -> None:
         place, groups = self._split_outputs(request)
         pose = read_numbers(place, (NUMBER,) * 4, (4,))
         flange = self._flange(pose, *self._frames(request))
         length_mm = float(np.linalg.norm(flange.pose[:3] - self.arm.last_target().pose[:3]))
         outputs = tuple(self._on_the_way(text, n, length_mm) for n, text in enumerate(groups, start=5))
         self._order(flange, request, linear=linear, outputs=outputs)
-        return ""
 
     @staticmethod
     def _split_outputs(request: Request) -> tuple[Request, tuple[str, ...]]:
@@ -270,13 +257,11 @@ class Mg400Commands:
             raise RefusedError(ErrorId.PARAMETER_RANGE - n)
         return share if share >= 0 else 1.0 + share, int(index), int(level)
 
-    def _arc(self, request: Request) -> str:
+    def _arc(self, request: Request) -> None:
         """``Arc(X1,Y1,Z1,R1,X2,Y2,Z2,R2)``: move along the circle through the present place and two others."""
-        numbers = read_numbers(request, (NUMBER,) * 8, (8,))
-        self._go_round(request, numbers, laps=0)
-        return ""
+        self._go_round(request, read_numbers(request, (NUMBER,) * 8, (8,)), laps=0)
 
-    def _circle(self, request: Request) -> str:
+    def _circle(self, request: Request) -> None:
         """``Circle(count,{X1,Y1,Z1,R1},{X2,Y2,Z2,R2})``, or in the form of the vendor's client: eight numbers and the count."""
         if len(request.values) == 3:
             laps = self._whole(request, 0, LAPS)
@@ -285,7 +270,6 @@ class Mg400Commands:
             *numbers, count = read_numbers(request, (NUMBER,) * 8 + (LAPS,), (9,))
             laps = int(count)
         self._go_round(request, numbers, laps=laps)
-        return ""
 
     def _go_round(self, request: Request, numbers: list[float], *, laps: int) -> None:
         """Queue the lines of an arc, or of whole circles. Places on one straight line are refused."""
@@ -298,7 +282,7 @@ class Mg400Commands:
         for pose in poses * max(laps, 1):
             self.arm.order(Order(pose, True, speeds))
 
-    def _relative(self, request: Request) -> str:
+    def _relative(self, request: Request) -> None:
         """``RelMovLUser(dx, dy, dz, dr, user)`` and similar commands. The offset is along the axes of the user or tool frame."""
         values = read_numbers(request, (NUMBER,) * 4 + (INDEX,), (4, 5))
         offset, index = PlanarFrame(*values[:4]), int(values[4]) if len(values) == 5 else None
@@ -311,35 +295,29 @@ class Mg400Commands:
             along = turn @ offset
             end = PlanarFrame(last.x + along.x, last.y + along.y, last.z + along.z, last.r + offset.r)
         self._order(end, request, linear=request.name[6] == "l")
-        return ""
 
     def _order(self, flange: PlanarFrame, request: Request, *, linear: bool, outputs: tuple[tuple[float, int, int], ...] = ()) -> None:
-        speeds = self._speeds(request, "l" if linear else "j")
-        if linear:
-            self.arm.order(Order(flange.pose, True, speeds, outputs=outputs))
-            return
-        try:
-            self.arm.order(Order(self.arm.joints_at(flange), False, speeds, outputs=outputs))
-        except RefusedError:
-            self.arm.order(Order(flange.pose, True, speeds, outputs=outputs))  # planning raises the alarm if the target is out of reach
+        order = Order(flange.pose, True, self._speeds(request, "l" if linear else "j"), outputs=outputs)
+        if not linear:
+            with suppress(RefusedError):  # planning raises the alarm if the target is out of reach
+                order = replace(order, end=self.arm.joints_at(flange), linear=False)
+        self.arm.order(order)
 
-    def _to_joints(self, request: Request, *, relative: bool) -> str:
+    def _to_joints(self, request: Request, *, relative: bool) -> None:
         joints = np.array(read_numbers(request, (NUMBER,) * 4, (4,)))
         if relative:
-            joints = joints + self.arm.last_joints_deg()
+            joints = joints + self.arm.joints_at(self.arm.last_target())
         self.arm.order(Order(joints, False, self._speeds(request, "j")))
-        return ""
 
-    def _jog(self, request: Request) -> str:
+    def _jog(self, request: Request) -> None:
         if not request.values:
             self.arm.reset()
-            return ""
+            return
         axis = request.values[0].lower().replace(" ", "")
         if axis not in AXES:  # according to the vendor's document, any other text stops a jog
             self.arm.stop_jog()
-            return ""
+            return
         self.arm.jog(axis, user=self._frames(request)[0])
-        return ""
 
     def _speeds(self, request: Request, kind: str) -> Speeds:
         speed = keyword_number(request, f"speed{kind}", PERCENT, self.arm.percent[f"speed{kind}"])

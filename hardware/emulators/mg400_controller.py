@@ -252,10 +252,6 @@ class Mg400Controller:
                 return PlanarFrame.of_pose(self.track.pose(max(self.track.end_s, time.monotonic())))
             return PlanarFrame.of_pose(last.end if last.linear else self.kinematics.forward(last.end))
 
-    def last_joints_deg(self) -> np.ndarray:
-        """Joints at the end of the queue."""
-        return self.joints_at(self.last_target())
-
     def joints_at(self, flange: PlanarFrame) -> np.ndarray:
         """Joints at a flange pose.
 

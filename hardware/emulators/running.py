@@ -23,8 +23,6 @@ def run_until_signal(
     device: AbstractContextManager[Any],
     ready: Callable[[], str],
     failure: Callable[[], Exception | None] = lambda: None,
-    *,
-    on_ready: Callable[[str], None] = say,
 ) -> None:
     """Run a device until SIGTERM or Ctrl-C, or until it fails. Use it in the main thread only.
 
@@ -33,11 +31,9 @@ def run_until_signal(
     device : context manager
         It listens while it is entered.
     ready : callable
-        Returns what listens, and where, once it does.
+        Returns what listens, and where, once it does. This is printed after ``ready``.
     failure : callable
         Returns the error with which the device ended, or None while it runs. The error is raised.
-    on_ready : callable, optional
-        Called once with ``ready ...`` when the device listens; by default it is printed.
     """
     ends = {signal.SIGTERM, signal.SIGINT}
     told: list[bool] = []
@@ -45,7 +41,7 @@ def run_until_signal(
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # signals are waited for, so that nothing is interrupted halfway
     try:
         with device:
-            on_ready(f"ready {ready()}")
+            say(f"ready {ready()}")
             while not told and not _comes(ends):
                 if (error := failure()) is not None:
                     raise error
@@ -72,7 +68,6 @@ def emulate_mg400(
     firmware: str = "1.7.0",
     lenient: bool = False,
     time_scale: float = 1.0,
-    on_ready: Callable[[str], None] = say,
 ) -> None:
     """Emulate a Dobot MG400 until it is ended; see ``Mg400Emulator``.
 
@@ -84,16 +79,14 @@ def emulate_mg400(
     _require_time_scale(time_scale)
     version = OLD_FIRMWARE if lenient else firmware
     arm = Mg400Emulator(host=host, port_offset=port_offset, faults=faults, firmware=version, time_scale=time_scale)
-    run_until_signal(arm, lambda: f"mg400 {host} {' '.join(str(port) for port in arm.ports.values())}", on_ready=on_ready)
+    run_until_signal(arm, lambda: f"mg400 {host} {' '.join(str(port) for port in arm.ports.values())}")
 
 
-def emulate_magician(
-    *, link: Path | None = None, faults: tuple[str, ...] = (), time_scale: float = 1.0, on_ready: Callable[[str], None] = say
-) -> None:
+def emulate_magician(*, link: Path | None = None, faults: tuple[str, ...] = (), time_scale: float = 1.0) -> None:
     """Emulate a Dobot Magician on a pseudo-terminal until it is ended; see ``MagicianEmulator``."""
     _require_time_scale(time_scale)
     arm = MagicianEmulator(link=link, faults=faults, time_scale=time_scale)
-    run_until_signal(arm, lambda: f"magician {link or arm.device}", on_ready=on_ready)
+    run_until_signal(arm, lambda: f"magician {link or arm.device}")
 
 
 def _require_time_scale(time_scale: float) -> None:

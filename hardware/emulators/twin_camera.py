@@ -3,13 +3,11 @@
 ``FeedbackPose`` reads this pose from the feedback ports of an MG400.
 """
 
-from collections.abc import Callable
-
 from hardware.arms.arm import ArmState
 from hardware.arms.mg400_link import Feedback
 from hardware.arms.mg400_wire import FEEDBACK_PERIOD_S, address_of, pose_in
 from hardware.emulators.camera import CameraEmulator
-from hardware.emulators.running import run_until_signal, say
+from hardware.emulators.running import run_until_signal
 from hardware.rig.geometry import PlacedObject
 from hardware.workcell.build import twin_camera
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
@@ -69,7 +67,6 @@ def emulate_camera(
     fps: float = 30.0,
     faults: tuple[str, ...] = (),
     plain_light: bool = False,
-    on_ready: Callable[[str], None] = say,
 ) -> None:
     """Stream the twin's frames as JPEGs over HTTP until it is ended.
 
@@ -93,4 +90,4 @@ def emulate_camera(
     source = twin_camera(sensor, placed, pose, Form.RAW, fps=fps, plain_light=plain_light)
     device = CameraEmulator(source, host=host, port=port, faults=faults)
     with pose:
-        run_until_signal(device, lambda: f"camera {device.url}", lambda: device.error, on_ready=on_ready)
+        run_until_signal(device, lambda: f"camera {device.url}", lambda: device.error)

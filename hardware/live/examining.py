@@ -27,17 +27,17 @@ class Examination(ReadableResult):
     notes: list[str] = field(default_factory=list)
 
     @property
-    def bad(self) -> bool:
-        """Whether any finding is bad."""
-        return any(found.verdict is Grade.BAD for found in self.findings)
+    def failed(self) -> bool:
+        """Whether the sensor failed in any finding."""
+        return any(found.verdict is Grade.FAILED for found in self.findings)
 
     def lines(self) -> list[str]:
         """Lines of text: each finding with its remedy below it, then the irregularities."""
         lines = [f"note: {note}" for note in self.notes]
         for found in self.findings:
-            lines.append(f"{found.verdict.upper():5} {found.name:10} {found.text}")
+            lines.append(f"{found.verdict.upper():8} {found.name:10} {found.text}")
             if found.remedy:
-                lines.append(f"      -> {found.remedy}")
+                lines.append(f"         -> {found.remedy}")
         return lines
 
 

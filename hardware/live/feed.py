@@ -169,7 +169,7 @@ def require_feed(camera: str, arm: str, recording: str, sensor: SensorSpec) -> N
 
 
 class CameraFeed:
-    """A camera, its estimates, and an arm; a ``twin.studio.live_mode.LiveFeed``.
+    """A camera, its estimates, and an arm; a ``twin.studio.modes.live_mode.LiveFeed``.
 
     Parameters
     ----------

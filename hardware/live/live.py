@@ -21,7 +21,7 @@ from hardware.live.rerun_view import RerunView
 from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import load_rest_frame
 from twin.errors import FrameError, OptionError, TwinError
-from twin.estimate import Estimate, Estimator, SensorModel, pins_in
+from twin.estimate import Estimate, Estimator, SensorModel, pins_in, readable_labels
 from twin.pins import Pipeline
 from twin.records import KeptAlso
 from twin.records.session import SESSION_FILES, SessionWriter
@@ -121,7 +121,7 @@ class LiveSession:
     def lines(self, estimate: Estimate) -> list[str]:
         """Lines of text: pose with its interval, rates and losses."""
         if estimate.valid:
-            rows = zip(estimate.names, estimate.value, estimate.low, estimate.high, strict=True)
+            rows = zip(readable_labels(estimate.names), estimate.value, estimate.low, estimate.high, strict=True)
             pose = [f"{name} {value:+.2f} [{low:+.2f}, {high:+.2f}]" for name, value, low, high in rows]
         else:
             pose = [f"not valid: {estimate.reason}"]

@@ -197,7 +197,7 @@ class SafeArm:
 
     def clip_pose(self, pose: np.ndarray) -> np.ndarray:
         """The pose (6,), as near to the given one as the limits permit, that ``move_linear`` would allow from the arm's present pose."""
-        return clip(pose, self._newest_state("clipped").pose, self.limits, self.kinematics)
+        return clip(pose, self._newest_state("clip_pose").pose, self.limits, self.kinematics)
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         """As ``Arm.move_joints``. Returns the allowed joints.

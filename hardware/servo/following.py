@@ -111,8 +111,8 @@ class FollowPlan:
             if kind_of(self.arm) != "simulated":
                 open_arm(self.arm)  # an arm that does not exist is said first; nothing is opened
                 raise OptionError(
-                    f"`arm` {quote(self.arm)} moves by what a camera sees: give the sensor's with `camera`; `camera=twin` draws the "
-                    "frames for the pose that the arm reports, and such a loop does not feel what it touches"
+                    f"`arm` {quote(self.arm)} needs a camera: give the sensor's with `camera`; `camera=twin` renders frames for the pose "
+                    "that the arm reports, and these do not show the real contact"
                 )
             object.__setattr__(self, "camera", TWIN)
 
@@ -125,7 +125,7 @@ class DryRunDone:
 
     def lines(self) -> list[str]:
         """The result as lines of text."""
-        return ["nothing was moved; leave out `dry_run` to begin"]
+        return ["nothing was moved; run it without `dry_run` to begin"]
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class Followed:
                 f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
             ]
         else:
-            out[0] += "; where the object truly stands is not known, so nothing is measured against it (`known_place` says it is)"
+            out[0] += "; the true position of the object is unknown, so errors against it are not measured (`known_place` if it is known)"
         return out + ([in_short(f"ended early: {self.failure}")] if self.failure else [])
 
 
@@ -211,7 +211,9 @@ def follow(
             session.keep_rest(rest)
         take_rest = partial(_take_rest, session, model) if takes_rest else None
         hooks = LoopHooks(law, take_rest, partial(_note_step, session, step, steps))
-        loop = ServoLoop(rig, plan.servo, model, _settings(plan, rig, steps), hooks)
+        period_s = 1.0 / (plan.stream_hz or STREAM_HZ)
+        settings = LoopSettings(steps, plan.stream_hz is None, period_s, rig.frame_timeout_s, GIVE_UP_S)
+        loop = ServoLoop(rig, plan.servo, model, settings, hooks)
         try:
             loop.run(rig.placed.start_pose(plan.servo.indent_mm))
         except TwinError as error:
@@ -256,16 +258,6 @@ def _rig_of(plan: FollowPlan, model: SensorModel) -> Rig:
         seed=plan.seed,
         plain_light=plan.plain_light,
         at_once=plan.stream_hz is None,
-    )
-
-
-def _settings(plan: FollowPlan, rig: Rig, steps: int) -> LoopSettings:
-    return LoopSettings(
-        steps,
-        blocking=plan.stream_hz is None,
-        period_s=1.0 / (plan.stream_hz or STREAM_HZ),
-        frame_timeout_s=rig.frame_timeout_s,
-        give_up_s=GIVE_UP_S,
     )
 
 

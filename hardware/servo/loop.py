@@ -109,7 +109,7 @@ class ServoLoop:
             No usable frame or estimate for ``give_up_s``, or the arm failed.
         """
         touching = False
-        with self.mover.watched():
+        with self.mover.watching():
             try:
                 with self._watch.alert():
                     self._approach(start_pose)
@@ -213,7 +213,7 @@ class ServoLoop:
             self._hold(str(refused), refused, age_s)
             return
         if self._held_since is not None:
-            LOG.warning("%s: goes on after %.1f s", self.arm.name, time.monotonic() - self._held_since)
+            LOG.warning("%s: continues after %.1f s", self.arm.name, time.monotonic() - self._held_since)
         self._memory, self._held_since = memory, None
         self.decided.append((Decided.MOVE, age_s))
         self._record(state, from_pose, self._sent, fresh=fresh, taken_s=taken_s)
@@ -261,7 +261,7 @@ class ServoLoop:
         behind_s = now_s - (now_s if self._behind_since is None else self._behind_since)
         if behind_s > MOVE_TIMEOUT_S:
             raise DeviceError(
-                f"{self.arm.name}: says that it moves, but has not come near its target for {behind_s:.1f} s; "
+                f"{self.arm.name}: reports that it moves, but has not come near its target for {behind_s:.1f} s; "
                 "look for what holds it, call clear_error(), then begin again"
             )
 
@@ -324,7 +324,10 @@ class ServoLoop:
             ("deg from the normal", reading.angle_deg, self.servo.plausible_deg),
         ):
             if not low <= got <= high:
-                return reading, f"the model says {got:.1f} {name}, which can't be ([{low:g}, {high:g}]); give another model or sensor"
+                return (
+                    reading,
+                    f"the model estimates {got:.1f} {name}, outside the possible [{low:g}, {high:g}]; give another model or sensor",
+                )
         return reading, ""
 
     def _hold(self, reason: str, problem: Exception | None, age_s: float = float("nan")) -> None:
@@ -344,8 +347,8 @@ class ServoLoop:
 
     def _turn_back(self, target: np.ndarray) -> None:
         """Leave the object, turn the last axis back by a full turn, and touch the object again at a target (6,) of the other turn."""
-        self.notes.append(f"step {len(self.records)}: the last axis was at its end and turned back, clear of the object")
-        LOG.warning("%s: the last axis is at its end; it turns back, clear of the object", self.arm.name)
+        self.notes.append(f"step {len(self.records)}: the last axis reached its limit and turned back, clear of the object")
+        LOG.warning("%s: the last axis has reached its limit; it turns back, clear of the object", self.arm.name)
         with self._watch.doing("turning its last axis back"):
             self.arm.stop()
             self.mover.forget()
@@ -360,7 +363,7 @@ def require_labels(mounting: Mounting, names: tuple[str, ...]) -> None:
     """Raise ``DeviceError`` unless a model has the labels that following needs. Call it before anything moves."""
     if not {mounting.depth_label, mounting.angle_label} <= set(names):
         raise DeviceError(
-            f"the model tells {', '.join(names)}; following a surface needs the experiment's {mounting.depth_label} and "
+            f"the model estimates {', '.join(names)}; following a surface needs the experiment's {mounting.depth_label} and "
             f"{mounting.angle_label}"
         )
 

@@ -40,5 +40,5 @@ def load_for_outlines(path: Path, contacts_of: Callable[[Policy], KnownContacts 
     """
     policy = load_policy(path)
     if policy.about["task"] not in AROUND:
-        raise PolicyError(f"{path}: of {policy.about['task']}; an arm goes along an outline with policies of {' or '.join(AROUND)}")
+        raise PolicyError(f"{path}: a policy of {policy.about['task']}; to follow an outline give a policy of {' or '.join(AROUND)}")
     return PolicyModel(policy, contacts=contacts_of(policy))

@@ -4,7 +4,6 @@ The measures are the Tac-VGNN paper's smoothness S, and others that do not depen
 the trajectory, a zoom with its local smoothness, depth and angle.
 """
 
-import csv
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -15,9 +14,9 @@ from hardware.rig.geometry import PlacedObject, matrix_of
 from hardware.servo.law import Reading, tangent_of
 from hardware.servo.step import StepRecord
 from twin.report.charts import muted_colour, new_figure
+from twin.report.table import write_table
 from twin.report.themes import BLUE, RED
 from twin.rig.mounting import Mounting
-from twin.store import text_file
 
 # Number of points in a window of the local smoothness.
 LOCAL_N = 9
@@ -220,11 +219,8 @@ def write_csv(path: Path, trajectory: Trajectory) -> Path:
             columns |= {f"{stem}_x_mm": values[:, 0], f"{stem}_y_mm": values[:, 1]}
         else:
             columns[name] = values
-    with text_file(path) as file:
-        writer = csv.writer(file)
-        writer.writerow(["step", *columns])
-        writer.writerows([k, *(f"{value:.6g}" for value in row)] for k, row in enumerate(zip(*columns.values(), strict=True)))
-    return path
+    steps = range(len(trajectory.tool_mm))
+    return write_table(path, [{"step": k} | {name: float(values[k]) for name, values in columns.items()} for k in steps])
 
 
 def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outline_mm: np.ndarray | None = None) -> Figure:
@@ -238,7 +234,7 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
         if outline_mm is not None:
             ax.plot(*outline_mm.T, color=muted_colour(), lw=3, alpha=0.5, label="object")
         ax.plot(*path.tool_mm.T, color=TOOL, lw=1, label="tool")
-        ax.plot(*path.surface_mm.T, ".", color=FELT, ms=3, label="surface as felt")
+        ax.plot(*path.surface_mm.T, ".", color=FELT, ms=3, label="estimated surface")
         ax.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
     whole.set_title("trajectory")
     whole.legend(loc="best", fontsize=8)

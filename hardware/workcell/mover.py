@@ -65,7 +65,7 @@ class Mover:
         self._came: list[np.ndarray] = []  # the poses (6,) at which the arm was since it stood clear of the object
 
     @contextmanager
-    def watched(self) -> Iterator[None]:
+    def watching(self) -> Iterator[None]:
         """Context in which the threads look at arm and camera."""
         with self.watch.watching(), self.eyes.watching():
             yield
@@ -118,7 +118,7 @@ class Mover:
             if np.linalg.norm(sent[:3] - target[:3]) < NEAR_MM and turn_between_deg(sent, target) < NEAR_DEG:
                 return state
         short_mm = float(np.linalg.norm(sent[:3] - target[:3]))
-        raise DeviceError(f"{self.arm.name}: {MOST_PIECES} moves end {short_mm:.1f} mm from the target; allow longer steps in `limits`")
+        raise DeviceError(f"{self.arm.name}: {MOST_PIECES} moves end {short_mm:.1f} mm from the target; allow longer steps in `safety`")
 
     def send(self, target: np.ndarray) -> np.ndarray:
         """Send a move to a pose (6,), while frames are fresh. Returns the pose that was commanded."""
@@ -156,7 +156,7 @@ class Mover:
         Returns the failures, which are also added to ``notes``.
         """
         back: dict[str, Callable[[], object]] = {"retreat": self._withdraw} if touching else {}
-        with self.watch.doing("letting go"):
+        with self.watch.doing("withdrawing"):
             failed = try_each(stop=self.arm.stop, **back, disable=self.arm.disable)
         self.notes += failed
         return failed
@@ -181,7 +181,7 @@ class Mover:
             return
         self._safe.normal = -matrix_of(pose)[:3, :3] @ self._placed.mounting.axis
         if self._safe.retreat() is None:
-            raise NoWayBackError(f"the limits allow no way back: {self._safe.decisions[-1].decision.reason}; free the sensor by hand")
+            raise NoWayBackError(f"the limits allow no path back: {self._safe.decisions[-1].decision.reason}; free the sensor by hand")
 
     def _lasts_s(self, here: np.ndarray, target: np.ndarray) -> float:
         """Longest time that a move between poses (6,) may take."""

@@ -69,19 +69,19 @@ def check_plan(
     for start, end in pairwise(way):
         if why := _forbidden(rig.arm, start, end):
             raise DeviceError(
-                f"{rig.arm.name}: the limits forbid the way to the {rig.placed.spec.name}: {why}; correct 'placement' in the file for "
-                "`servo` (a Magician reaches that of `servo=magician`), or `limits`"
+                f"{rig.arm.name}: the limits forbid the path to the {rig.placed.spec.name}: {why}; correct 'placement' in the file for "
+                "`servo` (a Magician reaches that of `servo=magician`), or `safety`"
             )
     blocked = [n for n, pose in enumerate(planned) if not _can_retreat(rig, pose)]
     if blocked[:1] == [0]:
-        raise DeviceError(f"{rig.arm.name}: the limits allow no way back from the start; correct 'placement' in the file for `servo`")
+        raise DeviceError(f"{rig.arm.name}: the limits allow no path back from the start; correct 'placement' in the file for `servo`")
     way_mm = sum(float(np.linalg.norm(end[:3] - start[:3])) for start, end in pairwise(way))
-    back = f"a way back from all {len(planned)} planned poses"
+    back = f"a path back from all {len(planned)} planned poses"
     if blocked:
-        back = f"no straight way back from {len(blocked)} of {len(planned)} planned poses: from there the arm goes back the way it came"
+        back = f"no straight path back from {len(blocked)} of {len(planned)} planned poses: from there the arm returns the way it came"
     return [
         *seen,
-        f"way: {len(way) - 1} moves, {way_mm:.0f} mm, to {' '.join(f'{value:.1f}' for value in planned[0])} (mm, deg)",
+        f"path: {len(way) - 1} moves, {way_mm:.0f} mm, to {' '.join(f'{value:.1f}' for value in planned[0])} (mm, deg)",
         f"limits: {back}",
         f"time: about {way_mm / linear_mm_s + spent_s:.0f} s",
     ]
@@ -115,8 +115,8 @@ def check_standing(source: FrameSource, arm: SafeArm, pipeline: Pipeline) -> lis
     ``check_plan``."""
     seen, here = check_sight(source, pipeline), arm.state().pose
     if why := _forbidden(arm, here, here):
-        raise DeviceError(f"{arm.name}: stands outside its limits, so no step leads back here: {why}; move it inside by hand")
-    return [*seen, "limits: the way back of each step is inside"]
+        raise DeviceError(f"{arm.name}: stands outside its limits, so it could not step back here: {why}; move it inside by hand")
+    return [*seen, "limits: the path back of each step is inside"]
 
 
 def _forbidden(arm: Arm, start: np.ndarray, end: np.ndarray) -> str:

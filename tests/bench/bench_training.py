@@ -12,8 +12,7 @@ import torch
 from scenes import load_sensor
 from training.data.pins import PinTable
 from training.models import model_named
-from training.models.cnn.inputs import ImageInputs
-from training.models.part import Inputs, PinModel
+from training.models.part import ArrayInputs, Inputs, PinModel
 from training.studies.tac_vgnn.models import measure_training
 from twin.pins import make_graph, nominal_reference
 from twin.types import Form
@@ -39,7 +38,7 @@ def inputs_of(name: str, pins: PinTable) -> Inputs:
     model = model_named(name)
     if isinstance(model, PinModel):
         return model.prepare_pins(pins, np.arange(len(pins))).inputs
-    return ImageInputs(np.random.default_rng(0).integers(0, 256, (len(pins), 128, 128), dtype=np.uint8))
+    return ArrayInputs(np.random.default_rng(0).integers(0, 256, (len(pins), 128, 128), dtype=np.uint8))
 
 
 def main() -> None:

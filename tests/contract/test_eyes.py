@@ -108,7 +108,7 @@ def test_an_arm_does_not_leave_standstill_without_a_frame(arm):
         eyes, before = FreshFrames(arm, source), arm.state().pose
         with pytest.raises(BlindError, match="moves only with fresh frames"):
             eyes.await_frame(timeout_s=0.3)
-        with eyes.watched(), pytest.raises(BlindError):
+        with eyes.watching(), pytest.raises(BlindError):
             eyes.move(lambda: arm.move_linear(before + [0, 5, 0, 0, 0, 0]))
     np.testing.assert_array_equal(arm.state().pose, before)
 
@@ -123,7 +123,7 @@ def test_a_motion_that_is_sent_after_the_stop_is_stopped_too(arm):
             time.sleep(0.5)
             return arm.move_linear(target, wait=False)
 
-        with eyes.watched(), pytest.raises(BlindError, match="no new picture"):
+        with eyes.watching(), pytest.raises(BlindError, match="no new picture"):
             eyes.move(send, ends=False)
         assert not arm.state().moving
 
@@ -281,7 +281,7 @@ def test_the_plan_is_checked_before_anything_moves(kind, servo, refused):
                 check()
         else:
             lines = check()
-            assert [line.split(":")[0] for line in lines] == ["camera", "sensor", "way", "limits", "time"] and "frames/s" in lines[0]
+            assert [line.split(":")[0] for line in lines] == ["camera", "sensor", "path", "limits", "time"] and "frames/s" in lines[0]
             assert "331 of 331 pins of mg400-331" in lines[1]
         np.testing.assert_array_equal(at.reads(), before)
 

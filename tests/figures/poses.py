@@ -184,7 +184,7 @@ def register() -> None:
     )
     for sensor in SETS:
         common = {"sensors": (sensor,), "code": ("training.studies.sim_to_real",), "recordings": (SETS[sensor],), "beside": NO_PICTURES}
-        command = f"twin study sim-to-real --sensor {sensor} --frames DIR --labels {LABELS} --count 300 --seed"
+        command = f"twin study sim-to-real --sensor {sensor} --frames DIR --num-labelled {LABELS} --count 300 --seed"
         for seed in SIMULATED_SEEDS:
             job(f"sim_to_real.{sensor}.seed{seed}", f"{command} {seed}", minutes=8, **common)(
                 partial(taught_by_the_twin, sensor=sensor, seed=seed)

@@ -46,6 +46,8 @@ print(json.dumps([name for name, job in JOBS.items() if is_kept(job)]))
 """
 CLOCKS = ("ms", "seconds", "time")
 """Beginnings and ends of the names of columns that hold times."""
+CHARTS = ("panel.png", "errors.png")
+"""Pictures that are drawn to be looked at. No figure is measured on them."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,9 @@ def contents(path: Path) -> dict[str, np.ndarray]:
 def differences(old: Path, new: Path) -> list[str]:
     """Files and arrays that both folders hold but that differ, and results that one of them lacks."""
     kinds = (".npz", ".npy", ".csv", ".png", ".safetensors")
-    before, after = ({str(path.relative_to(side)) for path in side.rglob("*") if path.suffix in kinds} for side in (old, new))
+    before, after = (
+        {str(path.relative_to(side)) for path in side.rglob("*") if path.suffix in kinds and path.name not in CHARTS} for side in (old, new)
+    )
     found = [f"{name}: not there" for name in sorted(before - after)]
     for name in sorted(before & after):
         first, second = contents(old / name), contents(new / name)

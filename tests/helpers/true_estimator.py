@@ -17,6 +17,10 @@ class TrueEstimate:
     reason: str = ""
     seen: None = None
 
+    @property
+    def units(self) -> tuple:
+        return tuple("deg" if name[-1] in "456" else "mm" for name in self.names)
+
 
 class TrueEstimator:
     """Callable like a model. ``noise_mm`` and ``noise_deg`` are standard deviations; ``fail`` gives a reason to be not valid."""

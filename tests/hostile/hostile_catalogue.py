@@ -349,7 +349,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     f"realism {{raw}} {U} --out {{out}}": {"--max-frames": "0 -1", "--quality": "best"},
     f"calibrate optics {U} --frames {{raw}}": {"--out": "{out} {out}/spec", "--out {out}/spec.toml --max-frames": "0 -1"},
     f"calibrate contact {S} --frames {{recording}} --out {{out}}/spec.toml --elements 6 --workers 1": {
-        "--labels": "0 3 -1",
+        "--num-labelled": "0 3 -1",
         "--seed": "-1",
         "--hold": "nonsense",
         "--workers": "0 -1",
@@ -421,7 +421,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--seed": "-1",
     },
     f"study sim-to-real {S} --frames {{recording}} --out {{out}} --elements 6 --workers 1": {
-        "--labels": "0 -1 1000000",
+        "--num-labelled": "0 -1 1000000",
         "--count": "0 -1 2000000000",
         "--draws": "0 -1 2000000000",
         "--epochs": "0",

@@ -319,7 +319,7 @@ def test_a_dry_run_tells_the_plan_and_moves_nothing(stand_in, tmp_path, monkeypa
     common = ("--camera", "twin", "--arm", "simulated", "--sensor", "mg400-331", "--plain-light", "--count", 2)
     run("collect", *common, "--out", tmp_path / "c", "--dry-run")
     assert not enabled and "nothing was moved" in told
-    assert all(caplog.text.count(f"{part}: ") >= 2 for part in ("camera", "way", "limits", "time"))
+    assert all(caplog.text.count(f"{part}: ") >= 2 for part in ("camera", "path", "limits", "time"))
 
 
 def test_what_is_not_attached_leaves_no_session_in_the_way(stand_in, tmp_path):

@@ -14,7 +14,7 @@ from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.pins import Pipeline, nominal_reference
 from twin.pins.batch import recording_reference
-from twin.pins.legacy import LegacyPipeline
+from twin.pins.detectors.legacy import LegacyPipeline
 from twin.rig.labels import read_arm_labels
 from twin.simulator import Simulator
 from twin.types import Form

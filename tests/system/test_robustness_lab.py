@@ -14,7 +14,7 @@ from twin.evaluation.degradation.sweep import SweepSettings, run_sweep
 from twin.frames import open_recording
 from twin.frames.images import write_image
 from twin.pins import make_detector, shipped_detector, tune
-from twin.pins.reference import nominal_reference
+from twin.pins.labelling.reference import nominal_reference
 from twin.types import Form
 
 SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127", "ur5-331-raw": "ur5-331"}
@@ -41,7 +41,7 @@ def test_tune_check_and_robustness_from_the_command_line(tmp_path):
     assert tuned.returncode == 0, tuned.stderr
     assert "all pins in view found in 100 %" in tuned.stdout and (tmp_path / "mine.toml").is_file()
     checked = run("check", frames, "--sensor", "mg400-127", "--pipeline", tmp_path / "mine.toml")
-    assert checked.returncode == 0 and "GOOD" in checked.stdout, checked.stdout + checked.stderr
+    assert checked.returncode == 0 and "HEALTHY" in checked.stdout, checked.stdout + checked.stderr
     plan = tmp_path / "plan.toml"
     plan.write_text('steps = [1.0]\n[[condition]]\nname = "hot-pixels"\n[[condition]]\nname = "caps-faded"\n')
     pipelines = ("--pipeline", "twin", "--pipeline", tmp_path / "mine.toml", "--conditions", plan, "--jobs", "1", "--max-frames", "2")

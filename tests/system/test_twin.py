@@ -9,8 +9,8 @@ from scenes import SpecError, load_object, load_sensor
 from twin.mechanics.path import ContactPose
 from twin.one_contact import RenderedContact, look_at
 from twin.pins.graph import make_graph
+from twin.pins.labelling.reference import nominal_reference
 from twin.pins.pipeline import Pipeline
-from twin.pins.reference import nominal_reference
 from twin.simulator import Simulator
 from twin.types import Form
 

@@ -99,7 +99,7 @@ def across_objects(out: Path) -> Path:
         for k, thing in enumerate((*train, *unseen))
     ]
     write_table(out / "objects.csv", rows)
-    return write_page(out, plan=plan, names=LABELS, ranges=experiment.ranges(), rows=rows, verdicts=verdicts(plan, rows, LABELS))
+    return write_page(out, plan, rows, verdicts(plan, rows, LABELS))
 
 
 def study(out: Path) -> Path:

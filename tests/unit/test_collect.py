@@ -193,7 +193,7 @@ def test_a_contact_that_the_arm_stops_short_of_is_not_the_one_that_was_asked_for
         asked = draw_contact(experiment, 1, 0).pose
         assert abs(float(rows(tmp_path)[0]["pose_2"]) - asked[1]) < 1.0  # mm: less than two moves may be off
     else:
-        with pytest.raises(DeviceError, match="`limits`"):
+        with pytest.raises(DeviceError, match="`safety`"):
             run(rig, tmp_path, 1)
         assert rows(tmp_path) == []
 

@@ -17,13 +17,13 @@ from twin.frames.forms import is_two_level
 from twin.optics.preview import Preview
 from twin.optics.surfaces import cap_albedo
 from twin.pins import Grade, Pipeline, examine, tune
-from twin.pins.caps import measure_caps
-from twin.pins.identify import LayoutInFrame, _at_likelier_spots, identify, score_layout
-from twin.pins.legacy import LegacyPipeline
-from twin.pins.matching import match
-from twin.pins.reference import make_reference
-from twin.pins.rest import Rest
-from twin.pins.tune import _at_rest
+from twin.pins.detectors.legacy import LegacyPipeline
+from twin.pins.detectors.tune import _at_rest
+from twin.pins.finding.caps import measure_caps
+from twin.pins.labelling.identify import LayoutInFrame, _at_likelier_spots, identify, score_layout
+from twin.pins.labelling.matching import match
+from twin.pins.labelling.reference import make_reference
+from twin.pins.labelling.rest import Rest
 from twin.types import Form, Frame
 
 GRID = PinsSpec(layout="grid", columns=7, rows=9)
@@ -96,7 +96,7 @@ def test_a_sensor_of_dark_pins_is_made_checked_and_tuned(made):
         assert seen.valid and seen.found == 63 and cKDTree(true).query(seen.pins_px)[0].max() < 1
     usual, findings = found.sensor.pipeline.usual_caps, {one.name: one for one in examine(frames, found.sensor)}
     assert usual is not None and usual.contrast == pytest.approx(135, abs=15)
-    assert {findings[name].verdict for name in ("brightness", "saturation", "focus", "glare", "layout", "pins")} == {Grade.GOOD}
+    assert {findings[name].verdict for name in ("brightness", "saturation", "focus", "glare", "layout", "pins")} == {Grade.HEALTHY}
     assert "below the skin" in findings["brightness"].text
     detector = tune(frames, found.sensor).detector
     assert detector.blob.polarity == "dark" and detector.evidence is not None and detector.evidence.exact_rate == 1
@@ -108,10 +108,10 @@ def test_white_skin_around_dark_caps_is_saturated_and_black_caps_are_not(made):
     found, _, _ = made
     images, _ = dots(1, level=(290, 0), light=0.0, corner=0.0)
     findings = {one.name: one for one in examine([Frame(image, Form.RAW) for image in images], found.sensor)}
-    assert findings["saturation"].verdict is Grade.BAD and "skin" in findings["saturation"].text
+    assert findings["saturation"].verdict is Grade.FAILED and "skin" in findings["saturation"].text
     images, _ = dots(1, level=(180, 0), light=0.0, corner=0.0)
     findings = {one.name: one for one in examine([Frame(image, Form.RAW) for image in images], found.sensor)}
-    assert findings["saturation"].verdict is Grade.GOOD
+    assert findings["saturation"].verdict is Grade.HEALTHY
 
 
 def test_thresholded_frames_of_dark_pins_are_recognised(tmp_path):

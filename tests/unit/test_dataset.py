@@ -77,7 +77,7 @@ def replaced_in_secret(file, other):
     return size
 
 
-@pytest.mark.parametrize("of", [lambda data: data.pins.nodes_px, lambda data: image_inputs(data).images.numpy()], ids=["pins", "pictures"])
+@pytest.mark.parametrize("of", [lambda data: data.pins.nodes_px, lambda data: image_inputs(data).values.numpy()], ids=["pins", "pictures"])
 def test_what_is_kept_of_frames_is_not_that_of_frames_that_were_replaced(tmp_path, of):
     names = [f"f_{k}.png" for k in range(2)]
     folder = tmp_path / "r"

@@ -15,9 +15,9 @@ from twin.errors import FrameError, OptionError
 from twin.frames.forms import known_frames
 from twin.geometry.pins import pin_lattice
 from twin.pins import METHODS, load_detector, make_detector, shipped_detector, tune, write_detector
-from twin.pins.own_finder import own_detector, own_name, own_places
-from twin.pins.reference import nominal_reference
-from twin.pins.tune_files import tune_on_frames
+from twin.pins.detectors.own_finder import own_detector, own_name, own_places
+from twin.pins.detectors.tune_files import tune_on_frames
+from twin.pins.labelling.reference import nominal_reference
 from twin.types import Form, Frame
 
 # scale spaces give whole pixels; DoH, from an integral image, is off by about one
@@ -80,7 +80,7 @@ def test_every_method_tunes_itself_and_finds_the_pins(spec, foreign, tuned_by, m
 
 
 def test_a_tuning_tells_what_it_left_out_and_frames_of_another_size(spec, tuned, tmp_path, monkeypatch):
-    monkeypatch.setattr("twin.pins.tune_files.tune", lambda *_, **__: tuned)
+    monkeypatch.setattr("twin.pins.detectors.tune_files.tune", lambda *_, **__: tuned)
     for k in range(3):
         cv2.imwrite(str(tmp_path / f"f_{k}.png"), np.full((240, 320), 40 * k, np.uint8))
     (tmp_path / "f_1.png").write_bytes(b"no picture")
@@ -154,7 +154,7 @@ def test_a_tuning_that_is_worse_than_the_specification_says_so(spec, tuned, tmp_
     for rate in (0.0, 1.0):
         evidence = tuned.detector.evidence.model_copy(update={"exact_rate": rate, "low_rate": 0.0})
         made = replace(tuned, detector=tuned.detector.model_copy(update={"evidence": evidence}))
-        monkeypatch.setattr("twin.pins.tune_files.tune", lambda *_, made=made, **__: made)
+        monkeypatch.setattr("twin.pins.detectors.tune_files.tune", lambda *_, made=made, **__: made)
         odd = tune_on_frames(tmp_path, spec).odd
         assert any("specification itself finds all pins in 100% of these frames" in note for note in odd) == (rate == 0.0), odd
 

@@ -131,7 +131,7 @@ def test_a_push_pays_what_it_gains_and_waiting_and_going_back_pay_nothing():
     for middle in (10.0, 20.0, 20.0, 15.0, 19.0):
         batch.T_object[0, 2, 3] = middle
         batch.T_work[0, :3, 3] = start + [0.0, 0.0, middle]
-        judged = task.judge(batch._observe_world())
+        judged = task.evaluate(batch._observe_world())
         told.append((judged.reward[0], judged.terms["gain_mm"][0], judged.terms["off_mm"][0]))
         assert judged.terms["miss_mm"][0] == pytest.approx(0.0)
     reward, gain, off = np.array(told).T
@@ -147,10 +147,9 @@ def test_a_way_back_and_forth_covers_nothing():
     for along in (0.0, 0.5, 1.0, 0.5, 1.0, 1.5):
         batch.T_work[0] = standing_on(batch.tool, surface, along, 3.0, 0.0)
         if not rewards:
-            task.kept[0, 2:4] = surface.depth_and_angle(batch.tool.mounting, batch.tool.seen(batch.T_work, batch.T_object)).place_mm[
-                0, [0, 2]
-            ]
-        rewards.append(task.judge(batch._observe_world()).reward[0])
+            pose = batch.tool.object_poses(batch.T_work, batch.T_object)
+            task.kept[0, 2:4] = surface.depth_and_angle(batch.tool.mounting, pose).place_mm[0, [0, 2]]
+        rewards.append(task.evaluate(batch._observe_world()).reward[0])
     assert rewards == pytest.approx([0.0, 1.0, 1.0, 0.0, 0.0, 1.0]) and task.kept[0, 0] == pytest.approx(1.5)
 
 
@@ -249,8 +248,8 @@ def test_a_state_without_touch_is_not_good_and_a_lost_object_ends_the_episode(ta
         ({"backend": "cuda"}, "backend='cuda'"),
         ({"steps": -1}, "steps=-1"),
         ({"pictures": "photo"}, "pictures='photo'"),
-        ({"backend": "fem", "friction_memory": False}, "friction_memory"),
-        ({"friction_memory": "no"}, "friction_memory='no'"),
+        ({"backend": "fem", "friction_history": False}, "friction_history"),
+        ({"friction_history": "no"}, "friction_history='no'"),
         ({"objects": 5}, "objects=5"),
         ({"objects": ("can", 5)}, "objects="),
         ({"axes": 1.0}, "axes=1.0"),

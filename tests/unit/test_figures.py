@@ -65,7 +65,7 @@ def test_every_jobs_code_and_files_are_found():
 
 def test_only_code_that_a_figure_comes_from_makes_it_old():
     pins, poses = (set(module.code_behind(name).modules) for name in ("twin.pins.batch", "training.studies.sim_to_real"))
-    assert "twin.pins.blobs" in pins and "twin.mechanics.solver" not in pins
+    assert "twin.pins.finding.blobs" in pins and "twin.mechanics.solver" not in pins
     assert {"twin.mechanics.solver", "training.studies.sim_to_real.model_inversion"} <= poses
     assert not [name for name in pins | poses if name.startswith(module.UNMEASURED)]
 

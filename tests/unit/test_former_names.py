@@ -8,6 +8,8 @@ import typer
 from typer.testing import CliRunner
 
 import twin
+from scenes.rig import RigSpec
+from training.environments.batch import Options
 from training.generation.config import GenerationConfig
 from twin.cli import command_line
 from twin.cli.command import App, as_function
@@ -82,3 +84,9 @@ def test_no_former_name_is_a_present_one_of_the_same_command():
 
     assert sum(len(hidden) for _, hidden in options(typer.main.get_command(command_line()))) > 10
     assert all(len(names) == len(set(names)) for names, _ in options(typer.main.get_command(command_line())))
+
+
+def test_keys_and_environment_options_of_version_1_are_read():
+    rig = RigSpec.model_validate({"tcp_to_dome_mm": -17.0, "tcp_aside_mm": 0.4})
+    assert rig.tcp_binormal_mm == 0.4
+    assert Options.from_keywords({"friction_memory": False}).friction_history is False

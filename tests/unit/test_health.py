@@ -20,7 +20,7 @@ from twin.geometry.pins import rest_pins
 from twin.mechanics.path import ContactPose
 from twin.pins import DetectorSpec, Grade, examine
 from twin.pins.check import drift_of
-from twin.pins.reference import nominal_reference
+from twin.pins.labelling.reference import nominal_reference
 from twin.types import Form, Frame
 
 
@@ -43,7 +43,7 @@ PLACE = ("shift", "turn", "scale", "stretch", "mirror")
 
 def test_an_undamaged_sensor_has_no_bad_finding():
     found = verdicts(frames("noise", 0.0))
-    assert {f.verdict for f in found.values()} == {Grade.GOOD}, found
+    assert {f.verdict for f in found.values()} == {Grade.HEALTHY}, found
     assert set(found) == {"brightness", "saturation", "focus", "glare", "stray light", "layout", "pins", "specks", *PLACE}
 
 
@@ -63,7 +63,7 @@ def test_an_undamaged_sensor_has_no_bad_finding():
 )
 def test_a_planted_fault_is_named(name, severity, finding):
     found = verdicts(frames(name, severity))
-    assert found[finding].verdict is not Grade.GOOD and found[finding].remedy, found
+    assert found[finding].verdict is not Grade.HEALTHY and found[finding].remedy, found
 
 
 def test_a_white_housing_beside_a_pad_is_no_glare_and_a_white_patch_on_it_is():
@@ -76,14 +76,14 @@ def test_a_white_housing_beside_a_pad_is_no_glare_and_a_white_patch_on_it_is():
     glaring = housed.copy()
     x, y = np.rint(rest.pins_px.mean(axis=0)).astype(int)
     glaring[y - 25 : y + 25, x - 25 : x + 25] = 255
-    for image, verdict in ((housed, Grade.GOOD), (glaring, Grade.BAD)):
+    for image, verdict in ((housed, Grade.HEALTHY), (glaring, Grade.FAILED)):
         found = {each.name: each for each in examine([replace(frame, image=image)], pad)}
         assert found["glare"].verdict is verdict, found["glare"]
 
 
 def test_a_black_frame_is_bad_and_nothing_crashes():
     found = verdicts([Frame(np.zeros((480, 640), np.uint8), Form.RAW)])
-    assert found["pins"].verdict is Grade.BAD and found["brightness"].verdict is Grade.BAD and "place" in found
+    assert found["pins"].verdict is Grade.FAILED and found["brightness"].verdict is Grade.FAILED and "place" in found
 
 
 def test_frames_that_cannot_be_used_are_named():
@@ -140,5 +140,5 @@ def test_frames_of_the_size_for_which_the_detector_was_tuned_are_checked(tmp_pat
     places = tuple(map(tuple, rest_px.tolist()))
     tuned = DetectorSpec(name="mine", method="twin", form=Form.PROCESSED, size_px=size_px, blob=blob, pins_px=places)
     found = {each.name: each for each in examine_sensor(str(tmp_path / "a.png"), spec, detector=tuned).findings}
-    assert found["pins"].verdict is Grade.GOOD
-    assert (found["shift"].verdict is Grade.GOOD) == (not shift_px), found
+    assert found["pins"].verdict is Grade.HEALTHY
+    assert (found["shift"].verdict is Grade.HEALTHY) == (not shift_px), found

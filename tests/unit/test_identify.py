@@ -10,8 +10,8 @@ from scenes.pins import PinsSpec
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
 from twin.pins import tune
-from twin.pins.bumps import find_bumps
-from twin.pins.identify import _match_known, identify, score_layout, symmetries
+from twin.pins.finding.bumps import find_bumps
+from twin.pins.labelling.identify import _match_known, identify, score_layout, symmetries
 from twin.types import Form, Frame
 
 LAYOUTS = [

@@ -146,7 +146,7 @@ def test_every_label_of_the_recordings_leads_somewhere(name):
 @pytest.mark.parametrize(("approach", "sign"), [("x", 1), ("y", 1), ("y", -1), ("z", -1)])
 def test_an_arm_that_turns_under_a_force_is_where_a_larger_angle_would_have_sent_it(approach, sign):
     plan = load_experiment("surface-2d").model_copy(update={"approach": approach})
-    rig = RigSpec(tcp_to_dome_mm=-17.0, tcp_lateral_mm=0.7, tcp_aside_mm=0.4, turn_sign=sign, image_turn_deg=80.0, plate_tilt_deg=-1.0)
+    rig = RigSpec(tcp_to_dome_mm=-17.0, tcp_lateral_mm=0.7, tcp_binormal_mm=0.4, turn_sign=sign, image_turn_deg=80.0, plate_tilt_deg=-1.0)
     pose, further = np.zeros(6), np.zeros(6)
     pose[TURNING[approach]] = 12.0
     further[TURNING[approach]] = 12.0 + 0.6

@@ -25,7 +25,7 @@ def commands(firmware=(1, 7, 0), faults=(), enabled=True):
         request, rest = take_request(text)
         assert not rest
         try:
-            return {**table.dashboard, **table.motion}[request.name](request)
+            return {**table.dashboard, **table.motion}[request.name](request) or ""
         except RefusedError as refusal:
             return refusal.error_id
 

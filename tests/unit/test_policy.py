@@ -205,12 +205,12 @@ def test_pictures_are_seen_as_means_of_squares():
     assert seen[1, 2, 1] == pytest.approx(0.5) and seen.sum() == pytest.approx(0.5)
 
 
-def test_a_policy_that_learnt_without_friction_memory_is_also_judged_with_it(tmp_path, few_looks, monkeypatch):
+def test_a_policy_that_learnt_without_friction_history_is_also_judged_with_it(tmp_path, few_looks, monkeypatch):
     asked = []
     monkeypatch.setattr(
-        learn, "evaluate_policy", lambda policy, task, options, episodes, seed: asked.append(options.friction_memory) or 0.5
+        learn, "evaluate_policy", lambda policy, task, options, episodes, seed: asked.append(options.friction_history) or 0.5
     )
-    made = learn_policy(LearnPlan("SurfaceFollow", replace(SMALL, friction_memory=False), minutes=0.001, environments=2), tmp_path)
+    made = learn_policy(LearnPlan("SurfaceFollow", replace(SMALL, friction_history=False), minutes=0.001, environments=2), tmp_path)
     assert asked == [False, True] and len(made.success) == 2
 
 

@@ -13,12 +13,12 @@ from twin.errors import FrameError
 from twin.frames import open_recording
 from twin.frames.forms import raw_to_recording
 from twin.pins import Pipeline, measure_reference, nominal_reference
-from twin.pins.blobs import SPECK_LEVELS, circular_mask, despeckle, find_blobs
-from twin.pins.legacy import LegacyPipeline
-from twin.pins.matching import confirm, match, rematch
+from twin.pins.detectors.legacy import LegacyPipeline
+from twin.pins.finding.blobs import SPECK_LEVELS, circular_mask, despeckle, find_blobs
+from twin.pins.labelling.matching import confirm, match, rematch
+from twin.pins.labelling.reference import folded_fraction
+from twin.pins.labelling.split import split_chains
 from twin.pins.pipeline import lower_levels
-from twin.pins.reference import folded_fraction
-from twin.pins.split import split_chains
 from twin.types import Form, Frame
 
 CENTROID_RAW_PX = 0.05  # rms on a drawn gray cap with noise: a tenth of what rendering is held to

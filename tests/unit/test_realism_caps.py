@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from twin.pins.caps import measure_caps
+from twin.pins.finding.caps import measure_caps
 
 FINE = 6  # subpixels per pixel in the drawing
 LOW, HIGH = 20.0, 140.0

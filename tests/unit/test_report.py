@@ -256,18 +256,23 @@ def test_a_table_marks_the_best_and_names_its_units():
     rows = [{"model": "a", "error_mm": 0.2, "share": 0.5}, {"model": "b", "error_mm": 0.1, "share": 0.25}]
     rows.append({"model": "c", "error_mm": None})
     table = make_table(rows, ["model", Column.of("error_mm", best="least"), Column("share", "share", "%", decimals=0, scale=100)])
-    assert [(head.title, head.unit, head.number) for head in table.heads] == [
+    assert [tuple(head.values()) for head in table["heads"]] == [
         ("model", "", False),
         ("error", "mm", True),
         ("share", "%", True),
     ]
-    assert [[cell.text for cell in row] for row in table.body] == [["a", "0.200", "50"], ["b", "0.100", "25"], ["c", NOTHING, NOTHING]]
-    assert ["best" in row[1].style for row in table.body] == [False, True, False]
+    texts = [[cell["text"] for cell in row] for row in table["body"]]
+    assert texts == [
+        ["a", "0.200", "50"],
+        ["b", "0.100", "25"],
+        ["c", NOTHING, NOTHING],
+    ]
+    assert ["best" in row[1]["style"] for row in table["body"]] == [False, True, False]
 
 
 def test_a_single_value_is_not_the_best():
     table = make_table([{"a": 1.0}, {"a": None}], [Column("a", "a", best="most")])
-    assert "best" not in table.body[0][0].style
+    assert "best" not in table["body"][0][0]["style"]
 
 
 def test_rows_are_written_for_machines(tmp_path):

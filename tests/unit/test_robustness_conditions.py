@@ -17,7 +17,7 @@ from twin.geometry.pins import rest_pins
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview
 from twin.pins import shipped_detector
-from twin.pins.reference import nominal_reference
+from twin.pins.labelling.reference import nominal_reference
 from twin.types import Form
 
 LADDER = (0.0, 0.1, 0.3, 0.6, 1.0)

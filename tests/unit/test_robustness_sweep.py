@@ -24,7 +24,7 @@ from twin.evaluation.degradation.shots import DegradedFrame, RealSource
 from twin.evaluation.degradation.study import check_pipelines, consensus, study
 from twin.evaluation.degradation.sweep import ModelAnswer, SweepSettings, cells_of, run_sweep
 from twin.pins import Found, make_detector, shipped_detector
-from twin.pins.reference import nominal_reference
+from twin.pins.labelling.reference import nominal_reference
 from twin.types import Form, Frame
 
 RECALL = next(m for m in MEASURES if m.name == "recall")

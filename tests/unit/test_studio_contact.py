@@ -47,8 +47,8 @@ def test_a_pose_is_its_numbers():
 def test_limits_are_kept_and_named():
     within, why = ObjectPose(x_mm=99.0, tilt_x_deg=-80.0).within_limits()
     assert within.x_mm == LIMITS["x_mm"][1] and within.tilt_x_deg == LIMITS["tilt_x_deg"][0]
-    assert "x ends at 20 mm" in why and "tilt x ends at -60 deg" in why
-    with pytest.raises(ContactError, match="depth_mm: nan is no finite number"):
+    assert "x is limited to 20 mm" in why and "tilt x is limited to -60 deg" in why
+    with pytest.raises(ContactError, match="depth_mm: nan is not a finite number"):
         ObjectPose(depth_mm=float("nan")).within_limits()
 
 
@@ -161,7 +161,7 @@ def test_a_changed_friction_begins_the_contact_anew(contact):
 def test_the_recordings_form_is_refused_where_there_is_none():
     camera = StudioCamera.__new__(StudioCamera)
     camera.spec = SENSOR.model_copy(update={"recording": None})
-    with pytest.raises(FrameError, match="has no recordings' form; show raw frames"):
+    with pytest.raises(FrameError, match="has no processed frames; show raw frames"):
         camera.as_recorded(Frame(np.zeros((4, 4), np.uint8), Form.RAW))
 
 
@@ -180,7 +180,7 @@ def test_the_window_holds_mask_and_recording(name):
 def test_depth_and_both_tilts_are_the_inverse_of_the_arms_way():
     sensor, experiment, rng = load_sensor("ur5-331"), load_experiment("surface-3d"), np.random.default_rng(0)
     radius, surface = sensor.skin.outer_radius_mm, SmoothSurface(PLANE)
-    odd = rig_of(sensor).model_copy(update={"turn_offset_deg": (0.3, -0.5, 2.0), "plate_tilt_deg": 3.0, "tcp_aside_mm": 0.4})
+    odd = rig_of(sensor).model_copy(update={"turn_offset_deg": (0.3, -0.5, 2.0), "plate_tilt_deg": 3.0, "tcp_binormal_mm": 0.4})
     for rig in (rig_of(sensor), odd):
         for _ in range(20):
             pose = np.array([0, 0, rng.uniform(0, 5), *rng.uniform(-20, 20, 2), 0])

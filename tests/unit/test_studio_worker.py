@@ -123,7 +123,7 @@ def test_what_stands_still_is_traced_then_refined_and_shown_with_its_own_picture
     kinds = [(a.lit, a.mesh) for a in answers if a.arrived]
     usual = [(lit, SolvedMesh.USUAL) for lit in (Light.RASTERISED, Light.ROUGH, Light.TRACED)]
     assert kinds == [*usual, (Light.TRACED, SolvedMesh.FINE)]  # the fine mesh's picture comes when it is as good as the one before
-    assert len(tracer.goals_for_agents) == 2
+    assert len(tracer.asked) == 2
     assert tracer.started >= 1
 
 
@@ -257,9 +257,9 @@ def test_a_way_is_written_and_read(tmp_path):
         (b"x_mm\n1\n", "expected the columns"),
         (b"time_s,up\n1,2\n", "expected the columns"),
         (b"time_s,x_mm\n0,a\n", "not readable as a trajectory"),
-        (b"time_s,x_mm\n0,1\n0,2\n", "time_s does not rise"),
+        (b"time_s,x_mm\n0,1\n0,2\n", "time_s does not increase"),
         (b"time_s,x_mm\n", "0 rows"),
-        (b"time_s,x_mm\n0,nan\n", "no finite number"),
+        (b"time_s,x_mm\n0,nan\n", "not a finite number"),
         (b"time_s,x_mm\n0,1,2\n", "not readable as a trajectory"),
         (b"\xff\xfe", "not readable as a trajectory"),
     ],
@@ -284,7 +284,7 @@ def test_a_video_shows_each_picture_for_its_time(tmp_path):
 
 
 def test_nothing_shown_makes_no_video(tmp_path: Path):
-    assert "nothing was shown" in FilmWriter(tmp_path / "video.mp4").close()
+    assert "no picture was shown" in FilmWriter(tmp_path / "video.mp4").close()
     assert not (tmp_path / "video.mp4").exists()
 
 

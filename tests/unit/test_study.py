@@ -68,11 +68,11 @@ def test_unknown_parts_are_named():
 
 def test_an_epochs_time_is_given_only_where_an_epoch_was_run(data):
     from training.models import MODELS
-    from training.models.cnn.inputs import ImageInputs
+    from training.models.part import ArrayInputs
 
     row = measure_training("gnn", data.pins, MODELS["gnn"].prepare(data, np.arange(len(data))).inputs, 32)
     assert row["rows_timed"] == len(data) and row["s_per_epoch"] == pytest.approx(row["ms_per_frame"] * len(data) / 1e3)
-    images = ImageInputs(np.zeros((len(data), 128, 128), np.uint8))
+    images = ArrayInputs(np.zeros((len(data), 128, 128), np.uint8))
     row = measure_training("cnn-v2", data.pins, images, 8)
     assert row["rows_timed"] == 32 and row["s_per_epoch"] is None
 

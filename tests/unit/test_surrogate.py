@@ -238,7 +238,7 @@ def test_friction_remembers_the_way(surrogate, sensor):
 
     assert apart(0.8) > 0.3  # mm
     assert apart(0.0) < 0.02
-    assert apart(0.8, friction_memory=False) < 0.02
+    assert apart(0.8, friction_history=False) < 0.02
 
 
 def test_what_is_felt_does_not_depend_on_the_poses_in_which_a_way_is_told(surrogate, sensor):

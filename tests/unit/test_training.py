@@ -153,7 +153,7 @@ def test_a_run_of_an_earlier_version_is_judged_and_says_what_it_cannot_tell(data
     judged = data.pins.image_name[rows_to_evaluate(estimator, data, "validation")].tolist()
     assert sorted(judged) == sorted(kept)
     (said,) = changed_since(estimator.config, data, estimator.part)
-    assert "can't be told" in said
+    assert "can't be found out" in said
 
 
 def test_frames_of_folders_of_one_name_are_told_apart(data, tmp_path):

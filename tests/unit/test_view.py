@@ -22,8 +22,8 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.pins import Grade, Pipeline, examine, make_reference, measure_reference, nominal_reference, view_of
-from twin.pins.identify import symmetries
-from twin.pins.view import MOST_TURN_DEG
+from twin.pins.labelling.identify import symmetries
+from twin.pins.labelling.view import MOST_TURN_DEG
 from twin.rig.labels import read_arm_labels
 from twin.types import Form, Frame
 
@@ -173,7 +173,10 @@ def test_a_pressed_or_foreign_frame_at_rest_is_an_error_of_every_reader(tmp_path
     away = (known - known.mean(axis=0)) / np.abs(known - known.mean(axis=0)).max()
     cv2.imwrite(str(tmp_path / "frame_1_0.png"), drawn(model, known).image)
     pressed = known + 15.0 * away * np.exp(-4 * (away**2).sum(axis=1))[:, None]
-    for image, words in ((drawn(model, pressed).image, "seems pressed"), (np.zeros((256, 256), np.uint8), "no use as no-contact frame")):
+    for image, words in (
+        (drawn(model, pressed).image, "seems pressed"),
+        (np.zeros((256, 256), np.uint8), "not usable as a no-contact frame"),
+    ):
         cv2.imwrite(str(tmp_path / "init_0.png"), image)
         with pytest.raises(FrameError, match=f"init_0.png: .*{words}.*`no_contact` FRAME"):
             predict_frames("mg400-127", tmp_path)
@@ -226,7 +229,7 @@ def test_the_written_copy_is_a_sensor_and_wrong_sides_are_refused(tmp_path):
         again.camera.turn_deg == pytest.approx(made.camera.turn_deg) and again.pipeline.recording.rest_px == made.pipeline.recording.rest_px
     )
     found = {each.name: each for each in examine([frames["rest"]], again)}
-    assert all(found[name].verdict is Grade.GOOD for name in ("shift", "turn", "scale", "stretch", "mirror"))
+    assert all(found[name].verdict is Grade.HEALTHY for name in ("shift", "turn", "scale", "stretch", "mirror"))
     with pytest.raises(FrameError, match="need two pushes, or one and a twist"):
         registered_view(spec, frames["rest"], {"x": frames["x"]})
     with pytest.raises(FrameError, match="hardly moves the pins"):
@@ -243,9 +246,9 @@ def test_check_names_stretch_and_mirror():
     found = {
         f.name: f for f in examine([drawn(model_of("mg400-127"), carried(known_of("mg400-127"), mirrored=True, scale=(1.1, 1)))], spec)
     }
-    assert found["mirror"].verdict is Grade.BAD and found["stretch"].verdict is Grade.BAD and "10" in found["stretch"].text
+    assert found["mirror"].verdict is Grade.FAILED and found["stretch"].verdict is Grade.FAILED and "10" in found["stretch"].text
     plain = {f.name: f for f in examine([drawn(model_of("mg400-127"), known_of("mg400-127"))], load_sensor("mg400-127"))}
-    assert plain["mirror"].verdict is Grade.GOOD and "can't be seen" in plain["mirror"].text
+    assert plain["mirror"].verdict is Grade.HEALTHY and "can't be seen" in plain["mirror"].text
 
 
 @pytest.mark.parametrize(("turn_deg", "mirrored"), [(30.0, False), (-100.0, True), (0.0, True)])
@@ -273,7 +276,7 @@ def test_a_turn_at_the_limit_is_measured(tmp_path):
 
 def test_a_dark_frame_is_no_frame_at_rest():
     spec = load_sensor("mg400-127")
-    with pytest.raises(FrameError, match="no use as no-contact frame, no pins"):
+    with pytest.raises(FrameError, match="not usable as a no-contact frame: no pins"):
         measure_reference(spec, Form.PROCESSED, Frame(np.zeros((256, 256), np.uint8), Form.PROCESSED, "init_0.png"))
 
 

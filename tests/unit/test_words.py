@@ -45,7 +45,6 @@ NAMES_ALLOWED = {
 # A participle alone is no name of a function, except where it returns its argument changed, as ``sorted`` does.
 PARTICIPLES_ALLOWED = {
     ("hardware/safety/safe_arm.py", "_ungated"),
-    ("hardware/workcell/mover.py", "watched"),
     ("scenes/plugins.py", "offered"),
     ("training/environments/baselines.py", "seen"),
     ("training/environments/learn.py", "seen"),
@@ -91,8 +90,8 @@ PARTICIPLES_ALLOWED = {
     ("twin/evaluation/degradation/conditions/skin.py", "swollen"),
     ("twin/evaluation/degradation/conditions/skin.py", "torn"),
     ("twin/optics/defocus.py", "defocused"),
-    ("twin/pins/matching.py", "proven"),
-    ("twin/studio/twin_mode.py", "moved"),
+    ("twin/pins/labelling/matching.py", "proven"),
+    ("twin/studio/modes/twin_mode.py", "moved"),
     ("twin/types.py", "undeformed"),
 }
 IRREGULAR = {

@@ -129,7 +129,7 @@ def test_a_lost_process_is_replaced(tmp_path):
 
 def test_a_task_that_always_ends_its_process_is_given_up_when_the_others_are_done(tmp_path):
     done = []
-    with pytest.raises(WorkersError, match="1 of 2 tasks .*enough memory.*goes on from there"):
+    with pytest.raises(WorkersError, match="1 of 2 tasks .*enough memory.*resumes from there"):
         for task in in_processes(dying, (str(tmp_path), "a"), ["a", "b"], processes=2):
             done.append(task)
     assert done == ["b"]

@@ -24,11 +24,11 @@ from twin.geometry.pins import pin_lattice, rest_pins, usual_spacing
 from twin.optics.relief import cap_planes
 from twin.pins import Grade, Pipeline, examine, nominal_reference, tune, with_detector
 from twin.pins.batch import recording_reference
-from twin.pins.detector_spec import shipped_detector
-from twin.pins.identify import Candidate, LayoutInFrame
-from twin.pins.rest import Rest, rest_from_contacts
-from twin.pins.rest import rest_of as rest_found
-from twin.pins.tune import _at_rest
+from twin.pins.detectors.detector_spec import shipped_detector
+from twin.pins.detectors.tune import _at_rest
+from twin.pins.labelling.identify import Candidate, LayoutInFrame
+from twin.pins.labelling.rest import Rest, rest_from_contacts
+from twin.pins.labelling.rest import rest_of as rest_found
 from twin.types import Form, Frame
 
 DOCS = Path(__file__).parents[2] / "docs" / "your-own-sensor.md"
@@ -60,7 +60,7 @@ def test_frames_that_a_specification_was_made_from_are_well(made):
     spec = load_sensor(found.written[0])
     frames = list(open_recording(folder, spec))
     findings = {f.name: f for f in examine(frames, spec)}
-    assert {findings[name].verdict for name in ("brightness", "focus", "stray light", "pins")} == {Grade.GOOD}, findings
+    assert {findings[name].verdict for name in ("brightness", "focus", "stray light", "pins")} == {Grade.HEALTHY}, findings
     assert spec.pipeline.usual_caps is not None and f"({spec.pipeline.usual_caps.contrast:.0f} expected)" in findings["brightness"].text
     cut = int(rest[:, 0].max()) - 15  # before the outermost pins on the right
     camera = spec.camera.model_copy(update={"width_px": cut})
@@ -69,7 +69,7 @@ def test_frames_that_a_specification_was_made_from_are_well(made):
     pipeline = Pipeline(cropped, Form.RAW)
     assert all(pipeline(frame).expected < 61 for frame in frames)
     pins = next(f for f in examine(frames, cropped) if f.name == "pins")
-    assert pins.verdict is Grade.GOOD and "lie outside the picture" in pins.text, pins
+    assert pins.verdict is Grade.HEALTHY and "lie outside the picture" in pins.text, pins
     health, _ = _health(cropped, Form.RAW, frames, folder)
     assert health.all_pins == 1.0 and not health.steadily_lost
 
@@ -120,7 +120,7 @@ def test_a_tip_of_another_size_is_the_same_picture_with_other_lengths(made, tmp_
         assert now == pytest.approx(0.4 * before, rel=2e-3), key
     seen = [project(sensor.view, rest_pins(sensor.geometry).caps_mm) for sensor in (usual.sensor, spec)]
     assert np.abs(seen[0] - seen[1]).max() < 0.05
-    assert next(f for f in examine(list(open_recording(folder, spec)), spec) if f.name == "twin").verdict is Grade.GOOD
+    assert next(f for f in examine(list(open_recording(folder, spec)), spec) if f.name == "twin").verdict is Grade.HEALTHY
 
 
 @pytest.mark.parametrize("radius_mm", [0.0, -3.0, 1e4, float("nan")])
@@ -135,8 +135,8 @@ def test_lengths_that_do_not_belong_to_the_camera_are_found_by_a_check(made):
     spec, frames = made[0].sensor, list(open_recording(made[2], made[0].sensor))
     shrunk = spec.model_copy(update={"skin": spec.skin.model_copy(update={"outer_radius_mm": 10.0})})
     findings = {f.name: f for f in examine(frames, shrunk)}
-    assert findings["pins"].verdict is Grade.GOOD
-    assert findings["twin"].verdict is Grade.BAD and "`radius_mm`" in findings["twin"].remedy
+    assert findings["pins"].verdict is Grade.HEALTHY
+    assert findings["twin"].verdict is Grade.FAILED and "`radius_mm`" in findings["twin"].remedy
 
 
 def test_a_layout_of_too_few_pins_for_a_camera_is_told(tmp_path):

@@ -35,6 +35,9 @@ MOST_LEFT_OUT = 0.02  # share of the frames, those with the largest misfit, that
 FLAG_CHI2 = 60.0  # least difference of chi^2 by which a sign error must fit better than both other hypotheses
 ODD_CHI2 = 12.0  # ratio of a frame's chi^2 to the median above which the frame fits no hypothesis
 STILL = 0.16  # ratio to the median displacement below which there is no contact (published recordings: 0.19 in the shallowest taps)
+FEWEST_UNDONE = 20  # least number of frames without an executed move, and the range of their moves, from which the tilt is determined
+LEAST_SPAN_MM = 1.0
+NUDGE = 1e-3  # change of the scaled depth by which the pins' derivative is computed
 HYPOTHESES = ("executed", "not executed", "angle's sign", "shear's sign")
 
 
@@ -115,9 +118,15 @@ def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
         if (now == done).all():
             break
         done = now
-    if labels.depth is not None:
-        depth = labels.depth, degree, scale[labels.depth]
-        tilt = _depth_per_move(terms[1], modes, weight, precision, hypotheses[1], move[:, 0], used & ~done, *depth)
+    undone = used & ~done
+    if labels.depth is not None and undone.sum() >= FEWEST_UNDONE and np.ptp(move[undone, 0]) >= LEAST_SPAN_MM:
+        nudged = hypotheses[1].copy()
+        nudged[:, labels.depth] += NUDGE
+        along = (polynomials(nudged, degree) - terms[1]) @ weight / NUDGE
+        steep = np.einsum("mi,ij,mj->m", along, precision, along, optimize=True)
+        beyond = np.einsum("mi,ij,mj->m", along, precision, modes - terms[1] @ weight, optimize=True)
+        beyond_mm = scale[labels.depth] * beyond / np.maximum(steep, 1e-12)  # depth that the pins show beyond the label
+        tilt = float(np.polyfit(move[undone, 0], beyond_mm[undone], 1)[0])
     usual = np.median(best[~no_contact])
     # The polynomials are an approximation, so the misfits are larger than from noise alone. They are divided by the usual misfit.
     odds = np.clip((chi2[:, 1] - chi2[:, 0]) / (2 * max(usual / modes.shape[1], 1.0)), -50, 50)
@@ -204,55 +213,6 @@ def polynomials(hypothesis: np.ndarray, highest: int) -> np.ndarray:
 
 def _misfit(residual: np.ndarray, precision: np.ndarray) -> np.ndarray:
     return np.einsum("mi,ij,mj->m", residual, precision, residual, optimize=True)
-
-
-def _depth_per_move(
-    terms: np.ndarray,
-    modes: np.ndarray,
-    weight: np.ndarray,
-    precision: np.ndarray,
-    hypothesis: np.ndarray,
-    shear_mm: np.ndarray,
-    rows: np.ndarray,
-    depth: int,
-    degree: int,
-    depth_scale: float,
-) -> float:
-    """Slope, mm per mm, of the depth that the pins show beyond the label over the move, for frames whose move was not executed.
-
-    Parameters
-    ----------
-    terms : (M, P) float
-        Polynomials of the hypothesis "not executed".
-    modes : (M, D) float
-        Amplitudes of the displacement's modes.
-    weight : (P, D) float
-        Coefficients of the fit, from polynomials to modes.
-    precision : (D, D) float
-        Inverse covariance of the fit's residuals.
-    hypothesis : (M, C) float
-        The scaled labels of the hypothesis.
-    shear_mm : (M,) float
-        ``move_1`` of the table.
-    rows : (M,) bool
-        Frames whose move was not executed.
-    depth : int
-        Column of the depth in ``hypothesis``.
-    degree : int
-        Degree of the polynomials.
-    depth_scale : float
-        Depth in mm that corresponds to the value 1 in ``hypothesis``.
-    """
-    if rows.sum() < 20 or np.ptp(shear_mm[rows]) < 1:
-        return 0.0
-    step = 1e-3
-    nudged = hypothesis.copy()
-    nudged[:, depth] += step
-    along = (polynomials(nudged, degree) - terms) @ weight / step
-    residual = modes - terms @ weight
-    steep = np.einsum("mi,ij,mj->m", along, precision, along, optimize=True)
-    beyond = depth_scale * np.einsum("mi,ij,mj->m", along, precision, residual, optimize=True) / np.maximum(steep, 1e-12)
-    return float(np.polyfit(shear_mm[rows], beyond[rows], 1)[0])
 
 
 def _find_duplicates(nodes_px: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from twin.frames import Recording
 from twin.frames.forms import gray_levels
 from twin.pins import Pipeline, make_graph, make_reference
 from twin.pins.batch import UNMEASURED, recording_reference
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 from twin.progress import Step
 from twin.store import cached_arrays
 from twin.types import Form, Frame

@@ -57,6 +57,10 @@ def require_task(task: str) -> None:
         raise OptionError(f"there is no task {task!r}; {hint}tasks are {', '.join(TASKS)}")
 
 
+FORMER_OPTIONS = {"friction_memory": "friction_history"}
+"""Present names of options by their names in version 1."""
+
+
 @dataclass(frozen=True)
 class Options:
     """Options of an environment, given by keyword.
@@ -83,7 +87,7 @@ class Options:
         for each episode.
     pictures : {"none", "preview", "traced"}
         Find the pins with the real pipeline in rendered frames. Observation "image" uses previews if the value is "none".
-    friction_memory : bool
+    friction_history : bool
         With False each step forgets the object's earlier path (only for ``surrogate``; it serves to measure the memory's effect).
     steps : int, optional
         Number of steps of an episode; the task's by default.
@@ -98,16 +102,11 @@ class Options:
     objects: tuple[str, ...] | None = None
     randomise: str | None = None
     pictures: Pictures = "none"
-    friction_memory: bool = True
+    friction_history: bool = True
     steps: int | None = None
 
     def __post_init__(self) -> None:
-        known: list[tuple[str, tuple[str, ...]]] = [
-            ("observation", KINDS),
-            ("backend", BACKENDS),
-            ("pictures", PICTURES),
-        ]
-        for name, values in known:
+        for name, values in (("observation", KINDS), ("backend", BACKENDS), ("pictures", PICTURES)):
             if getattr(self, name) not in values:
                 raise OptionError(f"{name}={getattr(self, name)!r}: expected one of {', '.join(values)}")
         require_whole("stack", self.stack, 1)
@@ -115,8 +114,8 @@ class Options:
             raise OptionError(f"stack={self.stack!r}: expected at most {MOST_STACK}")
         if self.steps is not None:
             require_whole("steps", self.steps, 1)
-        if not isinstance(self.friction_memory, bool):
-            raise OptionError(f"friction_memory={self.friction_memory!r}: expected True or False")
+        if not isinstance(self.friction_history, bool):
+            raise OptionError(f"friction_history={self.friction_history!r}: expected True or False")
         for name in ("sensor", "surrogate", "randomise"):
             given = getattr(self, name)
             if isinstance(given, PathLike):
@@ -134,9 +133,9 @@ class Options:
             raise OptionError(f"axes={self.axes!r}: expected some of {', '.join(AXES)}, each once")
         if self.objects is not None and not self.objects:
             raise OptionError("objects=(): expected at least one object")
-        if self.backend == "fem" and not self.friction_memory:
+        if self.backend == "fem" and not self.friction_history:
             raise OptionError(
-                "friction_memory=False goes with backend='surrogate' alone: finite elements always have history-dependent friction"
+                "friction_history=False goes with backend='surrogate' alone: finite elements always have history-dependent friction"
             )
 
     @classmethod
@@ -148,6 +147,7 @@ class Options:
         OptionError
             There is no such option, or a value is not valid.
         """
+        options = {FORMER_OPTIONS.get(name, name): value for name, value in options.items()}
         known = [field.name for field in fields(cls)]
         for name in options:
             if name not in known:
@@ -428,7 +428,7 @@ class Batch:
             return FiniteElements(self.sensor, self.count)
         require_known(self.randomisation)
         found = surrogate_of(self.sensor, self.options.surrogate)
-        return SurrogateContacts(found, self.sensor, self.count, friction_memory=self.options.friction_memory)
+        return SurrogateContacts(found, self.sensor, self.count, friction_history=self.options.friction_history)
 
     def _make_eye(self) -> Eye | None:
         options = self.options

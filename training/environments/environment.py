@@ -17,7 +17,7 @@ from twin.errors import OptionError
 from twin.types import FloatArray, ImageArray
 
 if TYPE_CHECKING:
-    from twin.studio.episode import EpisodePage
+    from twin.studio.modes.episode import EpisodePage
 
 RENDER_MODES = ("rgb_array", "human")
 """Values of ``render_mode`` besides None."""
@@ -125,7 +125,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         """Show the newest step on the page, if the render mode is ``human``."""
         if self.render_mode != "human":
             return
-        from twin.studio.episode import EpisodePage, EpisodeStep
+        from twin.studio.modes.episode import EpisodePage, EpisodeStep
 
         batch = self.batch
         frame, contact = batch.frame(0), batch.contacts[0]

@@ -167,7 +167,7 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
     """
     torch.set_num_threads(1)
     begun_s, used_s = time.monotonic(), time.process_time()
-    vector = TactileVectorEnv(plan.task, plan.environments, autoreset_mode=AutoresetMode.SAME_STEP, **_option_values(plan.options))
+    vector = TactileVectorEnv(plan.task, plan.environments, autoreset_mode=AutoresetMode.SAME_STEP, **asdict(plan.options))
     blank = _untrained_inputs(plan, vector)
     env = SteppedTogether(vector, blank)
     env.seed(plan.seed)
@@ -197,8 +197,8 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
     success: dict[str, float] = {
         str(plan.options.backend): evaluate_policy(made, plan.task, plan.options, plan.episodes, seed=10_000 + plan.seed)
     }
-    if not plan.options.friction_memory:
-        remembering = replace(plan.options, friction_memory=True)
+    if not plan.options.friction_history:
+        remembering = replace(plan.options, friction_history=True)
         success["surrogate, friction remembers"] = evaluate_policy(made, plan.task, remembering, plan.episodes, seed=10_000 + plan.seed)
     if plan.fem_episodes:
         true = on_finite_elements(plan.options, tuple(vector.batch.objects))
@@ -212,7 +212,7 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
 def on_finite_elements(options: Options, objects: tuple[str, ...]) -> Options:
     """The same environment and objects on finite elements, with rasterised frames and the real pipeline."""
     seen: Pictures = "preview" if options.observation != "oracle" else "none"
-    return replace(options, backend="fem", surrogate=None, friction_memory=True, pictures=seen, objects=objects)
+    return replace(options, backend="fem", surrogate=None, friction_history=True, pictures=seen, objects=objects)
 
 
 def _write_curve(curve: Sequence[tuple[int, float, float, float]], table: Path, picture: Path) -> None:
@@ -233,7 +233,7 @@ def evaluate_policy(policy: Policy, task: str, options: Options, episodes: int, 
     long successes.
     """
     rows = min(episodes, ROWS_JUDGED if options.backend == "surrogate" else 1)
-    vector = TactileVectorEnv(task, rows, autoreset_mode="SameStep", **_option_values(options))
+    vector = TactileVectorEnv(task, rows, autoreset_mode="SameStep", **asdict(options))
     seen, _ = vector.reset(seed=seed)
     share = np.array([len(range(row, episodes, rows)) for row in range(rows)])
     ended = solved = np.zeros(rows, int)
@@ -243,10 +243,6 @@ def evaluate_policy(policy: Policy, task: str, options: Options, episodes: int, 
         if counted.any():
             ended, solved = ended + counted, solved + (counted & told["final_info"]["is_success"])
     return float(solved.sum() / episodes)
-
-
-def _option_values(options: Options) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in Options.__dataclass_fields__}
 
 
 def _split_observation(observed: dict[str, Any]) -> tuple[FloatArray, FloatArray]:

@@ -82,8 +82,7 @@ class DisplacementModel:
     def at(self, a: np.ndarray) -> np.ndarray:
         """Displacements (M, 2N) at coordinates (M, D)."""
         lead = len(self.scale)
-        found: np.ndarray = self.mean + (a * self.scale) @ self.modes[:lead] + _terms(a) @ self.weights @ self.modes[lead:]
-        return found
+        return self.mean + (a * self.scale) @ self.modes[:lead] + _terms(a) @ self.weights @ self.modes[lead:]
 
     def slopes(self, a: np.ndarray, step: float = 1e-4) -> np.ndarray:
         """Derivatives (M, 2N, D) of the displacements by the coordinates (M, D)."""

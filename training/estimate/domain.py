@@ -21,6 +21,7 @@ where the others make them most probable, and what is not known of them counts a
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cache
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Any
@@ -360,8 +361,7 @@ class Domain:
         away = (moved.ravel() - self.mean)[known]
 
         def probable(x: FloatArray) -> FloatArray:
-            found: FloatArray = (x - np.linalg.solve(inner, modes @ x.T).T @ modes) / NOISE**2
-            return found
+            return (x - np.linalg.solve(inner, modes @ x.T).T @ modes) / NOISE**2
 
         within = columns[..., known]
         weighted = probable(within.reshape(-1, within.shape[-1])).reshape(within.shape)
@@ -451,16 +451,11 @@ def _terms(a: np.ndarray) -> np.ndarray:
     return np.concatenate([np.ones((*a.shape[:-1], 1)), a, a[..., i] * a[..., j], a[..., k] * a[..., m] * a[..., n]], axis=-1)
 
 
-_PRODUCTS: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-
-
+@cache
 def _products(lead: int) -> tuple[np.ndarray, np.ndarray]:
     """Indices (2, t) and (3, t) of the factors of the products in ``_terms``."""
-    if lead not in _PRODUCTS:
-        cubed = min(lead, CUBED)
-        pairs, triples = (list(combinations_with_replacement(range(n), degree)) for n, degree in ((lead, 2), (cubed, 3)))
-        _PRODUCTS[lead] = np.array(pairs, int).reshape(-1, 2).T, np.array(triples, int).reshape(-1, 3).T
-    return _PRODUCTS[lead]
+    pairs, triples = (list(combinations_with_replacement(range(n), degree)) for n, degree in ((lead, 2), (min(lead, CUBED), 3)))
+    return np.array(pairs, int).reshape(-1, 2).T, np.array(triples, int).reshape(-1, 3).T
 
 
 def learn_domain(
@@ -568,8 +563,7 @@ def _fit_changes(flat: np.ndarray, labelled: np.ndarray, motions: np.ndarray, rn
 
 def _places(reference: Reference) -> FloatArray:
     """Places (N, 2) of the pins at rest about their middle, in mean spacings."""
-    found: FloatArray = (reference.pins_px - reference.pins_px.mean(axis=0)) / reference.spacing_px.mean()
-    return found
+    return (reference.pins_px - reference.pins_px.mean(axis=0)) / reference.spacing_px.mean()
 
 
 def _motions(reference: Reference) -> np.ndarray:
@@ -604,15 +598,13 @@ def _apart(motions: np.ndarray, modes: np.ndarray) -> np.ndarray:
 def _whitening(left: np.ndarray) -> np.ndarray:
     """Inverse square root (D, D) of the covariance of differences (M, D)."""
     square = np.atleast_2d(np.cov(left.T))
-    white: np.ndarray = np.linalg.inv(np.linalg.cholesky(square + WHITE * np.diag(np.diag(square)) + 1e-12 * np.eye(len(square))))
-    return white
+    return np.linalg.inv(np.linalg.cholesky(square + WHITE * np.diag(np.diag(square)) + 1e-12 * np.eye(len(square))))
 
 
 def _remove_similarity(moved: FloatArray, reference: Reference) -> FloatArray:
     """Displacements (N, 2) in spacings without the similarity of a displaced camera."""
     spacing_px = reference.spacing_px.mean()
-    aligned: FloatArray = align(reference.pins_px[None] + moved * spacing_px, reference.pins_px)[0][0] / spacing_px
-    return aligned
+    return align(reference.pins_px[None] + moved * spacing_px, reference.pins_px)[0][0] / spacing_px
 
 
 def _rates(found: Domain, flat: np.ndarray, labels: np.ndarray, units: Sequence[str], rng: np.random.Generator) -> np.ndarray:

@@ -12,7 +12,7 @@ from training.estimate.domain import Domain
 from twin.errors import FrameError
 from twin.frames import spread_indices
 from twin.pins import PinView, Reference, make_reference, measure_reference, view_of
-from twin.pins.view import camera_modes
+from twin.pins.labelling.view import camera_modes
 from twin.types import Form, Frame
 
 FEWEST_VIEWED = 8
@@ -53,7 +53,7 @@ class RestPlaces:
         ------
         FrameError
             The frame shows a contact, or not this sensor, or the camera's picture is displaced so far that estimates would be wrong
-            (``twin.pins.view``).
+            (``twin.pins.labelling.view``).
         """
         reference = measure_reference(self.sensor, self.form, frame, known=self.known)
         return reference, self.require_view(reference.pins_px, frame.name or "frame").describe_ambiguity()

@@ -23,7 +23,7 @@ from training.data.pins import PinTable, cap_light
 from training.errors import TrainingError
 from training.models.recipes import Recipe
 from twin.pins import Pipeline
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 from twin.types import Frame, Observation
 
 LIKELY = 0.5  # least probability of a contact for which a frame gets an estimate
@@ -40,6 +40,25 @@ class Inputs(Protocol):
     def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """The network's arguments for some rows (B,) int64."""
         ...
+
+
+class ArrayInputs:
+    """Inputs that are one array: ``batch`` gives some of its rows.
+
+    Parameters
+    ----------
+    values : (M, ...) array
+    """
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = torch.from_numpy(values)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """See ``Inputs``."""
+        return (self.values[rows],)
 
 
 @dataclass(frozen=True)

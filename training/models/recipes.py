@@ -1,6 +1,6 @@
 """The settings of a training run. Each model has its own values (``training.models``)."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,3 @@ class Recipe:
     scaling: str = "standard"
     members: int = 2
     kernel: bool = False
-
-
-def as_dict(recipe: Recipe) -> dict[str, object]:
-    """The settings as a dict for JSON."""
-    return asdict(recipe)

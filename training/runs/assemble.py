@@ -22,7 +22,7 @@ from training.runs.config import RunConfig, training_labels
 from training.runs.gaussian_process import SMOOTH_AND_LINEAR, TWO_FIDELITIES, Points, Processes, fit_processes, fit_smooth_processes
 from training.runs.networks import predict_rows
 from twin.errors import warn_once
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 
 # Share of the labels that should lie inside their intervals.
 COVERAGE = 0.9

@@ -18,7 +18,7 @@ The prediction of a row from all other rows (leave-one-out) is eq. 5.12.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -135,8 +135,7 @@ class Kernel:
 
     def __call__(self, a: Points, b: Points) -> np.ndarray:
         """(A, B) the covariance between rows, without noise."""
-        found: np.ndarray = self.between(self.divide_by_lengths(a), self.divide_by_lengths(b))
-        return found
+        return self.between(self.divide_by_lengths(a), self.divide_by_lengths(b))
 
     def divide_by_lengths(self, points: Points) -> Placed:
         """Rows divided by the lengths."""
@@ -318,9 +317,7 @@ class Processes:
         return cls(kernels, Points(found["inputs"], found["second"]), found["weight"])
 
 
-def fit_processes(
-    inputs: np.ndarray, labels: np.ndarray, *, seed: int, group: np.ndarray | None = None, progress: Callable | None = None
-) -> tuple[Processes, np.ndarray]:
+def fit_processes(inputs: np.ndarray, labels: np.ndarray, *, seed: int, group: np.ndarray | None = None) -> tuple[Processes, np.ndarray]:
     """Processes with a smooth and a linear term, for K standardised labels (M, K) on inputs (M, D).
 
     Parameters
@@ -329,8 +326,6 @@ def fit_processes(
         Chooses the rows on which the likelihood is maximised. The predictions then use all rows.
     group : (M,) int, optional
         As in ``Posterior``.
-    progress : callable, optional
-        Called with (labels done, K).
 
     Returns
     -------
@@ -340,7 +335,7 @@ def fit_processes(
     """
     points = Points.of(inputs)
     start = Kernel(SMOOTH_AND_LINEAR, 5.0 * _standard_deviations(inputs), np.array([1.0, 0.3]), np.array([0.05]))
-    return _fit_processes(start, points, labels, sample_rows(len(points), seed), group, progress)
+    return _fit_processes(start, points, labels, sample_rows(len(points), seed), group)
 
 
 def fit_smooth_processes(inputs: np.ndarray, labels: np.ndarray, *, group: np.ndarray | None = None) -> tuple[Processes, np.ndarray]:
@@ -353,15 +348,12 @@ def fit_smooth_processes(inputs: np.ndarray, labels: np.ndarray, *, group: np.nd
     squares = (chosen**2).sum(axis=1)
     middle = np.median(np.maximum(squares[:, None] + squares - 2 * chosen @ chosen.T, 0.0))
     lengths = np.full(inputs.shape[1], max(SMOOTH_LENGTHS * np.sqrt(middle), LEAST_SPREAD))
-    kernels, weights, left_out = [], [], []
+    kernels = [Kernel(SMOOTH_AND_LINEAR, lengths, SMOOTH_SIZES, np.array([noise])) for noise in SMOOTH_NOISES]
+    best = []
     for label in labels.T:
-        kernel_of = [Kernel(SMOOTH_AND_LINEAR, lengths, SMOOTH_SIZES, np.array([noise])) for noise in SMOOTH_NOISES]
-        tried = [Posterior(kernel, points, label, group) for kernel in kernel_of]
-        best = tried[int(np.argmin([np.abs(posterior.left_out - label).mean() for posterior in tried]))]
-        kernels.append(best.kernel)
-        weights.append(best.weight)
-        left_out.append(best.left_out)
-    return Processes(kernels, points, np.stack(weights, axis=1)), np.stack(left_out, axis=1)
+        tried = [Posterior(kernel, points, label, group) for kernel in kernels]
+        best.append(min(tried, key=lambda posterior: np.abs(posterior.left_out - label).mean()))
+    return _join_posteriors(best)
 
 
 def fit_two_fidelities(
@@ -391,7 +383,7 @@ def fit_two_fidelities(
     inputs, labels = np.concatenate([simulated[chosen], real]), np.concatenate([simulated_labels[chosen], real_labels])
     points = Points(inputs, np.repeat([0.0, 1.0], [len(chosen), len(real)]))
     start = Kernel(TWO_FIDELITIES, 5.0 * _standard_deviations(inputs), np.array([1.0, 0.3, 0.1, 0.1, 0.1]), np.array([0.05, 0.05]), 2.0)
-    processes, left_out = _fit_processes(start, points, labels, np.arange(len(points)), None, None)
+    processes, left_out = _fit_processes(start, points, labels, np.arange(len(points)), None)
     return processes, left_out[len(chosen) :]
 
 
@@ -404,17 +396,17 @@ def sample_rows(count: int, seed: int) -> np.ndarray:
 
 
 def _fit_processes(
-    start: Kernel, points: Points, labels: np.ndarray, rows: np.ndarray, group: np.ndarray | None, progress: Callable | None
+    start: Kernel, points: Points, labels: np.ndarray, rows: np.ndarray, group: np.ndarray | None
 ) -> tuple[Processes, np.ndarray]:
-    kernels, weights, left_out = [], [], []
-    for k, label in enumerate(labels.T):
-        posterior = Posterior(climb_likelihood(start, points.rows(rows), label[rows]), points, label, group)
-        kernels.append(posterior.kernel)
-        weights.append(posterior.weight)
-        left_out.append(posterior.left_out)
-        if progress:
-            progress(k + 1, labels.shape[1])
-    return Processes(kernels, points, np.stack(weights, axis=1)), np.stack(left_out, axis=1)
+    return _join_posteriors(
+        [Posterior(climb_likelihood(start, points.rows(rows), label[rows]), points, label, group) for label in labels.T]
+    )
+
+
+def _join_posteriors(found: list[Posterior]) -> tuple[Processes, np.ndarray]:
+    """The processes of K labels of the same points, and the predictions (M, K) of left-out rows."""
+    weight, left_out = (np.stack([getattr(each, name) for each in found], axis=1) for name in ("weight", "left_out"))
+    return Processes([each.kernel for each in found], found[0].points, weight), left_out
 
 
 def _standard_deviations(inputs: np.ndarray) -> np.ndarray:

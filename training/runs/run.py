@@ -13,7 +13,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import monotonic
 
@@ -25,7 +25,6 @@ from training.data.label_code import LabelCode, goes_round
 from training.errors import TrainingError
 from training.models import model_named
 from training.models.part import Prepared
-from training.models.recipes import as_dict
 from training.runs.assemble import calibrate
 from training.runs.config import RunConfig, training_labels, training_rows
 from training.runs.identity import ASIDE, difference, frame_marks, identity_of
@@ -199,7 +198,7 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
     kept_out = np.setdiff1d(np.arange(len(data)), train)
     return {
         "model": config.model,
-        "recipe": as_dict(config.recipe),
+        "recipe": asdict(config.recipe),
         "labels": config.labels,
         "columns": list(data.targets.names),
         "units": list(data.targets.units),

@@ -55,6 +55,6 @@ def contact_finding(frames: list[Frame], sensor: SensorSpec, run: Path | None = 
     share = len(strange) / max(judged, 1)
     text = f"{judged - len(strange)} of {judged} frames with pins are contacts that the weights of {sensor.name} know"
     if not strange:
-        return Finding("contacts", Grade.GOOD, share, text, "")
-    verdict = Grade.BAD if share > MOST_STRANGE else Grade.WATCH
+        return Finding("contacts", Grade.HEALTHY, share, text, "")
+    verdict = Grade.FAILED if share > MOST_STRANGE else Grade.DEGRADED
     return Finding("contacts", verdict, share, f"{text}; {'; '.join(strange[:3])}", "see the reasons; leave these frames out")

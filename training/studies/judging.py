@@ -4,7 +4,6 @@ The second part measures robustness. Images are changed before the pipeline read
 displaced in a random direction, or pins are removed. The result is the increase of the errors.
 """
 
-import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,11 +23,13 @@ from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
 from training.runs.assemble import conformal_quantile
 from training.runs.identity import rows_named
+from twin.estimate import readable_labels
 from twin.frames import open_recording
 from twin.progress import Step
 from twin.report.charts import new_figure, save_figure
+from twin.report.table import write_table
 from twin.rig.labels import EXECUTED_FILES
-from twin.store import made_by, text_file, write_json
+from twin.store import made_by, write_json
 from twin.types import Form, Frame
 
 # Edges of the bins for which errors are reported separately: depth pose_2, absolute angle pose_6, and absolute shear move_1.
@@ -204,14 +205,14 @@ def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarra
     truth = getattr(targets, labels)
     half_width = made.half_width_raw if labels == "raw" else made.half_width
     told = [np.clip(each, *limits_of(targets.names)) for each in (made.mean, made.mean - half_width, made.mean + half_width)]
-    path = out / "predictions.csv"
-    with text_file(path) as file:
-        writer = csv.writer(file)
-        parts = [f"{name}_{part}" for name in targets.names for part in ("true", "pred", "lo90", "hi90")]
-        writer.writerow(["image_name", *parts, "executed_probability", "valid"])
-        for m, row in enumerate(rows):
-            cells = [f"{v:.6g}" for k in range(len(targets.names)) for v in (truth[m, k], *(each[m, k] for each in told))]
-            writer.writerow([data.pins.image_name[row], *cells, f"{made.executed[m]:.4g}", int(np.isfinite(made.mean[m]).all())])
+    parts = dict(zip(("true", "pred", "lo90", "hi90"), (truth, *told), strict=True))
+    table = [
+        {"image_name": data.pins.image_name[row]}
+        | {f"{name}_{part}": float(values[m, k]) for k, name in enumerate(targets.names) for part, values in parts.items()}
+        | {"executed_probability": f"{made.executed[m]:.4g}", "valid": int(np.isfinite(made.mean[m]).all())}
+        for m, row in enumerate(rows)
+    ]
+    path = write_table(out / "predictions.csv", table)
     write_json(out / "metrics.json", metrics | {"made_by": made_by(__name__)})
     return [path, out / "metrics.json", _draw(out / "errors.png", made, truth, targets, labels)]
 
@@ -222,7 +223,7 @@ def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, lab
     figure, axes = new_figure(count, 2, panel_inch=3.6)
     undone = np.nan_to_num(targets.executed, nan=1.0) < 0.5
     errors = label_error(np.clip(made.mean, *limits_of(targets.names)), truth, targets.units)
-    for k, (name, unit) in enumerate(zip(targets.names, targets.units, strict=True)):
+    for k, (name, unit) in enumerate(zip(readable_labels(targets.names), targets.units, strict=True)):
         error = errors[:, k]
         for chosen, colour, label in ((~undone, "#1f77b4", "move executed"), (undone, "#ff7f0e", "not executed")):
             near = truth[chosen, k] + error[chosen]  # a direction is drawn within half a turn of the truth
@@ -246,20 +247,8 @@ def _similar(image: np.ndarray, *, scale: float = 1.0, turn_deg: float = 0.0, sh
     return cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_LINEAR)
 
 
-def scale_image(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
-    """The image one per cent larger or smaller, at random."""
-    return _similar(image, scale=1 + SCALE_CHANGE * rng.choice([-1, 1]))
-
-
-def shift_image(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
-    """The image shifted by two px in a random direction."""
-    angle = rng.uniform(0, 2 * np.pi)
+def _shift_image(image: np.ndarray, angle: float) -> np.ndarray:
     return _similar(image, shift_px=(SHIFT_CHANGE_PX * np.cos(angle), SHIFT_CHANGE_PX * np.sin(angle)))
-
-
-def turn_image(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
-    """The image turned by one degree, at random to the left or to the right."""
-    return _similar(image, turn_deg=TURN_CHANGE_DEG * rng.choice([-1.0, 1.0]))
 
 
 def erase_pins(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
@@ -275,7 +264,13 @@ def erase_pins(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstim
     return image
 
 
-CHANGES: dict[str, Change] = {"1 % scale": scale_image, "2 px shift": shift_image, "1 deg turn": turn_image, "5 pins erased": erase_pins}
+# The changes. The sign, the direction and the pins are sampled at random.
+CHANGES: dict[str, Change] = {
+    "1 % scale": lambda image, rng, _: _similar(image, scale=1 + SCALE_CHANGE * rng.choice([-1, 1])),
+    "2 px shift": lambda image, rng, _: _shift_image(image, rng.uniform(0, 2 * np.pi)),
+    "1 deg turn": lambda image, rng, _: _similar(image, turn_deg=TURN_CHANGE_DEG * rng.choice([-1.0, 1.0])),
+    "5 pins erased": erase_pins,
+}
 
 
 def measure_changes(

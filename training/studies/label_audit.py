@@ -1,7 +1,5 @@
 """Audit of a recording: a test of whether its labels agree with its pins. The results are tables, numbers, a picture and a page."""
 
-import csv
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,9 +16,9 @@ from twin.progress import Progress, silent, stage
 from twin.report.charts import muted_colour, new_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, PagePicture
-from twin.report.table import Column
+from twin.report.table import Column, write_table
 from twin.rig.labels import as_executed
-from twin.store import made_by, write_json, write_text, writes
+from twin.store import made_by, write_json, writes
 from twin.types import Form, ReadableResult
 
 # Columns of a table that an audit reads.
@@ -182,7 +180,7 @@ def _write_evidence(out: Path, audit: Audit, data: Dataset, page: Page) -> list[
             chart, "Evidence for the findings: which hypothesis fits each frame, corrections of the angle, moves along the table, drift"
         )
     )
-    return [write_text(out / "labels_corrected.csv", _labels_csv(audit, data, labels)), chart]
+    return [write_table(out / "labels_corrected.csv", _label_rows(audit, data, labels)), chart]
 
 
 def _findings(summary: dict) -> list[dict]:
@@ -210,18 +208,17 @@ def _some(names: list[str]) -> str:
     return f"{', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''}" or "none"
 
 
-def _labels_csv(audit: Audit, data: Dataset, labels: dict[str, np.ndarray]) -> str:
-    text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow(["image_name", "executed", *labels, *(f"chi2_{story.replace(' ', '_')}" for story in HYPOTHESES), "findings"])
+def _label_rows(audit: Audit, data: Dataset, labels: dict[str, np.ndarray]) -> list[dict[str, object]]:
+    columns = labels | {f"chi2_{story.replace(' ', '_')}": audit.chi2[:, k] for k, story in enumerate(HYPOTHESES)}
+    flags = {"no contact": audit.no_contact, "wrong sign": audit.wrong_sign, "fits no hypothesis": audit.odd}
+    rows = []
     for k, name in enumerate(data.pins.image_name):
-        flags = {"no contact": audit.no_contact, "wrong sign": audit.wrong_sign, "fits no hypothesis": audit.odd}
-        said = [flag for flag, rows in flags.items() if rows[k]]
+        said = [flag for flag, found in flags.items() if found[k]]
         if audit.duplicates[k] != k:
             said.append(f"same pins as {data.pins.image_name[audit.duplicates[k]]}")
-        numbers = [f"{v:.6g}" for v in (*(column[k] for column in labels.values()), *audit.chi2[k])]
-        writer.writerow([name, f"{audit.executed[k]:.4g}", *numbers, "; ".join(said)])
-    return text.getvalue()
+        numbers = {key: float(values[k]) for key, values in columns.items()}
+        rows.append({"image_name": name, "executed": f"{audit.executed[k]:.4g}"} | numbers | {"findings": "; ".join(said)})
+    return rows
 
 
 def _evidence_figure(audit: Audit, data: Dataset, labels: dict[str, np.ndarray]) -> Figure:

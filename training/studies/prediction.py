@@ -14,6 +14,7 @@ from training.estimate.estimator import PoseEstimate, PoseEstimator
 from training.studies.evaluation import models_of_kinds
 from twin.camera.projection import project
 from twin.errors import FrameError
+from twin.estimate import readable_labels
 from twin.frames import Recording, evenly_read, open_recording
 from twin.frames.folders import IMAGE_FOLDERS, references_in
 from twin.frames.forms import from_raw
@@ -165,7 +166,7 @@ def _find_rest_frame(recording: Recording, picture: Path) -> None:
 def _describe_estimate(made: PoseEstimate) -> str:
     if not made.valid:
         return f"not valid: {made.reason}"
-    rows = zip(made.names, made.units, made.value, made.low, made.high, strict=True)
+    rows = zip(readable_labels(made.names), made.units, made.value, made.low, made.high, strict=True)
     pose = ", ".join(f"{name} {value:.3f} {unit} [{low:.3f}, {high:.3f}]" for name, unit, value, low, high in rows)
     moved = (
         "" if made.executed != made.executed else f", move executed with probability {made.executed:.2f}"

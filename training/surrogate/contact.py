@@ -13,7 +13,6 @@ turns under the force so far; at the end of the motion this is repeated until th
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -55,18 +54,23 @@ MOST_SETTLING = 2
 """Largest number of extra load steps at the end of a motion, until a compliant arm is at rest."""
 
 
-@dataclass
 class LinearContacts:
-    """B contacts of one linear skin with M nodes.
+    """B contacts of one linear skin with M nodes; at first nothing is touched.
 
-    Attributes
+    Parameters
     ----------
     node_mm : (M, 3) float
         Nodes at rest.
-    answer : (M, 3, 3, M) float32
-        Displacement (third) of node j (last) for a force along an axis (second) at node i (first), mm/N.
-    bending : tuple of float32 arrays
-        Arrays of the network that corrects the linear skin (see ``Bending.kernel``).
+    answer : (M, M, 3, 3) float
+        As of ``Surrogate``; stored as (M, 3, 3, M) float32: displacement (third) of node j (last) for a force along an axis (second) at
+        node i (first), mm/N.
+    count : int
+        B.
+    bending : tuple of float32 arrays, optional
+        Arrays of the network that corrects the linear skin (see ``Bending.kernel``); by default the skin is linear.
+
+    Attributes
+    ----------
     kind : (B,) int
         Kinds of the solids (see ``twin.objects.kernels.solid``).
     sizes : (B, SIZES) float
@@ -91,57 +95,16 @@ class LinearContacts:
         Share of Coulomb's bound that the pressing nodes bear together.
     """
 
-    node_mm: FloatArray
-    answer: FloatArray
-    bending: tuple[FloatArray, ...]
-    kind: IntArray
-    sizes: FloatArray
-    friction: FloatArray
-    compliance_mm_per_n: FloatArray
-    turning: FloatArray
-    taken: FloatArray
-    force_n: FloatArray
-    moved_mm: FloatArray
-    bent_mm: FloatArray
-    anchor_mm: FloatArray
-    seen_mm: FloatArray
-    gap_mm: FloatArray
-    held: BoolArray
-    slides: BoolArray
-    used: FloatArray
-
-    @classmethod
-    def at_rest(
-        cls, node_mm: FloatArray, answer: FloatArray, count: int, *, bending: tuple[FloatArray, ...] | None = None
-    ) -> "LinearContacts":
-        """The contacts of ``count`` sensors that touch nothing; ``answer`` (M, M, 3, 3) as of ``Surrogate``.
-
-        ``bending`` is what ``Bending.kernel`` gives; without it the skin is linear.
-        """
+    def __init__(self, node_mm: FloatArray, answer: FloatArray, count: int, *, bending: tuple[FloatArray, ...] | None = None) -> None:
         size = len(node_mm)
-        force, moved, anchor, seen = np.zeros((4, count, size, 3))
-        held, slides = np.zeros((2, count, size), bool)
-        friction, compliance, used = np.zeros((3, count))
-        return cls(
-            node_mm=node_mm,
-            answer=np.ascontiguousarray(answer.transpose(0, 3, 2, 1), np.float32),
-            bending=unbent(size) if bending is None else bending,
-            kind=np.zeros(count, np.int64),
-            sizes=np.zeros((count, SIZES)),
-            friction=friction,
-            compliance_mm_per_n=compliance,
-            turning=np.zeros((count, 10)),
-            taken=np.tile(np.eye(4), (count, 1, 1)),
-            force_n=force,
-            moved_mm=moved,
-            bent_mm=np.zeros((count, 3, size), np.float32),
-            anchor_mm=anchor,
-            seen_mm=seen,
-            gap_mm=np.full((count, size), np.inf),
-            held=held,
-            slides=slides,
-            used=used,
-        )
+        self.node_mm, self.answer = node_mm, np.ascontiguousarray(answer.transpose(0, 3, 2, 1), np.float32)
+        self.bending = unbent(size) if bending is None else bending
+        self.kind, self.sizes, self.turning = np.zeros(count, np.int64), np.zeros((count, SIZES)), np.zeros((count, 10))
+        self.friction, self.compliance_mm_per_n, self.used = np.zeros((3, count))
+        self.taken = np.tile(np.eye(4), (count, 1, 1))
+        self.force_n, self.moved_mm, self.anchor_mm, self.seen_mm = np.zeros((4, count, size, 3))
+        self.bent_mm, self.gap_mm = np.zeros((count, 3, size), np.float32), np.full((count, size), np.inf)
+        self.held, self.slides = np.zeros((2, count, size), bool)
 
     @property
     def radius_mm(self) -> float:
@@ -203,10 +166,7 @@ class LinearContacts:
 def between(start: FloatArray, stop: FloatArray, steps: int) -> FloatArray:
     """Poses (steps, 4, 4) after each of equal steps of a path: the origin moves in a straight line, the object turns about a fixed axis."""
     T = np.empty((steps, 4, 4))
-    for k in range(steps):
-        for i in range(4):
-            for j in range(4):
-                T[k, i, j] = stop[i, j]
+    T[:] = stop
     if steps == 1:
         return T
     turn = start[:3, :3].copy() @ stop[:3, :3].T.copy()
@@ -216,14 +176,10 @@ def between(start: FloatArray, stop: FloatArray, steps: int) -> FloatArray:
     there = stop[:3, :3].copy()
     for k in range(steps - 1):
         left = 1 - (k + 1) / steps
-        for i in range(3):
-            T[k, i, 3] += left * (start[i, 3] - stop[i, 3])
+        T[k, :3, 3] += left * (start[:3, 3] - stop[:3, 3])
         if sine > NO_TURN:
             axis = cross / sine
-            more = (np.sin(angle * left) * axis + (1 - np.cos(angle * left)) * (axis @ axis)) @ there  # Rodrigues' formula
-            for i in range(3):
-                for j in range(3):
-                    T[k, i, j] += more[i, j]
+            T[k, :3, :3] += (np.sin(angle * left) * axis + (1 - np.cos(angle * left)) * (axis @ axis)) @ there  # Rodrigues' formula
     return T
 
 
@@ -237,8 +193,7 @@ def _distances(
         row, turn, place = rows[r], T[r, :3, :3], T[r, :3, 3]
         _to_object_frame(node, still, turn, place, points)
         found, _, _ = solid(points, kind[row], sizes[row])
-        for i in range(len(node)):
-            gap[r, i] = found[i]
+        gap[r] = found
         _to_object_frame(origin, origin, turn, place, middle)
         distance, outward, _ = solid(middle, kind[row], sizes[row])
         centre[r, 0] = distance[0]
@@ -285,9 +240,7 @@ def _follow(
             T = _deflect_arm(way[min(step, last)], turning[row], force[row])
             if step > last and _motion(taken[row], T, node[0, 2]) <= SETTLED_MM:
                 break
-            for p in range(4):
-                for q in range(4):
-                    taken[row, p, q] = T[p, q]
+            taken[row] = T
             turn, place = T[:3, :3], T[:3, 3]
             count = 0
             gap = before[row]
@@ -312,10 +265,7 @@ def _follow(
             if count:
                 _to_object_frame(node, moved[row], turn, place, here)
                 used[row] = _record_friction(near[:count], turn, here, normal, force[row], anchor[row], mu, held[row], slides[row])
-            for i in range(len(node)):
-                before[row, i] = gap[i]
-                for p in range(3):
-                    seen[row, i, p] = here[i, p]
+            before[row], seen[row] = gap, here
 
 
 @compiled()
@@ -520,6 +470,5 @@ def _record_friction(
             borne += np.sqrt(size)
             slides[i] = friction > 0 and np.sqrt(size) >= SLIDES * friction * press
             if slides[i]:
-                for p in range(3):
-                    anchor[i, p] = here[i, p]
+                anchor[i] = here[i]
     return borne / bound if bound > 0 else 0.0

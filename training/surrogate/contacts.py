@@ -32,12 +32,12 @@ class SurrogateContacts:
         A sensor with the surrogate's mechanics. ``felt`` begins with its pins at rest.
     count : int
         Number of sensors.
-    friction_memory : bool
+    friction_history : bool
         False: at every pose the contact begins again.
     """
 
-    def __init__(self, surrogate: Surrogate, sensor: SensorSpec, count: int, *, friction_memory: bool = True) -> None:
-        self._surrogate, self._sensor, self._memory = surrogate, sensor, friction_memory
+    def __init__(self, surrogate: Surrogate, sensor: SensorSpec, count: int, *, friction_history: bool = True) -> None:
+        self._surrogate, self._sensor, self._memory = surrogate, sensor, friction_history
         self._rest = rest_of(sensor)
         self._cap_mm = sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
         modes = surrogate.modes
@@ -50,7 +50,7 @@ class SurrogateContacts:
         self._turns = turns.reshape(-1, 6)
         self._cap_modes = np.ascontiguousarray((modes[:, :, 0] + self._cap_mm * modes[:, :, 1]).reshape(flat), np.float32)
         self._caps_rest = self._rest[:, 0] + self._cap_mm * self._rest[:, 1]
-        self._linear = LinearContacts.at_rest(surrogate.node_mm, surrogate.answer, count, bending=surrogate.bending.kernel(surrogate.read))
+        self._linear = LinearContacts(surrogate.node_mm, surrogate.answer, count, bending=surrogate.bending.kernel(surrogate.read))
         self._before = np.tile(np.eye(4), (count, 1, 1))  # the poses commanded last
         self._known = np.zeros(count, bool)
         self._gap = np.full((count, len(surrogate.node_mm)), np.inf)

@@ -321,14 +321,14 @@ def sample_states(
 ) -> _Samples:
     """States of the linear skin along a solved path, and the true states, both turned about the sensor's axis.
 
-    ``bending`` is that of ``LinearContacts.at_rest``.
+    ``bending`` is that of ``LinearContacts``.
     """
     about = np.eye(4)
     about[:3, :3] = turn = _about_z(turn_rad)
     poses = about @ path.T
     obj = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
     assert isinstance(obj, CompiledSolid)
-    linear, row = LinearContacts.at_rest(skin.node_mm, answer.astype(np.float32), 1, bending=bending), np.zeros(1, int)
+    linear, row = LinearContacts(skin.node_mm, answer.astype(np.float32), 1, bending=bending), np.zeros(1, int)
     linear.begin(0, obj, path.friction)
     rest = rest_pins(lattice_sensor(sensor).geometry)
     states = []
@@ -351,8 +351,7 @@ def sample_states(
 def _main(rows: FloatArray, count: int) -> FloatArray:
     """The first principal directions (count, n) of rows (S, n), without subtraction of their mean."""
     rows = rows.astype(np.float64)
-    found: FloatArray = np.linalg.eigh(rows.T @ rows)[1][:, ::-1][:, :count].T.astype(np.float32)
-    return found
+    return np.linalg.eigh(rows.T @ rows)[1][:, ::-1][:, :count].T.astype(np.float32)
 
 
 def _carry_modes(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> FloatArray:

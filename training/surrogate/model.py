@@ -157,8 +157,7 @@ def by_row(x: FloatArray, matrix: FloatArray) -> FloatArray:
     rows = len(x)
     if rows % BLOCK:
         x = np.concatenate([x, np.zeros((-rows % BLOCK, x.shape[1]), x.dtype)])
-    product: FloatArray = (x.reshape(-1, BLOCK, x.shape[1]) @ matrix).reshape(len(x), -1)[:rows]
-    return product
+    return (x.reshape(-1, BLOCK, x.shape[1]) @ matrix).reshape(len(x), -1)[:rows]
 
 
 def features(

@@ -54,8 +54,7 @@ class AtNodes:
 
     def moved_mm(self, state: ContactState) -> FloatArray:
         """Displacements (M, 3) float32 of the surrogate's nodes."""
-        found: FloatArray = (self.shares @ (state.nodes_mm[self.outer] - self.rest_mm)).astype(np.float32)
-        return found
+        return (self.shares @ (state.nodes_mm[self.outer] - self.rest_mm)).astype(np.float32)
 
     def force_n(self, state: ContactState) -> FloatArray:
         """Forces on the skin (M, 3) float32. The force at each contact place is shared among the three nodes around it."""
@@ -75,12 +74,10 @@ class AtNodes:
 def interpolation_matrix(start: FloatArray, places: FloatArray) -> FloatArray:
     """Matrix (N, P) that interpolates values known in directions (P, 3) to other directions (N, 3)."""
     shares = RBFInterpolator(laid_flat(start), np.eye(len(start)), neighbors=NEIGHBOURS, kernel="thin_plate_spline")
-    found: FloatArray = shares(laid_flat(places))
-    return found
+    return shares(laid_flat(places))
 
 
 def laid_flat(directions: FloatArray) -> FloatArray:
     """Map directions (n, 3), of any length, to a plane (n, 2): the angle from the apex becomes the distance from the origin."""
     across = np.linalg.norm(directions[:, :2], axis=1, keepdims=True)
-    flat: FloatArray = directions[:, :2] * np.arctan2(across, directions[:, 2:]) / np.maximum(across, 1e-12)
-    return flat
+    return directions[:, :2] * np.arctan2(across, directions[:, 2:]) / np.maximum(across, 1e-12)

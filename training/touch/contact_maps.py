@@ -66,8 +66,7 @@ class Directions:
 
     def amplitudes(self, values: np.ndarray) -> np.ndarray:
         """Amplitudes (M, k) of values (M, V)."""
-        found: np.ndarray = (values - self.mean) @ self.rows.T / (self.rows[0] @ self.rows[0])
-        return found
+        return (values - self.mean) @ self.rows.T / (self.rows[0] @ self.rows[0])
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ with its neighbours', and the largest average, a (px), gives the probability (at
 import numpy as np
 
 from training.models.vgnn.registration import align
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 from twin.types import BoolArray, FloatArray
 
 MIDDLE_PX = 0.28

@@ -354,8 +354,7 @@ def resample_path(drag: Drag, at: np.ndarray, eyes: CapView, rng: np.random.Gene
     part = at - low
 
     def between(values: np.ndarray) -> np.ndarray:
-        mixed: np.ndarray = (values[low].T * (1 - part) + values[low + 1].T * part).T
-        return mixed
+        return (values[low].T * (1 - part) + values[low + 1].T * part).T
 
     drag_mm, share, limit = between(drag.drag_mm), between(drag.share), drag.whole_mm
     whole = drag_mm >= limit if np.isfinite(limit) else np.zeros(len(at), bool)
@@ -534,35 +533,33 @@ class SlipErrors:
     direction_deg: float
 
 
+# Entries of ``SlipErrors`` that are means over frames or contacts.
+MEANS = ("whole_accuracy", "false_alarms", "lead_mm", "share", "share_covered", "left_mm", "left_covered")
+
+
 def compare_slip(model: SlipModel, ways: Sequence[DragPath]) -> SlipErrors:
     """Compare the estimates for ways with the true values."""
-    right: list[bool] = []
-    alarms: list[bool] = []
-    inside: list[bool] = []
-    leads: list[float] = []
-    left: list[float] = []
-    shares: list[float] = []
-    shares_inside: list[bool] = []
+    found: dict[str, list[float]] = {name: [] for name in MEANS}
     turned: list[float] = []
     for way in ways:
         tracker = SlipTracker(model)
         told = [tracker(modes) for modes in way.modes]
-        right += [(slip.whole > 0.5) == whole for slip, whole in zip(told, way.whole.tolist(), strict=True)]
-        shares += [abs(slip.share - share) for slip, share in zip(told, way.share.tolist(), strict=True)]
-        shares_inside += [slip.share_low <= share <= slip.share_high for slip, share in zip(told, way.share.tolist(), strict=True)]
-        alarms += [slip.alarm for slip, begins in zip(told, way.begins.tolist(), strict=True) if not begins]
+        found["whole_accuracy"] += [(slip.whole > 0.5) == whole for slip, whole in zip(told, way.whole.tolist(), strict=True)]
+        found["share"] += [abs(slip.share - share) for slip, share in zip(told, way.share.tolist(), strict=True)]
+        found["share_covered"] += [slip.share_low <= share <= slip.share_high for slip, share in zip(told, way.share.tolist(), strict=True)]
+        found["false_alarms"] += [slip.alarm for slip, begins in zip(told, way.begins.tolist(), strict=True) if not begins]
         if way.whole.any():
             at = next((k for k, slip in enumerate(told) if slip.alarm and way.drag_mm[k] > 0), len(told) - 1)
             slides_mm = float(way.drag_mm[0] + way.left_mm[0])
-            leads.append(slides_mm - float(way.drag_mm[at]))
+            found["lead_mm"].append(slides_mm - float(way.drag_mm[at]))
         for k in np.flatnonzero(np.isfinite(way.left_mm) & ~way.whole).tolist():
-            left.append(abs(told[k].left_mm - float(way.left_mm[k])))
-            inside.append(told[k].left_low_mm <= way.left_mm[k] <= told[k].left_high_mm)
+            found["left_mm"].append(abs(told[k].left_mm - float(way.left_mm[k])))
+            found["left_covered"].append(told[k].left_low_mm <= way.left_mm[k] <= told[k].left_high_mm)
         true_deg = float(np.degrees(np.arctan2(way.direction[1], way.direction[0])))
         turned += [abs((told[k].direction_deg - true_deg + 180) % 360 - 180) for k in np.flatnonzero(way.drag_mm > SEEN_DRAG_MM).tolist()]
-    numbers = (_mean(right), _mean(alarms), _mean(leads), _mean([lead < 0 for lead in leads]), _mean(shares), _mean(shares_inside))
-    more = (_mean(left), _mean(inside), np.median(turned) if turned else np.nan)
-    return SlipErrors(len(ways), len(right), *(float(value) for value in (*numbers, *more)))
+    means = {name: _mean(values) for name, values in found.items()} | {"late": _mean([lead < 0 for lead in found["lead_mm"]])}
+    direction_deg = float(np.median(turned)) if turned else float("nan")
+    return SlipErrors(contacts=len(ways), frames=len(found["whole_accuracy"]), direction_deg=direction_deg, **means)
 
 
 def _mean(values: Sequence[float]) -> float:

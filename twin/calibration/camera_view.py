@@ -17,11 +17,11 @@ from twin.evaluation.pictures.aligned import with_changes
 from twin.frames import open_recording
 from twin.frames.forms import from_raw, gray_levels
 from twin.geometry.pins import rest_pins
-from twin.pins.identify import SHOWN, score_layout
+from twin.pins.labelling.identify import SHOWN, score_layout
+from twin.pins.labelling.reference import make_reference, project_rest
+from twin.pins.labelling.rest import require_even
+from twin.pins.labelling.view import PinView, camera_modes, views_of
 from twin.pins.pipeline import Pipeline
-from twin.pins.reference import make_reference, project_rest
-from twin.pins.rest import require_even
-from twin.pins.view import PinView, camera_modes, views_of
 from twin.types import Form, Frame
 
 SIDES = {"x": (1.0, 0.0), "-x": (-1.0, 0.0), "y": (0.0, 1.0), "-y": (0.0, -1.0)}

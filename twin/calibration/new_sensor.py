@@ -19,13 +19,13 @@ from twin.frames.images import write_image
 from twin.geometry.pins import rest_pins, usual_spacing
 from twin.optics.relief import cap_planes
 from twin.pins.batch import draw_overlay
-from twin.pins.caps import measure_caps
 from twin.pins.check import CAPS_MEASURED, lost_in_view, usual_caps
-from twin.pins.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, with_detector
-from twin.pins.identify import STEADY, Candidate, Identified, identify, score_layout, unnamed_spots
+from twin.pins.detectors.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, with_detector
+from twin.pins.detectors.tune import Tuned, tune
+from twin.pins.finding.caps import measure_caps
+from twin.pins.labelling.identify import STEADY, Candidate, Identified, identify, score_layout, unnamed_spots
+from twin.pins.labelling.rest import Rest, rest_of, turn_of
 from twin.pins.pipeline import Pipeline
-from twin.pins.rest import Rest, rest_of, turn_of
-from twin.pins.tune import Tuned, tune
 from twin.progress import Progress, silent, stage
 from twin.report.numbers import number
 from twin.report.page import Page, PagePicture

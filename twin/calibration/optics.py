@@ -32,8 +32,8 @@ from twin.frames.images import read_image, write_image
 from twin.mechanics.skin_fit import FittedPins, SkinFit
 from twin.optics.relief import DETAILS, without
 from twin.optics.render import Renderer
+from twin.pins.labelling.rest import require_even
 from twin.pins.pipeline import Pipeline
-from twin.pins.rest import require_even
 from twin.progress import Bar, Progress, Step, silent, stage
 from twin.report.page import Page, PagePicture, code
 from twin.report.table import Column

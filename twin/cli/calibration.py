@@ -19,8 +19,10 @@ from twin.cli.options import (
     CORES,
     QUALITY,
     Elements,
+    Experiment,
     Formerly,
     FormOrAuto,
+    MaxFrames,
     NoContact,
     Out,
     Residual,
@@ -59,7 +61,7 @@ def new_sensor(
         Path | None, typer.Option("--label-table", metavar="TABLE", help="table of labels: also fit the contact"), Formerly("labels")
     ] = None,
     experiment: Annotated[
-        str | None, typer.Option("--experiment", metavar="E", help="how the labelled contacts were made; taken from the table if not given")
+        str | None, typer.Option("--experiment", metavar="E", help="experiment of the labelled contacts; by default from the table")
     ] = None,
     contacts: Annotated[int, typer.Option("--contacts", min=4, metavar="N", help="labelled frames to which the contact is fitted")] = 20,
     optics: Annotated[bool, typer.Option("--optics", help="also fit light and colours")] = False,
@@ -70,27 +72,25 @@ def new_sensor(
     no_contact: NoContact = None,
     table: Table = None,
     form: FormOrAuto = None,
-    max_frames: Annotated[
-        int, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")
-    ] = 40,
+    max_frames: MaxFrames = 40,
     *,
     progress: Progress,
 ) -> "WholeSensor":
     """Make a specification of your own sensor from its frames.
 
-    Give a folder of frames, a video or a recording, of any size, colour, gray or thresholded. Some should show contacts of different
-    kinds, and one no contact. Nothing else need be known: the layout of the pins is identified, their places without contact found (in
-    init_0.png or --no-contact, in a frame that shows no contact, or made from many contacts, and it says which), and mask, threshold and
-    camera fitted. Where the layout is unsure, the two likeliest are named with what would decide; then give --layout.
+    Give a folder of frames, a video or a recording, of any size, colour, gray or thresholded. Some frames should show contacts of
+    different kinds, and one no contact. It identifies the layout of the pins (markers) and their positions at rest (from init_0.png,
+    --no-contact, a frame without contact, or from many contacts; it prints which), and fits mask, threshold and camera. If the layout is
+    unsure, it prints the two most probable ones, and what would decide; then give --layout.
 
-    With --label-table TABLE it continues with the contact, as 'twin calibrate contact' does; with --optics to light and colours, as 'twin
-    calibrate optics' does (raw frames). --table TABLE only names the frames and their order, and fits nothing. With --camera a live camera
-    takes the place of the folder: it says when to press.
+    With --label-table TABLE it also fits the contact, as 'twin calibrate contact' does; with --optics also light and colours, as 'twin
+    calibrate optics' does (raw frames). --table TABLE only gives the names of the frames and their order. With --camera a live camera
+    replaces the folder, and the command asks you to press.
 
     \b
     Writes:
       MY.toml             a short, commented specification: --sensor MY.toml
-      MY-new/index.html   what is known, what is assumed, what to do to know more;
+      MY-new/index.html   known values, assumed values, steps that determine more;
                           pictures of frames with their pins beside it
       MY-contact/, MY-calibration/, MY-frames/  by --label-table,
                                              --optics, --camera
@@ -152,31 +152,29 @@ def calibrate_optics(
     no_contact: Annotated[
         Path | None, typer.Option("--no-contact", metavar="FRAME", help="a raw frame without contact: fits the camera")
     ] = None,
-    max_frames: Annotated[
-        int, typer.Option("--max-frames", min=1, metavar="N", help="fit at most N frames, evenly spread"), Formerly("limit")
-    ] = 6,
+    max_frames: MaxFrames = 6,
     pipeline: Tuning = None,
     *,
     progress: Progress,
 ) -> "OpticsCalibration":
     """Fit light, colours, sharpness and noise to raw frames.
 
-    Start from your sensor's specification ('twin new'), or from the shipped one that is most like it. The frames may show any contact:
-    their pins are found (a few may be lost), the skin is fitted to them, the twin renders the same state, and its parameters are moved
-    until both agree, by differentiating the path tracer (LEDs, reflectances, haze) and by least squares (ring, reflections, specks, each
-    cap's own reflectance and outline, blur, aperture, sharpening, colour fringes, compression, noise). What is left then is measured: a
-    tile of light and colour that moves with each cap and the skin around it, and a background that stays in place. With
-    --no-contact one frame without contact fits the camera first.
+    Start from your sensor's specification ('twin new'), or from the most similar shipped one. The frames may show any contact. The skin is
+    fitted to their pins (a few may be lost), and the twin renders the same state. Its parameters are fitted until both agree, by
+    differentiable path tracing (LEDs, reflectances, haze) and by least squares (ring, reflections, specks, each cap's own reflectance and
+    outline, blur, aperture, sharpening, colour fringes, compression, noise). The remaining difference is measured: a tile of light and
+    colour that moves with each cap and the skin around it, and a background that stays in place. With --no-contact one frame without
+    contact fits the camera first.
 
     \b
     Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it its measured
     tables and pictures (SPEC.*.csv, SPEC.*.uri), and SPEC-calibration/ with
-    index.html (before, after, what is left, changes) and the stages' results.
+    index.html (before, after, remaining error, changes) and the stages' results.
 
     An interrupted run resumes.
 
-    What frames do not determine is kept at the starting values, and named: the response curve (gamma) and the product of LED power and
-    exposure in any case; distance and focal length if all frames are without contact.
+    Quantities that frames do not determine keep their starting values, and are listed: the response curve (gamma) and the product of LED
+    power and exposure in any case; distance and focal length if all frames are without contact.
 
     \b
     Example:
@@ -197,13 +195,11 @@ def calibrate_contact(
         int, typer.Option("--num-labelled", min=4, metavar="N", help="frames to fit to, chosen at random"), Formerly("labels")
     ] = 20,
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the choice of frames")] = 0,
-    experiment: Annotated[
-        str, typer.Option("--experiment", metavar="E", help="how they were recorded ('twin experiments')")
-    ] = "surface-2d",
+    experiment: Experiment = "surface-2d",
     obj: Annotated[
         str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
     ] = None,
-    hold: Annotated[list[str] | None, typer.Option("--hold", metavar="KEY", help="leave this parameter as it is; may be repeated")] = None,
+    hold: Annotated[list[str] | None, typer.Option("--hold", metavar="KEY", help="do not fit this parameter; may be repeated")] = None,
     workers: Workers = CORES,
     elements: Elements = FINE,
     form: FormOrAuto = None,
@@ -216,15 +212,15 @@ def calibrate_contact(
 ) -> "ContactCalibration | ForceComparison":
     """Fit the contact to labelled frames of the real sensor, or to a table of forces.
 
-    From the no-contact frame (init_0.png) and N labelled frames: contact offset, tool point, angle offset and sign, tilt of the
-    surface, direction of the robot's axes in the image, friction, how far the arm gives way and turns, stiffness of the gel relative to
-    the skin and how much its volume yields, thickness of the skin, length of the pins. Whether each frame's move had been executed
-    when it was taken is found along with them. A frame that fits neither case gets a small weight. As many other frames, at most 20,
-    are kept out of the fit, and the error is stated on them.
+    It uses the no-contact frame (init_0.png) and N labelled frames. It fits contact offset, tool point, angle offset and sign, tilt of the
+    surface, direction of the robot's axes in the image, friction, the arm's compliances, stiffness of the gel relative to the skin and its
+    compressibility, thickness of the skin, and length of the pins. It also determines whether the move of each frame was executed when it
+    was taken. A frame that fits neither case gets a small weight. The same number of other frames, at most 20, is held out, and the error
+    is given on them.
 
-    Pins do not determine newtons. Where the table has a column of forces along the approach (N; Fz, or the one that rig.force_sensor names)
-    with 3 presses or more, weighed with a kitchen scale for example, the stiffness of skin and gel is scaled to them; other rows may be
-    empty. It says how far forces may still be off (skin.stiffness_factor), or which stiffness is assumed.
+    Pins do not determine newtons. If the table has a column of forces along the approach (N; Fz, or the column of rig.force_sensor) with 3
+    or more presses, for example weighed with a kitchen scale, the stiffness of skin and gel is scaled to them; other rows may be empty. It
+    prints the remaining uncertainty of forces (skin.stiffness_factor), or the assumed stiffness.
 
     With --frames TABLE.csv, a table of poses and forces of a load cell without frames, N rows are fitted (radius of the dome, stiffness,
     friction, zero of the depth, tool point, zero and turn of the cell), each parameter only if they determine it, and all other rows are
@@ -232,13 +228,13 @@ def calibrate_contact(
 
     \b
     Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/
-    with index.html (parameters with their uncertainty and what the frames
-    determine of them, frames with their probabilities, before and after),
-    calibration.json and contacts/. An interrupted run resumes.
+    with index.html (parameters with their uncertainty before and after the fit,
+    frames with their probabilities, before and after), calibration.json and
+    contacts/. An interrupted run resumes.
 
     \b
     It simulates about 50 + 60 N contacts. Each takes 1 to 3 s on one core;
-    --workers shares them among processes.
+    --workers sets the number of processes.
 
     \b
     Example:
@@ -271,7 +267,7 @@ def validate(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording, or TABLE.csv of forces")],
     out: Out,
-    experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how it was recorded ('twin experiments')")] = "surface-2d",
+    experiment: Experiment = "surface-2d",
     obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the touched object; the experiment's own if not given")] = None,
     max_frames: Annotated[
         int | None, typer.Option("--max-frames", min=1, metavar="N", help="N frames, chosen at random"), Formerly("limit")
@@ -291,11 +287,11 @@ def validate(
 ) -> "Validation | ForceComparison":
     """Compare the twin's pins with those of real frames.
 
-    The contact of each labelled frame is simulated along the arm's way, from the frame's label and the sensor's [rig] alone ('twin
-    calibrate contact' fits a [rig]). The simulated displacement is added to the recorded pins without contact (init_0.png). If
-    move_executed.csv or labels_corrected.csv ('twin audit') says that a move was not executed, this move is not simulated. Errors are
-    stated separately for executed and not executed moves, by depth, angle and shear. For some frames with an executed move the errors
-    are also stated with the friction that fits the frame best.
+    The contact of each labelled frame is simulated along the arm's path, from the frame's label and the sensor's [rig] alone ('twin
+    calibrate contact' fits a [rig]). The simulated displacement is added to the recorded pins without contact (init_0.png). A move that
+    move_executed.csv or labels_corrected.csv ('twin audit') marks as not executed is not simulated. Errors are given separately for
+    executed and not executed moves, by depth, angle and shear. For some frames with an executed move the errors are also given with the
+    friction that fits the frame best.
 
     With --frames TABLE.csv, a table of poses and forces without frames, the simulated forces are compared with the measured ones.
 
@@ -356,20 +352,20 @@ def realism(
 ) -> "Realism":
     """Compare real raw frames with their renders.
 
-    They are compared pair by pair, and as two sets. Each real frame's pins are found, the skin is fitted to them, and the sensor in
-    that state is rendered and captured. Every cap stands where it stood in the real frame, so the differences come from camera and
-    light. With --pose-aligned the whole twin is evaluated as well: the labels in targets.csv (pose_3 depth in mm, pose_4 and pose_5
-    turns in deg, a tap on a flat plate) become contacts. The arm's kinematics is fitted to the pins of one half of the frames, and
-    the error is stated on the other half.
+    They are compared in pairs, and as two sets. The skin is fitted to the pins of each real frame, and the sensor in this state is
+    rendered. Every cap has its position in the real frame, so the differences come from camera and light. With --pose-aligned the complete
+    twin is evaluated as well: contacts are simulated from the labels in targets.csv (pose_3 depth in mm, pose_4 and pose_5 tilts in deg, a
+    tap on a flat plate). The arm's kinematics is fitted to the pins of one half of the frames, and evaluated on the other half (held-out
+    frames).
 
-    It reads a folder of raw colour or gray frames of one size (images/ with targets.csv, or any folder). Frames that are black,
-    saturated, of another size or without all their pins are refused by name. The exit code is 0 if at least one frame was good.
+    It reads a folder of raw colour or gray frames of one size (images/ with targets.csv, or any folder). Frames that are black, saturated,
+    of another size or without all their pins are left out and listed. The exit code is 0 if at least one frame was good.
 
     \b
     Writes:
       index.html      pictures side by side, all figures, plots
-      metrics.json    every figure: PSNR, SSIM, FLIP over the lens disc; what is
-                      missed on the caps, and how much of it is fixed to each cap;
+      metrics.json    every figure: PSNR, SSIM, FLIP over the lens disc; the error
+                      on the caps, and its share that is the same for a cap;
                       differences by radius; spots; spectra; two-sample accuracy;
                       pin errors
       frames.csv      figures of each frame
@@ -379,16 +375,15 @@ def realism(
       pictures/       real, rendered and difference of each frame
 
     \b
-    How to read it: no render can do better than PSNR and SSIM of two real frames
-    with the same contact. Two-sample accuracy is the share of patches of unseen
-    frames that a small network puts into the right set: at 100 % it always
-    distinguishes real from rendered, at 50 % never. --thorough trains a
-    stronger network, too,
-    and both on two halves of the real frames, which should give 50 %. What is
-    missed on the caps and fixed to each of them is what a better relief could
-    hold. --without removes a measured detail (ablation): the caps' relief, the
+    How to read it: the upper bound of PSNR and SSIM are those of two real frames
+    with the same contact. Two-sample accuracy is the share of patches of held-out
+    frames that a small network classifies correctly: at 100 % it always
+    distinguishes real from rendered, at 50 % never. --thorough also trains a
+    stronger network, and both on two halves of the real frames, which should give
+    50 %. A better relief could model the part of the error that is the same for a
+    cap. --without removes a measured detail (ablation): the caps' relief, the
     skin's grain, the background. --residual adds the sensor's residual network;
-    evaluate it on frames that it was not taught on.
+    evaluate it on held-out frames.
 
     \b
     Example:
@@ -447,18 +442,18 @@ def robustness(
     *,
     progress: Progress,
 ) -> "DegradationResult":
-    """How far may the sensor degrade before preprocessing fails?
+    """Measure how far the sensor can degrade before preprocessing fails.
 
-    Sweeps each condition (dim or dead LEDs, room light, glare, defocus, motion, dirt, scratches, bubbles, haze, lost and faded
-    caps, torn skin, a displaced camera, noise, JPEG, lost rows, wrong settings, ...; --list names them) from nothing to severe
-    over a set of contacts, runs pipelines and models on every frame, and compares with where the pins truly are.
+    It increases each condition from severity 0 (none) to 1 (unusable) on a set of contacts: dim or dead LEDs, room light, glare, defocus,
+    motion, dirt, scratches, bubbles, haze, lost and faded caps, torn skin, a displaced camera, noise, JPEG, lost rows, wrong settings, ...
+    (--list lists them). It runs pipelines and models on every frame, and compares with the ground truth: recall and precision of the pins.
 
     \b
     Writes:
       index.html      envelope (where each pipeline fails), ranking, plots, worst
                       frames
-      envelope.csv    severity and parameter at which each measure's limit is
-                      crossed
+      envelope.csv    severity and parameter at which each measure crosses its
+                      limit
       curves.csv      every measure against severity, with its 90 % interval
       frames.csv      every frame
       real-on-rendered.csv  with --frames: where real and rendered frames fail,
@@ -468,16 +463,16 @@ def robustness(
                       not used
 
     \b
-    With --frames DIR real frames take the place of rendered ones. Then only
-    conditions that act on a frame are swept, and the truth is the pins on which
+    With --frames DIR real frames replace the rendered ones. Then the sweep covers
+    only conditions that act on a frame, and the reference is the pins on which
     several detectors agree. Raw frames are compared with the envelope of rendered
-    ones, which shows how much of a sound sensor's margin this sensor has left.
-    Rendered frames are swept for that, too; --no-rendered leaves this out.
+    ones. This shows the remaining margin of this sensor against a healthy one.
+    For this, rendered frames are swept, too; --no-rendered turns it off.
 
     \b
-    Code of your own that finds pins is evaluated, too: --pipeline mine.py:my_pins
-    takes the function my_pins of the file. It is given the picture of a frame
-    (uint8, gray or RGB) and returns the places (n, 2) of the pins it finds, x and
+    It can evaluate your own pin detection, too: --pipeline mine.py:my_pins
+    takes the function my_pins of the file. The function gets the picture of a
+    frame (uint8, gray or RGB) and returns the positions (n, 2) of the pins, x and
     y in px, in any order.
 
     \b
@@ -524,11 +519,11 @@ def audit(
     *,
     progress: Progress,
 ) -> "LabelAudit":
-    """Find what is wrong with the labels of a recording.
+    """Find wrong labels of a recording.
 
-    It needs a recording of one object (a plate, an edge) with labels pose_1..6 and move_1..6, of which some vary, and uses its pins and
-    targets.csv alone. It looks for moves that were not executed when the frame was taken, sign errors, frames without contact, frames
-    that fit no label, frames that occur twice, drift along the table, and faults of the files.
+    It needs a recording of one object (a plate, an edge) with labels pose_1..6 and move_1..6; some of them must vary. It uses only pins
+    and targets.csv. It detects moves that were not executed when the frame was taken, sign errors, frames without contact, frames that fit
+    no label, duplicate frames, drift along the table, and faults of the files.
 
     \b
     Writes:

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from twin.cli import app
-from twin.cli.options import Formerly, FormOrAuto, NoContact, Out, Sensor, Table, Tuning, load_if_named, sensor_with
+from twin.cli.options import FormOrAuto, MaxFrames, NoContact, Out, Sensor, Table, Tuning, load_if_named, sensor_with
 from twin.progress import Progress
 
 if TYPE_CHECKING:
     from hardware.live.examining import Examination
     from twin.pins.batch import Preprocessed
+    from twin.pins.detectors.tune_files import TunedOnFrames
     from twin.pins.graph_files import Graphs
-    from twin.pins.tune_files import TunedOnFrames
 
 
 @app.command("preprocess")
@@ -38,9 +38,9 @@ def preprocess(
 ) -> "Preprocessed":
     """Find the pins in every frame.
 
-    The frames are an image, a folder of images, a video, or a folder of the recordings (frames_bw/, images/, sensor_images/ or
-    processed_images/ with targets.csv and metadata). A file init_* is the reference without contact, not a frame. Broken frames are
-    listed and skipped. The exit code is 0 if at least one frame was good.
+    The input is an image, a folder of images, a video, or a recording (frames_bw/, images/, sensor_images/ or processed_images/ with
+    targets.csv and metadata). A file init_* is the reference without contact, not a frame. Broken frames are listed and skipped. The exit
+    code is 0 if at least one frame was good.
 
     \b
     Writes pins.npz:
@@ -48,8 +48,8 @@ def preprocess(
       pins_px (M, N, 2)  (x, y) in px of the input frame, pixel centres at
                          integers, the specification's pin order; NaN where a pin
                          has no blob of its own
-      predicted_px       same shape: the motion model's guess for the pins that
-                         are NaN in pins_px, NaN for all others
+      predicted_px       same shape: positions that the motion model predicts for
+                         pins that are NaN in pins_px, NaN for all others
       area_px2 (M, N)    Voronoi cell areas
       found (M,), valid (M,)
     and summary.json (frames, in_view: median number of pins that the picture's
@@ -77,7 +77,7 @@ def graph(
     out: Out,
     kind: Annotated[Literal["knn", "delaunay", "voronoi"], typer.Option("--kind", help="kind of graph")] = "voronoi",
     form: FormOrAuto = None,
-    legacy: Annotated[bool, typer.Option("--legacy", help="the published release's own method and boundary, to compare with")] = False,
+    legacy: Annotated[bool, typer.Option("--legacy", help="method and boundary of the published code, for comparison")] = False,
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
@@ -100,9 +100,8 @@ def graph(
       graph.png     the first graph
       surface.png   its cell areas as a surface: no contact, contact, difference
 
-    With --legacy (for frames in the recordings' form) pins, edges and areas are computed as by the published release: the nodes are in
-    its detector's order, in px of its resized image, relative to its scalar median. A frame in which not exactly all pins are found is
-    left out.
+    With --legacy (for processed frames) pins, edges and areas are computed as by the published code: the nodes are in its detector's
+    order, in px of its resized image, relative to its scalar median. A frame in which not exactly all pins are found is left out.
 
     \b
     Example:
@@ -121,12 +120,10 @@ def tune(
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="folder of frames, video or recording")],
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE.toml", help="the file to write")] = None,
     method: Annotated[
-        Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"], typer.Option("--method", help="whose parameters")
+        Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"], typer.Option("--method", help="method to tune")
     ] = "twin",
     form: FormOrAuto = None,
-    max_frames: Annotated[
-        int, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")
-    ] = 12,
+    max_frames: MaxFrames = 12,
     table: Table = None,
     no_contact: NoContact = None,
     *,
@@ -134,14 +131,14 @@ def tune(
 ) -> "TunedOnFrames":
     """Find parameters of the pin detection for your own frames.
 
-    These are mask, crop, threshold and blob parameters. Of the sensor's specification only the layout of the pins is used (count, rings,
-    round or hexagon). Give some frames, with or without contact, as they come from the camera or as a recorder thresholded them
-    (then there is no crop, and the threshold hardly matters).
+    These are mask, crop, threshold and blob parameters. From the sensor's specification only the layout of the pins is used (count, rings,
+    round or hexagon). Give some frames, with or without contact, raw or thresholded. For thresholded frames there is no crop, and the
+    threshold hardly matters.
 
-    It prints how reliable the result is: in how many frames all pins are found, by how many gray levels the threshold may change, and
-    what speaks against the result. It writes a file that --pipeline of the other commands takes. The section [blob] of this file can be
-    copied to [pipeline.raw] or [pipeline.recording] of a sensor's specification. The file also holds the pins' places at rest: of a frame
-    without contact (init_*, --no-contact, or one among the frames), else made from the contacts, which it says.
+    It prints the reliability of the result: the share of frames in which all pins are found (recall), the range of the threshold in gray
+    levels, and warnings. It writes a file for --pipeline of the other commands. You can copy the section [blob] of this file to
+    [pipeline.raw] or [pipeline.recording] of a sensor's specification. The file also contains the pins' positions at rest: from a frame
+    without contact (init_*, --no-contact, or one among the frames), otherwise estimated from the contacts. It prints which.
 
     \b
     Example:
@@ -149,27 +146,25 @@ def tune(
     """
     from scenes import load_sensor
     from twin.frames import frames_at
-    from twin.pins.tune_files import tune_on_frames
+    from twin.pins.detectors.tune_files import tune_on_frames
 
     at = frames_at(frames, table, no_contact)
     return tune_on_frames(at, load_sensor(sensor), out=out, method=method, form=form, limit=max_frames, progress=progress)
 
 
-# Exit code of 'twin check' if the sensor's condition is bad. It differs from those of a failure (1) and of a wrong command line (2).
-BAD = 3
+# Exit code of 'twin check' if the sensor has failed. It differs from those of a failure (1) and of a wrong command line (2).
+FAILED = 3
 
 
-@app.command("check", exit_code=lambda found: BAD if found.bad else 0)
+@app.command("check", exit_code=lambda found: FAILED if found.failed else 0)
 def check(
     source: Annotated[
         str, typer.Argument(metavar="FRAME", help="image, folder of frames, video, recording, or a camera: 0, /dev/video2, http://...")
     ],
     sensor: Sensor,
     form: FormOrAuto = None,
-    pipeline: Annotated[Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="what 'twin tune' wrote")] = None,
-    max_frames: Annotated[
-        int, typer.Option("--max-frames", min=1, metavar="N", help="look at no more than N frames, evenly spread"), Formerly("limit")
-    ] = 20,
+    pipeline: Annotated[Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="file of 'twin tune'")] = None,
+    max_frames: MaxFrames = 20,
     no_contact: Annotated[Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, for --push")] = None,
     push: Annotated[
         list[str] | None,
@@ -182,24 +177,24 @@ def check(
         Path | None, typer.Option("--out", metavar="FILE.toml", help="copy of the specification with the view of --push")
     ] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", metavar="RUN", help="run that must know the contacts; the sensor's shipped weights by default")
+        Path | None, typer.Option("--model", metavar="RUN", help="run that must know the contacts; by default the sensor's weights")
     ] = None,
     *,
     progress: Progress,
 ) -> "Examination":
-    """Check the health of the sensor, and say what to do.
+    """Check the health of the sensor, with remedies.
 
-    It checks brightness, focus, missing pins, specks, glare, and drift from the calibration. It looks at a frame, a folder of frames, a
-    video or a camera, with or without contact, and compares the frames with the one that the twin draws from the sensor's specification.
-    Thresholded recordings show pins, specks and place only. A lost pin or a spot counts as a fault of the sensor if it is
-    there in half of the frames, so give frames of several contacts. If there are weights of the sensor, frames whose contacts they do
-    not know (torn, displaced, of no known kind) are named with the reason.
+    It checks brightness, focus, missing pins, specks, glare, and drift from the calibration. The input is a frame, a folder of frames, a
+    video or a camera, with or without contact. It compares the frames with a frame that the twin renders from the sensor's specification.
+    In thresholded frames it can check only pins, specks and position. A lost pin or a spot counts as a fault of the sensor if half of the
+    frames show it, so give frames of several contacts. If there are weights of the sensor, it lists frames outside their domain (torn,
+    displaced, unknown contact) with the reason.
 
-    The exit code is 3 if something is bad, else 0.
+    The exit code is 3 if something has failed, otherwise 0.
 
-    On a symmetric layout a turn by its symmetry and a mirror can't be seen in pins of an unknown unit. Contacts that push the pins to known
-    sides decide: with --push and --no-contact, turn, mirror, size and place of the picture and the pins at rest are found, written to
-    --out as a copy of the specification, and the frames are checked against that copy.
+    On a symmetric layout, the pins of an unknown unit do not show a turn by a symmetry, or a mirror. Contacts that push the pins in known
+    directions determine both. With --push and --no-contact it determines turn, mirror, size and position of the picture and the pins at
+    rest, writes them to --out as a copy of the specification, and checks the frames against this copy.
 
     \b
     Example:

@@ -22,6 +22,7 @@ from twin.cli.options import (
     Also,
     Device,
     Elements,
+    Experiment,
     Formerly,
     FormOrAuto,
     NoContact,
@@ -57,20 +58,20 @@ if TYPE_CHECKING:
 
 @app.command("dataset", goes_on=True)
 def make_dataset(
-    experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="experiment name ('twin experiments') or file")],
+    experiment: Experiment,
     sensor: Sensor,
     count: Annotated[int, typer.Option("--count", min=1, metavar="N", help="contacts")],
     out: Out,
-    wide: Annotated[bool, typer.Option("--wide", help="the experiment's slightly larger ranges, for a data set to train on")] = False,
+    wide: Annotated[bool, typer.Option("--wide", help="slightly larger ranges, for a training set")] = False,
     obj: Annotated[
         str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
     ] = None,
-    images: Annotated[Literal["raw", "gray", "recording", "none"], typer.Option("--images", help="what pictures to make")] = "raw",
-    states: Annotated[Literal["all", "end"], typer.Option("--states", help="which states of a contact become frames")] = "end",
+    images: Annotated[Literal["raw", "gray", "recording", "none"], typer.Option("--images", help="kind of pictures")] = "raw",
+    states: Annotated[Literal["all", "end"], typer.Option("--states", help="states of a contact that become frames")] = "end",
     randomise: Annotated[
-        str | None, typer.Option("--randomise", metavar="R", help="randomisation name or file; nothing if not given")
+        str | None, typer.Option("--randomise", metavar="R", help="domain randomisation: a name or a file; none by default")
     ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of all draws; the experiment's own if not given")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of all samples; the experiment's own if not given")] = None,
     workers: Workers = CORES,
     scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
     quality: Annotated[Quality | None, typer.Option(help=QUALITY, show_default="rasterised")] = None,
@@ -82,41 +83,40 @@ def make_dataset(
 ) -> "Simulated":
     """Simulate a labelled data set with ground truth.
 
-    It simulates the contacts of an experiment and writes them in the recordings' own format. For each contact a pose and a move are drawn
-    from the experiment's ranges, in robot coordinates ('twin experiments' lists them). Finite elements follow the arm's way, and the last
-    state, or every converged state, becomes a frame. A contact that does not converge is listed, and drawn again.
+    It simulates the contacts of an experiment and writes them in the format of recordings. For each contact a pose and a move are sampled
+    from the experiment's ranges, in robot coordinates ('twin experiments' lists them). Finite elements follow the arm's path, and the last
+    state, or every converged state, becomes a frame. A contact that does not converge is listed, and sampled again.
 
     \b
     --images raw        the camera's frames
              gray       their luminance
-             recording  cropped and thresholded, as the recordings are
+             recording  processed (cropped, thresholded) like recordings
              none       pins alone, without rendering (vgnn and the other graph
                         networks train on them; 'twin train' reads them like
                         frames)
-    --states all        also the states on the way, labelled by how far tap and
-                        move have gone. All states of a contact share a path_id,
-                        and they all go either into the training or into the
-                        validation part
+    --states all        also the states on the path, each with its own label. All
+                        states of a contact share a path_id, and they are all
+                        either in the training or in the validation part
     --randomise R       domain randomisation between contacts: a name ('twin
                         randomisations') or a file
 
     \b
     Writes:
       images/ or frames_bw/, init_0.png, targets.csv, meta.json: as in a recording
-      move_executed.csv   whether each frame's move had been made
+      move_executed.csv   whether the move of each frame was executed
       truth.zarr          caps (mm, px), pins with noise, forces, torque, areas in
                           contact and sliding, the object's pose: one row a frame
-      draws.csv           what was sampled for each contact; failures.csv: draws
-                          that failed
+      draws.csv           sampled parameters of each contact; failures.csv:
+                          samples that failed
       generation.json     all resolved specifications and options
-      made_by.json        the code that made it; a version whose code for contacts
-                          differs does not continue the data set, because its
+      made_by.json        the code that made it; a version with other code for
+                          contacts does not resume the data set, because its
                           frames would differ
-      records/            one for each finished contact; with them the same
-                          command continues after any end, or to a larger --count
+      records/            one for each finished contact, from which the same
+                          command resumes, also with a larger --count
       lerobot/, huggingface/, mcap/: with --also, when the data set is finished
 
-    The result depends on the options alone. Every byte is the same with any number of workers and after any interruption.
+    The result depends on the options alone. It does not depend on the number of workers or on interruptions, to the last byte.
 
     \b
     Examples:
@@ -176,11 +176,11 @@ def train(
     \b
     vgnn              ours: Voronoi graph network on matched pins, ensemble,
                       calibrated 90 % intervals
-    steered           ours for an edge whose direction goes round the whole circle
+    steered           ours for edges with directions on the whole circle
     touch             ours for forces: modes of the pins and light of the caps,
                       ensemble and Gaussian process; needs a few hundred frames.
-                      Of simulated contacts it also learns contact maps,
-                      and slip over time of simulated drags
+                      Trained on simulated contacts, it also estimates contact
+                      maps; trained on simulated drags, also slip
     tac-vgnn          the paper's network: Delaunay graph, Voronoi areas; dense
                       layers 96, 64
     tac-vgnn-release  the same with the published code's dense layers: 128, 96
@@ -189,27 +189,27 @@ def train(
                       128 x 128 px
 
     --target selects the labels, which are columns of the recording's table. It is a preset (surface-2d: pose_2 pose_6; surface-2d-shear:
-    also move_1 move_6; surface-3d: pose_3 pose_4 pose_5; edge-2d; edge-3d; edge-circle; contact) or names with commas between. With
-    --label-kind corrected, a move that was not executed is taken out of the labels, if move_executed.csv or labels_corrected.csv beside the
-    table says so.
+    also move_1 move_6; surface-3d: pose_3 pose_4 pose_5; edge-2d; edge-3d; edge-circle; contact) or names separated by commas. With
+    --label-kind corrected, the labels do not contain moves that move_executed.csv or labels_corrected.csv beside the table marks as not
+    executed.
 
-    contact is everything that the table contains about a contact: poses and moves that vary, measured forces (Fx, Fy, Fz in N). Of
-    simulated contacts it is also force_x, force_y, force_z (N, of the skin on the object, sensor frame), torque_z (N mm, about the sensor's
-    axis), contact_area (mm2), slip_share (0 to 1) and contact (0 or 1).
+    contact stands for all labels of the table that describe a contact: poses and moves that vary, measured forces (Fx, Fy, Fz in N). For
+    simulated contacts these are also force_x, force_y, force_z (N, of the skin on the object, sensor frame), torque_z (N mm, about the
+    sensor's axis), contact_area (mm2), slip_share (0 to 1) and contact (0 or 1).
 
-    Depth and angle of simulated contacts are relative to the touched surface, whatever its shape: the indentation along the normal at
-    the nearest place, and the angle from this normal. So data sets of several objects can be joined: give --data once for each.
+    Depth and angle of simulated contacts are relative to the touched surface of any shape: the indentation along the normal at the nearest
+    point, and the angle from this normal. So data sets of several objects can be joined: give --data once for each.
 
-    A random fifth of the rows is kept out of training for 'twin evaluate'. Of simulated data it is a fifth of the contacts, with all
-    their states. --split gives the seed of this choice; with --split -1 all rows are trained on. The choice goes by the frames' names: the
-    order of the table does not matter.
+    A random fifth of the rows is held out for 'twin evaluate'. For simulated data it is a fifth of the contacts, with all their states.
+    --split is the seed of this choice; with --split -1 all rows are used for training. The choice depends on the frames' names, not on the
+    order of the table.
 
     \b
     Writes to --out: config.json (resolved, with the sensor and the parameters of
     the pipeline), curves.csv, weights.pt, maps.safetensors and slip.safetensors
     (touch, simulated contacts and drags), and checkpoint.pt while it runs. The
-    same command continues a run that was interrupted, if frames and labels are
-    still the same.
+    same command resumes an interrupted run, if frames and labels are still the
+    same.
 
     \b
     Example:
@@ -257,12 +257,12 @@ def evaluate(
     """Evaluate a trained model on a labelled recording.
 
     \b
-    --rows validation  the fifth of the run's own recording that was kept out of
-                       its training, by the frames' names
-    --rows all         every row, for a recording that the model has not seen
+    --rows validation  held-out frames: the fifth of the run's own recording that
+                       was not used for training, by the frames' names
+    --rows all         every row, for a recording that was not used for training
 
-    Weights for several kinds of contact, such as those of ur5-331 for its binary pictures, are evaluated with --rows all by the labels that
-    the recording varies. The share of frames that they take for each kind is printed.
+    Weights for several kinds of contact, such as those of ur5-331 for its binary pictures, are evaluated with --rows all on the labels that
+    vary in the recording. The share of frames that they classify as each kind is printed.
 
     \b
     Writes:
@@ -274,8 +274,8 @@ def evaluate(
                        whose move was not executed; ms per frame
       errors.png
 
-    With --robustness it also writes robustness.csv: errors on frames whose image is changed (1 % scale, 2 px shift, 1 deg turn, 5 pins
-    erased, each in a random direction), and how much larger they are than the errors on the unchanged frames.
+    With --robustness it also writes robustness.csv: errors on changed frames (1 % scale, 2 px shift, 1 deg turn, 5 pins erased, each in a
+    random direction), and their increase over the errors on the unchanged frames.
 
     \b
     Example:
@@ -292,22 +292,23 @@ def predict(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
     maps: Annotated[Path | None, typer.Option("--maps", metavar="DIR", help="folder for the contact maps of each frame")] = None,
-    sequence: Annotated[bool, typer.Option("--sequence", help="the frames follow each other in time: estimate slip, too")] = False,
+    sequence: Annotated[bool, typer.Option("--sequence", help="the frames are a sequence in time: estimate slip, too")] = False,
     table: Table = None,
     no_contact: NoContact = None,
 ) -> "Predictions":
-    """Tell the pose in every frame, with its 90 % interval.
+    """Estimate the pose in every frame, with its 90 % interval.
 
     The model contains its sensor and pipeline, and a frame of another sensor is refused. If there is a frame without contact (init_0.png)
-    in the recording or beside a single picture, the pins are counted from that frame. The exit code is 0 if at least one frame gave a pose.
+    in the recording or beside a single picture, displacements of pins are relative to that frame. The exit code is 0 if at least one frame
+    gave a pose.
 
     With --maps DIR it also writes, for each frame, the pressure and the shear over the skin, the contact patch and the deformed skin:
-    arrays (NAME.npz) and a picture (NAME.png). The model must be touch and have learnt from simulated contacts.
+    arrays (NAME.npz) and a picture (NAME.png). The model must be touch, trained on simulated contacts.
 
-    With --sequence the frames follow each other in time, as those of a video, and a model that was trained on simulated drags also
-    estimates slip: slip_begins and slip_whole (probabilities that a tenth of the contact, and that all of it, slides), slip_sliding (share
-    of the contact that slides under the drag, 0 to 1), slip_left (drag in mm until all slides) and slip_direction (deg, sensor frame, of
-    the object over the skin).
+    With --sequence the frames are a sequence in time, as those of a video, and a model that was trained on simulated drags also estimates
+    slip: slip_begins and slip_whole (probabilities that a tenth of the contact, and that all of it, slides), slip_sliding (share of the
+    contact that slides under the drag, 0 to 1), slip_left (drag in mm until all slides) and slip_direction (deg, sensor frame, of the
+    object over the skin).
 
     \b
     Examples:
@@ -325,8 +326,8 @@ def predict(
 def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, touch or steered")], out: Out) -> None:
     """Write a small copy of a finished training run.
 
-    Its numbers have half the precision, and its size is less than a tenth. It can be given wherever a RUN is asked for. For example,
-    the run of a study is packed so:
+    Its numbers have half the precision, and its size is less than a tenth. Every command that takes a RUN takes it. This packs the run of
+    a study:
 
     \b
     Example:
@@ -346,8 +347,8 @@ def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, 
 def make_surrogate(
     sensor: Sensor,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="file to write, *.safetensors")],
-    paths: Annotated[int, typer.Option("--paths", metavar="N", help="solved paths to learn from, about 6 s each on one core")] = 120,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="another seed draws other paths")] = 0,
+    paths: Annotated[int, typer.Option("--paths", metavar="N", help="solved paths to train on, about 6 s each on one core")] = 120,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the sampled paths")] = 0,
     workers: Workers = CORES,
     *,
     progress: Progress,
@@ -355,11 +356,11 @@ def make_surrogate(
     """Make a fast surrogate model of a sensor's finite elements.
 
     Finite elements solve random contacts: plates, balls, cylinders, edges and prisms that press, shear, twist, roll, leave and return. The
-    surrogate is the skin at small strain with exact contact and friction at 271 nodes, and a small network for what large deformations
-    change. The network begins with that of mg400-331 and learns on. A surrogate takes about a sixtieth of the time, and less where
-    many contacts are computed together. Every fifth path is only evaluated with; the errors are printed and kept in the file.
+    surrogate is the linear skin at small strain, with exact contact and friction at 271 nodes, and a small network for the effects of
+    large deformations. Training starts from the network of mg400-331. A surrogate takes about a sixtieth of the time, and less if many
+    contacts are computed together. Every fifth path is held out; the errors on it are printed and stored in the file.
 
-    Surrogates of the shipped sensors go with the package; the environments take others by surrogate=FILE.
+    The package contains surrogates of the shipped sensors; environments take others with surrogate=FILE.
 
     \b
     Example:
@@ -380,8 +381,10 @@ def learn(
     randomise: Annotated[
         str | None, typer.Option("--randomise", metavar="R", help="domain randomisation between episodes, e.g. moves")
     ] = None,
-    surrogate: Annotated[Path | None, typer.Option("--surrogate", metavar="FILE", help="for a sensor of one's own")] = None,
-    objects: Annotated[str | None, typer.Option("--objects", callback=each_once, help="in place of the task's, commas between")] = None,
+    surrogate: Annotated[Path | None, typer.Option("--surrogate", metavar="FILE", help="surrogate model of your own sensor")] = None,
+    objects: Annotated[
+        str | None, typer.Option("--objects", callback=each_once, help="objects instead of the task's, separated by commas")
+    ] = None,
     friction_history: Annotated[
         bool,
         typer.Option("--friction-history/--no-friction-history", help="history-dependent friction; switch it off to measure its effect"),
@@ -392,19 +395,18 @@ def learn(
         typer.Option("--state-estimator/--no-state-estimator", help="first train a state estimator of place and force"),
         Formerly("sight"),
     ] = True,
-    minutes: Annotated[float, typer.Option("--minutes", min=0, callback=finite, help="most time")] = 30.0,
-    environments: Annotated[int, typer.Option("--environments", min=2, help="stepped together")] = 32,
-    fem: Annotated[int, typer.Option("--fem", min=0, metavar="N", help="episodes on finite elements in which the policy is evaluated")] = 0,
+    minutes: Annotated[float, typer.Option("--minutes", min=0, callback=finite, help="maximum time")] = 30.0,
+    environments: Annotated[int, typer.Option("--environments", min=2, help="number of environments that are stepped together")] = 32,
+    fem: Annotated[int, typer.Option("--fem", min=0, metavar="N", help="episodes with finite elements for the evaluation")] = 0,
     seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and episodes")] = 0,
     *,
     progress: Progress,
 ) -> "Learnt":
-    """Learn a policy of a task, from nothing.
+    """Train a policy of a task by reinforcement learning.
 
-    The task's environments run together on the surrogate of the sensor's finite elements, and proximal policy optimisation
-    (stable-baselines3; pip install 'tactip-twin[rl]') learns from them until 97 % of the newest 100 episodes are solved, or the time is
-    over. The policy is then evaluated on 100 other episodes, and with --fem N on N episodes of finite elements, with rasterised frames
-    through the real pipeline.
+    The task's environments run together on the surrogate model of the sensor. Proximal policy optimisation (stable-baselines3; pip install
+    'tactip-twin[rl]') trains until 97 % of the newest 100 episodes are solved, or the time is over. Then the policy is evaluated on 100
+    other episodes, and with --fem N on N episodes with finite elements and rasterised frames through the real pipeline.
 
     \b
     Writes:
@@ -422,7 +424,7 @@ def learn(
         "sensor": sensor,
         "observation": observation,
         "randomise": randomise,
-        "friction_memory": friction_history,
+        "friction_history": friction_history,
         "surrogate": surrogate,
         "objects": names_in(objects) if objects else None,
     }

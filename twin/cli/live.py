@@ -24,6 +24,7 @@ from twin.cli.options import (
     AtRest,
     Camera,
     DryRun,
+    Experiment,
     FormOrAuto,
     KnownPlace,
     Limits,
@@ -55,7 +56,7 @@ def live(
     camera: Camera = "",
     record: Annotated[Path | None, typer.Option("--record", metavar="DIR", help="new folder for the session")] = None,
     replay: Annotated[Path | None, typer.Option("--replay", metavar="DIR", help="recorded session, instead of a camera")] = None,
-    headless: Annotated[bool, typer.Option("--headless", help="show nothing, print the figures at the end")] = False,
+    headless: Annotated[bool, typer.Option("--headless", help="no page: only print the figures at the end")] = False,
     rerun: Annotated[
         str | None, typer.Option("--rerun", metavar="T", help="viewer, a new file *.rrd, or a viewer's address rerun+http://...")
     ] = None,
@@ -67,15 +68,15 @@ def live(
 ) -> "WatchResult":
     """Show a model's estimates on a camera's frames.
 
-    It shows pins, graph, Voronoi map, the pose with its 90 % interval, and rates on a page for the browser, and prints the page's address.
+    A page for the browser shows pins, graph, Voronoi map, the pose with its 90 % interval, and rates. The command prints its address.
     With --rerun (package rerun-sdk) they go to Rerun's viewer or to a file: frame, pins, graph and pose on a time line. The studio shows
-    the same in its mode 'Live', with an arm and the sensor's health beside it.
+    the same in its mode 'Live', with an arm and the sensor's health.
 
-    With --record DIR every frame is kept, lossless, with its estimate. The folder can be read even if the program was killed. --replay
-    DIR runs the model on the same frames again, and says whether the estimates are the same. With --at-rest first there must be no
-    contact at the start; the first frame is then kept with the session. Without it pins are counted from where the model knows them to be
-    at rest, or, once 40 contacts that differ have determined other places, from there, as 'twin predict' does. --also keeps the session in
-    further formats when it ends.
+    With --record DIR every frame is written, lossless, with its estimate. The folder can be read even if the program was killed. --replay
+    DIR runs the model on the same frames again, and prints whether the estimates are the same. With --at-rest first there must be no
+    contact at the start; the first frame is then written with the session. Otherwise displacements of pins are relative to the model's
+    positions at rest. After 40 different contacts these are replaced by estimated positions, as in 'twin predict'. --also writes the
+    session in further formats when it ends.
 
     A model that was trained on simulated drags also uses earlier frames and estimates slip: see 'twin predict --help', --sequence.
 
@@ -116,18 +117,16 @@ def collect(
     arm: ArmOption,
     sensor: Sensor,
     out: Out,
-    experiment: Annotated[
-        str, typer.Option("--experiment", metavar="E", help="experiment name ('twin experiments') or file")
-    ] = "surface-2d",
+    experiment: Experiment = "surface-2d",
     count: Annotated[int, typer.Option("--count", min=1, help="contacts in the folder at the end")] = 100,
-    obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the experiment's own if not given")] = None,
+    obj: Annotated[str | None, typer.Option("--object", metavar="O", help="object; the experiment's own if not given")] = None,
     servo: ServoName = "surface",
     form: FormOrAuto = None,
     safety: Limits = None,
     seed: Annotated[
         int | None, typer.Option("--seed", min=0, help="seed of the sampled contacts; the experiment's own if not given")
     ] = None,
-    design: Annotated[str, typer.Option("--design", help="random, or even (fill the ranges)")] = "random",
+    design: Annotated[str, typer.Option("--design", help="random, or even (spread over the ranges)")] = "random",
     plain_light: PlainLight = False,
     also: Also = None,
     dry_run: DryRun = False,
@@ -136,16 +135,16 @@ def collect(
 ) -> "Collected":
     """Collect labelled frames with a camera and an arm.
 
-    Each contact has a random pose and shear, a tap, and one frame. With --design even the first contacts fill the experiment's ranges
-    evenly, however many are made: choose it where each label costs time. The frame was exposed after the arm reported that it stands at the
-    commanded pose. The label is the reported pose.
+    Each contact has a random pose and shear, a tap, and one frame. With --design even the contacts are spread evenly over the
+    experiment's ranges, for any number of contacts: use it if labels are expensive. The frame is exposed after the arm has reported that it
+    stands at the commanded pose. The label is the reported pose.
 
-    The arm goes around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm goes straight and
-    stays in front of it. It lifts off between contacts; at the end it stands 50 mm away, disabled. The program does not know the arm's
-    links and the object's holder: make sure that both have room. The frame without contact is refused if the sensor seems pressed in it.
+    The arm moves around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm moves straight and
+    stays in front of it. It lifts off between contacts; at the end it stands 50 mm away, disabled. The program has no model of the arm's
+    links and the object's holder: make sure that both have room. A frame without contact is refused if it seems to show a contact.
 
-    The folder has the recordings' own format (targets.csv, frames_bw/ or images/, init_0.png without contact, meta.json). The times are in
-    contacts.jsonl. The same command continues an interrupted collection. With --also each contact is kept in further formats before the
+    The folder has the format of recordings (targets.csv, frames_bw/ or images/, init_0.png without contact, meta.json). The times are in
+    contacts.jsonl. The same command resumes an interrupted collection. With --also each contact is written in further formats before the
     next one is made.
 
     \b
@@ -208,18 +207,18 @@ def servo(
 ) -> "Followed":
     """Follow an object's outline with the sensor.
 
-    This is pose-based tactile servoing, frame by frame. By default it runs in the twin: the arm is simulated, and the frames are drawn
+    This is pose-based tactile servoing, frame by frame. By default it runs in the twin: the arm is simulated, and the frames are rendered
     for the contact at its pose. With --camera and --arm the same loop runs on devices, real or emulated.
 
-    The arm goes around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm goes straight and
-    stays in front of it. The program does not know the arm's links and the object's holder: make sure that both have room. After any
-    end, Ctrl-C included, the arm stops, retreats along the surface's normal and is disabled.
+    The arm moves around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm moves straight and
+    stays in front of it. The program has no model of the arm's links and the object's holder: make sure that both have room. At the
+    end, also after Ctrl-C, the arm stops, retreats along the surface's normal and is disabled.
 
-    Once on a round the last axis of an MG400 comes to its end. Then the sensor leaves the object by 50 mm, the axis turns back by a full
-    turn, and the sensor touches the same place again. The place is said before the arm moves.
+    Once in a round the last axis of an MG400 reaches its limit. Then the sensor leaves the object by 50 mm, the axis turns back by a full
+    turn, and the sensor touches the same place again. The command prints the place before the arm moves.
 
-    Before the arm touches anything, a frame is taken from which the model counts pins. With --at-rest none it counts them from where it
-    knows them to be at rest, or where the contacts show that they are. Models on graphs count them from the specification's layout.
+    Before the first contact a frame is taken, the zero of pin displacements. With --at-rest none the model uses its own
+    positions at rest, or those estimated from contacts. Models on graphs use the specification's layout.
 
     \b
     Example:
@@ -234,7 +233,7 @@ def servo(
     Writes to --out:
       trajectory.csv, trajectory.png
       measures.json   smoothness S as the Tac-VGNN paper defines it, path, depth
-                      and angle errors, jerk, share of the way, lost contacts;
+                      and angle errors, jerk, share of the path, lost contacts;
                       rate, latency and age of the frames
       session/        with --record; in further formats with --also
 
@@ -322,9 +321,9 @@ def run_policy(
 ) -> "Followed":
     """Run a trained policy on a camera and an arm.
 
-    The policy of 'twin learn' sees the pins of each frame, found by the live pipeline, and moves the tool. The way to the object, the frame
-    without contact, the safety layer, letting go and what is written are those of 'twin servo', and so are the options. It always waits for
-    the end of a move (it has no --stream), and counts the pins from its own first frame (it has no --at-rest). By default it runs in the
+    The policy of 'twin learn' gets the pins of each frame from the live pipeline, and moves the tool. Approach, frame without contact,
+    safety layer, retreat, files and options are those of 'twin servo'. It always waits for the end of a move (it has no --stream), and
+    displacements of pins are relative to its own first frame (it has no --at-rest). By default it runs in the
     twin. The exit code is 1 if it ended early.
 
     \b
@@ -370,7 +369,7 @@ app.add_typer(emulate, name="emulate")
 FaultOption = Annotated[
     list[str] | None, typer.Option("--fault", metavar="NAME[=VALUE]", help="switch a fault on; '--fault help' lists them; may be repeated")
 ]
-TimeScale = Annotated[float, typer.Option("--time-scale", help="how much faster than the real arm it moves", min=1e-3)]
+TimeScale = Annotated[float, typer.Option("--time-scale", help="speed relative to the real arm", min=1e-3)]
 
 
 def faults_of(wanted: list[str] | None, known: dict[str, tuple[float | None, str]]) -> tuple[str, ...]:
@@ -388,8 +387,8 @@ def mg400(
     host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
     port_offset: Annotated[int, typer.Option("--port-offset", help="added to 29999 and 30003 to 30006")] = 0,
     fault: FaultOption = None,
-    firmware: Annotated[str, typer.Option("--firmware", help="version to behave like; below 1.5.6 it answers bare echoes")] = "1.7.0",
-    lenient: Annotated[bool, typer.Option("--lenient", help="as firmware 1.5.5: bare echoes, no reply to moves")] = False,
+    firmware: Annotated[str, typer.Option("--firmware", help="emulated version; below 1.5.6 replies are bare echoes")] = "1.7.0",
+    lenient: Annotated[bool, typer.Option("--lenient", help="like firmware 1.5.5: bare echoes, no reply to moves")] = False,
     time_scale: TimeScale = 1.0,
 ) -> None:
     """Emulate a Dobot MG400 on its network ports.
@@ -446,7 +445,7 @@ def camera(
 ) -> None:
     """Emulate the sensor's camera as a stream over HTTP.
 
-    The stream of JPEGs shows the contact at the pose of an emulated arm. The pose comes from the arm's feedback ports, so camera and arm
+    The stream of JPEGs shows the contact at the pose of an emulated arm. It reads the pose from the arm's feedback ports, so camera and arm
     may run in different processes.
 
     \b

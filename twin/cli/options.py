@@ -44,8 +44,10 @@ QUALITY = "rasterised without noise, or path-traced with more and more samples"
 Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
 Object = Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder to write to; made if missing")]
-Force = Annotated[bool, typer.Option("--force", help="write over files that this program did not write")]
+Force = Annotated[bool, typer.Option("--force", help="overwrite files that this program did not write")]
 FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; found from size and content if not given")]
+Experiment = Annotated[str, typer.Option("--experiment", metavar="E", help="how contacts are made: a name ('twin experiments') or a file")]
+MaxFrames = Annotated[int, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")]
 Residual = Annotated[bool, typer.Option("--residual", help="add the sensor's residual network")]
 Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch finds one), cpu or cuda")]
 
@@ -67,8 +69,8 @@ def finite(value: float | None) -> float | None:
     return value
 
 
-Target = Annotated[str, typer.Option("--target", callback=each_once, help="preset, or label columns with commas between")]
-Split = Annotated[int, typer.Option("--split", min=-1, max=MOST_SEED, help="seed of the fifth kept out of training; -1: none")]
+Target = Annotated[str, typer.Option("--target", callback=each_once, help="preset, or label columns separated by commas")]
+Split = Annotated[int, typer.Option("--split", min=-1, max=MOST_SEED, help="seed of the held-out fifth; -1: nothing is held out")]
 Threads = Annotated[int | None, typer.Option("--threads", min=1, max=MOST_THREADS, help="CPU threads")]
 Workers = Annotated[int, typer.Option("--workers", min=1, metavar="N", show_default="one for each core", help="processes on this machine")]
 Pair = tuple[float, float]
@@ -78,7 +80,7 @@ NoContact = Annotated[
     Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, if it is not init_0.png beside the frames")
 ]
 Tuning = Annotated[
-    Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="pin detection that 'twin tune' wrote, instead of the sensor's own")
+    Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="pin detection of 'twin tune', instead of the sensor's own")
 ]
 # Sensor whose trained weights are shipped with the package.
 SHIPPED_MODEL = Path("mg400-331")
@@ -86,7 +88,7 @@ Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a numb
 Steps = Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")]
 Record = Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")]
 NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")]
-KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stands where --servo says, so measure against it")]
+KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stands exactly at --servo: measure errors against it")]
 ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS, magician:PORT")]
 
 
@@ -94,10 +96,10 @@ ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, s
 AlsoFormat = StrEnum("AlsoFormat", {"LEROBOT": "lerobot", "HUGGINGFACE": "huggingface", "MCAP": "mcap"})
 Also = Annotated[
     list[AlsoFormat] | None,
-    typer.Option("--also", help="keep it in this format, too, in a subfolder of that name; may be repeated ('twin convert --help')"),
+    typer.Option("--also", help="also write this format, in a subfolder of that name; may be repeated ('twin convert --help')"),
 ]
-PlainLight = Annotated[bool, typer.Option("--plain-light", help="draw the twin's frames with direct light alone, without path tracing")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, and move nothing")]
+PlainLight = Annotated[bool, typer.Option("--plain-light", help="render the twin's frames with direct light alone, without path tracing")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, without motion")]
 ServoName = Annotated[str, typer.Option("--servo", help="gains, speeds and the object's place: a name, or a TOML file")]
 Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, or a TOML file"), Formerly("limits")]
 AtRest = Annotated[
@@ -105,8 +107,8 @@ AtRest = Annotated[
     typer.Option(
         "--at-rest",
         metavar="FRAME|first|none",
-        help="frame without contact that pins are counted from: a file, the first frame (an error if the sensor is pressed in it), "
-        "or none (the places that the model knows, or that are estimated from some forty contacts)",
+        help="frame without contact, the zero of displacements: a file, the first frame (an error if it shows a contact), "
+        "or none (positions at rest of the model, or estimated from some forty contacts)",
     ),
 ]
 

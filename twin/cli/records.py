@@ -18,32 +18,32 @@ Format = Literal["recording", "lerobot", "huggingface", "mcap"]
 
 @app.command("convert")
 def convert_command(
-    sources: Annotated[list[Path], typer.Argument(metavar="SOURCE...", help="recordings, sessions, or translated records")],
+    sources: Annotated[list[Path], typer.Argument(metavar="SOURCE...", help="recordings, sessions, or converted records")],
     to: Annotated[Format, typer.Option("--to", metavar="FORMAT", help="recording, lerobot, huggingface or mcap")],
     out: Out,
     sensor: Annotated[
-        str | None, typer.Option("--sensor", metavar="S", help="sensor whose pins are found; a source's own if not given")
+        str | None, typer.Option("--sensor", metavar="S", help="sensor for the pin detection; by default that of a source")
     ] = None,
-    task: Annotated[str, typer.Option("--task", metavar="TEXT", help="what the episodes do; by default what each source says")] = "",
+    task: Annotated[str, typer.Option("--task", metavar="TEXT", help="task of the episodes; by default that of each source")] = "",
     video: Annotated[bool, typer.Option("--video", help="with lerobot: pictures as video, which loses detail")] = False,
     *,
     progress: Progress,
 ) -> "Converted":
-    """Translate records to other tools' formats, and back.
+    """Convert records to other tools' formats, and back.
 
-    A SOURCE is a recording, a simulated data set, a collection, the session of 'twin live --record' or 'twin servo --record', or what this
-    command wrote. One contact path, or one round of a servo, is one episode.
+    A SOURCE is a recording, a simulated data set, a collection, the session of 'twin live --record' or 'twin servo --record', or the output
+    of this command. One contact path, or one round of a servo, is one episode.
 
     \b
-    --to recording    pictures with targets.csv, as this program reads everywhere
+    --to recording    pictures with targets.csv, which every command here reads
          lerobot      LeRobotDataset v3; pictures lossless (PNG), or with --video
-         huggingface  pictures with metadata, as 'imagefolder' and the viewer read
+         huggingface  pictures with metadata, for 'imagefolder' and the viewer
          mcap         a file with ROS 2 messages for each episode
 
-    Every format holds the picture, the time, and as far as the source knows them pins, pose, move, wrench, estimate and action. Pins are
+    Every format contains the picture, the time, and, if the source has them, pins, pose, move, wrench, estimate and action. Pins are
     found in the pictures if the source has none and its sensor is known. docs/records.md has names, units, frames and axes.
 
-    The same command resumes after any end, and adds what is new: several rounds become one data set. Episodes that are there already are
+    After an interruption the same command resumes. It also adds new sources: several rounds become one data set. Existing episodes are
     not written again.
 
     \b

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @app.command("sensors")
 def sensors() -> None:
-    """List the sensors, and where to put one's own.
+    """List the sensors, and the folder for your own.
 
     \b
     Example:
@@ -37,7 +37,7 @@ def sensors() -> None:
 
 @app.command("objects")
 def objects() -> None:
-    """List the objects, and where to put one's own.
+    """List the objects, and the folder for your own.
 
     \b
     Example:
@@ -50,9 +50,9 @@ def objects() -> None:
 
 @app.command("experiments")
 def experiments() -> None:
-    """List the experiments, and where to put one's own.
+    """List the experiments, and the folder for your own.
 
-    An experiment says which contacts are made, in the robot's coordinates.
+    An experiment defines the contacts, in the robot's coordinates.
 
     \b
     Example:
@@ -65,7 +65,7 @@ def experiments() -> None:
 
 @app.command("randomisations")
 def randomisations() -> None:
-    """List the randomisations, and where to put one's own.
+    """List the randomisations, and the folder for your own.
 
     A randomisation (domain randomisation) is the distribution of the quantities that vary between simulated frames.
 
@@ -80,10 +80,10 @@ def randomisations() -> None:
 
 @app.command("doctor", exit_code=lambda machine: 0 if machine.can_render else 1)
 def doctor() -> "Machine":
-    """Say what is there and what is missing, with the remedy.
+    """Check this machine, and list what is missing, with the remedy.
 
-    It looks at packages, Mitsuba's variants (and which one is used, and why), LLVM, GPU, offscreen 3D, cameras and serial ports. The
-    exit code is 1 if nothing can be rendered on this machine.
+    It checks packages, Mitsuba's variants (with the one that is used, and why), LLVM, GPU, offscreen 3D, cameras and serial ports. The
+    exit code is 1 if this machine cannot render.
 
     \b
     Example:
@@ -96,7 +96,7 @@ def doctor() -> "Machine":
 
 @app.command("demo")
 def demo(out: Out = Path("out/demo"), *, progress: Progress) -> "Demo":
-    """Run the whole chain on shipped sensors, as one page.
+    """Run the whole pipeline on shipped sensors, as one page.
 
     It presses, renders, finds pins and builds graphs for several sensors and objects. It writes pictures and a page (index.html).
 
@@ -131,7 +131,7 @@ def render_contact_command(
     """Press an object against a sensor and render the frame.
 
     The pose is the OBJECT's, relative to the sensor. The image shows the sensor's x to the right and y down; z points out of
-    the tip at the object. Angles turn right-handed about those axes.
+    the tip towards the object. Angles are right-handed about these axes.
 
     \b
             image                        side view (y towards you)
@@ -144,23 +144,23 @@ def render_contact_command(
               towards the object)            object             v z
 
     \b
-    --indent-mm D     object pushed by D along -z, counted from first touch
+    --indent-mm D     object moved by D along -z, from first touch
     --tilt-deg RX RY  object first turned about x by RX, then about y by RY,
                       through the tip: RX > 0 brings the object closer where
                       y < 0, RY > 0 where x > 0
-    --shear-mm X Y    then dragged by X along x and Y along y (+X drags the pins
+    --shear-mm X Y    then moved by X along x and Y along y (+X drags the pins
                       right, +Y drags them down)
     --twist-deg RZ    and turned about z by RZ (RZ > 0 turns the pins from x to y,
                       clockwise in the image)
-    --offset-mm X Y   where on the object it is touched: the object is shifted by
-                      this before it approaches
+    --offset-mm X Y   point of contact on the object: the object is shifted by
+                      this before the approach
 
     \b
     Writes:
       frame.png    the frame
       frame.exr    linear light on the whole raw frame
       truth.npz    caps_mm, caps_px, rest_px, visible: one row a pin, in the
-                   specification's order; places, normals and forces of the
+                   specification's order; positions, normals and forces of the
                    contact
       truth.json   force_n of the skin on the object in the sensor's axes (z > 0
                    when pressed), torque_nmm about the sensor's origin, area_mm2,

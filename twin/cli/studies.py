@@ -51,7 +51,7 @@ OBJECTS = "can,mesh-can,square,prism,tin-box"
 def study_servo_command(
     models: Annotated[list[Path], typer.Option("--model", metavar="RUN", help="folder of a training run; give it once for each model")],
     out: Out,
-    objects: Annotated[str, typer.Option("--objects", callback=each_once, help="names with commas between")] = OBJECTS,
+    objects: Annotated[str, typer.Option("--objects", callback=each_once, help="names separated by commas")] = OBJECTS,
     servo: ServoName = "surface",
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="steps on each object, instead of once around it")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")] = 0,
@@ -61,7 +61,7 @@ def study_servo_command(
 ) -> "ServoStudy":
     """Follow the Tac-VGNN paper's five objects with each model.
 
-    It runs in the twin, and compares how well the models follow.
+    It runs in the twin, and compares the errors of the models.
 
     \b
     Example:
@@ -92,14 +92,14 @@ UNSEEN = "cylinder,edge"
 def study_objects(
     sensor: Sensor,
     out: Out,
-    train: Annotated[str, typer.Option("--train", help="objects to train on, with commas between; the first also alone")] = TRAIN,
-    unseen: Annotated[str, typer.Option("--unseen", help="objects never trained on, with commas between")] = UNSEEN,
-    count: Annotated[int, typer.Option("--count", min=2, metavar="N", help="contacts of each object to train on")] = 100,
-    tests: Annotated[int, typer.Option("--tests", min=1, metavar="N", help="other contacts of each object to evaluate on")] = 50,
+    train: Annotated[str, typer.Option("--train", help="training objects, separated by commas; the first also alone")] = TRAIN,
+    unseen: Annotated[str, typer.Option("--unseen", help="unseen objects, separated by commas")] = UNSEEN,
+    count: Annotated[int, typer.Option("--count", min=2, metavar="N", help="training contacts of each object")] = 100,
+    tests: Annotated[int, typer.Option("--tests", min=1, metavar="N", help="held-out contacts of each object for the evaluation")] = 50,
     experiment: Annotated[
-        str, typer.Option("--experiment", metavar="E", help="contacts to evaluate on ('twin experiments')")
+        str, typer.Option("--experiment", metavar="E", help="contacts for the evaluation ('twin experiments')")
     ] = "objects-2d",
-    randomise: Annotated[str, typer.Option("--randomise", metavar="R", help="randomisation ('twin randomisations')")] = "moves",
+    randomise: Annotated[str, typer.Option("--randomise", metavar="R", help="domain randomisation ('twin randomisations')")] = "moves",
     seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the contacts and the weights")] = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of both trainings, instead of the study's own")] = None,
     workers: Workers = CORES,
@@ -114,15 +114,15 @@ def study_objects(
       twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod \\
           --unseen cylinder,edge --out out/objects
 
-    Two models learn from the same number of contacts that are simulated in the twin (pins alone, every state on their way). 'mixed' learns
-    from --count contacts of each object of --train, the other from the first of these objects alone. Both are evaluated on --tests other
-    contacts of every object, including the objects of --unseen.
+    Two models are trained on the same number of simulated contacts (pins alone, every state on the path). 'mixed' is trained
+    on --count contacts of each object of --train, the other on the first of these objects alone. Both are evaluated on --tests held-out
+    contacts of every object, including the unseen objects (--unseen).
 
-    Labels mean the same on every object. The depth is the indentation along the surface's normal at the place nearest to the dome's
-    centre, and the angle is measured from this normal, as if a flat plate were touched there. --experiment gives the ranges in which the
+    Labels have the same meaning on every object. The depth is the indentation along the surface's normal at the point nearest to the dome's
+    centre, and the angle is measured from this normal, as on a flat plate. --experiment gives the ranges in which the
     models are evaluated; they are trained on its wider ranges.
 
-    The same command continues an interrupted study. The run that learnt several objects can be given wherever a RUN is asked for:
+    The same command resumes an interrupted study. Every command that takes a RUN takes the run that was trained on several objects:
 
     \b
     Example:
@@ -157,52 +157,51 @@ def study_sim_to_real(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled real recording")],
     out: Out,
-    num_labelled: Annotated[
-        int, typer.Option("--num-labelled", min=8, metavar="N", help="labelled frames beside the simulated ones"), Formerly("labels")
-    ] = 40,
+    num_labelled: Annotated[int, typer.Option("--num-labelled", min=8, metavar="N", help="labelled real frames"), Formerly("labels")] = 40,
     seed: Annotated[
-        int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the rasterised frames, the contacts and the weights")
+        int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the choice of frames, the contacts and the weights")
     ] = 0,
-    experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how the frames were recorded")] = "surface-2d",
+    experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="experiment of the recording")] = "surface-2d",
     contacts: Annotated[
         str | None,
-        typer.Option("--contacts", metavar="E", help="experiment to simulate; if not given, one wider than the frames' own"),
+        typer.Option("--contacts", metavar="E", help="experiment to simulate; by default one wider than --experiment"),
     ] = None,
-    draws: Annotated[int, typer.Option("--draws", min=1, help="draws of the learnt difference of the pins, for each contact")] = 2,
+    draws: Annotated[int, typer.Option("--draws", min=1, help="samples of the pins' discrepancy for each contact")] = 2,
     count: Annotated[int, typer.Option("--count", min=10, metavar="N", help="contacts to simulate")] = 500,
     sim: Annotated[
         list[Path] | None,
-        typer.Option("--sim", metavar="DIR", exists=True, file_okay=False, help="simulated data set instead; several are joined"),
+        typer.Option("--sim", metavar="DIR", exists=True, file_okay=False, help="existing simulated data set; several are joined"),
     ] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
-    ablate: Annotated[bool, typer.Option("--ablate", help="also train without one ingredient at a time")] = False,
+    ablate: Annotated[bool, typer.Option("--ablate", help="also train without one ingredient at a time (ablation)")] = False,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of every training, instead of the model's own")] = None,
     workers: Workers = CORES,
     elements: Elements = FINE,
     *,
     progress: Progress,
 ) -> "sim_to_real.SimToRealResult":
-    """Train in the twin or on real frames, test on real ones.
+    """Train in the twin or on real frames, evaluate on real ones.
 
     \b
     Example:
       twin study sim-to-real --sensor mg400-331 --frames DIR --num-labelled 40 \\
           --seed 0 --out out/sim-to-real
 
-    --experiment says how the arm moved in the recording and what is learnt; --contacts is the experiment that is simulated.
+    --experiment is the experiment of the recording, with its labels; --contacts is the experiment that is simulated.
 
     First, --num-labelled real frames are sampled at random from four fifths of the recording. The friction of the simulated contacts is
-    drawn from the friction found on these frames. The difference between the twin's pins and the real pins on these frames is learnt as a
-    Gaussian process of the label, and drawn --draws times for every simulated contact. With --calibrate the specification is fitted to
-    these frames first ('twin calibrate contact'; about an hour). All models are evaluated on the remaining fifth:
+    sampled from the friction of these frames (domain randomisation). A Gaussian process of the label is fitted to the discrepancy between
+    the twin's pins and the real pins on these frames, and sampled --draws times for every simulated contact. With --calibrate the
+    specification is fitted to these frames first ('twin calibrate contact'; about an hour). All models are evaluated on the held-out fifth:
 
     \b
       simulated            vgnn trained on simulated contacts alone (steered, if
-                           a label goes round the whole circle); its 90 %
+                           a label is a direction on the whole circle); its 90 %
                            intervals are calibrated on the labelled frames
       simulated and real   the same, averaged with a Gaussian process of the pins
-                           of both simulated contacts and labelled frames;
-                           also the twin that is read, with 0 to 500 frames
+                           of both simulated contacts and labelled frames
+                           (co-kriging); also model inversion, with 0 to 500
+                           labelled frames
       ..., N without labels
                            vgnn or steered, trained on the labelled frames and on
                            N others, whose labels model inversion estimates
@@ -211,7 +210,7 @@ def study_sim_to_real(
       ..., even            the same with frames that are nearest to an even
                            sequence ('twin collect --design even')
       --ablate             also models trained on simulated contacts with one
-                           change each: without the learnt difference of the pins,
+                           change each: without the discrepancy of the pins,
                            with a fifth of the contacts, a coarse mesh, one
                            friction, any friction, no moves, sampled tolerances of
                            skin and gel, and without calibration; this simulates
@@ -219,7 +218,7 @@ def study_sim_to_real(
 
     The contacts are simulated in --out/sim, without pictures. With --sim finished data sets of 'twin dataset' or 'twin study objects'
     are used instead (give it once for each). If a data set has pictures, the pins are those that the pipeline finds in them. The same
-    command continues an interrupted study.
+    command resumes an interrupted study.
 
     Writes to --out: sim_only/, sim_plus_real/, sim_taught/ and real_N/, each a RUN; study.csv and index.html.
     """
@@ -253,19 +252,19 @@ def study_tac_vgnn(
     data: Annotated[Path, typer.Option("--data", metavar="DIR", help="labelled recording")],
     sensor: Sensor,
     out: Out,
-    models: Annotated[str, typer.Option("--models", help="names with commas between")] = MODELS,
-    seeds: Annotated[str, typer.Option("--seeds", help="seeds of weights and order, with commas between")] = "0",
+    models: Annotated[str, typer.Option("--models", help="names separated by commas")] = MODELS,
+    seeds: Annotated[str, typer.Option("--seeds", help="seeds of weights and order, separated by commas")] = "0",
     label_kind: Annotated[
         str, typer.Option("--label-kind", help="labels to train on: raw (as in the paper) or corrected"), Formerly("labels")
     ] = "raw",
     target: Target = "surface-2d",
-    split: Annotated[int, typer.Option("--split", min=0, max=MOST_SEED, help="seed of the fifth kept out of training")] = 0,
+    split: Annotated[int, typer.Option("--split", min=0, max=MOST_SEED, help="seed of the held-out fifth")] = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of training, instead of each model's own number")] = None,
     max_minutes: Annotated[
-        float | None, typer.Option("--max-minutes", min=0, callback=finite, help="time for all training together")
+        float | None, typer.Option("--max-minutes", min=0, callback=finite, help="time for all trainings together")
     ] = None,
     batches: Annotated[
-        str, typer.Option("--batches", help="batch sizes of the efficiency figure, with commas between; empty: no figure")
+        str, typer.Option("--batches", help="batch sizes of the efficiency figure, separated by commas; empty: no figure")
     ] = "64,256,512",
     contacts: Annotated[bool, typer.Option("--contacts/--no-contacts", help="press and render the contacts of the area figure")] = True,
     device: Device = "auto",
@@ -276,7 +275,7 @@ def study_tac_vgnn(
 ) -> "tac_vgnn.TacVgnnResult":
     """Repeat the Tac-VGNN paper's comparison on a recording.
 
-    It compares graphs, models and training efficiency, and shows how the Voronoi areas depend on the depth of a contact.
+    It compares graphs, models and training efficiency, and shows the dependence of the Voronoi areas on depth.
 
     \b
     Example:
@@ -284,11 +283,11 @@ def study_tac_vgnn(
           --max-minutes 120
 
     The models (--models) are gnn, tac-vgnn, tac-vgnn-release, cnn-v1, cnn-v2, and this project's vgnn. vgnn-without-graph,
-    vgnn-without-modes and vgnn-without-kernel show what each part of vgnn contributes.
+    vgnn-without-modes and vgnn-without-kernel are ablations of vgnn.
 
-    All models are trained on the same rows and labels, and evaluated on the same fifth. Each run is a folder below --out/runs as 'twin
-    train' writes it. The same command continues an interrupted study, so a study may be spread over several days. --max-minutes is shared
-    evenly among the runs that are still to do. A run that this time ended is reported as ended early.
+    All models are trained on the same rows and labels, and evaluated on the same held-out fifth. Each run is a folder below --out/runs, as
+    'twin train' writes it. The same command resumes an interrupted study, so a study may take several days. --max-minutes is divided
+    evenly among the remaining runs. A run that this limit stopped is reported as ended early.
 
     \b
     Writes to --out: models.csv, graphs.csv, efficiency.csv, contacts.csv,

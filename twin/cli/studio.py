@@ -20,16 +20,18 @@ def studio(
     sensor: Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")] = "mg400-331",
     obj: Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")] = "sphere",
     state: Annotated[
-        str | None, typer.Option("--state", metavar="FILE", help="a state that the page has saved, or a link to one, instead of both")
+        str | None, typer.Option("--state", metavar="FILE", help="a state saved by the page, or its link, instead of sensor and object")
     ] = None,
     model: Annotated[
         Path | None, typer.Option("--model", metavar="RUN", help="folder of a run for its sensor; shipped weights if not given")
     ] = None,
     recording: Annotated[str, typer.Option("--recording", metavar="DIR", help="recording for the mode 'Recording'")] = "",
     camera: Annotated[str, typer.Option("--camera", metavar="C", help="camera for the mode 'Live', as 'twin live' takes it")] = "",
-    arm: Annotated[str, typer.Option("--arm", metavar="A", help="arm for the mode 'Live'; read only until the page arms it")] = "",
-    saves: Annotated[Path, typer.Option("--saves", metavar="DIR", help="folder for what the page saves")] = Path("out/studio"),
-    host: Annotated[str, typer.Option("--host", help="address to listen on; another one than this machine's is warned of")] = "127.0.0.1",
+    arm: Annotated[
+        str, typer.Option("--arm", metavar="A", help="arm for the mode 'Live'; it does not move until you arm it on the page")
+    ] = "",
+    saves: Annotated[Path, typer.Option("--saves", metavar="DIR", help="folder for files that the page saves")] = Path("out/studio"),
+    host: Annotated[str, typer.Option("--host", help="address to listen on; a warning if other machines can reach it")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=1, max=65535, help="port of the page; the next free one if it is taken")] = 8090,
     plain: Annotated[bool, typer.Option("--plain", help="no path tracing: pictures stay rasterised")] = False,
     seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="end after this time")] = None,
@@ -37,19 +39,20 @@ def studio(
     """Move an object over the skin, on a page in the browser.
 
     Drag the object with the arrows and rings of the gizmo, or use sliders, typed numbers or keys (shift and arrows, page up and page down;
-    with ctrl they turn it; 'ctrl + K' lists all). At once the page shows the skin with its pins, the camera's picture, the pins found and
-    their Voronoi cells, force and torque, and the model's estimate with its 90 % interval beside the truth.
+    with ctrl they turn it; 'ctrl + K' lists all). The page immediately shows the skin with its pins, the camera's picture, the detected
+    pins and their Voronoi cells, force and torque, and the model's estimate with its 90 % interval beside the ground truth.
 
     While the object moves, contacts are solved on the usual mesh and pictures are rasterised. When it stands still, the picture is
-    path-traced and the contact is solved again on a fine mesh. The page says which of them it shows. Where the object may not go, it stops,
-    and the page says why.
+    path-traced and the contact is solved again on a fine mesh. The page shows which of them it displays. The object stops at its limits,
+    and the page shows the reason.
 
-    Other modes: Degrade (what the pipeline and the model tolerate on this contact), Recording (labels against estimates), Live (camera and
-    arm), Your own sensor (a specification from a folder of frames, as 'twin new' makes it, with the layout drawn over them and corrected).
+    Other modes: Degrade (the severity that the pipeline and the model tolerate on this contact), Recording (labels against estimates),
+    Live (camera and arm), Your own sensor (a specification from a folder of frames, as 'twin new' makes it, with the layout over the
+    frames).
 
-    The page's folder 'Save' shows a link that opens the whole state again, in a browser while the studio runs, or with --state.
+    The page's folder 'Save' shows a link that opens the complete state again, in a browser while the studio runs, or with --state.
 
-    The page is served for this machine alone, loads nothing from elsewhere, and several browsers see the same state. Ctrl-C ends it.
+    Only this machine can open the page, and the page loads nothing from other servers. All browsers show the same state. Ctrl-C ends it.
 
     \b
     Example:

@@ -13,8 +13,8 @@ from twin.frames.forms import form_named
 from twin.mechanics.path import ContactPose
 from twin.one_contact import look_at
 from twin.pins.graph import make_graph
-from twin.pins.reference import nominal_reference
-from twin.progress import Step
+from twin.pins.labelling.reference import nominal_reference
+from twin.progress import Step, unheard
 from twin.report.plots import ObservedFrame
 from twin.simulator import RenderedFrame, Simulator
 from twin.types import ContactState, Form
@@ -67,7 +67,7 @@ class ContactResult:
     seconds: dict[str, float]
 
 
-def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form: Form, *, progress: Step | None = None) -> ContactResult:
+def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form: Form, *, progress: Step = unheard) -> ContactResult:
     """Press, render, capture, detect, and build the graph, for one contact."""
     form, timed = form_named(form), Timed()
     state = timed.run("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
@@ -89,7 +89,7 @@ class DepthRow:
     force_n: float
 
 
-def depth_table(sensor: str, *, progress: Step | None = None) -> list[DepthRow]:
+def depth_table(sensor: str, *, progress: Step = unheard) -> list[DepthRow]:
     """Press a plane to the four depths of the recordings' table (true caps, no rendering)."""
     spec = load_sensor(sensor)
     simulator = Simulator(spec)
@@ -105,6 +105,5 @@ def depth_table(sensor: str, *, progress: Step | None = None) -> list[DepthRow]:
         change = 100 * float(np.mean(areas[middle] / rest_area_px2[middle]) - 1)
         moved = float(np.hypot(*(caps_px - rest_px).T).mean())
         rows.append(DepthRow(indent_mm, moved, measured_px, change, float(state.force_n[2])))
-        if progress:
-            progress((number + 1) / len(TABLE_INDENTS_MM))
+        progress((number + 1) / len(TABLE_INDENTS_MM))
     return rows

@@ -7,5 +7,3 @@ It reads the folder formats of the sensor's users: ``frames_bw/`` with ``init_0.
 from twin.frames.folders import distinct_stems, natural_key
 from twin.frames.images import read_image
 from twin.frames.recording import Recording, evenly_read, frames_at, open_recording, spread_indices
-
-__all__ = ["Recording", "distinct_stems", "evenly_read", "frames_at", "natural_key", "open_recording", "read_image", "spread_indices"]

@@ -51,7 +51,7 @@ def odd_entries(folder: Path) -> list[str]:
         try:
             require_regular(path)
         except OSError as error:
-            reason = "a link to nothing" if path.is_symlink() and isinstance(error, FileNotFoundError) else error.strerror
+            reason = "a broken link" if path.is_symlink() and isinstance(error, FileNotFoundError) else error.strerror
             found.append(f"{path.name}: {reason}; left out")
     return found
 
@@ -105,7 +105,7 @@ def the_video_in(path: Path) -> Path:
     if videos:
         raise FrameError(f"{path}: {len(videos)} videos here ({_some(path, videos)}); give one of them")
     if deeper := _deeper_folders(path):
-        raise FrameError(f"{path}: no pictures here, but deeper down ({_some(path, deeper)}); give the folder that they lie in")
+        raise FrameError(f"{path}: no pictures here, but in folders below ({_some(path, deeper)}); give the folder of the pictures")
     if references_in(path):
         raise FrameError(f"{path}: no frames (only no-contact references, init_*); give a folder of frames")
     suffixes = ", ".join(sorted(s[1:] for s in IMAGE_SUFFIXES))

@@ -151,7 +151,7 @@ def _decode_picture(data: bytes) -> tuple[np.ndarray, str]:
         raise FrameError(f"damaged ({fault[0]}); copy it again, or leave it out")
     odd = [NOT_TURNED.format(f"EXIF {orientation}")] if orientation != UPRIGHT else []
     if extra := ADDED_BYTES.search(said[0]):
-        odd.append(f"holds {extra[1]} bytes that belong to no part of it: damaged, or of a camera that adds some; look at its pins")
+        odd.append(f"contains {extra[1]} extra bytes: it is damaged, or the camera adds such bytes; check its pins")
     return image, "; ".join(odd)
 
 

@@ -33,7 +33,7 @@ COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 """Columns of whole numbers that LeRobot adds itself."""
 NUMBERS = ("float", "int", "uint", "bool")
 """Beginnings of the type names of numeric features, which become labels."""
-DAMAGED = "give the data set whole, as it was written"
+DAMAGED = "give the complete data set"
 Episode = dict[str, Any]
 
 

@@ -158,35 +158,24 @@ class Recording:
 
     def _read_chosen(self, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
         """Index and frame, or the reason why it can't be read, of chosen frames of any source."""
-        if self._dataset is not None:
-            return self._dataset_frames(self._dataset, chosen)
-        return self._video_frames(self._video, chosen) if self._video is not None else self._pictures(chosen)
-
-    def _dataset_frames(self, dataset: LeRobotFrames, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
-        """Index and frame, or the reason why it can't be read, of chosen frames of a LeRobot data set."""
-        for index, image in dataset.frames(chosen):
-            try:
-                yield index, image if isinstance(image, str) else self._frame(image, index)
-            except FrameError as error:
-                yield index, str(error)
-
-    def _pictures(self, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
-        """Index and frame, or the reason why it can't be read, of chosen pictures."""
-        for index in sorted(chosen):
-            try:
-                yield index, self.read(index)
-            except FrameError as error:
-                yield index, str(error)
-
-    def _video_frames(self, video: Video, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
-        """Index and frame, or the reason why it can't be read, of chosen frames of a video."""
-        for index, time_s, image in video.frames():
-            if index not in chosen:
-                continue
+        for index, image, time_s in self._images(chosen):
             try:
                 yield index, image if isinstance(image, str) else self._frame(image, index, time_s)
             except FrameError as error:
                 yield index, str(error)
+
+    def _images(self, chosen: Collection[int]) -> Iterator[tuple[int, np.ndarray | str, float]]:
+        """Index, picture, or the reason why it can't be read, and time (s) of chosen frames, in order."""
+        if self._dataset is not None:
+            yield from ((index, image, 0.0) for index, image in self._dataset.frames(chosen))
+        elif self._video is not None:
+            yield from ((index, image, time_s) for index, time_s, image in self._video.frames() if index in chosen)
+        else:
+            for index in sorted(chosen):
+                try:
+                    yield index, self._image(self._files[index]), 0.0
+                except FrameError as error:
+                    yield index, str(error), 0.0
 
     def take_reference(self, candidates: list[Path]) -> None:
         """Use the first readable picture of the frames' size as the no-contact frame."""
@@ -327,7 +316,7 @@ def open_recording(
 def _open_with_table(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
     """The recording at ``path``, with the table and the other files that lie beside its frames."""
     if not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
-        link = "a link to nothing" if os.path.islink(path) else "no such file or folder"
+        link = "a broken link" if os.path.islink(path) else "no such file or folder"
         raise FrameError(f"{quote(path, LONGEST_PATH)}: {link}; give a picture, a folder of frames, a recording or a video")
     if path.is_dir() and is_lerobot(path):
         return _open_dataset(path, known, form, table)

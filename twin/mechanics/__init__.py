@@ -5,5 +5,3 @@ from twin.mechanics.batch import ContactJob, ContactOutcome, press_many
 from twin.mechanics.law import ContactLaw
 from twin.mechanics.path import ContactPath, ContactPose
 from twin.mechanics.solver import SkinSolver
-
-__all__ = ["ContactJob", "ContactLaw", "ContactOutcome", "ContactPath", "ContactPose", "Friction", "SkinSolver", "press_many"]

@@ -1,5 +1,3 @@
 """Objects as signed-distance fields, in the object frame: the sensor touches the origin first, and z points into the object."""
 
 from twin.objects.build import ObjectField, build_field
-
-__all__ = ["ObjectField", "build_field"]

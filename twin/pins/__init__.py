@@ -5,36 +5,10 @@ the condition of a sensor from a few of its frames.
 """
 
 from twin.pins.check import Finding, Grade, examine
-from twin.pins.detector import Detector, Found, make_detector
-from twin.pins.detector_spec import METHODS, DetectorSpec, load_detector, shipped_detector, with_detector, write_detector
+from twin.pins.detectors.detector import Detector, Found, make_detector
+from twin.pins.detectors.detector_spec import METHODS, DetectorSpec, load_detector, shipped_detector, with_detector, write_detector
+from twin.pins.detectors.tune import Tuned, tune
 from twin.pins.graph import make_graph, node_features
+from twin.pins.labelling.reference import Reference, make_reference, nominal_reference
+from twin.pins.labelling.view import PinView, view_of
 from twin.pins.pipeline import Pipeline, measure_reference
-from twin.pins.reference import Reference, make_reference, nominal_reference
-from twin.pins.tune import Tuned, tune
-from twin.pins.view import PinView, view_of
-
-__all__ = [
-    "Detector",
-    "DetectorSpec",
-    "Finding",
-    "Found",
-    "Grade",
-    "METHODS",
-    "Pipeline",
-    "Reference",
-    "Tuned",
-    "PinView",
-    "examine",
-    "load_detector",
-    "make_detector",
-    "make_graph",
-    "make_reference",
-    "measure_reference",
-    "node_features",
-    "nominal_reference",
-    "shipped_detector",
-    "tune",
-    "view_of",
-    "with_detector",
-    "write_detector",
-]

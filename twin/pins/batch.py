@@ -1,6 +1,6 @@
 """The pipeline applied to a whole recording. The results are files in a folder: pins, a summary, and pictures of the found pins."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
@@ -15,9 +15,10 @@ from twin.frames import Recording, open_recording
 from twin.frames.forms import blob_spec, gray_levels
 from twin.frames.images import write_image
 from twin.frames.recording import BadFrame
+from twin.pins.labelling.reference import Reference, nominal_reference
+from twin.pins.labelling.view import view_of
 from twin.pins.pipeline import Pipeline, measure_reference
-from twin.pins.reference import Reference, nominal_reference
-from twin.pins.view import view_of
+from twin.progress import Step, unheard
 from twin.store import made_by, write_json, write_npz, writes
 from twin.types import Form, Frame, Observation, ReadableResult
 
@@ -106,7 +107,7 @@ def preprocess_recording(
     out_dir: str | Path,
     form: Form | None = None,
     overlay: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Step = unheard,
 ) -> Preprocessed:
     """Observe every frame of a recording and write ``pins.npz``, ``summary.json`` and, with ``overlay``, the pictures ``overlay/``.
 
@@ -167,7 +168,7 @@ def preprocess_recording(
 
 
 def _observe_frames(
-    recording: Recording, pipeline: Pipeline, pictures_dir: Path | None, progress: Callable[[int, int], None] | None
+    recording: Recording, pipeline: Pipeline, pictures_dir: Path | None, progress: Step
 ) -> tuple[list[str], list[Observation], list[BadFrame]]:
     """Names and observations of a recording's frames, and the frames that do not suit the pipeline. Pictures go to the given folder."""
     names: list[str] = []
@@ -186,8 +187,7 @@ def _observe_frames(
         observations.append(observation)
         if pictures_dir is not None:
             write_image(pictures_dir / overlay_name(frame.name, pictures), draw_overlay(frame, observation))
-        if progress:
-            progress(frame.sequence + 1, len(recording))
+        progress(frame.sequence + 1, len(recording))
     return names, observations, unfit
 
 

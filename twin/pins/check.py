@@ -17,14 +17,14 @@ from twin.camera.capture import expose
 from twin.frames import spread_indices
 from twin.frames.forms import blob_spec, gray_levels, known_frames, pin_levels
 from twin.optics.preview import Preview
-from twin.pins.caps import Caps, measure_caps
-from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
-from twin.pins.identify import score_layout
+from twin.pins.detectors.detector_spec import DetectorSpec, shipped_detector, with_detector
+from twin.pins.detectors.tune import other_layout
+from twin.pins.finding.caps import Caps, measure_caps
+from twin.pins.labelling.identify import score_layout
+from twin.pins.labelling.reference import Reference, nominal_reference, project_rest
+from twin.pins.labelling.view import MOST_STRETCH, view_of
 from twin.pins.pipeline import Pipeline
-from twin.pins.reference import Reference, nominal_reference, project_rest
-from twin.pins.tune import other_layout
-from twin.pins.view import MOST_STRETCH, view_of
-from twin.progress import Step
+from twin.progress import Step, unheard
 from twin.types import Form, Frame, Observation
 
 LEAST_RIM = 0.5
@@ -61,9 +61,9 @@ GLARE_CAPS = 2
 class Grade(StrEnum):
     """Grade of a finding."""
 
-    GOOD = "good"
-    WATCH = "watch"
-    BAD = "bad"
+    HEALTHY = "healthy"
+    DEGRADED = "degraded"
+    FAILED = "failed"
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Finding:
     remedy: str
 
 
-def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None = None, *, progress: Step | None = None) -> list[Finding]:
+def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None = None, *, progress: Step = unheard) -> list[Finding]:
     """Check a sensor by frames of one form, with or without contact.
 
     Parameters
@@ -115,8 +115,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
     seen = []
     for k, frame in enumerate(frames):
         seen.append(pipeline(frame))
-        if progress:
-            progress(k + 1, len(frames))
+        progress(k + 1, len(frames))
     nominal = nominal_reference(spec, form)
     findings = [
         _layout(frames, spec, pipeline.blob_spec.polarity),
@@ -175,18 +174,18 @@ def drift_of(pins_px: np.ndarray, rest_px: np.ndarray, outmost: np.ndarray, *, b
     return Drift(np.array([shift.real, shift.imag]), float(np.degrees(np.angle(a))), float(abs(a)), float(contact), bulge)
 
 
-def _verdict(value: float, watch: float, bad: float) -> Grade:
-    """Grade of a value by two limits. If ``bad`` is larger than ``watch``, large values are bad, else small ones. NaN is bad."""
-    sign = 1 if bad > watch else -1
-    if not np.isfinite(value) or sign * value > sign * bad:
-        return Grade.BAD
-    return Grade.WATCH if sign * value > sign * watch else Grade.GOOD
+def _verdict(value: float, degraded: float, failed: float) -> Grade:
+    """Grade of a value by two limits. If ``failed`` is larger than ``degraded``, large values have failed, else small ones. So has NaN."""
+    sign = 1 if failed > degraded else -1
+    if not np.isfinite(value) or sign * value > sign * failed:
+        return Grade.FAILED
+    return Grade.DEGRADED if sign * value > sign * degraded else Grade.HEALTHY
 
 
 def _finding(name: str, value: float, limits: tuple[float, float], text: str, remedy: str) -> Finding:
     """A finding with its verdict by the limits (watch, bad). If the verdict is good, there is no remedy."""
     verdict = _verdict(value, *limits)
-    return Finding(name, verdict, float(value), text, "" if verdict is Grade.GOOD else remedy)
+    return Finding(name, verdict, float(value), text, "" if verdict is Grade.HEALTHY else remedy)
 
 
 def _layout(frames: list[Frame], spec: SensorSpec, polarity: Polarity) -> Finding:
@@ -255,7 +254,7 @@ def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> lis
         return [
             Finding(
                 "place",
-                Grade.BAD,
+                Grade.FAILED,
                 np.nan,
                 "the camera's place can't be determined: too few pins at the rim",
                 "see the other findings first",

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 from twin.pins.voronoi import directed_edges, triangulate, voronoi
 from twin.types import PinGraph
 

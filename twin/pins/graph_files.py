@@ -13,10 +13,10 @@ from twin.errors import FrameError, OptionError
 from twin.frames import open_recording
 from twin.frames.forms import frame_size, polarity_of
 from twin.pins.batch import recording_reference
+from twin.pins.detectors.legacy import LegacyPipeline
 from twin.pins.graph import GraphKind, make_graph
-from twin.pins.legacy import LegacyPipeline
+from twin.pins.labelling.reference import Reference, nominal_reference, spread_out
 from twin.pins.pipeline import Pipeline
-from twin.pins.reference import Reference, nominal_reference, spread_out
 from twin.report.charts import new_figure, save_figure
 from twin.report.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes
 from twin.store import write_npz, writes

@@ -1,7 +1,7 @@
 """The pipeline: observation of the pins in a frame, the same for rendered, recorded and live frames.
 
 The limits of an observation were chosen, not derived. A frame that is meant to show no contact is refused if its pins are displaced in a
-way that no displacement of the camera explains (`measure_reference`, `twin.pins.view`).
+way that no displacement of the camera explains (`measure_reference`, `twin.pins.labelling.view`).
 """
 
 from dataclasses import replace
@@ -14,14 +14,14 @@ from scipy.spatial import cKDTree
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
 from twin.frames.forms import blob_spec, form_named, frame_size, levels_at, pin_levels
-from twin.pins.blobs import Blobs, Mask, circular_mask, despeckle, find_blobs, find_spots, own_threshold
+from twin.pins.finding.blobs import Blobs, Mask, circular_mask, despeckle, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
-from twin.pins.identify import SHOWN, score_layout
-from twin.pins.matching import Match, complete, confirm, look_again, match, proven, rematch
-from twin.pins.reference import Reference, folded_fraction, make_reference, nominal_reference
-from twin.pins.rest import require_even
-from twin.pins.split import split_chains, split_merged
-from twin.pins.view import NO_CONTACT_REMEDY, camera_modes, view_of
+from twin.pins.labelling.identify import SHOWN, score_layout
+from twin.pins.labelling.matching import Match, complete, confirm, look_again, match, proven, rematch
+from twin.pins.labelling.reference import Reference, folded_fraction, make_reference, nominal_reference
+from twin.pins.labelling.rest import require_even
+from twin.pins.labelling.split import split_chains, split_merged
+from twin.pins.labelling.view import NO_CONTACT_REMEDY, camera_modes, view_of
 from twin.types import Form, Frame, Observation
 
 MOST_RIM_LOST = 0.75
@@ -146,13 +146,13 @@ class Pipeline:
         reason = self._reason(blobs, int(paired.sum()), expected, nodes_px, extra_px) or self._rim_lost(paired, nodes_px)
         if not reason and found.lead < LEAST_LEAD * np.sqrt(len(paired)):
             reason = (
-                "ambiguous pins: two ways to name them, a row apart, explain the frame nearly alike; press or shear less, uncover "
-                "hidden pins, and hide what looks like pins beside them"
+                "ambiguous pins: two labellings, a row apart, explain the frame nearly equally well; press or shear less, uncover "
+                "hidden pins, and cover what looks like pins beside them"
             )
         if not reason and (unnamed := self._count_unnamed(blobs, found, nodes_px)) >= LEAST_UNNAMED <= lost:
             reason = (
                 f"ambiguous pins: {unnamed} blobs continue the rows of pins, and {lost} pins are lost: the picture is torn, or part is "
-                "named a row apart; grab the frame again, or hide what looks like pins"
+                "labelled a row apart; take the frame again, or cover what looks like pins"
             )
         if not reason and between > MOST_BETWEEN:
             reason = f"wrong pins: {between:.0%} of them stand between caps; stray light, a wrong threshold, or another sensor's frame"
@@ -283,7 +283,7 @@ class Pipeline:
         if lost <= MOST_RIM_LOST * len(rim):
             return ""
         return (
-            f"the rim is not seen: {lost} of the {len(rim)} outermost pins are lost; light that fades, too high a threshold, or a sensor "
+            f"the rim is not visible: {lost} of the {len(rim)} outermost pins are lost; fading light, too high a threshold, or a sensor "
             "of fewer pins: run 'twin tune' on these frames, or 'twin new'"
         )
 
@@ -325,7 +325,7 @@ class Pipeline:
             return f"too few pins: {found} of {n} found among {len(blobs.px)} blobs, {MIN_FOUND:.0%} needed"
         folded = folded_fraction(self.reference, nodes_px)
         if folded > MAX_FOLDED:
-            return f"inconsistent pins: the labelling turns {folded:.1%} of the layout over"
+            return f"inconsistent pins: the labelling inverts {folded:.1%} of the layout"
         shift = np.linalg.norm(np.median(nodes_px, axis=0) - self._center_px)
         if shift > MAX_SHIFT * self._radius_px:
             return f"inconsistent pins: the layout is displaced by {shift:.0f} px"
@@ -383,7 +383,7 @@ def measure_reference(spec: SensorSpec, form: Form, frame: Frame, *, known: Refe
     """
     name, expected, modes = frame.name or "frame", known or nominal_reference(spec, form), camera_modes(spec, form)
     seen = Pipeline(spec, form, expected, graph="delaunay")(frame)
-    refused = FrameError(f"{name}: no use as no-contact frame, {seen.reason}; {NO_CONTACT_REMEDY}")
+    refused = FrameError(f"{name}: not usable as a no-contact frame: {seen.reason}; {NO_CONTACT_REMEDY}")
     if seen.graph is not None:
         try:
             if known is None and blob_spec(spec.pipeline, form).rest_origin == "contacts":  # such places are dented themselves

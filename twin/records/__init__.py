@@ -6,20 +6,3 @@ being made.
 
 from twin.records.convert import ALSO, FORMATS, Converted, KeptAlso, convert, open_records, open_writer, with_pins
 from twin.records.record import CHANNELS, About, Episode, RecordError, Records, RecordStep
-
-__all__ = [
-    "ALSO",
-    "CHANNELS",
-    "FORMATS",
-    "About",
-    "Converted",
-    "Episode",
-    "KeptAlso",
-    "RecordError",
-    "Records",
-    "RecordStep",
-    "convert",
-    "open_records",
-    "open_writer",
-    "with_pins",
-]

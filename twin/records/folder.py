@@ -145,6 +145,48 @@ class FolderWriter(ABC):
                 raise RecordError(f"{episode.key}: {name} of shape {got}, expected {self.about.shape(name)}; record it apart")
 
 
+class PicturesWriter(FolderWriter):
+    """Writes single pictures and tables of several episodes.
+
+    Parameters
+    ----------
+    folder, about, rate_hz
+        As for ``FolderWriter``.
+    held_steps : int
+        Number of pictures after which a table of several episodes is written. With 0 each episode is safe at once.
+    """
+
+    def __init__(self, folder: Path, about: About, rate_hz: int, *, held_steps: int = HELD_STEPS) -> None:
+        super().__init__(folder, about, rate_hz)
+        self.held_steps = held_steps
+
+    @abstractmethod
+    def _write_step(self, episode: Episode, step: RecordStep, number: int, k: int) -> Any:
+        """Write the picture of the step ``k`` of the episode ``number``, and return its row for ``_commit``."""
+
+    @abstractmethod
+    def _commit(self, group: list[dict[str, Any]], rows: list[Any]) -> None:
+        """Write the tables of episodes with these facts, and with a row for each step."""
+
+    def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
+        group: list[dict[str, Any]] = []
+        rows: list[Any] = []
+        for episode in episodes:
+            number, before = len(self.facts) + len(group), len(rows)
+            for k, step in enumerate(episode.steps()):
+                self._require_fitting(episode, step)
+                rows.append(self._write_step(episode, step, number, k))
+            if len(rows) > before:
+                group.append(self._facts(episode, len(rows) - before))
+            if len(rows) > self.held_steps:
+                self._commit(group, rows)
+                yield group
+                group, rows = [], []
+        if group:
+            self._commit(group, rows)
+            yield group
+
+
 def read_sidecar(folder: Path, form: str = "") -> tuple[About, dict[str, Any]]:
     """The description of a folder.
 

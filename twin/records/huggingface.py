@@ -17,7 +17,7 @@ import numpy as np
 from twin.errors import FrameError
 from twin.frames.images import read_image, write_image
 from twin.frames.tables import base_name
-from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, read_facts, records_in, require_numbered
+from twin.records.folder import AGAIN, PicturesWriter, read_facts, records_in, require_numbered
 from twin.records.record import CHANNELS, TIME, About, Episode, RecordError, Records, RecordStep, library
 from twin.store import remove_parts, replace_folder, write_json, write_text, write_with
 from twin.store.atomic import PART
@@ -40,26 +40,19 @@ Pictures with metadata. In Python: `datasets.load_dataset("imagefolder", data_di
 """
 
 
-class HuggingFaceWriter(FolderWriter):
-    """Writes records as pictures with ``metadata.parquet``.
-
-    Parameters
-    ----------
-    folder, about, rate_hz
-        As for ``FolderWriter``.
-    held_steps : int
-        Number of pictures after which a folder of several episodes is finished. With 0 each episode has its own folder and is safe at once.
-    """
+class HuggingFaceWriter(PicturesWriter):
+    """Writes records as pictures with ``metadata.parquet``. The pictures of episodes that are written together are in one folder."""
 
     FORMAT = "huggingface"
     NAMES = (DATA, EPISODES, CARD)
     FOLDERS = (DATA, EPISODES)
     LIBRARIES = ("pyarrow.parquet",)
 
-    def __init__(self, folder: Path, about: About, rate_hz: int, *, held_steps: int = HELD_STEPS) -> None:
-        super().__init__(folder, about, rate_hz)
-        self.held_steps = held_steps
-        self._next = 0  # number of the next folder
+    _next = 0  # number of the next folder
+
+    @property
+    def _part(self) -> Path:
+        return self.folder / DATA / f".{self._next:06d}{PART}"
 
     def _begin(self) -> None:
         super()._begin()
@@ -73,44 +66,25 @@ class HuggingFaceWriter(FolderWriter):
         self._next = len(listed)
         return [facts for _, facts in _facts_in(self.folder)]
 
-    def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
-        group: list[dict[str, Any]] = []
-        lines: list[dict[str, Any]] = []
-        for episode in episodes:
-            part = self.folder / DATA / f".{self._next:06d}{PART}"
-            part.mkdir(exist_ok=True)
-            length, number = 0, len(self.facts) + len(group)
-            for length, step in enumerate(episode.steps(), 1):
-                self._require_fitting(episode, step)
-                name = f"episode_{number:06d}_{length - 1:06d}.png"
-                write_image(part / name, step.image)
-                lines.append(self._line(name, number, length - 1, episode, step))
-            if length:
-                group.append(self._facts(episode, length))
-            if len(lines) > self.held_steps:
-                yield self._commit(part, group, lines)
-                group, lines = [], []
-        if group:
-            yield self._commit(part, group, lines)
-        remove_parts(self.folder / DATA)
-
-    def _line(self, name: str, episode: int, number: int, whole: Episode, step: RecordStep) -> dict[str, Any]:
+    def _write_step(self, episode: Episode, step: RecordStep, number: int, k: int) -> dict[str, Any]:
         """One row of the metadata. Every row has the same keys, as the reader requires."""
+        self._part.mkdir(exist_ok=True)
+        name = f"episode_{number:06d}_{k:06d}.png"
+        write_image(self._part / name, step.image)
         numbers = {CHANNELS[key].column: step.values[key].tolist() for key in self.about.numbers}
-        head = {"file_name": name, "episode_index": episode, "frame_index": number, "task": whole.task}
+        head = {"file_name": name, "episode_index": number, "frame_index": k, "task": episode.task}
         return head | {TIME: float(step.time_s)} | numbers
 
-    def _commit(self, part: Path, group: list[dict[str, Any]], lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    def _commit(self, group: list[dict[str, Any]], rows: list[Any]) -> None:
         parquet, pa = library("pyarrow.parquet"), library("pyarrow")
         counted = [("file_name", pa.string()), ("episode_index", pa.int64()), ("frame_index", pa.int64()), ("task", pa.string())]
         kinds = {name: pa.list_(pa.float32()) for name in self.about.numbers}
         named = [(CHANNELS[name].column, pa.list_(kind) if len(self.about.shape(name)) == 2 else kind) for name, kind in kinds.items()]
-        table = pa.Table.from_pylist(lines, pa.schema([*counted, (TIME, pa.float64()), *named]))
-        write_with(part / METADATA, lambda file: parquet.write_table(table, file, write_page_checksum=True))
-        replace_folder(part, self.folder / DATA / f"{self._next:06d}")
+        table = pa.Table.from_pylist(rows, pa.schema([*counted, (TIME, pa.float64()), *named]))
+        write_with(self._part / METADATA, lambda file: parquet.write_table(table, file, write_page_checksum=True))
+        replace_folder(self._part, self.folder / DATA / f"{self._next:06d}")
         write_json(self.folder / EPISODES / f"{self._next:06d}.json", {"episodes": group})
         self._next += 1
-        return group
 
 
 def huggingface_records(folder: Path) -> Records:
@@ -122,11 +96,10 @@ def huggingface_records(folder: Path) -> Records:
         The folder is damaged, or another program wrote it.
     """
     found = _facts_in(folder)
-    return records_in(folder, HuggingFaceWriter.FORMAT, [facts for _, facts in found], partial(_reader, folder, found))
-
-
-def _reader(folder: Path, found: list[tuple[str, dict[str, Any]]], about: About, index: int) -> Any:
-    return partial(_steps_of, folder / DATA / found[index][0], about, index)
+    facts = [each for _, each in found]
+    return records_in(
+        folder, HuggingFaceWriter.FORMAT, facts, lambda about, index: partial(_steps_of, folder / DATA / found[index][0], about, index)
+    )
 
 
 def _steps_of(folder: Path, about: About, index: int) -> Iterator[RecordStep]:

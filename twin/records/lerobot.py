@@ -11,6 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from twin.errors import FrameError
 from twin.frames import open_recording
+from twin.frames.lerobot import COUNTERS
 from twin.frames.videos import describe_pauses
 from twin.records.folder import AGAIN, FolderWriter, image_of, png, read_json, read_sidecar, records_in
 from twin.records.record import CHANNELS, IMAGE, TIME, About, Episode, RecordError, Records, RecordStep, library, off_s
@@ -45,8 +47,6 @@ PIXEL_STEP = 4
 """Step between the pixels, in each direction, from which the statistics of pictures are computed."""
 QUANTILES = {"q01": 1.0, "q10": 10.0, "q50": 50.0, "q90": 90.0, "q99": 99.0}
 """Names and percentages of the quantiles in LeRobot's statistics."""
-COUNTERS = ("frame_index", "episode_index", "index", "task_index")
-"""Columns of whole numbers that LeRobot requires."""
 FOURCC = "mp4v"
 """Codec of videos that every build of OpenCV has (MPEG-4 part 2)."""
 
@@ -98,12 +98,11 @@ class LeRobotWriter(FolderWriter):
         return [_facts_of(row) for row in rows]
 
     def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
-        waiting = _Peeked(episodes)
-        while waiting.has_next:
-            if group := self._write_group(waiting):
+        while (first := next(episodes, None)) is not None:
+            if group := self._write_group(chain([first], episodes)):
                 yield [facts for _, facts, _ in group]
 
-    def _write_group(self, waiting: "_Peeked") -> list[tuple[dict[str, Any], dict[str, Any], dict[str, dict[str, np.ndarray]]]]:
+    def _write_group(self, waiting: Iterator[Episode]) -> list[tuple[dict[str, Any], dict[str, Any], dict[str, dict[str, np.ndarray]]]]:
         """Write a file of episodes, then the data set's description. Returns row, facts and statistics of each episode."""
         group: list[tuple[dict[str, Any], dict[str, Any], dict[str, dict[str, np.ndarray]]]] = []
         at = {"chunk_index": self._file // CHUNK_FILES, "file_index": self._file % CHUNK_FILES}
@@ -126,15 +125,14 @@ class LeRobotWriter(FolderWriter):
         self._frames += sum(row["length"] for row, _, _ in group)
         return group
 
-    def _fill(self, file: BinaryIO, *, waiting: "_Peeked", group: list, at: dict[str, int], video: Path) -> None:
+    def _fill(self, file: BinaryIO, *, waiting: Iterator[Episode], group: list, at: dict[str, int], video: Path) -> None:
         """Write episodes into an open data file until it is large enough."""
         parquet, pa = library("pyarrow.parquet"), library("pyarrow")
         schema = pa.schema(self._schema(pa), metadata={"huggingface": json.dumps({"info": {"features": self._hf_features()}})})
         frames, written = self._frames, 0
-        film = _VideoWriter(video, self.rate_hz, self.about.size_px) if self.video else None
+        film = _open_film(video, self.rate_hz, self.about.size_px) if self.video else None
         with parquet.ParquetWriter(file, schema, compression="snappy", write_page_checksum=True) as table:
-            while (not group or written < self.held_bytes) and waiting.has_next:
-                episode = next(waiting)
+            for episode in waiting:
                 number, rows, length = len(self.facts) + len(group), [], 0
                 task = self._task(episode.task)
                 gathered = _Gathered(self.about)
@@ -143,7 +141,7 @@ class LeRobotWriter(FolderWriter):
                     gathered.add(step, length)
                     row = self._row(step, length, number, frames + length, task)
                     if film is not None:
-                        film.add(step.image)
+                        film.write(np.ascontiguousarray(_colour(step.image)[..., ::-1]))
                     rows.append(row)
                     written += len(row[IMAGE]["bytes"]) if IMAGE in row else 4 * sum(self.about.numbers.values())
                     length += 1
@@ -159,8 +157,10 @@ class LeRobotWriter(FolderWriter):
                 row = self._episode_row(episode, number, frames, length, at)
                 group.append((row, self._facts(episode, length), stats))
                 frames += length
+                if written >= self.held_bytes:
+                    break
         if film is not None:
-            film.close()
+            film.release()
 
     def notes(self) -> list[str]:
         if not self._off:
@@ -283,27 +283,6 @@ class LeRobotWriter(FolderWriter):
         )
 
 
-class _Peeked(Iterator[Episode]):
-    """An iterator that can tell whether there is one more episode."""
-
-    def __init__(self, episodes: Iterator[Episode]) -> None:
-        self._episodes = iter(episodes)
-        self._next: Episode | None = None
-
-    @property
-    def has_next(self) -> bool:
-        """Whether there is one more episode. It is taken from the source only now."""
-        if self._next is None:
-            self._next = next(self._episodes, None)
-        return self._next is not None
-
-    def __next__(self) -> Episode:
-        if not self.has_next or self._next is None:
-            raise StopIteration
-        found, self._next = self._next, None
-        return found
-
-
 class _Gathered:
     """Data from which an episode's statistics are computed."""
 
@@ -375,19 +354,12 @@ def _together(a: dict[str, dict[str, np.ndarray]], b: dict[str, dict[str, np.nda
     return found
 
 
-class _VideoWriter:
+def _open_film(path: Path, rate_hz: int, size_px: tuple[int, int]) -> cv2.VideoWriter:
     """A video to which frames are written."""
-
-    def __init__(self, path: Path, rate_hz: int, size_px: tuple[int, int]) -> None:
-        self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*FOURCC), float(rate_hz), size_px)
-        if not self._writer.isOpened():
-            raise RecordError(f"this OpenCV can't write {FOURCC} videos; leave out `video`")
-
-    def add(self, image: np.ndarray) -> None:
-        self._writer.write(np.ascontiguousarray(_colour(image)[..., ::-1]))
-
-    def close(self) -> None:
-        self._writer.release()
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*FOURCC), float(rate_hz), size_px)
+    if not film.isOpened():
+        raise RecordError(f"this OpenCV can't write {FOURCC} videos; leave out `video`")
+    return film
 
 
 def lerobot_records(folder: Path) -> Records:
@@ -399,11 +371,8 @@ def lerobot_records(folder: Path) -> Records:
         The data set is damaged, or LeRobot or another program wrote it.
     """
     rows = _episode_rows(folder)
-    return records_in(folder, LeRobotWriter.FORMAT, [_facts_of(row) for row in rows], partial(_reader, folder, rows))
-
-
-def _reader(folder: Path, rows: list[dict[str, Any]], about: About, index: int) -> Any:
-    return partial(_steps_of, folder, rows[index], about)
+    facts = [_facts_of(row) for row in rows]
+    return records_in(folder, LeRobotWriter.FORMAT, facts, lambda about, index: partial(_steps_of, folder, rows[index], about))
 
 
 def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[RecordStep]:

@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from twin.errors import TwinError, extras_named
 from twin.types import Form, ImageArray
@@ -129,16 +130,8 @@ class About:
 
     def plain(self) -> dict[str, Any]:
         """The properties as JSON."""
-        return {
-            "sensor": self.sensor,
-            "form": str(self.form),
-            "size_px": list(self.size_px),
-            "gray": self.gray,
-            "numbers": self.numbers,
-            "estimates": list(self.estimates),
-            "frame": self.frame,
-            "robot": self.robot,
-            "channels": {name: CHANNELS[name].meaning for name in self.numbers},
+        return TypeAdapter(About).dump_python(self, mode="json", warnings=False) | {
+            "channels": {name: CHANNELS[name].meaning for name in self.numbers}
         }
 
     @classmethod
@@ -147,23 +140,13 @@ class About:
 
         Raises
         ------
-        KeyError, TypeError, ValueError
-            Something is missing or wrong.
+        ValueError
+            A property is missing or wrong.
         """
-        numbers = {name: int(plain["numbers"][name]) for name in CHANNELS if name in plain["numbers"]}
-        if set(numbers) != set(plain["numbers"]) or not all(0 < count < 1_000_000 for count in numbers.values()):
+        about = TypeAdapter(About).validate_python(plain)
+        if not set(about.numbers) <= CHANNELS.keys() or not all(0 < count < 1_000_000 for count in about.numbers.values()):
             raise ValueError("unknown channels")
-        width, height = plain["size_px"]
-        return cls(
-            str(plain["sensor"]),
-            Form(plain["form"]),
-            (int(width), int(height)),
-            bool(plain["gray"]),
-            numbers,
-            tuple(map(str, plain["estimates"])),
-            str(plain["frame"]),
-            str(plain["robot"]),
-        )
+        return replace(about, numbers={name: about.numbers[name] for name in CHANNELS if name in about.numbers})
 
     def differs(self, other: "About") -> list[str]:
         """Reasons why episodes of another record do not fit into this one."""

@@ -5,7 +5,6 @@ Recordings of any origin, collections, and simulated data sets with their truth 
 """
 
 import csv
-import io
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,11 +23,11 @@ from twin.frames import Recording, open_recording
 from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
 from twin.frames.tables import numbers
-from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, episode_of, format_of, read_facts, read_json, read_sidecar
+from twin.records.folder import AGAIN, PicturesWriter, episode_of, format_of, read_facts, read_json, read_sidecar
 from twin.records.record import CHANNELS, NOMINAL_HZ, About, Channel, Episode, RecordError, Records, RecordStep, digest, float32, seconds
 from twin.rig.labels import as_executed, read_executed
 from twin.rig.mounting import Mounting
-from twin.store import write_json, write_npz, write_text
+from twin.store import text_file, write_json, write_npz
 from twin.types import Form
 
 TABLE, PINS, EPISODES, META, REST = "targets.csv", "pins.npz", "episodes.json", "meta.json", "init_0.png"
@@ -240,25 +239,14 @@ def _read_description(path: Path) -> dict[str, Any]:
     return told
 
 
-class RecordingWriter(FolderWriter):
+class RecordingWriter(PicturesWriter):
     """Writes records as a recording. Numbers that recordings do not have go into further columns and into ``pins.npz``.
 
     A recording has one picture without contact: that of the first episode that has one.
-
-    Parameters
-    ----------
-    folder, about, rate_hz
-        As for ``FolderWriter``.
-    held_steps : int
-        Number of frames after which the table is written again. With 0 this happens after each episode, so that each is safe at once.
     """
 
     FORMAT = "recording"
     NAMES = (TABLE, PINS, EPISODES, META, REST, "images", "frames_bw")
-
-    def __init__(self, folder: Path, about: About, rate_hz: int, *, held_steps: int = HELD_STEPS) -> None:
-        super().__init__(folder, about, rate_hz)
-        self.held_steps = held_steps
 
     @property
     def _pictures(self) -> Path:
@@ -286,50 +274,35 @@ class RecordingWriter(FolderWriter):
             raise RecordError(f"{self.folder}: {TABLE} or {PINS} is damaged; {AGAIN}") from error
         return facts
 
-    def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
-        group: list[dict[str, Any]] = []
-        rows: list[list[str]] = []
-        pins: list[np.ndarray] = []
-        for episode in episodes:
-            number, before = len(self.facts) + len(group), len(rows)
-            for k, step in enumerate(episode.steps()):
-                self._require_fitting(episode, step)
-                name = f"frame_{number}_{k}.png"
-                write_image(self._pictures / name, step.image)
-                rows.append(self._row(name, number, step))
-                pins += [step.values["pins"]] if "pins" in self.about.numbers else []
-            if len(rows) > before:
-                if episode.rest is not None and not (self.folder / REST).is_file():
-                    write_image(self.folder / REST, episode.rest)
-                group.append(episode.facts() | {"length": len(rows) - before})
-            if len(rows) > self.held_steps:
-                yield self._commit(group, rows, pins)
-                group, rows, pins = [], [], []
-        if group:
-            yield self._commit(group, rows, pins)
+    def _facts(self, episode: Episode, length: int) -> dict[str, Any]:
+        if episode.rest is not None and not (self.folder / REST).is_file():
+            write_image(self.folder / REST, episode.rest)
+        return episode.facts() | {"length": length}
 
-    def _row(self, name: str, number: int, step: RecordStep) -> list[str]:
-        cells = [name, name.rpartition("_")[0], "1", str(number + 1), str(number), repr(float(step.time_s))]
+    def _write_step(self, episode: Episode, step: RecordStep, number: int, k: int) -> tuple[list[str], list[np.ndarray]]:
+        """The cells of the table's row, and the pins, if the record has them."""
+        data_name = f"frame_{number}"
+        name = f"{data_name}_{k}.png"
+        write_image(self._pictures / name, step.image)
+        cells = [name, data_name, "1", str(number + 1), str(number), repr(float(step.time_s))]
         for channel in self._columns():
             cells += ["" if np.isnan(value) else repr(float(value)) for value in step.values[channel]]
-        return cells
+        return cells, [step.values["pins"]] if "pins" in self.about.numbers else []
 
     def _columns(self) -> dict[str, list[str]]:
         return {name: columns_of(CHANNELS[name], self.about.axes(name)) for name in self.about.numbers if name != "pins"}
 
-    def _commit(self, group: list[dict[str, Any]], rows: list[list[str]], pins: list[np.ndarray]) -> list[dict[str, Any]]:
+    def _commit(self, group: list[dict[str, Any]], rows: list[Any]) -> None:
         """Write the table, the pins and, last, the list of episodes. Each file is replaced as a whole."""
-        self._rows += rows
-        self._pins += pins
-        text = io.StringIO(newline="")
-        writer = csv.writer(text, lineterminator="\n")
-        named = [column for columns in self._columns().values() for column in columns]
-        writer.writerow(["image_name", "data_name", "obj_id", "pose_id", PATH, TIME_S, *named])
-        writer.writerows(self._rows)
+        self._rows += [cells for cells, _ in rows]
+        self._pins += [pins_px for _, pins in rows for pins_px in pins]
         facts = [*self.facts, *group]
         if self._pins:
             write_npz(self.folder / PINS, {"image_name": np.array([row[0] for row in self._rows]), "pins_px": np.stack(self._pins)})
-        write_text(self.folder / TABLE, text.getvalue())
+        with text_file(self.folder / TABLE) as text:
+            writer = csv.writer(text, lineterminator="\n")
+            named = [column for columns in self._columns().values() for column in columns]
+            writer.writerow(["image_name", "data_name", "obj_id", "pose_id", PATH, TIME_S, *named])
+            writer.writerows(self._rows)
         write_json(self.folder / META, {"comments": facts[0]["task"], "sensor": self.about.sensor, "num_poses": len(facts)})
         write_json(self.folder / EPISODES, {"episodes": facts})
-        return group

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from twin.report.table import Column, Row, TemplateTable, make_table
+from twin.report.table import Column, Row, make_table
 from twin.report.themes import dark_of, stylesheet
 from twin.store import write_text
 
@@ -56,44 +56,6 @@ class PagePicture:
             raise ValueError(f"{self.path}: a picture of a page needs a text that says what it shows (alt)")
 
 
-@dataclass(frozen=True)
-class _Block:
-    kind: str
-    title: str = ""
-    anchor: str = ""
-    text: str = ""
-    lines: Sequence[str] = ()
-    tone: str = ""
-    layout: str = ""
-    table: TemplateTable | None = None
-    pictures: Sequence[PagePicture] = ()
-
-
-@dataclass(frozen=True)
-class _File:
-    path: Path
-    what: str
-
-
-@dataclass(frozen=True)
-class _Source:
-    """A picture in the form that the template needs."""
-
-    src: str
-    dark: str
-    alt: str
-    caption: str
-    kind: str
-    width_px: int | None
-
-
-@dataclass(frozen=True)
-class _Link:
-    href: str
-    name: str
-    what: str
-
-
 @dataclass
 class Page:
     """A page that is being made: its parts are added in their order, then it is written.
@@ -113,43 +75,43 @@ class Page:
     made_by: str
     topic: str = "TacTip twin"
     lead: str = ""
-    _blocks: list[_Block] = field(default_factory=list, init=False)
-    _files: list[_File] = field(default_factory=list, init=False)
+    _blocks: list[dict[str, Any]] = field(default_factory=list, init=False)
+    _files: list[tuple[Path, str]] = field(default_factory=list, init=False)
 
     def section(self, title: str, *paragraphs: str) -> None:
         """Begin a section, with its first paragraphs."""
-        self._blocks.append(_Block("section", title=title, anchor=slug(title)))
+        self._blocks.append({"kind": "section", "title": title, "anchor": slug(title)})
         self.text(*paragraphs)
 
     def heading(self, title: str, *, anchor: str = "") -> None:
         """Begin a part of a section; ``anchor`` is the name for links to it (by default it is made from the title)."""
-        self._blocks.append(_Block("heading", title=title, anchor=anchor or slug(title)))
+        self._blocks.append({"kind": "heading", "title": title, "anchor": anchor or slug(title)})
 
     def text(self, *paragraphs: str) -> None:
         """Add paragraphs."""
-        self._blocks += [_Block("text", text=paragraph) for paragraph in paragraphs if paragraph]
+        self._blocks += [{"kind": "text", "text": paragraph} for paragraph in paragraphs if paragraph]
 
     def items(self, items: Sequence[str]) -> None:
         """Add a list."""
         if items:
-            self._blocks.append(_Block("items", lines=items))
+            self._blocks.append({"kind": "items", "lines": items})
 
     def notice(self, title: str, items: Sequence[str], *, tone: Literal["", "good", "bad"] = "") -> None:
         """Add important notes. Without items nothing is added."""
         if items:
-            self._blocks.append(_Block("notice", title=title, lines=items, tone=tone))
+            self._blocks.append({"kind": "notice", "title": title, "lines": items, "tone": tone})
 
     def table(self, rows: Sequence[Row], columns: Sequence[Column | str], *, caption: str = "") -> None:
         """Add a table (see `twin.report.table.make_table`)."""
-        self._blocks.append(_Block("table", table=make_table(rows, columns, caption=caption)))
+        self._blocks.append({"kind": "table", "table": make_table(rows, columns, caption=caption)})
 
     def figures(self, *pictures: PagePicture, layout: Literal["", "row", "beside"] = "") -> None:
         """Add pictures: one below the other, in a ``row`` that wraps, or a narrow one ``beside`` a wide one."""
-        self._blocks.append(_Block("figures", pictures=pictures, layout=layout))
+        self._blocks.append({"kind": "figures", "pictures": pictures, "layout": layout})
 
     def download(self, path: Path, what: str = "") -> None:
         """Add a link to a file beside the page, and a description of its content."""
-        self._files.append(_File(path, what))
+        self._files.append((path, what))
 
     def write(self, path: Path, *, embed: bool = False) -> Path:
         """Write the page, and return the path.
@@ -165,8 +127,8 @@ class Page:
 
     def html(self, folder: Path, *, embed: bool = False) -> str:
         """The page as HTML, for a file in ``folder``."""
-        blocks = [{**vars(block), "pictures": [_source(picture, folder, embed) for picture in block.pictures]} for block in self._blocks]
-        sections = [block for block in self._blocks if block.kind == "section"]
+        blocks = [block | {"pictures": [_source(each, folder, embed) for each in block.get("pictures", ())]} for block in self._blocks]
+        sections = [block for block in self._blocks if block["kind"] == "section"]
         environment = Environment(
             loader=PackageLoader("twin.report", "."), undefined=StrictUndefined, autoescape=True, trim_blocks=True, lstrip_blocks=True
         )
@@ -177,7 +139,7 @@ class Page:
             lead=self.lead,
             contents=sections if len(sections) >= FEWEST_IN_CONTENTS else [],
             blocks=blocks,
-            files=[_Link(quote(_within(file.path, folder).as_posix(), safe="/"), file.path.name, file.what) for file in self._files],
+            files=[{"href": _address(path, folder), "name": path.name, "what": what} for path, what in self._files],
             provenance=provenance(self.made_by),
         )
 
@@ -226,11 +188,16 @@ def link_to(anchor: str) -> str:
     return f"#{quote(anchor, safe='')}"
 
 
-def _source(picture: PagePicture, folder: Path, embed: bool) -> _Source:
+def _source(picture: PagePicture, folder: Path, embed: bool) -> dict[str, object]:
+    """A picture in the form that the template needs."""
     dark = dark_of(picture.path) if picture.kind == "chart" else None
-    paths = [_within(path, folder) for path in (picture.path, dark) if path is not None]
-    found = [_embed_file(folder / path) if embed else quote(path.as_posix(), safe="/") for path in paths]
-    return _Source(found[0], found[1] if dark else "", picture.alt, picture.caption, picture.kind, picture.width_px)
+    found = [_embed_file(folder / _within(path, folder)) if embed else _address(path, folder) for path in (picture.path, dark) if path]
+    return {**vars(picture), "src": found[0], "dark": found[1] if dark else ""}
+
+
+def _address(path: Path, folder: Path) -> str:
+    """Address of a file in a page of a folder."""
+    return quote(_within(path, folder).as_posix(), safe="/")
 
 
 def _embed_file(path: Path) -> str:

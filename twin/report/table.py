@@ -1,15 +1,14 @@
 """Tables: CSV files, and the tables of a page."""
 
 import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from twin.report.numbers import column, is_number
-from twin.store import write_text
+from twin.store import text_file
 
 Row = Mapping[str, object]
 UNITS = {
@@ -85,34 +84,8 @@ class Cell:
     href: str = ""
 
 
-@dataclass(frozen=True)
-class Head:
-    """A heading in the form that the template needs."""
-
-    title: str
-    unit: str
-    number: bool
-
-
-@dataclass(frozen=True)
-class StyledCell:
-    """A cell in the form that the template needs; ``style`` holds its CSS classes."""
-
-    text: object
-    number: bool
-    style: str
-    note: str
-    bar: int | None
-    href: str
-
-
-@dataclass(frozen=True)
-class TemplateTable:
-    """A table in the form that the template needs: ``body`` has a list of cells for each row, one for each of ``heads``."""
-
-    heads: list[Head]
-    body: list[list[StyledCell]]
-    caption: str
+TemplateTable = dict[str, Any]
+"""A table in the form that the template needs: ``heads``, ``body`` with a list of cells for each row (one for each head), ``caption``."""
 
 
 def make_table(rows: Sequence[Row], columns: Sequence[Column | str], *, caption: str = "") -> TemplateTable:
@@ -134,9 +107,9 @@ def make_table(rows: Sequence[Row], columns: Sequence[Column | str], *, caption:
         numeric = entry.align == "right" or any(is_number(value) for value in values)
         texts = column(values, entry.digits, decimals=entry.decimals, signed=entry.signed)
         marked = _best(values, entry.best)
-        heads.append(Head(entry.title, entry.unit, numeric))
+        heads.append({"title": entry.title, "unit": entry.unit, "number": numeric})
         shown.append([_style_cell(c, v, t, numeric, k in marked) for k, (c, v, t) in enumerate(zip(cells, values, texts, strict=True))])
-    return TemplateTable(heads, [list(row) for row in zip(*shown, strict=True)], caption)
+    return {"heads": heads, "body": [list(row) for row in zip(*shown, strict=True)], "caption": caption}
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> Path:
@@ -151,11 +124,11 @@ def write_table(path: Path, rows: Sequence[Row]) -> Path:
 
 
 def _write_csv(path: Path, columns: list[str], rows: Sequence[Row]) -> Path:
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, fieldnames=columns, restval="")
-    writer.writeheader()
-    writer.writerows(rows)
-    return write_text(path, text.getvalue())
+    with text_file(path) as text:
+        writer = csv.DictWriter(text, fieldnames=columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
 
 
 def _plain(value: object) -> str:
@@ -174,8 +147,9 @@ def _best(values: list[object], best: str) -> set[int]:
     return {k for k, value in known.items() if value == wanted}
 
 
-def _style_cell(cell: Cell, value: object, text: str, numeric: bool, best: bool) -> StyledCell:
+def _style_cell(cell: Cell, value: object, text: str, numeric: bool, best: bool) -> dict[str, object]:
+    """A cell in the form that the template needs; ``style`` holds its CSS classes."""
     styles = [name for name, given in (("number", numeric), ("best", best), (cell.tone, bool(cell.tone))) if given]
     bar = None if cell.bar is None else round(100 * min(max(cell.bar, 0.0), 1.0))
     shown = value if isinstance(value, str) else text  # texts with markup are not changed
-    return StyledCell(shown, numeric, " ".join(styles), cell.note, bar, cell.href)
+    return {"text": shown, "number": numeric, "style": " ".join(styles), "note": cell.note, "bar": bar, "href": cell.href}

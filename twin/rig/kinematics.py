@@ -81,7 +81,7 @@ def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, apex
     """``T_sensor_object`` (4, 4) for a pose (6,) of the arm in mm and deg; ``apex_mm`` is the z of the skin's apex."""
     unturned = _UNTURNED[experiment.approach]
     turn = tool_turn(rig, pose)
-    centre = pose[:3] + turn @ unturned @ [rig.tcp_lateral_mm, rig.tcp_aside_mm, rig.tcp_to_dome_mm]
+    centre = pose[:3] + turn @ unturned @ [rig.tcp_lateral_mm, rig.tcp_binormal_mm, rig.tcp_to_dome_mm]
     height_mm = apex_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm
     surface = unturned @ [*rig.object_shift_mm, height_mm]
     sensor = turn @ unturned

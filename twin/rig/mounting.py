@@ -117,7 +117,7 @@ class Mounting:
             axis,
             across,
             rig.image_turn_deg,
-            rig.tcp_to_dome_mm * axis + rig.tcp_lateral_mm * across + rig.tcp_aside_mm * np.cross(axis, across),
+            rig.tcp_to_dome_mm * axis + rig.tcp_lateral_mm * across + rig.tcp_binormal_mm * np.cross(axis, across),
             skin.apex_mm,
             max(skin.apex_mm, *skin.half_size_mm),
             f"pose_{experiment.axis + 1}",

@@ -153,7 +153,7 @@ def tilted_labels(
     leaned = Rotation.from_euler("x", tilt_x).apply(seen)
     tilt_y = np.arctan2(unspun[0], unspun[2]) - np.arctan2(leaned[0], leaned[2])
     turn = about_z * Rotation.from_euler("xy", [tilt_x, tilt_y])
-    arm_mm = turn.apply([rig.tcp_lateral_mm, rig.tcp_aside_mm, rig.tcp_to_dome_mm])
+    arm_mm = turn.apply([rig.tcp_lateral_mm, rig.tcp_binormal_mm, rig.tcp_to_dome_mm])
     stands_mm = (apex_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm) * plate[2]
     depth_mm = (stands_mm - plate @ arm_mm - (distance_mm[0] - surface.raised_mm)) / plate[2]
     tilts = rig.turn_sign * np.degrees([tilt_x, tilt_y]) - np.array(rig.turn_offset_deg[:2])

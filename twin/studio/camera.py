@@ -109,7 +109,7 @@ class StudioCamera:
             The sensor has no processed form.
         """
         if self.spec.recording is None:
-            raise FrameError(f"{self.spec.name} has no recordings' form; show raw frames")
+            raise FrameError(f"{self.spec.name} has no processed frames; show raw frames")
         return in_form(raw, Form.PROCESSED, self.spec.recording)
 
     def crop(self, image: ImageArray, form: Form) -> ImageArray:

@@ -234,7 +234,7 @@ class MovingContact:
         self._why_blocked = ""
         self._fine: Follower | None = None
         self._fine_T: FloatArray | None = None
-        self._fine_lost = ""
+        self.fine_lost = ""  # why this contact has no answer on the fine mesh; "" if it has one or may still get one
         self._way: deque[FloatArray] = deque()
         self._refined, self._restarts = False, 0
 
@@ -271,11 +271,6 @@ class MovingContact:
             lift = 0.5 * (low + high)
             low, high = (low, lift) if not self.refusal(_lift(T, lift)) else (lift, high)
         return _lift(T, high), "; ".join(part for part in (reason, f"the object stops here: {why}") if part)
-
-    def has_arrived(self, wished: ObjectPose) -> bool:
-        """Whether the object is at the pose to which a wish moves it, or the solver found no path there."""
-        goal, _ = self.admissible(wished)
-        return self._is_there(goal)
 
     def _is_there(self, goal: FloatArray) -> bool:
         near = (T for T in (self._T, self._blocked) if T is not None)
@@ -346,7 +341,7 @@ class MovingContact:
         try:
             state = self._fine.move(piece[-1], time.monotonic())
         except ContactError as error:
-            self._fine_lost, self._refined = f"no answer on the fine mesh: {error}", True
+            self.fine_lost, self._refined = f"no answer on the fine mesh: {error}", True
             return None
         self._fine_T = piece[-1]
         if self._way:
@@ -360,12 +355,7 @@ class MovingContact:
     def refined(self) -> bool:
         """Whether there is nothing to do on the fine mesh: no contact, or a finished or failed one, or a path that is too long."""
         free = self._T is None or self._last is None or not len(self._last.state.contact_mm)
-        return free or self._refined or bool(self._fine_lost)
-
-    @property
-    def fine_lost(self) -> str:
-        """Why this contact has no answer on the fine mesh; "" if it has one or may still get one."""
-        return self._fine_lost
+        return free or self._refined or bool(self.fine_lost)
 
     def again(self) -> ContactAnswer | None:
         """The newest answer, computed again after a change of form or model; None before the first answer."""
@@ -382,11 +372,11 @@ class MovingContact:
         self._blocked, self._refined, self._restarts = None, False, self._follower.restarts
         if begun_anew or self._follower.gap_mm(T) >= 0:
             self._way.clear()
-            self._fine, self._fine_T, self._fine_lost = None, None, ""
+            self._fine, self._fine_T, self.fine_lost = None, None, ""
         self._way.append(T)
         if len(self._way) > KEPT_WAY:
             self._way.clear()
-            self._fine_lost = f"the way in contact is longer than {KEPT_WAY} poses; lift the object off, and the fine mesh follows again"
+            self.fine_lost = f"the path in contact is longer than {KEPT_WAY} poses; lift the object off to use the fine mesh again"
         self._T, self.pose = T, ObjectPose.of(T, self._apex_mm)
 
     def _answer(

@@ -7,11 +7,11 @@ Frames and estimates are handed in; this package does not depend on the devices.
 from dataclasses import dataclass
 
 from scenes.sensor import SensorSpec
-from twin.estimate import Estimate
-from twin.pins.reference import Reference
+from twin.estimate import Estimate, readable_labels
+from twin.pins.labelling.reference import Reference
 from twin.studio.camera import dome_part
 from twin.studio.page import LineChart, StudioPage
-from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, label_name, paragraph
+from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, paragraph
 from twin.types import Frame, ImageArray, Observation
 
 CHARTED = 3
@@ -42,8 +42,8 @@ def frame_numbers(live: LiveFrame, seen: Observation) -> list[str]:
 
 def chart_values(estimate: Estimate) -> dict[str, float]:
     """The values for the chart, by label; none without an estimate."""
-    named = zip(estimate.names[:CHARTED], estimate.value, strict=False)
-    return {label_name(name)[0]: float(value) for name, value in named} if estimate.valid else {}
+    named = zip(readable_labels(estimate.names)[:CHARTED], estimate.value, strict=False)
+    return {name: float(value) for name, value in named} if estimate.valid else {}
 
 
 class LivePage(StudioPage):

@@ -17,6 +17,7 @@ import numpy as np
 import viser
 import websockets.asyncio.server
 from viser import uplot
+from viser._messages import GuiUpdateMessage
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
@@ -81,11 +82,20 @@ def value_of(control: viser.GuiInputHandle[str], kind: Callable[[str], Value], n
         return kind(given)
     except ValueError:
         put(control, now)
-        raise TwinError(f"'{quote(given)}' is no value of this control; choose one that the page offers") from None
+        raise TwinError(f"'{quote(given)}' is not a value of this control; choose one that the page offers") from None
 
 
-def put(control: viser.GuiInputHandle[Any], value: object) -> None:
-    """Set a control's value in all browsers."""
+def put(control: viser.GuiInputHandle[Any], value: object, *, send: bool = False) -> None:
+    """Set a control's value in all browsers.
+
+    Parameters
+    ----------
+    send : bool
+        Send the value although the control has it. A browser may show another one: its own change and a change by this program can
+        cross on their way.
+    """
+    if send and control.value == value:
+        control._impl.gui_api._websock_interface.queue_message(GuiUpdateMessage(control._impl.uuid, {"value": value}))
     setattr(control, "value", value)  # noqa: B010  # by its annotations the value can't be set
 
 
@@ -132,7 +142,7 @@ def guarded_server(hosts: Sequence[str], report: Callable[[str], None]) -> Itera
     def serving(*args: Any, process_request: Callable[[ServerConnection, Request], Response | None] | None = None, **more: Any) -> Any:
         def answer_request(connection: ServerConnection, request: Request) -> Response | None:
             if not from_own_page(request, hosts):
-                return connection.respond(HTTPStatus.FORBIDDEN, "only the studio's own page may connect\n")
+                return connection.respond(HTTPStatus.FORBIDDEN, "only the page of the studio may connect\n")
             address = urlsplit(request.path)
             if address.path == "/" and address.query and request.headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin"):
                 report(request.path)
@@ -349,7 +359,7 @@ class StudioPage:
         done.result(CHANGE_S)
         self.server.flush()
 
-    def guard(self, action: Callable[[], None]) -> Callable[[object], None]:
+    def guard(self, action: Callable[[], object]) -> Callable[[object], None]:
         """A callback of a control that calls ``action`` and shows the user's errors. Changes that this program makes do nothing."""
 
         def call_action(event: object) -> None:
@@ -362,6 +372,10 @@ class StudioPage:
                 self.say(str(error), bad=True)
 
         return call_action
+
+    def button(self, label: str, action: Callable[[], object], **options: Any) -> None:
+        """Add a button that calls an action (see ``guard``)."""
+        self.gui.add_button(label, **options).on_click(self.guard(action))
 
     def say(self, text: str, *, bad: bool = False) -> None:
         """Show a message for some seconds."""

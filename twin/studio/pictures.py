@@ -7,12 +7,10 @@ from html import escape
 import cv2
 import numpy as np
 
-from twin.estimate import Estimate
+from twin.estimate import Estimate, readable_labels
 from twin.pins.batch import FOUND_RGB, draw_overlay, voronoi_map
 from twin.types import FloatArray, Frame, ImageArray, Observation
 
-UNITS = {"1": "mm", "2": "mm", "3": "mm", "4": "deg", "5": "deg", "6": "deg"}
-"""Unit of a label by its axis."""
 ARROW_RGB = (255, 140, 40)
 """Colour of the arrows of the pins' displacements."""
 TOLD_APART_PX = 0.7
@@ -24,7 +22,7 @@ class OverlayChoices(StrEnum):
 
     NOTHING = "picture alone"
     GRAPH = "pins and graph"
-    WAYS = "ways of the pins"
+    WAYS = "trajectories of the pins"
 
 
 def camera_picture(frame: Frame, seen: Observation, rest_px: FloatArray, drawn: OverlayChoices) -> ImageArray:
@@ -50,12 +48,6 @@ def cell_picture(frame: Frame, seen: Observation, rest_px2: FloatArray) -> Image
     return np.asarray(voronoi_map(frame.image.shape[:2], seen, rest_px2), np.uint8)
 
 
-def label_name(name: str) -> tuple[str, str]:
-    """A label's readable name, and its unit: ``pose_2`` gives ('pose 2', 'mm')."""
-    kind, _, axis = name.rpartition("_")
-    return f"{kind} {axis}".strip(), UNITS.get(axis, "")
-
-
 def estimate_table(estimate: Estimate | None, truth: Mapping[str, float], *, missing: str = "no model") -> str:
     """HTML of the estimate with its 90 % interval and the true value. A true value outside the interval is marked."""
     if estimate is None:
@@ -63,12 +55,12 @@ def estimate_table(estimate: Estimate | None, truth: Mapping[str, float], *, mis
     if not estimate.valid:
         return f"<p class='bad'>No estimate: {escape(estimate.reason)}</p>"
     rows = []
-    for name, value, low, high in zip(estimate.names, estimate.value, estimate.low, estimate.high, strict=True):
-        label, unit = label_name(name)
+    titles = zip(estimate.names, readable_labels(estimate.names), estimate.units, strict=True)
+    for (name, label, unit), value, low, high in zip(titles, estimate.value, estimate.low, estimate.high, strict=True):
         known = name in truth
         kind = "" if not known else ("good" if low <= truth[name] <= high else "bad")
         true = f"{truth[name]:+.2f}" if known else "-"
-        cells = f"<td>{escape(label)}, {unit}</td><td>{value:+.2f}</td><td>{low:+.2f} to {high:+.2f}</td>"
+        cells = f"<td>{escape(', '.join(filter(None, (label, unit))))}</td><td>{value:+.2f}</td><td>{low:+.2f} to {high:+.2f}</td>"
         rows.append(f"<tr>{cells}<td class='{kind}'>{true}</td></tr>")
     head = "<tr><th>estimate</th><th>value</th><th>90 % interval</th><th>truth</th></tr>"
     return f"<table>{head}{''.join(rows)}</table>"

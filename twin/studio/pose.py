@@ -10,11 +10,11 @@ from twin.mechanics.path import carry_points
 from twin.types import FloatArray
 
 LIMITS: dict[str, tuple[float, float, str]] = {
-    "x_mm": (-20.0, 20.0, "farther aside nothing would touch the dome"),
-    "y_mm": (-20.0, 20.0, "farther aside nothing would touch the dome"),
+    "x_mm": (-20.0, 20.0, "farther from the axis the object does not reach the dome"),
+    "y_mm": (-20.0, 20.0, "farther from the axis the object does not reach the dome"),
     "depth_mm": (-10.0, 20.0, "the object's place above or below the tip"),
-    "tilt_x_deg": (-60.0, 60.0, "the dome reaches no farther"),
-    "tilt_y_deg": (-60.0, 60.0, "the dome reaches no farther"),
+    "tilt_x_deg": (-60.0, 60.0, "the dome does not reach farther"),
+    "tilt_y_deg": (-60.0, 60.0, "the dome does not reach farther"),
     "twist_deg": (-90.0, 90.0, "a quarter turn"),
 }
 """Lowest and highest value of each number, and the reason for the limits."""
@@ -63,10 +63,10 @@ class ObjectPose:
         for name, value in asdict(self).items():
             low, high, why = LIMITS[name]
             if not np.isfinite(value):
-                raise ContactError(f"{name}: {value} is no finite number; give one between {low:g} and {high:g}")
+                raise ContactError(f"{name}: {value} is not a finite number; give one between {low:g} and {high:g}")
             kept[name] = min(max(value, low), high)
             if kept[name] != value:
-                reasons.append(f"{readable_name(name)} ends at {kept[name]:g} {unit_of(name)}: {why}")
+                reasons.append(f"{readable_name(name)} is limited to {kept[name]:g} {unit_of(name)}: {why}")
         return ObjectPose(**kept), "; ".join(reasons)
 
     def words(self) -> str:

@@ -71,7 +71,7 @@ class StudioState(Section):
             It is not a state of this version's studio.
         """
         if len(content) > MOST_BYTES:
-            raise TwinError(f"{name}: {len(content)} bytes are no state of the studio; {remedy}")
+            raise TwinError(f"{name}: {len(content)} bytes are not a state of the studio; {remedy}")
         try:
             state = cls.model_validate(json.loads(content))
             Form(state.form), PinColour(state.colour), OverlayChoices(state.drawn)
@@ -79,7 +79,7 @@ class StudioState(Section):
             first = error.errors()[0]
             raise TwinError(f"{name}: {'.'.join(map(str, first['loc']))}: {first['msg']}; {remedy}") from error
         except (ValueError, RecursionError) as error:
-            raise TwinError(f"{name}: no state of the studio ({error}); {remedy}") from error
+            raise TwinError(f"{name}: not a state of the studio ({error}); {remedy}") from error
         if state.studio != 1 or not set(state.pose) <= set(NAMES):
             raise TwinError(f"{name}: a state of another version; {remedy}")
         return state
@@ -114,7 +114,7 @@ class StudioState(Section):
             given = dict(parse_qsl(urlsplit(link).query, keep_blank_values=True, strict_parsing=True, max_num_fields=50))
             numbers = {key: float(given.pop(key)) for key in (*NAMES, "friction") if key in given}
         except ValueError as error:
-            raise TwinError(f"{name}: no link to a state of the studio ({error}); {remedy}") from error
+            raise TwinError(f"{name}: not a link to a state of the studio ({error}); {remedy}") from error
         friction = {key: numbers.pop(key) for key in ("friction",) if key in numbers}
         pose = numbers or {"depth_mm": FIRST_DEPTH_MM}
         return cls.read(json.dumps({**given, **friction, "pose": pose}).encode(), name, remedy)
@@ -187,7 +187,7 @@ def read_trajectory(content: bytes, name: str) -> Way:
         raise TwinError(f"{name}: {len(rows)} rows; a trajectory has 1 to {MOST_ROWS}")
     times = [row.pop("time_s") for row in rows]
     if any(not later > earlier for earlier, later in zip(times, times[1:], strict=False)):
-        raise TwinError(f"{name}: time_s does not rise; sort the rows by time")
+        raise TwinError(f"{name}: time_s does not increase; sort the rows by time")
     poses = [ObjectPose(**({"depth_mm": 0.0} | row)) for row in rows]
     for pose in poses:
         pose.within_limits()  # raises an error if a number is not finite

@@ -6,14 +6,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from twin.studio.degrade_mode import DegradeMode
-from twin.studio.live_mode import FeedOpener, LiveMode
-from twin.studio.mode import PageMode
-from twin.studio.new_mode import NewMode
+from twin.studio.modes.degrade_mode import DegradeMode
+from twin.studio.modes.live_mode import FeedOpener, LiveMode
+from twin.studio.modes.mode import PageMode
+from twin.studio.modes.new_mode import NewMode
+from twin.studio.modes.recording_mode import RecordingMode
+from twin.studio.modes.twin_mode import ModelOf, TwinMode
 from twin.studio.page import LOCAL, StudioPage
-from twin.studio.recording_mode import RecordingMode
 from twin.studio.state import StudioState, heading
-from twin.studio.twin_mode import ModelOf, TwinMode
 
 PORT = 8090
 """Port of the page."""

@@ -75,7 +75,7 @@ class FilmWriter:
         """
         if self._writer is None or self._last is None:
             self._folder.cleanup()
-            return "no video: nothing was shown meanwhile"
+            return "no video: no picture was shown"
         self._write(self._last)
         self._writer.release()
         write_bytes(self._path, self._part.read_bytes())

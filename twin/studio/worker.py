@@ -95,7 +95,7 @@ class Worker(_OwnThread):
         self._way: deque[Wish] = deque()
         self._asked_trace = 0
         self._moved_s = time.monotonic()
-        self._newest: ContactAnswer | None = None
+        self.newest: ContactAnswer | None = None
         self._traces = tracer is not None
         if tracer is not None:
             tracer.on_outcome = self._wake
@@ -104,11 +104,6 @@ class Worker(_OwnThread):
         """Take the tracer's outcomes at once."""
         with self._news:
             self._news.notify()
-
-    @property
-    def newest(self) -> ContactAnswer | None:
-        """The newest answer."""
-        return self._newest
 
     @property
     def playing(self) -> bool:
@@ -174,7 +169,7 @@ class Worker(_OwnThread):
 
     def _busy(self) -> bool:
         """Whether the fine mesh has something to do."""
-        newest = self._newest
+        newest = self.newest
         seen = newest is not None and (newest.lit is Light.TRACED or not self._traces)
         return seen and not self._way and time.monotonic() - self._moved_s > REFINE_S and not self._contact.refined
 
@@ -187,7 +182,7 @@ class Worker(_OwnThread):
             self._publish(self._contact.step(wish[0]))
             self._moved_s = time.monotonic()
             with self._news:
-                if self._newest is not None and self._newest.arrived and self._wish is wish:
+                if self.newest is not None and self.newest.arrived and self._wish is wish:
                     self._wish = None
         elif self._busy():
             refined = self._contact.refine()
@@ -201,7 +196,7 @@ class Worker(_OwnThread):
 
     def _ask_trace(self) -> None:
         """Request the path-traced picture of an answer that stands still."""
-        newest = self._newest
+        newest = self.newest
         if newest is None or not self._traces or self._tracer is None or self._way:
             return
         still = time.monotonic() - self._moved_s > STILL_S
@@ -213,7 +208,7 @@ class Worker(_OwnThread):
         match outcome:
             case Traced():
                 answer = None
-                if not (outcome.rough and self._newest is not None and self._newest.lit is Light.TRACED):  # no good picture gives way
+                if not (outcome.rough and self.newest is not None and self.newest.lit is Light.TRACED):  # no good picture gives way
                     lit = Light.ROUGH if outcome.rough else Light.TRACED
                     answer = self._contact.newest_traced(outcome.solved, outcome.light, lit, outcome.ms)
                 if answer is not None:
@@ -230,9 +225,9 @@ class Worker(_OwnThread):
                 self._on_message(outcome.reason)
 
     def _publish(self, answer: ContactAnswer) -> None:
-        if self._newest is None and self._tracer is not None:
+        if self.newest is None and self._tracer is not None:
             self._tracer.start()  # not earlier, so that the first picture does not wait for it
-        self._newest = answer
+        self.newest = answer
         self._on_answer(answer)
 
 

@@ -6,7 +6,6 @@
 import time
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import Self
 
@@ -281,24 +280,14 @@ class DummyController(RobotController):
         super().__init__("simulated")
 
 
-class _Controllers(Mapping[str, type[RobotController]]):
+class _Controllers(dict[str, type[RobotController]]):
     """Classes of arms by cri's names."""
 
-    _classes = {"mg400": MG400Controller, "magician": MagicianController, "dummy": DummyController}
-
-    def __getitem__(self, kind: str) -> type[RobotController]:
-        if kind not in self._classes:
-            raise KeyError(f"no controller '{kind}'; there are: {', '.join(self._classes)}")
-        return self._classes[kind]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._classes)
-
-    def __len__(self) -> int:
-        return len(self._classes)
+    def __missing__(self, kind: str) -> type[RobotController]:
+        raise KeyError(f"no controller '{kind}'; there are: {', '.join(self)}")
 
 
-Controller = _Controllers()
+Controller = _Controllers(mg400=MG400Controller, magician=MagicianController, dummy=DummyController)
 
 
 def _percent(name: str, speed: float) -> float:

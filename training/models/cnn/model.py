@@ -9,11 +9,11 @@ import torch
 from torch import nn
 
 from training.data.dataset import Dataset
-from training.models.cnn.inputs import ImageInputs, image_inputs, small_image
+from training.models.cnn.inputs import image_inputs, small_image
 from training.models.cnn.network import Cnn
-from training.models.part import Model, Prediction, Prepared, Trained, refuse_sizes
+from training.models.part import ArrayInputs, Model, Prediction, Prepared, Trained, refuse_sizes
 from training.models.recipes import Recipe
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 from twin.types import Frame
 
 
@@ -38,7 +38,7 @@ class CnnModel(Model):
 
     def inputs_seen(self, data: Dataset) -> object:
         """See ``Model``: the small images."""
-        return image_inputs(data).images.numpy()
+        return image_inputs(data).values.numpy()
 
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Cnn:
         """See ``Model``; there are no sizes."""
@@ -52,7 +52,7 @@ class CnnModel(Model):
     def estimate_frame(self, trained: Trained, frame: Frame) -> Prediction:
         """See ``Model``."""
         trained.pipeline.check(frame)
-        return trained.ensemble(ImageInputs(small_image(frame.image)[None]), torch.zeros(1, dtype=torch.long))
+        return trained.ensemble(ArrayInputs(small_image(frame.image)[None]), torch.zeros(1, dtype=torch.long))
 
     def estimate_rows(self, trained: Trained, data: Dataset, rows: np.ndarray) -> Prediction:
         """See ``Model``."""

@@ -10,7 +10,7 @@ from training.models.graphs.network import Gcn
 from training.models.part import Learnt, PinModel, refuse_sizes
 from training.models.recipes import Recipe
 from twin.frames.forms import frame_size
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,35 +11,16 @@ from torch import nn
 from training.data.label_code import LabelCode
 from training.data.pins import PinTable
 from training.errors import TrainingError
-from training.models.part import Inputs, Learnt, Modes, PinModel, Weights, refuse_sizes
+from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Weights, refuse_sizes
 from training.models.recipes import Recipe
 from training.models.steered.field import waves_of
 from training.models.steered.network import Steered, SteeredSize
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 
 # Buffers that a small copy leaves out, because they follow from the pins at rest.
 DERIVED = ("fit", "order")
 # Components of the turned field that are inputs of a Gaussian process. Finer ones are noise to it.
 PROCESS_MODES = 20
-
-
-class BatchDisplacements:
-    """Displacements from rest of every frame: ``batch`` gives (B, N, 2), in mean rest spacings.
-
-    Parameters
-    ----------
-    moved : (M, N, 2) float
-    """
-
-    def __init__(self, moved: np.ndarray) -> None:
-        self.moved = torch.from_numpy(moved.astype(np.float32))
-
-    def __len__(self) -> int:
-        return len(self.moved)
-
-    def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Arguments of the network for some rows."""
-        return (self.moved[rows],)
 
 
 class SteeredModel(PinModel):
@@ -53,9 +34,9 @@ class SteeredModel(PinModel):
         refuse_sizes(self, size, tuple(field.name for field in fields(SteeredSize)))
         return Steered(waves_of(reference.pins_px), outputs, SteeredSize(**size))
 
-    def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> BatchDisplacements:
-        """See ``PinModel``. A lost pin is where its neighbours predict it."""
-        return BatchDisplacements((pins.nodes_px - pins.reference.pins_px) / reference.spacing_px.mean())
+    def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> ArrayInputs:
+        """See ``PinModel``: displacements from rest (M, N, 2) in mean rest spacings. A lost pin is where its neighbours predict it."""
+        return ArrayInputs(((pins.nodes_px - pins.reference.pins_px) / reference.spacing_px.mean()).astype(np.float32))
 
     def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
         """See ``Model``. Sets the principal components, and the turning sense in which the direction's label grows.
@@ -69,7 +50,7 @@ class SteeredModel(PinModel):
             raise TrainingError(
                 f"{self.name} is for labels of which one is a direction on the whole circle, these have {sum(code.circular)}; train vgnn"
             )
-        cast(Steered, network).prepare(cast(BatchDisplacements, inputs).moved[rows], numbers[rows], code)
+        cast(Steered, network).prepare(inputs.batch(rows)[0], numbers[rows], code)
 
     def modes(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> Modes:
         """See ``Model``. The inputs are the network's estimates, and the first components of the field after it is turned by them."""

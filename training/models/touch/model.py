@@ -14,12 +14,12 @@ from training.data.dataset import Dataset
 from training.data.label_code import LabelCode
 from training.data.pins import PinTable
 from training.errors import TrainingError
-from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Weights, refuse_sizes
+from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Prepared, Weights, refuse_sizes
 from training.models.recipes import Recipe
 from training.models.touch.features import Bases
 from training.models.touch.network import TouchNetwork
 from training.models.vgnn.registration import Registration, align, fit_registration
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 
 SIZES = {"modes": 40, "light_modes": 20, "width": 256, "depth": 3}
 """Numbers of modes of displacements (and of relative modes) and of modes of light; width and depth of the network."""
@@ -43,18 +43,9 @@ LIGHT_DECIMALS = 4
 """Decimals of the caps' light (logarithms of levels) that are compared between frames."""
 
 
-class TouchInputs:
-    """Features (M, D) of every frame."""
-
-    def __init__(self, features: np.ndarray) -> None:
-        self.x = torch.from_numpy((GAIN * features).astype(np.float32))
-
-    def __len__(self) -> int:
-        return len(self.x)
-
-    def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Arguments of the network for some rows."""
-        return (self.x[rows],)
+def _scale(features: np.ndarray) -> ArrayInputs:
+    """Inputs from features (M, D)."""
+    return ArrayInputs((GAIN * features).astype(np.float32))
 
 
 class TouchModel(PinModel):
@@ -85,20 +76,20 @@ class TouchModel(PinModel):
         moved = _remove_camera_motion(registration, pins, pins.reference, lost, together=False)
         bases = Bases.learn_bases(moved[train], pins.light[train], lost[train], modes=SIZES["modes"], light_modes=SIZES["light_modes"])
         learnt = {"registration": registration.arrays(), "bases": bases.arrays()}
-        return Prepared(TouchInputs(bases(moved, pins.light)), learnt)
+        return Prepared(_scale(bases(moved, pins.light)), learnt)
 
     def inputs_seen(self, data: Dataset) -> object:
         """See ``Model``: the pins, their places at rest, and the light of the caps."""
         return [super().inputs_seen(data), np.round(data.pins.light, LIGHT_DECIMALS) + 0.0]
 
-    def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> TouchInputs:
+    def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> ArrayInputs:
         """See ``PinModel``. If a frame without contact shows the camera's place, no displacement of the camera is estimated."""
         pins = pins.relative_to(reference) if pins.measured else pins
         registration, bases = Registration(**learnt["registration"]), Bases(**learnt["bases"])
         if bases.light_mean.any() and not pins.light.any():
             raise TrainingError("the model was trained on the light on the caps as well, and these pins come without it; give it frames")
         moved = _remove_camera_motion(registration, pins, reference, _find_untrusted(registration, pins, reference), together=together)
-        return TouchInputs(bases(moved, _as_bright(pins.light, bases)))
+        return _scale(bases(moved, _as_bright(pins.light, bases)))
 
     def initialise(self, network: torch.nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
         """See ``Model``. Sets the largest size of each feature in training."""
@@ -134,8 +125,7 @@ def _remove_camera_motion(
 def _as_bright(light: np.ndarray, bases: Bases) -> np.ndarray:
     """Light (M, N) without a common change of all caps that is larger than contacts cause: the camera's exposure, or the lamps."""
     brighter = ((light - bases.light_mean) * bases.seen).sum(axis=1, keepdims=True) / bases.seen.sum()
-    found: np.ndarray = light - np.where(np.abs(brighter) > BRIGHTER, brighter, 0.0)
-    return found
+    return light - np.where(np.abs(brighter) > BRIGHTER, brighter, 0.0)
 
 
 def _find_untrusted(registration: Registration, pins: PinTable, reference: Reference) -> np.ndarray:

@@ -5,7 +5,7 @@ import torch
 
 from training.models.vgnn.registration import Registration
 from twin.pins import make_graph
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 
 
 class PinInputs:

@@ -16,7 +16,7 @@ from training.models.recipes import Recipe
 from training.models.vgnn.inputs import PinInputs, fill_lost, pin_features, seated_inputs
 from training.models.vgnn.network import Vgnn, VgnnSize
 from training.models.vgnn.registration import Registration, fit_registration
-from twin.pins.reference import Reference
+from twin.pins.labelling.reference import Reference
 from twin.pins.voronoi import directed_edges, triangulate
 
 # Number of modes of the displacement that are inputs of the Gaussian process, with all modes of the areas. Finer modes are noise to it.

@@ -16,29 +16,17 @@ from twin.report.table import Column
 from twin.report.themes import BLUE, RED
 
 
-def write_page(
-    folder: Path,
-    *,
-    plan: ObjectsPlan,
-    names: Sequence[str],
-    ranges: Mapping[str, Sequence[float]],
-    rows: Sequence[Mapping],
-    verdicts: Sequence[str],
-) -> Path:
+def write_page(folder: Path, plan: ObjectsPlan, rows: Sequence[Mapping], verdicts: Sequence[str]) -> Path:
     """Write ``index.html`` and its chart, and return the page's path.
 
     Parameters
     ----------
     folder : Path
     plan : Plan
-    names : sequence of str
-        Labels.
-    ranges : mapping of str to (low, high)
-        Ranges of the labels that are evaluated.
     rows, verdicts : sequences
         As ``table`` and ``verdicts`` give them.
     """
-    alone = plan.alone.name
+    alone, names, ranges = plan.alone.name, plan.experiment.targets, plan.experiment.ranges()
     judged = ", ".join(f"{name} {number(ranges[name][0])} to {number(ranges[name][1])} {unit_of(name)}".rstrip() for name in names)
     page = Page(f"Objects never seen: {plan.sensor.name}", "twin study objects", topic="TacTip twin: study")
     page.lead = (

@@ -75,8 +75,8 @@ def run(plan: ObjectsPlan, out: Path, *, progress: Progress = silent) -> Objects
         with stage(progress, name) as step:
             train_in_twin(data, runs[name], seed=plan.seed, split=None, epochs=plan.epochs, progress=step)
     names, rows = plan.experiment.targets, table(plan, runs, sets)
-    said, ranges = verdicts(plan, rows, names), plan.experiment.ranges()
-    page = write_page(out, plan=plan, names=names, ranges=ranges, rows=rows, verdicts=said)
+    said = verdicts(plan, rows, names)
+    page = write_page(out, plan, rows, said)
     return ObjectsResult(rows, said, names, [write_table(out / "objects.csv", rows), page])
 
 

@@ -12,7 +12,6 @@ simulated contact one function is sampled from the posterior and added to the pi
 discrepancy, and with a wide spread of discrepancies where no labelled frame is near.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +24,7 @@ from twin.calibration.contact.fit import expect, mean_squared, simulate
 from twin.calibration.contact.parameters import PARAMETERS
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.evaluation.labelled.model import MeasuredFrames
+from twin.progress import Step, unheard
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
 
@@ -103,7 +103,7 @@ def label_axes(labels: list[ArmLabel]) -> np.ndarray:
 
 
 def measure_residuals(
-    setup: CalibrationSetup, measured: MeasuredFrames, progress: Callable | None = None, *, frictions: tuple = FRICTIONS
+    setup: CalibrationSetup, measured: MeasuredFrames, progress: Step = unheard, *, frictions: tuple = FRICTIONS
 ) -> Residuals:
     """Simulate labelled frames with several frictions, and compare each frame with the simulated state that is most like it.
 

@@ -92,15 +92,12 @@ class TwinField:
         if len(known) > AT_ONCE:
             return np.concatenate([self.own(known[first : first + AT_ONCE]) for first in range(0, len(known), AT_ONCE)])
         near = self._kernel(Points.of(self._inputs(known)), self._points)
-        found = near @ self._weight @ self._components
-        real, imaginary = np.split(found, 2, axis=1)
-        expected: np.ndarray = self._mean + real + 1j * imaginary
-        return expected
+        real, imaginary = np.split(near @ self._weight @ self._components, 2, axis=1)
+        return self._mean + real + 1j * imaginary
 
     def waves(self, moved_px: np.ndarray) -> np.ndarray:
         """Waves (B, C) of displacements (B, N, 2)."""
-        found: np.ndarray = (moved_px @ [1, 1j]) @ self._fit.T
-        return found
+        return (moved_px @ [1, 1j]) @ self._fit.T
 
     def noise(self, moved_px: np.ndarray) -> np.ndarray:
         """(2C, 2C) covariance, as ``parts``, of the waves by the noise of pins, in the object's frame.
@@ -121,13 +118,11 @@ class TwinField:
         if self.direction is None:
             return np.ones((len(known), 1))
         angle = self._sense * np.radians(known[:, self.direction])[:, None]
-        factors: np.ndarray = np.exp((-1j if back else 1j) * angle * self.order)
-        return factors
+        return np.exp((-1j if back else 1j) * angle * self.order)
 
     def scale_labels(self, known: np.ndarray) -> np.ndarray:
         """The varied labels (B, V), from -1 to 1 over their ranges."""
-        found: np.ndarray = (known[:, self.varied] - self.middle[self.varied]) / self.half[self.varied]
-        return found
+        return (known[:, self.varied] - self.middle[self.varied]) / self.half[self.varied]
 
     def scale_moves(self, known: np.ndarray) -> np.ndarray:
         """As ``scale_labels``, with moves m as m / sqrt(m0^2 + |m|^2), m0 = ``SLIPS_AT``.

@@ -12,12 +12,12 @@ import numpy as np
 
 from scenes import ExperimentSpec, ObjectSpec
 from training.data.dataset import Dataset
-from training.data.label_code import label_error, wrapped_deg
+from training.data.label_code import wrapped_deg
 from training.data.targets import unit_of
 from training.runs.gaussian_process import Kernel, Points, Posterior, Term, fit_processes
 from training.studies.sim_to_real.missed import MOST_FRAMES, choose_evenly
 from training.studies.sim_to_real.model_inversion import ModelInversion
-from training.studies.sim_to_real.steps import MODES, arm_labels, stands_and_moves, states_touching, states_within
+from training.studies.sim_to_real.steps import MODES, arm_labels, label_errors, stands_and_moves, states_touching, states_within
 from twin.rig.labels import ArmLabel
 
 READ = "model inversion"
@@ -211,12 +211,8 @@ def read_row(
     moved = real.pins.nodes_px - real.pins.reference.pins_px
     found = twin.estimate(moved[rows], [labels[row] for row in rows], moved[test], None if unlabelled is None else moved[unlabelled])
     targets = real.targets.rows(test)
-    made = named_labels(found, targets.names)
     row = {"trained_on": name, "labelled_frames": len(rows), "model": READ}
-    for kind in ("corrected", "raw"):
-        errors = np.abs(label_error(made, getattr(targets, kind), targets.units)).mean(axis=0)
-        row |= {f"{label}_{kind}": float(error) for label, error in zip(targets.names, errors, strict=True)}
-    return row
+    return row | label_errors(named_labels(found, targets.names), targets)
 
 
 def named_labels(found: np.ndarray, names: Sequence[str]) -> np.ndarray:

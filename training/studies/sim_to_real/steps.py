@@ -14,6 +14,7 @@ from training.data.design import nearest_to_even
 from training.data.label_code import LabelCode, goes_round, label_error
 from training.data.pins import voronoi_areas
 from training.data.simulated import config_of, is_pins_only, open_simulated
+from training.data.targets import Targets
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models import model_named, recipe_of
@@ -331,8 +332,14 @@ def quadratic_row(name: str, real: Dataset, rows: np.ndarray, test: np.ndarray) 
                 best = error
                 made[:, k] = x[test] @ (right.T @ (shrunk / sizes * (left.T @ y))) + shift[k]
     row = {"trained_on": name, "labelled_frames": len(rows), "model": "quadratic regression"}
-    targets = real.targets.rows(test)
+    told, targets = code.decode(made, np.zeros_like(made))[0], real.targets.rows(test)
+    return row | label_errors(told, targets) | {"leak_slope": leak_check(told, targets).slope}
+
+
+def label_errors(made: np.ndarray, targets: Targets) -> dict[str, Any]:
+    """The entries of the study's table for estimated labels (M, K): mean absolute errors."""
+    row: dict[str, Any] = {}
     for kind in ("corrected", "raw"):
-        errors = np.abs(label_error(code.decode(made, np.zeros_like(made))[0], getattr(targets, kind), targets.units)).mean(axis=0)
+        errors = np.abs(label_error(made, getattr(targets, kind), targets.units)).mean(axis=0)
         row |= {f"{label}_{kind}": float(error) for label, error in zip(targets.names, errors, strict=True)}
-    return row | {"leak_slope": leak_check(code.decode(made, np.zeros_like(made))[0], targets).slope}
+    return row

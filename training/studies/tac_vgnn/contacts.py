@@ -125,14 +125,7 @@ class AreaChange:
         }
 
 
-def twin_contacts(
-    spec: SensorSpec,
-    form: Form,
-    *,
-    depths_mm: tuple[float, ...] = DEPTHS_MM,
-    names: tuple[str, ...] = tuple(CONTACTS),
-    progress: Step | None = None,
-) -> list[AreaChange]:
+def twin_contacts(spec: SensorSpec, form: Form, *, progress: Step | None = None) -> list[AreaChange]:
     """Simulate and render every contact at every depth, find its pins, and compute their Voronoi cells.
 
     Raises
@@ -145,10 +138,9 @@ def twin_contacts(
     if not rest.valid or rest.graph is None:
         raise TwinError(f"{spec.name}: pins of the rendered frame without contact not found: {rest.reason}")
     found = []
-    for name in names:
-        stimulus, turn_deg, aside_mm = CONTACTS[name]
+    for name, (stimulus, turn_deg, aside_mm) in CONTACTS.items():
         obj = load_object(stimulus)
-        for depth in depths_mm:
+        for depth in DEPTHS_MM:
             poses = plan_path(spec.geometry, build_field(obj), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
             state = [state for _, state in simulator.solver.path(obj, ContactPath(_rotation_about_z(turn_deg) @ poses))][-1]
             seen = pipeline(simulator.render(state, form=form).frame)
@@ -156,7 +148,7 @@ def twin_contacts(
                 raise TwinError(f"{spec.name}, {name}, {depth:g} mm: {seen.reason}")
             found.append(AreaChange(name, depth, seen.graph, rest.graph.area_px2))
             if progress:
-                progress(len(found), len(names) * len(depths_mm))
+                progress(len(found), len(CONTACTS) * len(DEPTHS_MM))
     return found
 
 

@@ -2,5 +2,3 @@
 
 from twin.calibration.contact.fit import ContactFit, fit_contact
 from twin.calibration.contact.parameters import PARAMETERS, FittedParameter
-
-__all__ = ["PARAMETERS", "ContactFit", "FittedParameter", "fit_contact"]

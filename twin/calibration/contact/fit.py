@@ -25,7 +25,7 @@ from twin.calibration.contact.simulate import CalibrationSetup
 from twin.errors import FrameError
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.frames.forms import blob_spec
-from twin.progress import Step
+from twin.progress import Step, unheard
 from twin.rig.kinematics import rig_of
 from twin.types import Form
 
@@ -105,7 +105,7 @@ class Weights:
         return float(INDEPENDENT / self.variance_px2 * self.trust @ each)
 
 
-def fit_contact(setup: CalibrationSetup, measured: MeasuredFrames, *, progress: Step | None = None) -> ContactFit:
+def fit_contact(setup: CalibrationSetup, measured: MeasuredFrames, *, progress: Step = unheard) -> ContactFit:
     """Fit the setup's parameters and the sign of the turns.
 
     Raises
@@ -146,7 +146,7 @@ def fit_contact(setup: CalibrationSetup, measured: MeasuredFrames, *, progress: 
 
 
 def _search_values(
-    setup: CalibrationSetup, measured: MeasuredFrames, target: np.ndarray, start: np.ndarray, sign: int, progress: Step | None
+    setup: CalibrationSetup, measured: MeasuredFrames, target: np.ndarray, start: np.ndarray, sign: int, progress: Step
 ) -> tuple[np.ndarray, np.ndarray, Weights]:
     """The values (P,) with the least cost, their displacements (M, 2, N, 2) px, and the weights of the E-step for them."""
     prior = np.array([p.prior for p in setup.parameters])
@@ -181,7 +181,7 @@ def _search_values(
     return value, moved, weights
 
 
-def held_out_px(setup: CalibrationSetup, fit: ContactFit, measured: MeasuredFrames, *, progress: Step | None = None) -> tuple[float, float]:
+def held_out_px(setup: CalibrationSetup, fit: ContactFit, measured: MeasuredFrames, *, progress: Step = unheard) -> tuple[float, float]:
     """Mean pin error, before and after, on held-out frames. Each frame's error is that of the hypothesis that fits it better."""
     target = measured.pins_px - measured.no_contact_px
     errors = []
@@ -217,7 +217,7 @@ def expect(squared_px2: np.ndarray) -> Weights:
     return Weights(executed, trust, share, variance)
 
 
-def _start(setup: CalibrationSetup, measured: MeasuredFrames, target: np.ndarray, progress: Step | None) -> tuple[np.ndarray, int]:
+def _start(setup: CalibrationSetup, measured: MeasuredFrames, target: np.ndarray, progress: Step) -> tuple[np.ndarray, int]:
     """Values (P,) and sign of the turns at the start: the best fit among both signs and all quarter turns of the image."""
     value = values_of(setup.sensor, setup.experiment, setup.parameters)
     by_turn = np.argsort([-np.abs(label.pose[3:] - label.move[3:]).max() for label in measured.labels])[:START_FRAMES]
@@ -236,14 +236,14 @@ def _start(setup: CalibrationSetup, measured: MeasuredFrames, target: np.ndarray
     return tries[int(np.nanargmin(errors))]
 
 
-def simulate(setup: CalibrationSetup, measured: MeasuredFrames, values: list, sign: int, progress: Step | None = None) -> np.ndarray:
+def simulate(setup: CalibrationSetup, measured: MeasuredFrames, values: list, sign: int, progress: Step = unheard) -> np.ndarray:
     """(V, M, 2, N, 2) px for V vectors of values."""
     jobs = [(each, sign, row) for each in values for row in range(len(measured))]
     return setup.displacements(jobs, measured.labels, progress).reshape(len(values), len(measured), 2, -1, 2)
 
 
 def _slopes(
-    setup: CalibrationSetup, measured: MeasuredFrames, value: np.ndarray, sign: int, moved: np.ndarray, progress: Step | None
+    setup: CalibrationSetup, measured: MeasuredFrames, value: np.ndarray, sign: int, moved: np.ndarray, progress: Step
 ) -> np.ndarray:
     """Derivatives (P, M, 2, N, 2) of the displacements by each fitted quantity, px; 0 for a failed contact."""
     steps = np.diag([p.step for p in setup.parameters])

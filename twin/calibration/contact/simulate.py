@@ -14,7 +14,7 @@ from scenes.sensor import SensorSpec
 from twin.calibration.contact.parameters import PARAMETERS, FittedParameter, with_quantities
 from twin.errors import ContactError
 from twin.evaluation.labelled.model import ContactModel
-from twin.progress import Step
+from twin.progress import Step, unheard
 from twin.rig.labels import ArmLabel
 from twin.store import Item, find_arrays, inputs_digest, keep_arrays
 from twin.types import Form
@@ -53,7 +53,7 @@ class CalibrationSetup:
     workers: int = 1
     parameters: tuple[FittedParameter, ...] = PARAMETERS
 
-    def displacements(self, jobs: list[tuple], labels: list[ArmLabel], progress: Step | None = None) -> np.ndarray:
+    def displacements(self, jobs: list[tuple], labels: list[ArmLabel], progress: Step = unheard) -> np.ndarray:
         """(J, 2, N, 2) px after tap and after move, for jobs of (values (P,), turn_sign, row of ``labels``); NaN if the contact failed."""
         plans = [
             {"values": np.asarray(values).tolist(), "sign": int(sign), "pose": list(labels[row].pose), "move": list(labels[row].move)}
@@ -75,8 +75,7 @@ class CalibrationSetup:
         for k, both in outcomes(_contact, text, todo, workers=self.workers, scheduler=""):
             keep_arrays(self.folder, items[k], {"displacements_px": both})
             found[k] = both
-            if progress:
-                progress(len(found), len(items))
+            progress(len(found), len(items))
         return np.stack([found[k] for k in range(len(items))])
 
 

@@ -15,7 +15,7 @@ from twin.evaluation.pictures.aligned import SATURATED, Aligned, with_changes
 from twin.evaluation.pictures.spectra import bin_of, equal_count_edges, noise_sd
 from twin.evaluation.pictures.statistics import bare_skin
 from twin.frames.forms import gray_levels
-from twin.pins.caps import measure_caps
+from twin.pins.finding.caps import measure_caps
 
 # Fitted quantities in ``[response]``: least value, largest value, and step of the numerical derivatives.
 BOUNDS = {

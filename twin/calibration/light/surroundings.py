@@ -14,7 +14,7 @@ from twin.calibration.light.ring import fit_disc_edge, fit_ring
 from twin.calibration.light.specks import fit_specks
 from twin.calibration.light.still import Still, median_still
 from twin.errors import FrameError
-from twin.progress import Step
+from twin.progress import Step, unheard
 
 # Share of pixels at exactly 0 or 255 above which frames count as thresholded. Raw frames are saturated only on the ring.
 MOST_BINARY = 0.6
@@ -22,7 +22,7 @@ MOST_BINARY = 0.6
 MOST_FRAMES = 40
 
 
-def fit_surroundings(spec: SensorSpec, images: np.ndarray, pins_px: np.ndarray, progress: Step | None = None) -> SensorSpec:
+def fit_surroundings(spec: SensorSpec, images: np.ndarray, pins_px: np.ndarray, progress: Step = unheard) -> SensorSpec:
     """The specification with housing, LED places and reflections, and specks fitted to frames of one sensor.
 
     Parameters
@@ -55,8 +55,7 @@ def fit_surroundings(spec: SensorSpec, images: np.ndarray, pins_px: np.ndarray, 
     stages: tuple[Callable[[SensorSpec, Still], SensorSpec], ...] = (fit_disc_edge, turn_leds, fit_reflections, fit_ring, specks)
     for done, stage in enumerate(stages):
         spec = stage(spec, still)
-        if progress:
-            progress(done + 1, len(stages))
+        progress(done + 1, len(stages))
     return spec
 
 

@@ -1,7 +1,7 @@
 """A condition: one kind of degradation of a sensor, as frozen data, and the stage of the chain on which it acts.
 
-The stages are specification, contact, light on the film, camera response, frame, and the pipeline's settings. If the value is the nominal
-one, every hook returns its input unchanged, bit for bit.
+The stages are specification, contact, light on the film, camera response, frame, and the pipeline's settings. At severity 0 no hook is
+called, so that nothing changes, bit for bit.
 """
 
 import zlib
@@ -182,47 +182,46 @@ class DegradedCase:
         """The parameters' values in words."""
         return ", ".join(f"{c.value(severity):.3g} {c.unit}".strip() for c in self.conditions)
 
+    def _acting(self, stage: str, severity: float) -> list[tuple[Any, float, Condition]]:
+        """The changes at a stage, the field of `Condition` with this name, with their values. At severity 0 nothing acts."""
+        changes = [(getattr(c, stage), c.value(severity), c) for c in self.conditions]
+        return [each for each in changes if each[0] is not None] if severity > 0 else []
+
     def on_spec(self, spec: SensorSpec, severity: float) -> SensorSpec:
         """The degraded specification."""
-        for c in self.conditions:
-            if c.spec is not None:
-                spec = c.spec(spec, c.value(severity), c.rng())
+        for change, value, c in self._acting("spec", severity):
+            spec = change(spec, value, c.rng())
         return spec
 
     def on_light(self, light: np.ndarray, severity: float, view: PictureView, draw: int) -> np.ndarray:
         """Degraded linear light."""
-        for c in self.conditions:
-            if c.light is not None:
-                light = c.light(light, c.value(severity), view, c.rng(draw))
+        for change, value, c in self._acting("light", severity):
+            light = change(light, value, view, c.rng(draw))
         return light
 
     def on_frame(self, image: np.ndarray, severity: float, view: PictureView, draw: int) -> np.ndarray:
         """A degraded frame."""
-        for c in self.conditions:
-            if c.frame is not None:
-                image = c.frame(image, c.value(severity), view, c.rng(draw))
+        for change, value, c in self._acting("frame", severity):
+            image = change(image, value, view, c.rng(draw))
         return image
 
     def on_points(self, px: np.ndarray, severity: float, view: PictureView) -> np.ndarray:
         """The places to which points (n, 2) are moved."""
-        for c in self.conditions:
-            if c.moves is not None:
-                px = c.moves(px, c.value(severity), view)
+        for move, value, _ in self._acting("moves", severity):
+            px = move(px, value, view)
         return px
 
     def missing_caps(self, severity: float, view: PictureView) -> np.ndarray:
         """(N,) bool: caps that are gone."""
         gone = np.zeros(len(view.caps_px), bool)
-        for c in self.conditions:
-            if c.hides is not None:
-                gone |= c.hides(c.value(severity), view, c.rng())
+        for hides, value, c in self._acting("hides", severity):
+            gone |= hides(value, view, c.rng())
         return gone
 
     def on_setting(self, detector: DetectorSpec, severity: float) -> DetectorSpec:
         """The detector with wrong settings."""
-        for c in self.conditions:
-            if c.setting is not None:
-                detector = c.setting(detector, c.value(severity))
+        for change, value, _ in self._acting("setting", severity):
+            detector = change(detector, value)
         return detector
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.measures import MEASURES, POSE_MEASURES, Measure
 from twin.evaluation.degradation.sweep import SweepSettings, run_sweep
-from twin.pins.reference import nominal_reference
+from twin.pins.labelling.reference import nominal_reference
 
 DRAWS = 400
 """Number of bootstrap samples of the frames."""

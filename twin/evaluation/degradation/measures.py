@@ -7,7 +7,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from twin.evaluation.degradation.shots import DegradedFrame
-from twin.pins.detector import Detector, Found, reorder_to
+from twin.pins.detectors.detector import Detector, Found, reorder_to
 from twin.types import PinGraph
 
 # Largest distance between a detected position and its pin, relative to the distance of the pin's nearest neighbour. It was chosen

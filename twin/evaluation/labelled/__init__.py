@@ -2,5 +2,3 @@
 
 from twin.evaluation.labelled.compare import Comparison, compare, table_of
 from twin.evaluation.labelled.model import ContactModel, MeasuredFrames, measure_frames
-
-__all__ = ["Comparison", "ContactModel", "MeasuredFrames", "compare", "measure_frames", "table_of"]

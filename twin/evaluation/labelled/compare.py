@@ -7,7 +7,7 @@ import numpy as np
 
 from twin.errors import ContactError
 from twin.evaluation.labelled.model import ContactModel, MeasuredFrames
-from twin.progress import Step
+from twin.progress import Step, unheard
 from twin.rig.labels import poses_and_moves
 
 FRICTIONS = (0.0, 0.15, 0.25, 0.32, 0.4, 0.5, 0.65, 1.0, 2.0)
@@ -49,7 +49,7 @@ class Comparison:
     failures: dict[str, str]
 
 
-def compare(model: ContactModel, measured: MeasuredFrames, *, friction_frames: int = 0, progress: Step | None = None) -> Comparison:
+def compare(model: ContactModel, measured: MeasuredFrames, *, friction_frames: int = 0, progress: Step = unheard) -> Comparison:
     """Simulate every frame's contact, and fit an individual friction to some frames.
 
     ``friction_frames`` is the number of frames whose friction is fitted. They are spread evenly over the frames with an executed move.
@@ -62,8 +62,7 @@ def compare(model: ContactModel, measured: MeasuredFrames, *, friction_frames: i
     def simulate(row: int, friction: float | None = None) -> np.ndarray:
         nonlocal done
         done += 1
-        if progress:
-            progress(done, total)
+        progress(done, total)
         return measured.no_contact_px + model.displacement_px(measured.labels[row], friction)
 
     for row, name in enumerate(measured.names):

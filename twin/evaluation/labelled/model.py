@@ -20,7 +20,7 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.pins import Pipeline
 from twin.pins.batch import UNMEASURED, recording_reference
-from twin.progress import Step
+from twin.progress import Step, unheard
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel, read_arm_labels
@@ -67,7 +67,7 @@ def measure_frames(
     *,
     experiment: ExperimentSpec | None = None,
     form: Form | None = None,
-    progress: Step | None = None,
+    progress: Step = unheard,
 ) -> MeasuredFrames:
     """Find the pins of ``count`` random frames of a labelled recording (None: of all frames). The frames have the order of the table.
 
@@ -93,8 +93,7 @@ def measure_frames(
             reason = str(error)
         if reason:
             problems.append(f"{recording.names[row]}: left out: {reason}")
-        if progress:
-            progress(done + 1, len(chosen))
+        progress(done + 1, len(chosen))
     if not kept:
         raise FrameError(f"{folder}: no frame with pins among {len(chosen)}; {problems[-1] if problems else 'is it the right `sensor`?'}")
     names, told = [recording.names[row] for row in kept], [labels[row] for row in kept]

@@ -12,7 +12,7 @@ from twin.frames import open_recording, spread_indices
 from twin.frames.forms import gray_levels
 from twin.frames.recording import BadFrame
 from twin.pins.pipeline import Pipeline
-from twin.progress import Step
+from twin.progress import Step, unheard
 from twin.types import Form, Frame, Observation
 
 # A frame counts as dark if this percentile of the disc's gray levels is at most this level.
@@ -67,7 +67,7 @@ def read_real(
     limit: int | None = None,
     fitted: int = 0,
     lost: float = 0.0,
-    progress: Step | None = None,
+    progress: Step = unheard,
 ) -> RealFrames:
     """Read raw frames. If there are more than ``limit``, a selection that is evenly distributed over the recording is read.
 
@@ -106,8 +106,7 @@ def read_real(
         else:
             numbers = {key: float(c[index]) for key, c in recording.labels.items() if c.dtype.kind == "f"}
             frames.append(RealFrame(frame, observation.pins_px, numbers))
-        if progress:
-            progress(done + 1, len(chosen))
+        progress(done + 1, len(chosen))
     if not frames:
         first = refused[0]
         raise FrameError(f"{path}: none of {len(chosen)} frames are valid; the first, {first['image_name']}: {first['reason']}")

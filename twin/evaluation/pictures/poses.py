@@ -22,6 +22,7 @@ from scenes.rig import RigSpec
 from twin.camera.projection import project
 from twin.errors import FrameError
 from twin.mechanics.solver import SkinSolver
+from twin.progress import Step, unheard
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import object_pose
 from twin.rig.labels import ArmLabel
@@ -89,13 +90,12 @@ class PlateTaps:
         """The contact model with a rig, including the rig's friction and compliances."""
         return RigContact(self.solver, self.experiment, self._plate, rig=rig)
 
-    def pins_px(self, rig: RigSpec, labels: list[ArmLabel], progress: Callable[[int, int], None] | None = None) -> np.ndarray:
+    def pins_px(self, rig: RigSpec, labels: list[ArmLabel], progress: Step = unheard) -> np.ndarray:
         """Pins (m, N, 2) px of the labels' contacts."""
         contact, pins = self.contact(rig), []
         for label in labels:
             pins.append(project(self.solver.spec.view, contact.end(label).caps_mm))
-            if progress:
-                progress(len(pins), len(labels))
+            progress(len(pins), len(labels))
         return np.array(pins)
 
 
@@ -209,7 +209,7 @@ def _with_parameters(rig: RigSpec, experiment: ExperimentSpec, x: np.ndarray) ->
             "contact_offset_mm": rig.contact_offset_mm + float(x[0]),
             "tcp_to_dome_mm": rig.tcp_to_dome_mm + 10 * float(x[1]),
             "tcp_lateral_mm": rig.tcp_lateral_mm + float(x[2]),
-            "tcp_aside_mm": rig.tcp_aside_mm + float(x[3]),
+            "tcp_binormal_mm": rig.tcp_binormal_mm + float(x[3]),
             "image_turn_deg": (rig.image_turn_deg + 90 * float(x[4])) % 360,
             "turn_offset_deg": tuple(offsets.tolist()),
         }

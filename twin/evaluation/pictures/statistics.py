@@ -9,7 +9,7 @@ from twin.camera.projection import Disc
 from twin.evaluation.pictures.spectra import RadialRow, equal_count_edges, log_distance_db, noise_sd, radial_rows, radial_spectrum
 from twin.evaluation.pictures.spots import Spots, clear_of_pins, find_spots, pair_spots, steady_spots
 from twin.geometry.pins import usual_spacing
-from twin.pins.caps import Caps, measure_caps
+from twin.pins.finding.caps import Caps, measure_caps
 
 # Least distance of bare skin from every pin, as a share of the pins' spacing.
 CLEAR_SHARE = 0.55

@@ -20,18 +20,16 @@ def brighter(response: ResponseSpec, value: float, rng: np.random.Generator) -> 
 
 def noisier(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
     """More read and shot noise."""
-    return response.model_copy(update={"read_noise": float(np.hypot(response.read_noise, value))}) if value else response
+    return response.model_copy(update={"read_noise": float(np.hypot(response.read_noise, value))})
 
 
 def jpeg(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """Stronger JPEG compression."""
-    return compressed(image, max(100 - round(value), 1)) if value else image
+    return compressed(image, max(100 - round(value), 1))
 
 
 def coarser(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """A lower resolution. The picture is enlarged to the frame's size again, because the pipeline expects that size."""
-    if value == 1:
-        return image
     height, width = image.shape[:2]
     small = cv2.resize(image, (max(round(width / value), 8), max(round(height / value), 8)), interpolation=cv2.INTER_AREA)
     return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
@@ -41,13 +39,11 @@ def rows_lost(image: np.ndarray, value: float, view: PictureView, rng: np.random
     """Lost rows: each shows the last row that arrived before it."""
     lost = choose_share(len(image), value, rng)
     last = np.maximum.accumulate(np.where(lost, 0, np.arange(len(image))))
-    return image[last] if value else image
+    return image[last]
 
 
 def hot(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """Pixels that are stuck at white."""
-    if not value:
-        return image
     image = image.copy()
     image[rng.random(image.shape[:2]) < value] = 255
     return image
@@ -56,7 +52,7 @@ def hot(image: np.ndarray, value: float, view: PictureView, rng: np.random.Gener
 def posterised(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """Loss of the lowest bits. With a fraction of a bit the steps between levels are wider by that power of two."""
     step = 2.0**value
-    return np.clip(np.floor(image / step) * step, 0, 255).astype(np.uint8) if value else image
+    return np.clip(np.floor(image / step) * step, 0, 255).astype(np.uint8)
 
 
 CONDITIONS = (

@@ -26,8 +26,6 @@ MOST_HAZE = 1.0
 
 def bubbles(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     """Bubbles at the window, which are added one after the other. A fraction of a bubble is a fainter bubble."""
-    if not value:
-        return spec
     count = int(np.ceil(value))
     turn = rng.uniform(0, 2 * np.pi, MOST_BUBBLES)[:count]
     rho_mm = np.sqrt(rng.uniform(0, 1, MOST_BUBBLES))[:count] * spec.housing.aperture_radius_mm * BUBBLE_REACH
@@ -42,7 +40,7 @@ def bubbles(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorS
 
 def hazy(gel: GelSpec, value: float, rng: np.random.Generator) -> GelSpec:
     """Gel that scatters more light."""
-    return gel.model_copy(update={"haze": gel.haze + value * (MOST_HAZE - gel.haze)}) if value else gel
+    return gel.model_copy(update={"haze": gel.haze + value * (MOST_HAZE - gel.haze)})
 
 
 def yellowed(gel: GelSpec, value: float, rng: np.random.Generator) -> GelSpec:

@@ -13,13 +13,11 @@ GLARE_AT = (0.35, -0.25)
 
 def dimmed(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
     """All LEDs weaker."""
-    return leds.model_copy(update={"power": leds.power * (1 - value)}) if value else leds
+    return leds.model_copy(update={"power": leds.power * (1 - value)})
 
 
 def dead(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
     """Lit LEDs go out one after the other around the ring."""
-    if not value:
-        return leds
     balance = np.array(leds.balance or (1.0,) * len(leds.azimuth_deg))
     lit = np.setdiff1d(np.arange(len(balance)), leds.off)
     balance[lit] *= np.clip(1 - (value * len(lit) - np.arange(len(lit))), 0, 1)
@@ -34,8 +32,6 @@ def reddened(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRi
 
 def room_light(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """Additional light over the whole frame, which increases from one side of the disc to the other."""
-    if not value:
-        return light
     x, y = view.grid(light.shape)
     ramp = np.clip(0.5 + 0.5 * (0.8 * x + 0.6 * y), 0, 1)
     return light + over_channels(value * view.saturation * ramp, light)
@@ -43,8 +39,6 @@ def room_light(light: np.ndarray, value: float, view: PictureView, rng: np.rando
 
 def glare(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """The reflection of a lamp: uniform in the middle, with a steep edge."""
-    if not value:
-        return light
     x, y = view.grid(light.shape)
     radius = 0.5 * value * view.px_per_mm / view.radius_px
     away2 = ((x - GLARE_AT[0]) ** 2 + (y - GLARE_AT[1]) ** 2) / radius**2

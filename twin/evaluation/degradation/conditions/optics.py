@@ -54,18 +54,16 @@ def line_kernel(length_px: float, degrees: float) -> np.ndarray:
 
 def defocus(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """A focus that has moved."""
-    return blurred_by(light, disc_kernel(value * view.px_per_mm)) if value else light
+    return blurred_by(light, disc_kernel(value * view.px_per_mm))
 
 
 def motion(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """A camera that moves during the exposure."""
-    return blurred_by(light, line_kernel(value * view.px_per_mm, MOTION_DEG)) if value else light
+    return blurred_by(light, line_kernel(value * view.px_per_mm, MOTION_DEG))
 
 
 def rolled_focus(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """A tilted lens: the diameter of the circle of confusion is linear from one rim of the disc to the other."""
-    if not value:
-        return light
     x, y = view.grid(light.shape)
     place = np.clip(0.5 + 0.5 * (0.8 * y - 0.6 * x), 0, 1) * FOCUS_STEPS
     sharp_to_soft = [light] + [blurred_by(light, disc_kernel(value * view.px_per_mm * k / FOCUS_STEPS)) for k in range(1, FOCUS_STEPS + 1)]
@@ -77,8 +75,6 @@ def rolled_focus(light: np.ndarray, value: float, view: PictureView, rng: np.ran
 
 def dirt(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """Smudges that cover a share of the disc and absorb most of the light."""
-    if not value:
-        return light
     noise = rng.standard_normal(light.shape[:2], dtype=np.float32)
     field = cv2.GaussianBlur(noise, (0, 0), DIRT_SPACING_MM * view.px_per_mm)
     x, y = view.grid(light.shape)
@@ -89,8 +85,6 @@ def dirt(light: np.ndarray, value: float, view: PictureView, rng: np.random.Gene
 
 def scratched(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """Straight scratches across the disc that scatter the LEDs' light."""
-    if not value:
-        return light
     turn, away = rng.uniform(0, np.pi, MOST_SCRATCHES), rng.uniform(-0.9, 0.9, MOST_SCRATCHES)
     bright = rng.uniform(0.3, 1.0, MOST_SCRATCHES)
     x, y = view.grid(light.shape)

@@ -33,12 +33,12 @@ def torn_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
 
 def turned(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """A picture that is turned about its middle."""
-    return warped(image, _turn(value, image.shape)) if value else image
+    return warped(image, _turn(value, image.shape))
 
 
 def turned_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
     """Positions in a turned picture."""
-    return mapped(px, _turn(value, view.size_px[::-1])) if value else px
+    return mapped(px, _turn(value, view.size_px[::-1]))
 
 
 def _turn(degrees: float, shape: tuple[int, ...]) -> np.ndarray:
@@ -48,12 +48,12 @@ def _turn(degrees: float, shape: tuple[int, ...]) -> np.ndarray:
 
 def mirrored(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """A picture with left and right exchanged."""
-    return np.ascontiguousarray(image[:, ::-1]) if value else image
+    return np.ascontiguousarray(image[:, ::-1])
 
 
 def mirrored_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
     """Positions in a mirrored picture."""
-    return np.column_stack([view.size_px[0] - 1 - px[:, 0], px[:, 1]]) if value else px
+    return np.column_stack([view.size_px[0] - 1 - px[:, 0], px[:, 1]])
 
 
 CONDITIONS = (

@@ -13,8 +13,6 @@ AWAY = (np.cos(np.radians(30.0)), np.sin(np.radians(30.0)))
 
 def shifted(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     """The chip is displaced from the lens' axis."""
-    if not value:
-        return spec
     by = value * PictureView.of(spec, np.zeros((0, 2))).px_per_mm
     return alter(spec, camera={"cx_px": spec.camera.cx_px + AWAY[0] * by, "cy_px": spec.camera.cy_px + AWAY[1] * by})
 
@@ -31,8 +29,6 @@ def zoomed(camera: CameraSpec, value: float, rng: np.random.Generator) -> Camera
 
 def distorted(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     """Another lens, with a barrel distortion that moves the disc's rim inwards by a share of its radius."""
-    if not value:
-        return spec
     rim = lens_disc(spec.view, spec.housing).radius_px / spec.camera.fx_px
     return alter(spec, camera={"k1": spec.camera.k1 - value / rim**2})
 
@@ -66,22 +62,22 @@ def mapped(px: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 def rolled(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """A camera that is rotated about its axis."""
-    return warped(light, roll(value, view)) if value else light
+    return warped(light, roll(value, view))
 
 
 def rolled_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
     """Positions in the picture of a rolled camera."""
-    return mapped(px, roll(value, view)) if value else px
+    return mapped(px, roll(value, view))
 
 
 def sheared(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """Rows that are exposed one after the other while the camera moves."""
-    return warped(light, skew(0.5 * value * view.px_per_mm / view.radius_px, view)) if value else light
+    return warped(light, skew(0.5 * value * view.px_per_mm / view.radius_px, view))
 
 
 def sheared_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
     """Positions in a sheared picture."""
-    return mapped(px, skew(0.5 * value * view.px_per_mm / view.radius_px, view)) if value else px
+    return mapped(px, skew(0.5 * value * view.px_per_mm / view.radius_px, view))
 
 
 CONDITIONS = (

@@ -36,8 +36,6 @@ def cap_levels(appearance: AppearanceSpec, count: int) -> np.ndarray:
 
 def missing(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     """Caps that have come off."""
-    if not value:
-        return spec
     look = spec.appearance
     gone = sum(look.skin_albedo) / max(sum(look.cap_albedo), GONE) if look.dark_caps else GONE
     levels = np.where(choose_share(spec.pins.count, value, rng), gone, cap_levels(look, spec.pins.count))
@@ -51,8 +49,6 @@ def those_missing(value: float, view: PictureView, rng: np.random.Generator) -> 
 
 def broken(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     """Caps of which a part has broken off."""
-    if not value:
-        return spec
     old = np.array(spec.appearance.cap_shapes or np.zeros((spec.pins.count, len(BROKEN))))
     turn = rng.uniform(0, 2 * np.pi, spec.pins.count)
     new = np.zeros_like(old)
@@ -68,7 +64,7 @@ def faded(appearance: AppearanceSpec, value: float, rng: np.random.Generator) ->
     """Caps that have darkened; dark caps have become as bright as the skin."""
     if appearance.dark_caps:
         return appearance.model_copy(update={"cap_albedo": _towards(appearance.cap_albedo, appearance.skin_albedo, value)})
-    return appearance.model_copy(update={"cap_albedo": tuple(a * (1 - value) for a in appearance.cap_albedo)}) if value else appearance
+    return appearance.model_copy(update={"cap_albedo": tuple(a * (1 - value) for a in appearance.cap_albedo)})
 
 
 def _towards(albedo: Rgb, other: Rgb, value: float) -> tuple[float, ...]:
@@ -78,8 +74,6 @@ def _towards(albedo: Rgb, other: Rgb, value: float) -> tuple[float, ...]:
 
 def uneven(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     """Caps of different brightness."""
-    if not value:
-        return spec
     levels = cap_levels(spec.appearance, spec.pins.count) * np.exp(-value * np.abs(rng.standard_normal(spec.pins.count)))
     return alter(spec, appearance={"cap_levels": tuple(levels.tolist())})
 
@@ -89,13 +83,11 @@ def pale(appearance: AppearanceSpec, value: float, rng: np.random.Generator) -> 
     if appearance.dark_caps:
         return appearance.model_copy(update={"skin_albedo": _towards(appearance.skin_albedo, appearance.cap_albedo, value)})
     old = appearance.skin_albedo
-    return appearance.model_copy(update={"skin_albedo": tuple(a + value * (1 - a) for a in old)}) if value else appearance
+    return appearance.model_copy(update={"skin_albedo": tuple(a + value * (1 - a) for a in old)})
 
 
 def translucent(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """Room light through the skin, stronger on one side. Caps are in front of the skin and block the light."""
-    if not value:
-        return light
     x, y = view.grid(light.shape)
     bright = value * view.saturation * np.clip(0.7 + 0.3 * (0.6 * x - 0.8 * y), 0, 1) * (x * x + y * y < 1)
     return light + over_channels(bright * (1 - cap_cover(light.shape, view)), light)
@@ -103,8 +95,6 @@ def translucent(light: np.ndarray, value: float, view: PictureView, rng: np.rand
 
 def torn(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """A round hole, which shows room light instead of skin and caps."""
-    if not value:
-        return light
     x, y = view.grid(light.shape)
     away_px = np.hypot(x - TEAR_AT[0], y - TEAR_AT[1]) * view.radius_px
     cover = over_channels(np.clip(0.5 * value * view.px_per_mm - away_px + 0.5, 0, 1), light)
@@ -114,13 +104,13 @@ def torn(light: np.ndarray, value: float, view: PictureView, rng: np.random.Gene
 def those_torn_off(value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """Which caps (N,) lie in the hole."""
     at = view.center_px + np.array(TEAR_AT) * view.radius_px
-    return np.linalg.norm(view.caps_px - at, axis=1) < 0.5 * value * view.px_per_mm if value else np.zeros(len(view.caps_px), bool)
+    return np.linalg.norm(view.caps_px - at, axis=1) < 0.5 * value * view.px_per_mm
 
 
 def swollen(skin: SkinSpec, value: float, rng: np.random.Generator) -> SkinSpec:
     """Skin swollen by oil: thicker and larger."""
     grown = {name: getattr(skin, name) * (1 + value) for name in (*skin.size_keys, "thickness_mm")}
-    return skin.model_copy(update=grown) if value else skin
+    return skin.model_copy(update=grown)
 
 
 def cap_cover(shape: tuple[int, ...], view: PictureView) -> np.ndarray:

@@ -13,13 +13,13 @@ import viser
 from scenes import list_objects, list_sensors, load_object, load_sensor
 from scenes.base import SpecError
 from twin.errors import TwinError
-from twin.estimate import SensorModel
+from twin.estimate import SensorModel, readable_labels
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
 from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
-from twin.studio.mode import PageMode
+from twin.studio.modes.mode import PageMode
 from twin.studio.page import LineChart, StudioPage, put, value_of
-from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, label_name, number_table, paragraph
+from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of
 from twin.studio.scene import FULL_SCALE, PinColour, Scene
 from twin.studio.state import StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
@@ -87,7 +87,7 @@ class TwinMode(PageMode):
         page.on_address = self._links.give
         self._build_controls()
         self._forces, self._estimates, self._depths = (
-            LineChart(page, title) for title in ("force on the object, N", "estimates less truth", "indentation, mm")
+            LineChart(page, title) for title in ("force on the object, N", "error of the estimates", "indentation, mm")
         )
 
     # start and end
@@ -103,7 +103,7 @@ class TwinMode(PageMode):
         setup = contact.setup
         with self._showing:
             self.contact, self._tracer = contact, tracer
-            self.worker = Worker(contact, tracer, self._publish_answer, self._show_message)
+            self.worker = Worker(contact, tracer, self._publish_answer, self._page.say)
             self._rest = nominal_reference(setup.sensor, setup.form)
             self._scene = Scene(self._page.server, setup.sensor, contact.solver.mesh, contact.solver.rest())
             if self._loading:  # otherwise ``_load_rest`` shows the object
@@ -141,7 +141,7 @@ class TwinMode(PageMode):
                 self.contact.use(model)
                 self.worker.show_again()
 
-        self._model_note = "no model goes with this sensor; give one with --model"
+        self._model_note = "there is no model of this sensor; give one with --model"
         self.worker.do(use)
 
     def show(self) -> None:
@@ -191,6 +191,10 @@ class TwinMode(PageMode):
         self._wish = way[-1][1]
         self.worker.play(way)
 
+    def tap_and_shear(self) -> None:
+        """Play a tap and a shear with the present tilts and twist."""
+        self.play(tap_and_shear(self._wish))
+
     def _follow_drag(self, T: np.ndarray, ended: bool) -> None:
         self.ask(ObjectPose.of(T, self.contact.setup.sensor.skin.apex_mm))
         if ended and self.worker.newest is not None:
@@ -199,7 +203,7 @@ class TwinMode(PageMode):
     # controls
 
     def _build_controls(self) -> None:
-        gui, guarded, setup = self._page.gui, self._page.guard, self.contact.setup
+        gui, guarded, button, setup = self._page.gui, self._page.guard, self._page.button, self.contact.setup
         with self.folder:
             self._sliders = {}
             for name in NAMES:
@@ -219,25 +223,21 @@ class TwinMode(PageMode):
                 self._sensor = gui.add_dropdown("sensor", sensors, initial_value=self._state.sensor)
                 self._object = gui.add_dropdown("object", objects, initial_value=self._state.object)
                 self._friction = gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction())
-                anew = gui.add_button("Restart contact", hint="clear the history of friction and press straight down")
+                button("Restart contact", self.restart_contact, hint="clear the friction history and press straight down")
             with gui.add_folder("Show"):
                 forms = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
                 self._form = gui.add_dropdown("frame", forms, initial_value=str(setup.form))
                 self._drawing = gui.add_dropdown("overlay", tuple(map(str, OverlayChoices)), initial_value=str(self._drawn))
                 self._colour = gui.add_dropdown("colour pins by", tuple(map(str, PinColour)), initial_value=str(self._shown))
             with gui.add_folder("Move", expand_by_default=False):
-                tap = gui.add_button("Tap and shear")
+                button("Tap and shear", self.tap_and_shear)
                 upload = gui.add_upload_button("Play trajectory (CSV)", mime_type=".csv", hint="columns time_s, x_mm, y_mm, depth_mm, ...")
-                self._record_way = gui.add_checkbox("record the way", False)
-                undo = gui.add_button("Undo")
+                self._record_way = gui.add_checkbox("record the trajectory", False)
+                button("Undo", self.undo)
             with gui.add_folder("Save", expand_by_default=False):
-                buttons = {
-                    "Save picture": self.save_picture,
-                    "Save contact files": self.save_contact,
-                    "Save state": self.save_state,
-                }
-                for label, save in buttons.items():
-                    gui.add_button(label).on_click(guarded(save))
+                button("Save picture", self.save_picture)
+                button("Save contact files", self.save_contact)
+                button("Save state", self.save_state)
                 opened = gui.add_upload_button("Open a state", mime_type=".json")
                 link = self.state.link(self._page.url)
                 self._link = gui.add_text("link", link, hint="opens this state again; paste another one to open it")
@@ -248,9 +248,6 @@ class TwinMode(PageMode):
         self._friction.on_update(guarded(self._change_friction))
         self._object.on_update(guarded(self._change_object))
         self._sensor.on_update(guarded(self._change_sensor))
-        anew.on_click(guarded(self.restart_contact))
-        tap.on_click(guarded(lambda: self.play(tap_and_shear(self._wish))))
-        undo.on_click(guarded(self.undo))
         upload.on_upload(guarded(lambda: self.play(read_trajectory(upload.value.content, upload.value.name))))
         opened.on_upload(guarded(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
         self._link.on_update(guarded(lambda: self._links.give(self._link.value)))
@@ -261,9 +258,9 @@ class TwinMode(PageMode):
                 for key, sign in zip(keys, (-1, +1), strict=True):
                     label = f"{readable_name(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
                     command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # viser defines it as a literal
-                    command.on_trigger(partial(self._handle_key, name, sign))
+                    command.on_trigger(guarded(partial(self.nudge, name, sign)))
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
-        gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(lambda: self.play(tap_and_shear(self._wish))))
+        gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(self.tap_and_shear))
 
     def _slider_callback(self, name: str) -> Callable[[viser.GuiEvent[viser.GuiSliderHandle[float]]], None]:
         def moved(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
@@ -271,9 +268,6 @@ class TwinMode(PageMode):
                 self.ask(replace(self._wish, **{name: float(event.target.value)}))
 
         return moved
-
-    def _handle_key(self, name: str, sign: int, event: object) -> None:
-        self.nudge(name, sign)
 
     def _own_friction(self) -> float:
         setup = self.contact.setup
@@ -317,9 +311,9 @@ class TwinMode(PageMode):
         try:
             obj = load_object(name)
         except SpecError:
-            put(self._object, self._state.object)
+            put(self._object, self._state.object, send=True)
             raise
-        put(self._object, name)
+        put(self._object, name, send=True)
         self._state = self._state.model_copy(update={"object": name})
 
         def change() -> None:
@@ -337,7 +331,7 @@ class TwinMode(PageMode):
             try:
                 self.open(self.state.model_copy(update={"sensor": chosen, "form": str(Form.RAW)}))
             except (TwinError, SpecError):
-                put(self._sensor, self._state.sensor)
+                put(self._sensor, self._state.sensor, send=True)
                 raise
 
     def open(self, state: StudioState) -> None:
@@ -355,6 +349,7 @@ class TwinMode(PageMode):
             if self._tracer is not None:
                 self._tracer.__exit__(None, None, None)
             self._page.gui.set_panel_label(heading(state))
+            before, friction = self._choices(), self._own_friction()
             self._state, self._wish = state, state.object_pose()
             self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
             self._model_note = "the model is being loaded"
@@ -362,12 +357,17 @@ class TwinMode(PageMode):
             setup = self.contact.setup
             self._form.options = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
             self._sensor.options = tuple(sorted({*self._sensor.options, state.sensor}))
-            chosen = [(self._form, setup.form), (self._drawing, self._drawn), (self._colour, self._shown)]
-            for control, value in [*chosen, (self._sensor, state.sensor), (self._object, state.object)]:
-                if str(value) in control.options:
-                    put(control, str(value))
-            put(self._friction, self._own_friction())
+            for (control, old), (_, new) in zip(before, self._choices(), strict=True):
+                if control.value == old and new in control.options:  # otherwise the user has just chosen another one; its callback follows
+                    put(control, new)
+            if self._friction.value == friction:
+                put(self._friction, self._own_friction())
             self._begin()
+
+    def _choices(self) -> list[tuple[viser.GuiDropdownHandle[str], str]]:
+        """The page's dropdowns, each with the value that is in use."""
+        used = (self.contact.setup.form, self._drawn, self._shown, self._state.sensor, self._state.object)
+        return list(zip((self._form, self._drawing, self._colour, self._sensor, self._object), map(str, used), strict=True))
 
     def _open_link(self, link: str) -> None:
         """Show the state of a link, unless the page shows it already."""
@@ -379,9 +379,6 @@ class TwinMode(PageMode):
             raise TwinError(str(error)) from error
 
     # answers
-
-    def _show_message(self, text: str) -> None:
-        self._page.say(text)
 
     def _publish_answer(self, answer: ContactAnswer) -> None:
         if self._path is not None:
@@ -426,7 +423,7 @@ class TwinMode(PageMode):
         def change() -> None:
             self._scene.show(answer.state, self._shown)
             if answer.arrived:
-                self._scene.place_gizmo(self._gizmo_pose(answer))
+                self._scene.place_gizmo(answer.pose.matrix(contact.setup.sensor.skin.apex_mm))
                 self._follow_sliders(answer)
                 put(self._link, self.state.link(self._page.url))
             if self._active:
@@ -435,9 +432,6 @@ class TwinMode(PageMode):
             self._draw_charts(answer)
 
         self._page.together(change)
-
-    def _gizmo_pose(self, answer: ContactAnswer) -> np.ndarray:
-        return answer.pose.matrix(self.contact.setup.sensor.skin.apex_mm)
 
     def _follow_sliders(self, answer: ContactAnswer) -> None:
         """Set the sliders to the object's final pose, unless the user has made a new wish."""
@@ -457,7 +451,7 @@ class TwinMode(PageMode):
         across, into = float(np.hypot(*state.force_n[:2])), float(state.force_n[2])
         rows = {
             "force x, y, z": f"{force[0]:+.2f}  {force[1]:+.2f}  {force[2]:+.2f} N",
-            "across, friction used": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
+            "lateral force, ratio to normal": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
             "torque about z": f"{torque:+.1f} N mm",
             "indentation": f"{answer.indent_mm:+.2f} mm",
             "contact area, slipping": f"{state.area_mm2:.0f} mm2, {100 * state.slip_share:.0f} %",
@@ -471,7 +465,7 @@ class TwinMode(PageMode):
             number_table(rows),
             estimate_table(answer.estimate, answer.labels, missing=self._model_note)
             if len(state.contact_mm)
-            else paragraph("No contact: an estimate would mean nothing.", "note"),
+            else paragraph("No contact, therefore no estimate.", "note"),
             paragraph(self.contact.fine_lost, "note"),
             paragraph(f"pins coloured by {self._shown}: dark 0, bright {full:g} {unit}; {sum(answer.ms.values()):.0f} ms latency", "note"),
         ]
@@ -481,8 +475,8 @@ class TwinMode(PageMode):
         self._depths.add({"indentation": answer.indent_mm})
         estimate = answer.estimate
         if estimate is not None and estimate.valid:
-            known = zip(estimate.names, estimate.value, strict=True)
-            self._estimates.add({label_name(name)[0]: float(value) - answer.labels[name] for name, value in known if name in answer.labels})
+            known = zip(readable_labels(estimate.names), estimate.names, estimate.value, strict=True)
+            self._estimates.add({title: float(value) - answer.labels[name] for title, name, value in known if name in answer.labels})
 
     # saving
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin.pins.blobs import Blobs
-from twin.pins.matching import Match
-from twin.pins.reference import Reference
+from twin.pins.finding.blobs import Blobs
+from twin.pins.labelling.matching import Match
+from twin.pins.labelling.reference import Reference
 
 # All limits were chosen, not derived.
 # Largest distance, in spacings, from a pin's predicted place to a component that the pin may claim, and to the part that it gets.

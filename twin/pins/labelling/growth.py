@@ -8,6 +8,7 @@ were chosen, not derived.
 import numpy as np
 
 from twin.compiled import compiled
+from twin.pins.labelling.buckets import fill_buckets, nearest_free
 
 NEIGHBOURS = 18
 """Number of neighbours that predict the position of a place: two rings of a triangular lattice."""
@@ -73,37 +74,6 @@ def predict_place(i: int, lattice: np.ndarray, around: np.ndarray, spot: np.ndar
 
 
 @compiled()
-def _nearest(
-    x: float, y: float, reach: float, px: np.ndarray, head: np.ndarray, after: np.ndarray, grid: np.ndarray, owner: np.ndarray
-) -> int:
-    """The nearest free spot within reach of (x, y); -1 if there is none."""
-    x0, y0, cell, columns, rows = grid
-    best, best2 = -1, reach * reach
-    for cy in range(max(int((y - reach - y0) / cell), 0), min(int((y + reach - y0) / cell), int(rows) - 1) + 1):
-        for cx in range(max(int((x - reach - x0) / cell), 0), min(int((x + reach - x0) / cell), int(columns) - 1) + 1):
-            k = head[cy * int(columns) + cx]
-            while k >= 0:
-                d2 = (px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2
-                if owner[k] < 0 and d2 < best2:
-                    best, best2 = k, d2
-                k = after[k]
-    return best
-
-
-@compiled()
-def _cells(px: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spots by square cell: first spot of each cell, next spot in the same cell, and (x0, y0, cell, columns, rows)."""
-    x0, y0 = px[:, 0].min(), px[:, 1].min()
-    columns, rows = int((px[:, 0].max() - x0) / cell) + 1, int((px[:, 1].max() - y0) / cell) + 1
-    head, after = np.full(columns * rows, -1), np.full(len(px), -1)
-    for k in range(len(px)):
-        c = int((px[k, 1] - y0) / cell) * columns + int((px[k, 0] - x0) / cell)
-        after[k] = head[c]
-        head[c] = k
-    return head, after, np.array([x0, y0, cell, columns, rows])
-
-
-@compiled()
 def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndarray, cell: float) -> np.ndarray:
     """Grow a labelling: the spot (M,) of each place of a lattice, -1 for no spot.
 
@@ -122,11 +92,11 @@ def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndar
     """
     n = len(lattice)
     spot = start.copy()
-    owner = np.full(len(px), -1)
+    taken = np.zeros(len(px), np.bool_)
     for i in range(n):
         if spot[i] >= 0:
-            owner[spot[i]] = i
-    head, after, grid = _cells(px, cell)
+            taken[spot[i]] = True
+    buckets = fill_buckets(px, cell)
     claim, claimed = np.full(len(px), -1), np.zeros(len(px))
     near = min(NEAR, around.shape[1])
     for round_ in range(ROUNDS):
@@ -153,14 +123,14 @@ def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndar
                     x, y, spacing, count = predict_place(i, lattice, around, spot, px)
                     if count == 0:
                         continue
-                    k = _nearest(x, y, GATES[level] * spacing, px, head, after, grid, owner)
+                    k, d2 = nearest_free(x, y, GATES[level] * spacing, px, taken, buckets, cell)
                     if k >= 0:
-                        miss = ((px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2) / spacing**2
+                        miss = d2 / spacing**2
                         if claim[k] < 0 or miss < claimed[k]:
                             claim[k], claimed[k] = i, miss
                 for k in range(len(px)):
                     if claim[k] >= 0:
-                        spot[claim[k]], owner[k] = k, claim[k]
+                        spot[claim[k]], taken[k] = k, True
                         growing = True
         if round_ == ROUNDS - 1:
             break
@@ -174,7 +144,7 @@ def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndar
             break
         for i in range(n):
             if spot[i] >= 0 and kept[i] < 0:
-                owner[spot[i]] = -1
+                taken[spot[i]] = False
         spot = kept
     return spot
 

@@ -8,17 +8,17 @@ import numpy as np
 from scenes import load_object
 from scenes.experiment import ExperimentSpec
 from twin.errors import ContactError, FrameError, TwinError
-from twin.estimate import Estimate, SensorModel, pins_in
+from twin.estimate import Estimate, SensorModel, pins_in, readable_labels
 from twin.frames import Recording, open_recording
 from twin.pins.batch import recording_reference
 from twin.pins.pipeline import Pipeline
 from twin.rig.contact import RigContact
 from twin.rig.labels import ArmLabel, poses_and_moves, read_arm_labels
 from twin.studio.contact import MovingContact, experiment_of
-from twin.studio.mode import PageMode
+from twin.studio.modes.mode import PageMode
+from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import CELLS, StudioPage, put
 from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
-from twin.studio.twin_mode import TwinMode
 from twin.types import FloatArray, Form, Frame, Observation
 
 UNSURE = 0.5
@@ -75,7 +75,7 @@ class RecordingView:
         self.notes: list[str] = []
         self.reference, name = recording_reference(sensor, self.recording, self.notes)
         self._pipeline = Pipeline(sensor, self.recording.form, self.reference)
-        self.notes.append(f"pins are counted from {name}")
+        self.notes.append(f"displacements of pins are relative to {name}")
         self._labels: list[ArmLabel] = []
         try:
             self._labels = read_arm_labels(self.recording)
@@ -117,13 +117,13 @@ class RecordingView:
         seen = pins_in(frame, estimate, self._pipeline)
         label = self._labels[index] if self._labels else None
         told = {} if label is None else _label_values(label)
-        doubts = [] if label is None or label.executed else ["the audit says that the move was not executed"]
+        doubts = [] if label is None or label.executed else ["audit: the move was not executed"]
         executed = float(getattr(estimate, "executed", np.nan))
         if label is not None and np.abs(label.move).max() > 0 and executed < UNSURE:
-            doubts.append(f"the model gives the move's execution {100 * executed:.0f} %")
+            doubts.append(f"model: the move was executed with a probability of {100 * executed:.0f} %")
         if estimate is not None and estimate.valid:
-            values = zip(estimate.names, estimate.low, estimate.high, strict=True)
-            outside = [name for name, low, high in values if name in told and not low <= told[name] <= high]
+            values = zip(estimate.names, readable_labels(estimate.names), estimate.low, estimate.high, strict=True)
+            outside = [title for name, title, low, high in values if name in told and not low <= told[name] <= high]
             doubts += [f"{name} is outside the 90 % interval" for name in outside]
         return Looked(index, frame, seen, estimate, label, told, tuple(doubts))
 
@@ -180,15 +180,13 @@ class RecordingMode(PageMode):
         gui = page.gui
         with self.folder:
             self._path = gui.add_text("folder or video", first, hint="any recording that 'twin preprocess' reads, on the studio's machine")
-            opened = gui.add_button("Open")
+            page.button("Open", lambda: self.open(self._path.value))
             self._number = gui.add_slider("frame number", 0, 1, 1, 0, disabled=True)
             steps = gui.add_button_group("step", ("-10", "-1", "+1", "+10"))
-            doubt = gui.add_button("Next doubtful label", hint="the next frame whose label is doubtful")
+            page.button("Next doubtful label", lambda: self._wanted.give(-1), hint="the next frame whose label is doubtful")
             self._against = gui.add_checkbox("the twin's picture beside it", True)
-        opened.on_click(lambda event: self.open(self._path.value))
         self._number.on_update(page.guard(lambda: self._go(int(self._number.value))))
         steps.on_click(lambda event: self._go(int(self._number.value) + int(event.target.value)))
-        doubt.on_click(lambda event: self._wanted.give(-1))
         self._against.on_update(lambda event: self._wanted.give(int(self._number.value)))
 
     def show(self) -> None:
@@ -252,7 +250,7 @@ class RecordingMode(PageMode):
             if looked.doubts:
                 put(self._number, looked.index)
                 return looked
-        self._page.say("No label of this recording is doubted.")
+        self._page.say("No label of this recording is doubtful.")
         return None
 
     def _show_frame(self, view: RecordingView, looked: Looked, beside: np.ndarray, *, label: str = CELLS, note: str = "") -> None:
@@ -268,7 +266,7 @@ class RecordingMode(PageMode):
             paragraph("" if looked.seen.valid else f"The pipeline refuses the frame: {looked.seen.reason}", "stop"),
             number_table(rows),
             estimate_table(looked.estimate, looked.values, missing=next((n for n in view.notes if n.startswith("no estimates")), "")),
-            paragraph("Here the truth is the label." if looked.values else "", "note"),
+            paragraph("The label is used as ground truth." if looked.values else "", "note"),
             paragraph(note, "said"),
             *(paragraph(text, "note") for text in [*view.recording.problems, *view.notes][:4]),
         ]

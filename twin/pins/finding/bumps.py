@@ -63,7 +63,7 @@ class Bumps:
     size_px : (int, int)
         Width and height of the frame.
     hidden : (H, W) bool, optional
-        Pixels that a mask or fill hides (see ``twin.pins.extent``).
+        Pixels that a mask or fill hides (see ``twin.pins.labelling.extent``).
     """
 
     px: np.ndarray

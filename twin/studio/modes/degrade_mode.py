@@ -16,11 +16,11 @@ from twin.optics.preview import Shading
 from twin.pins import make_detector, nominal_reference, shipped_detector
 from twin.pins.pipeline import Pipeline
 from twin.studio.contact import ContactAnswer
-from twin.studio.mode import PageMode
+from twin.studio.modes.mode import PageMode
+from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import StudioPage, put
 from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, paragraph
 from twin.studio.pose import ObjectPose
-from twin.studio.twin_mode import TwinMode
 from twin.types import Form, Frame, Observation
 
 SLIDERS = 3
@@ -122,16 +122,12 @@ class DegradeMode(PageMode):
                     control.on_update(lambda event: self._restart())
                 self._choices.append(choice)
                 self._severities.append(slider)
-            edge = page.gui.add_button(
-                "Find breaking point", hint="raise the severity of condition 1 until something fails; the others stay"
-            )
-            none = page.gui.add_button("Reset")
-        edge.on_click(lambda event: self._find())
-        none.on_click(lambda event: self._reset())
+            page.button("Find breaking point", self._find, hint="raise the severity of condition 1 until something fails; the others stay")
+            page.button("Reset", self._reset)
 
     def show(self) -> None:
         """Show the twin's contact, degraded."""
-        self._page.show_nothing("The contact is drawn as a sensor sees it that something is wrong with ...")
+        self._page.show_nothing("Rendering the contact with a degraded sensor ...")
         self._wanted.give(None)
 
     def follow(self, answer: ContactAnswer) -> None:
@@ -177,7 +173,7 @@ class DegradeMode(PageMode):
         crop = self._twin.contact.camera.crop
         camera = crop(camera_picture(frame, judged.seen, judge.reference.pins_px, OverlayChoices.GRAPH), Form.RAW)
         cells = crop(cell_picture(frame, judged.seen, judge.reference.area_px2), Form.RAW)
-        words = "; ".join(f"{case.title} {case.label(severity)}" for case, severity in cases if severity) or "nothing is wrong"
+        words = "; ".join(f"{case.title} {case.label(severity)}" for case, severity in cases if severity) or "no degradation"
         numbers = [
             badge("degraded" if any(severity for _, severity in cases) else "as it is") + badge("rasterised"),
             paragraph(words, "note"),
@@ -202,12 +198,12 @@ class DegradeMode(PageMode):
                 return ""
             failed = judge(answer, [(case, severity), *others], shading).failed
             if failed and severity == 0.0:
-                return f"Already without {case.title} this frame fails: {', '.join(failed)}."
+                return f"This frame fails without {case.title}, too: {', '.join(failed)}."
             if failed:
                 fails = f"at {case.label(severity)} (severity {severity:g}) it fails: {', '.join(failed)}"
-                return f"Edge for this contact: {case.title} is borne up to {case.label(borne)} (severity {borne:g}); {fails}."
+                return f"Breaking point of this contact: {case.title} is tolerated up to {case.label(borne)} (severity {borne:g}); {fails}."
             borne = severity
-        return f"Edge for this contact: {case.title} is borne up to its most severe value, {case.label(1.0)}."
+        return f"Breaking point of this contact: {case.title} is tolerated up to its most severe value, {case.label(1.0)}."
 
 
 def _measures(judged: EvaluatedFrame, limits: dict[str, float]) -> str:

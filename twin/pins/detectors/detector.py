@@ -19,14 +19,14 @@ from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
 from twin.camera.capture import record
 from twin.errors import FrameError
 from twin.frames.forms import frame_size, from_raw, pin_levels, recording_to_raw
-from twin.pins.blobs import Mask, circular_mask, threshold
-from twin.pins.detector_spec import OWN, DetectorSpec, with_detector
+from twin.pins.detectors.detector_spec import OWN, DetectorSpec, with_detector
+from twin.pins.detectors.legacy import LegacyPipeline, legacy_graph
+from twin.pins.detectors.own_finder import own_places
+from twin.pins.finding.blobs import Mask, circular_mask, threshold
 from twin.pins.graph import make_graph
-from twin.pins.legacy import LegacyPipeline, legacy_graph
-from twin.pins.matching import match
-from twin.pins.own_finder import own_places
+from twin.pins.labelling.matching import match
+from twin.pins.labelling.reference import Reference, nominal_reference
 from twin.pins.pipeline import MIN_FOUND, Pipeline
-from twin.pins.reference import Reference, nominal_reference
 from twin.types import Form, Frame, PinGraph
 
 LEVELS = 255.0

@@ -13,11 +13,11 @@ from twin.calibration.new_sensor import NewSensor, new_sensor
 from twin.errors import TwinError
 from twin.frames import Recording, frames_at, open_recording
 from twin.pins.pipeline import Pipeline
-from twin.studio.mode import PageMode
+from twin.studio.modes.mode import PageMode
+from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import StudioPage, put
 from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, number_table, paragraph
 from twin.studio.state import next_path
-from twin.studio.twin_mode import TwinMode
 
 LARGER, SMALLER = "one larger", "one smaller"
 """Corrections of a layout: one ring more or less, or for a grid one row and one column."""
@@ -77,18 +77,16 @@ class NewMode(PageMode):
         self._pipeline: Pipeline | None = None
         self._making = self.newest(self._make, "new")
         self._looking = self.newest(self._look, "new-frame")
-        gui, guarded = page.gui, page.guard
+        gui = page.gui
         with self.folder:
             self._frames = gui.add_text("frames", "", hint="folder, video or recording on the studio's machine")
             self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
             self._layout = gui.add_text("layout", "", hint="empty: found; or rings:10, hexagon:6, grid:9x7, positions:FILE.csv")
-            propose = gui.add_button("Propose a specification")
-            correct = gui.add_button_group("layout is", (SMALLER, LARGER))
-            self._number = gui.add_slider("frame to look at", 0, 1, 1, 0, disabled=True)
-            use = gui.add_button("Use this sensor")
-        propose.on_click(guarded(self.propose))
-        correct.on_click(guarded(lambda: self.correct(+1 if correct.value == LARGER else -1)))
-        use.on_click(guarded(self.use))
+            page.button("Propose a specification", self.propose)
+            correct = gui.add_button_group("make the layout", (SMALLER, LARGER))
+            self._number = gui.add_slider("frame shown", 0, 1, 1, 0, disabled=True)
+            page.button("Use this sensor", self.use)
+        correct.on_click(page.guard(lambda: self.correct(+1 if correct.value == LARGER else -1)))
         self._number.on_update(self._follow_slider)
 
     def show(self) -> None:
@@ -145,7 +143,7 @@ class NewMode(PageMode):
     def _make(self, wish: Wish) -> None:
         def report(stage: str, done: float, total: float, note: str = "") -> None:
             share = f", {100 * done / total:.0f} %" if total else ""
-            self._page.say(f"looking at the frames: {stage}{share}")
+            self._page.say(f"processing the frames: {stage}{share}")
 
         no_contact = Path(wish.no_contact) if wish.no_contact else None
         try:

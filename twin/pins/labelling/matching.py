@@ -27,7 +27,8 @@ from scipy.spatial import cKDTree
 
 from twin.compiled import compiled
 from twin.geometry.drift import drift
-from twin.pins.reference import Reference, turned_over
+from twin.pins.labelling.buckets import Buckets, fill_buckets, nearest_free
+from twin.pins.labelling.reference import Reference, turned_over
 
 RIDGE = 0.25
 """Penalty of the local gradient, which draws it towards zero. It is equivalent to this many neighbours at a distance of one spacing."""
@@ -108,8 +109,6 @@ MOST_LEFT = 0.03
 MOST_MISFIT = 0.15
 """Largest rms distance, in spacings, from the places of the coherent motion to the blobs. Deep contacts of two recordings have
 at most 0.13, a torn picture 0.18."""
-Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
-"""Blobs by square cell: first blob of each cell, next blob in the same cell, x0, y0, columns, rows (see ``_buckets``)."""
 
 
 class LayoutArrays(NamedTuple):
@@ -255,7 +254,7 @@ def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) 
     px = np.ascontiguousarray(px)
     layout = _layout(reference)
     cell = float(np.median(reference.spacing_px))
-    buckets = _buckets(px, cell)
+    buckets = fill_buckets(px, cell)
     grown: dict[bytes, np.ndarray] = {}
     best = None
     for pin, blob in _seeds(reference, px):
@@ -312,7 +311,7 @@ def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np
     px = np.ascontiguousarray(px)
     cell = float(np.median(reference.spacing_px))
     layout = _layout(reference)
-    return _refine(layout, px, area_px2, blob, _buckets(px, cell), cell)
+    return _refine(layout, px, area_px2, blob, fill_buckets(px, cell), cell)
 
 
 def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: Match) -> Match:
@@ -330,7 +329,7 @@ def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: M
         return found
     px = np.ascontiguousarray(px)
     cell = float(np.median(reference.spacing_px))
-    layout, buckets = _layout(reference), _buckets(px, cell)
+    layout, buckets = _layout(reference), fill_buckets(px, cell)
     again = _refine(layout, px, area_px2, _grow(*layout[:3], px, np.where(main, blob, -1), buckets, cell), buckets, cell)
     across = (blob >= 0) & (again.blob < 0) & ~np.isin(blob, again.blob)
     if across.any():
@@ -451,38 +450,6 @@ def predict_all(rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, m
 
 
 @compiled()
-def _buckets(px: np.ndarray, cell: float) -> Buckets:
-    """Blobs by square cell: (first blob of each cell, next blob in the same cell, x0, y0, columns, rows)."""
-    x0, y0 = px[:, 0].min(), px[:, 1].min()
-    columns = int((px[:, 0].max() - x0) / cell) + 1
-    rows = int((px[:, 1].max() - y0) / cell) + 1
-    head = np.full(columns * rows, -1)
-    following = np.full(len(px), -1)
-    for k in range(len(px)):
-        c = int((px[k, 1] - y0) / cell) * columns + int((px[k, 0] - x0) / cell)
-        following[k] = head[c]
-        head[c] = k
-    return head, following, x0, y0, columns, rows
-
-
-@compiled()
-def _nearest(x: float, y: float, reach: float, px: np.ndarray, taken: np.ndarray, buckets: Buckets, cell: float) -> tuple[int, float]:
-    """Nearest free blob within ``reach`` of (x, y): (index or -1, squared distance)."""
-    head, following, x0, y0, columns, rows = buckets
-    best, best_d2 = -1, reach * reach
-    for cy in range(max(int((y - reach - y0) / cell), 0), min(int((y + reach - y0) / cell), rows - 1) + 1):
-        for cx in range(max(int((x - reach - x0) / cell), 0), min(int((x + reach - x0) / cell), columns - 1) + 1):
-            k = head[cy * columns + cx]
-            while k >= 0:
-                if not taken[k]:
-                    d2 = (px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2
-                    if d2 < best_d2:
-                        best, best_d2 = k, d2
-                k = following[k]
-    return best, best_d2
-
-
-@compiled()
 def _grow(
     rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, px: np.ndarray, start: np.ndarray, buckets: Buckets, cell: float
 ) -> np.ndarray:
@@ -523,7 +490,7 @@ def _grow(
                     continue
                 tried[i] = count
                 x, y = rest[i, 0] + ux, rest[i, 1] + uy
-                k, d2 = _nearest(x, y, GROW_GATES[level] * spacing[i], px, taken, buckets, cell)
+                k, d2 = nearest_free(x, y, GROW_GATES[level] * spacing[i], px, taken, buckets, cell)
                 if k >= 0:
                     cost = d2 / (spacing[i] * spacing[i])
                     if claim[k] < 0 or cost < claim_cost[k]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, OptionError
-from twin.pins.detector_spec import OWN, DetectorSpec, shipped_detector
+from twin.pins.detectors.detector_spec import OWN, DetectorSpec, shipped_detector
 from twin.types import Form, Frame
 
 

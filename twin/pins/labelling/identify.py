@@ -1,9 +1,9 @@
 """Identification of the pin layout of an unknown sensor from its frames alone.
 
-Each family of layouts (rings, hexagon, grid) labels the pin-like spots of each frame by its lattice (`twin.pins.families`). The part of
-the lattice that holds the spots is a candidate. A candidate is evaluated by what it does not explain: pins that should be in view but are
-not seen, and pin-like spots that belong to none of its pins, also at its rim and just outside it. Therefore a layout with one ring too few
-or too many explains less than the right layout, and is not chosen.
+Each family of layouts (rings, hexagon, grid) labels the pin-like spots of each frame by its lattice (`twin.pins.labelling.families`). The
+part of the lattice that holds the spots is a candidate. A candidate is evaluated by what it does not explain: pins that should be in view
+but are not seen, and pin-like spots that belong to none of its pins, also at its rim and just outside it. Therefore a layout with one ring
+too few or too many explains less than the right layout, and is not chosen.
 
 Pins may be brighter or darker than the skin. The gaps between dark pins are bright spots, too, and often form a lattice that explains all
 of them. But pins have skin on all sides, while gaps have skin on some sides and pins on others (`stand_out`).
@@ -24,13 +24,13 @@ from twin.errors import FrameError
 from twin.frames import spread_indices
 from twin.frames.forms import is_two_level, levels_at, pin_levels
 from twin.geometry.pins import namings, pin_lattice, usual_spacing
-from twin.pins.bumps import Bumps, find_bumps
-from twin.pins.extent import filled_area, find_beyond, in_view, open_sides, with_view
-from twin.pins.families import Family, families, family, family_of_positions, label_spots
-from twin.pins.growth import locate_places
-from twin.pins.matching import match
-from twin.pins.reference import make_reference, spread_out, together
-from twin.progress import Step
+from twin.pins.finding.bumps import Bumps, find_bumps
+from twin.pins.labelling.extent import filled_area, find_beyond, in_view, open_sides, with_view
+from twin.pins.labelling.families import Family, families, family, family_of_positions, label_spots
+from twin.pins.labelling.growth import locate_places
+from twin.pins.labelling.matching import match
+from twin.pins.labelling.reference import make_reference, spread_out, together
+from twin.progress import Step, unheard
 
 SIZES = tuple(0.003 * 1.4**k for k in range(8))
 """Sizes of spots that are tried: standard deviation of a Gaussian, as a share of the frame's longer side. A cap is about three standard
@@ -183,7 +183,7 @@ Look = Callable[[Bumps], LayoutInFrame | None]
 """Function that finds a layout in a frame's spots; None if it finds none."""
 
 
-def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Identified:
+def identify(images: list[np.ndarray], *, progress: Step = unheard) -> Identified:
     """Identify the layout in gray frames (H, W) uint8 of one sensor, with or without contact, with bright or dark pins.
 
     First each frame is labelled by itself. The layouts that are found in most frames are then matched to all frames, starting from the
@@ -199,7 +199,7 @@ def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Ident
     if found is not None and found.sure and found.best.pins.count >= FEWEST_VIEWED:
         return found
     inverted = [pin_levels(image, "dark") for image in images]
-    dark, _ = _attempt([inverted[k] for k in spread_indices(len(images), SIZED_ON)], None)
+    dark, _ = _attempt([inverted[k] for k in spread_indices(len(images), SIZED_ON)], unheard)
     if dark is not None and len(images) > SIZED_ON and _better(dark, found):
         dark, _ = _attempt(inverted, progress)
     if dark is not None and _better(dark, found):
@@ -209,7 +209,7 @@ def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Ident
     return found
 
 
-def _attempt(images: list[np.ndarray], progress: Step | None) -> tuple[Identified | None, FrameError | None]:
+def _attempt(images: list[np.ndarray], progress: Step) -> tuple[Identified | None, FrameError | None]:
     """The layout of bright pins in gray frames, or the reason why there is none."""
     try:
         return _identify_bright(images, progress), None
@@ -252,7 +252,7 @@ def stand_out(images: list[np.ndarray], seen: Sequence[LayoutInFrame], sigma_px:
     return not len(all_odd) or float(all_odd.mean()) <= MOST_GAPS
 
 
-def _identify_bright(images: list[np.ndarray], progress: Step | None) -> Identified:
+def _identify_bright(images: list[np.ndarray], progress: Step) -> Identified:
     """Identify the layout in frames whose caps are brighter than the skin.
 
     Raises
@@ -270,15 +270,13 @@ def _identify_bright(images: list[np.ndarray], progress: Step | None) -> Identif
     found: list[tuple[PinsSpec, list[LayoutInFrame]]] = []
     for k, by in enumerate(searched):
         found += _first_guesses(by, spots)
-        if progress:
-            progress(k + 1, 2 * len(searched))
+        progress(k + 1, 2 * len(searched))
     found = [guess for guess in found if np.median([one.explained for one in guess[1]]) >= LEAST_EXPLAINED]
     found.sort(key=lambda guess: -sum(one.explained for one in guess[1]))
     candidates = []
     for k, (pins, seen) in enumerate(found[:MOST_GUESSES]):
         candidates.append(_candidate(pins, seen, spots))
-        if progress:
-            progress(MOST_GUESSES + k, 2 * MOST_GUESSES)
+        progress(MOST_GUESSES + k, 2 * MOST_GUESSES)
     candidates = [c for c in candidates if c.explained >= LEAST_EXPLAINED and stand_out(images, c.seen, sigma)]
     candidates.sort(key=lambda c: -_merit(c))
     if not candidates:

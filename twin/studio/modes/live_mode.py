@@ -14,10 +14,10 @@ from twin.estimate import SensorModel, pins_in
 from twin.pins.check import Grade, examine
 from twin.pins.pipeline import Pipeline
 from twin.studio.live_page import LiveFrame, chart_values, frame_numbers, frame_pictures
-from twin.studio.mode import PageMode
+from twin.studio.modes.mode import PageMode
+from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import LineChart, StudioPage, put
 from twin.studio.pictures import badge, paragraph
-from twin.studio.twin_mode import TwinMode
 
 NUDGES = ("x -1", "x +1", "y -1", "y +1", "z -1", "z +1")
 """Moves that an armed arm can be given, mm in its base frame."""
@@ -108,19 +108,14 @@ class LiveMode(PageMode):
         with self.folder:
             self._camera = gui.add_text("camera", camera, hint="a number, /dev/videoN, http://..., a folder or a video")
             self._arm = gui.add_text("arm", arm, hint="simulated, mg400:ADDRESS, magician:PORT, or empty")
-            connect = gui.add_button("Connect")
-            disconnect = gui.add_button("Disconnect")
+            page.button("Connect", self.connect)
+            page.button("Disconnect", self.disconnect)
             self._record = gui.add_checkbox("record", False)
-            health = gui.add_button("Check the sensor's health")
-            stop = gui.add_button("EMERGENCY STOP", color="red", hint="stops the arm and cuts its power, armed or not")
+            page.button("Check the sensor's health", self.check_health)
+            page.button("EMERGENCY STOP", self.emergency_stop, color="red", hint="stops the arm and cuts its power, armed or not")
             self._armed = gui.add_checkbox("armed: the page may move the arm", False)
             self._limits = gui.add_html("")
-            nudges = gui.add_button_group("move, mm", NUDGES, visible=False)
-        self._nudges = nudges
-        connect.on_click(page.guard(self.connect))
-        disconnect.on_click(page.guard(self.disconnect))
-        health.on_click(page.guard(self.check_health))
-        stop.on_click(page.guard(self.emergency_stop))
+            self._nudges = nudges = gui.add_button_group("move, mm", NUDGES, visible=False)
         self._record.on_update(page.guard(self._toggle_record))
         self._armed.on_update(page.guard(self._toggle_armed))
         nudges.on_click(page.guard(lambda: self._nudge(nudges.value)))
@@ -191,7 +186,7 @@ class LiveMode(PageMode):
         if self._last is None or self._feed is None:
             raise TwinError("there is no frame yet; connect a camera first")
         findings = examine([self._last.frame], self._feed.model.sensor)
-        ill = [f"{finding.text} {finding.remedy}".strip() for finding in findings if finding.verdict is not Grade.GOOD]
+        ill = [f"{finding.text} {finding.remedy}".strip() for finding in findings if finding.verdict is not Grade.HEALTHY]
         self._health = ill or [f"All {len(findings)} checks are good."]
 
     def _toggle_record(self) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from scenes.sensor import BlobSpec
 from twin.compiled import compiled
-from twin.pins.bumps import find_bumps
+from twin.pins.finding.bumps import find_bumps
 
 GROWTH_PX = 4
 """Largest distance, px, by which a component is grown beyond its bounding box."""

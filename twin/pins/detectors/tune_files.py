@@ -7,9 +7,9 @@ from scenes import SensorSpec
 from twin.errors import OptionError
 from twin.frames import Recording, evenly_read, open_recording
 from twin.frames.forms import known_frames, times
-from twin.pins.detector_spec import Evidence, Method, write_detector
+from twin.pins.detectors.detector_spec import Evidence, Method, write_detector
+from twin.pins.detectors.tune import Tuned, tune
 from twin.pins.pipeline import Pipeline
-from twin.pins.tune import Tuned, tune
 from twin.progress import Progress, silent, stage
 from twin.store import writes_file
 from twin.types import Form, Frame, ReadableResult

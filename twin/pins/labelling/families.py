@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
 from twin.geometry.pins import pin_lattice, usual_spacing
-from twin.pins.bumps import Bumps
-from twin.pins.growth import NEIGHBOURS, grow
+from twin.pins.finding.bumps import Bumps
+from twin.pins.labelling.growth import NEIGHBOURS, grow
 
 NEARLY_ALL = 0.95
 """Share of the spots that a labelling must hold to end the search for a better start."""

@@ -12,14 +12,24 @@ from twin.errors import FrameError
 from twin.frames import spread_indices
 from twin.frames.forms import pin_levels, polarity_of
 from twin.geometry.pins import pin_lattice
-from twin.pins.detector import Found, make_detector
-from twin.pins.detector_spec import DetectorSpec, Evidence, Method, with_detector
-from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, Identified, identify, score_layout, smooth_view, symmetries
-from twin.pins.legacy import legacy_parameters
-from twin.pins.reference import Reference, make_reference, nominal_reference, together
-from twin.pins.rest import Rest, rest_of
-from twin.pins.view import camera_modes, view_of
-from twin.progress import Step
+from twin.pins.detectors.detector import Found, make_detector
+from twin.pins.detectors.detector_spec import DetectorSpec, Evidence, Method, with_detector
+from twin.pins.detectors.legacy import legacy_parameters
+from twin.pins.labelling.identify import (
+    SAME_SHAPE,
+    SHOWN,
+    SURE_EXPLAINED,
+    Candidate,
+    Identified,
+    identify,
+    score_layout,
+    smooth_view,
+    symmetries,
+)
+from twin.pins.labelling.reference import Reference, make_reference, nominal_reference, together
+from twin.pins.labelling.rest import Rest, rest_of
+from twin.pins.labelling.view import camera_modes, view_of
+from twin.progress import Step, unheard
 from twin.types import Form, Frame
 
 # Number of frames that are used, spread evenly. With more frames the parameters hardly change.
@@ -104,7 +114,7 @@ def tune(
     known: Candidate | None = None,
     rest: Rest | None = None,
     given: Frame | None = None,
-    progress: Step | None = None,
+    progress: Step = unheard,
 ) -> Tuned:
     """Find mask, threshold and blob parameters from frames of one size and form.
 
@@ -161,8 +171,7 @@ def tune(
     for k, detector in enumerate(tried):
         if sum(rates[k]) >= hopeful:
             rates[k] = _rate(make_detector(sensor, detector, second_look=False), judged)
-        if progress:
-            progress(k + 1, len(tried))
+        progress(k + 1, len(tried))
     best = _middle_of_plateau(tried, rates)
     evidence = _evidence(tried, rates, best, judged, reference, start)
     if doubts:

@@ -17,8 +17,8 @@ from twin.camera.projection import project
 from twin.errors import FrameError
 from twin.frames.forms import from_raw
 from twin.geometry.pins import namings, pin_lattice, rest_pins
-from twin.pins.identify import smooth_view
-from twin.pins.reference import Reference, make_reference
+from twin.pins.labelling.identify import smooth_view
+from twin.pins.labelling.reference import Reference, make_reference
 from twin.types import Form
 
 SURE = 0.8

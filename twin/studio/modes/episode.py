@@ -14,7 +14,7 @@ from twin.geometry.pins import rest_pins
 from twin.optics.surfaces import SkinSurface
 from twin.pins import Pipeline, nominal_reference
 from twin.studio.live_page import frame_pictures
-from twin.studio.mode import PageMode
+from twin.studio.modes.mode import PageMode
 from twin.studio.page import LineChart, StudioPage
 from twin.studio.pictures import badge, number_table
 from twin.studio.scene import PinColour, PinScene, TriangleMesh, colours

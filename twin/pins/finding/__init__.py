@@ -1,0 +1,1 @@
+"""From a picture to blobs: thresholds, spots, caps."""

@@ -1,0 +1,1 @@
+"""The modes of the studio: each is one class with its controls."""

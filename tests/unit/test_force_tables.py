@@ -53,21 +53,22 @@ def found(made):
     return find_conventions(setup_of(), labels, readings)
 
 
-def test_the_sign_of_the_angles_and_the_axes_of_the_force_sensor_are_found_and_said(found):
+def test_the_sign_of_the_angles_and_the_axes_of_the_force_sensor_are_found_and_stated(made, found):
     setup, notes = found
     rig = setup.sensor.rig
     assert rig.turn_sign == -1 and rig.force_sensor.frame == "work" and rig.force_sensor.gain == (1, 1, -1)
     assert rig.force_sensor.turn_deg == pytest.approx(TURN_DEG, abs=8.0)
-    assert notes[0].startswith("found") and "by left-handed" in notes[0] and "z reversed" in notes[0]
-    given, said = find_conventions(setup, [], np.zeros((0, 3)))
+    assert notes[0].startswith("determined") and "by left-handed" in notes[0] and "with z reversed" in notes[0]
+    labels, _, readings = made
+    given, said = find_conventions(setup, labels, readings)
     assert given is setup and said[0].startswith("given")
 
 
 def test_known_parameters_are_found_again_within_their_uncertainty(made, found):
     labels, _, readings = made
-    value, sd, told, _ = fit_forces(found[0], labels, readings)
+    value, sd, determined, _ = fit_forces(found[0], labels, readings)
     truth = [parameter.fitted_quantity(TRUTH[parameter.name]) for parameter in found[0].parameters] + [*OFFSET_N, TURN_DEG]
-    assert (np.abs(value - truth) < SLACK_SD * sd).all() and (told > 0.5).all()
+    assert (np.abs(value - truth) < SLACK_SD * sd).all() and (determined > 0.5).all()
     rig = found[0].sensor_of(value).rig
     assert rig.friction == pytest.approx(TRUTH["rig.friction"], rel=0.05)
     assert rig.contact_offset_mm == pytest.approx(TRUTH["rig.contact_offset_mm"], abs=0.05)
@@ -83,10 +84,10 @@ def test_a_parameter_that_the_rows_do_not_determine_is_left_at_its_start(monkeyp
 
     monkeypatch.setattr(ForceSetup, "forces", by_depth)
     setup = found[0]
-    value, _, told, _ = fit_forces(setup, labels, setup.readings(1.3 * forces, np.array([0, 0, 0, setup.reads.turn_deg])))
+    value, _, determined, _ = fit_forces(setup, labels, setup.readings(1.3 * forces, np.array([0, 0, 0, setup.reads.turn_deg])))
     at = {p.name: k for k, p in enumerate(setup.parameters)}
     friction, zero = at["rig.friction"], at["rig.contact_offset_mm"]
-    assert value[friction] == setup.start[friction] and told[friction] == 0
+    assert value[friction] == setup.start[friction] and determined[friction] == 0
     assert value[zero] == pytest.approx(0.3, abs=0.01)
 
 
@@ -109,7 +110,7 @@ def table(path, rows=9, **changes):
 
 
 def test_a_table_needs_no_frames_and_its_columns_may_be_named(tmp_path):
-    labels, forces = read_forces(table(tmp_path / "t.csv"), setup_of(), {"pose_3": "depth"})
+    labels, forces, _ = read_forces(table(tmp_path / "t.csv"), setup_of(), {"pose_3": "depth"})
     assert len(labels) == 9 and labels[3].pose.tolist() == [0, 0, 1.3, 3, 0, 0] and labels[3].move[0] == 0.5
     np.testing.assert_allclose(forces[:, 2], 0.2 * np.arange(9))
 
@@ -121,7 +122,7 @@ def test_a_table_needs_no_frames_and_its_columns_may_be_named(tmp_path):
         ({"pose_3": "deep"}, {}, "no column deep"),
         ({"pose_3": "depth"}, {"lines": {2: "p1,1.1,1,0.5,0.1,0,-"}}, "column Fz, row 2: no number; repair or remove the row"),
         ({"pose_3": "depth"}, {"lines": {2: "p1,1.1,1,0.5"}}, "row 2 has 4 cells, the header 7"),
-        ({"pose_3": "depth"}, {"rows": 5}, "column depth has 5 rows or is constant; give 8 presses or more"),
+        ({"pose_3": "depth"}, {"rows": 5}, "column depth has 5 rows or is constant; give 8 different presses or more"),
         ({"pose_3": "shear_x"}, {}, "column shear_x has 9 rows or is constant"),
     ],
 )
@@ -131,7 +132,7 @@ def test_a_bad_table_is_refused_with_its_column_and_row(tmp_path, columns, chang
 
 
 def test_the_experiment_must_approach_along_z(tmp_path):
-    with pytest.raises(FrameError, match="depth along z"):
+    with pytest.raises(FrameError, match="approach along z"):
         read_forces(table(tmp_path / "t.csv"), replace(setup_of(), experiment=load_experiment("surface-2d")), {"pose_3": "depth"})
 
 
@@ -154,7 +155,7 @@ def test_a_calibration_writes_a_specification_with_the_conventions_and_a_page(mo
     assert {path.name for path in made_of.written} == {"fit.toml", "index.html"} and (tmp_path / "fit-contact" / "rows.csv").is_file()
     assert made_of.summary["parts"]["evaluated"]["rows"] == 8 and max(made_of.summary["parts"]["evaluated"]["error_n"]) < 5 * NOISE_N
     said = "\n".join(made_of.lines())
-    assert "convention: found" in said and "rig.contact_offset_mm" in said and "these rows do not determine it" in said
+    assert "note: determined" in said and "rig.contact_offset_mm" in said and "these rows do not determine it" in said
     assert "rig.friction" not in said
     with pytest.raises(OptionError, match="no such parameter"):
         calibrate_to_file(tmp_path / "t.csv", sensor, EXPERIMENT, tmp_path / "b.toml", hold=["rig.fricton"])

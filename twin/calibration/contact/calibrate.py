@@ -13,7 +13,7 @@ from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.calibration.contact.fit import fit_contact, held_out_px, simulate
 from twin.calibration.contact.forces import FILES, FORCE_PARAMETERS, ForceComparison, ForceSetup, compare_table, is_table
-from twin.calibration.contact.newtons import MOST_PRESSES, Newtons, assume_stiffness, compare_forces, pressed_n, simulated_n
+from twin.calibration.contact.newtons import MOST_PRESSES, Newtons, assume_stiffness, compare_forces, pressed_n
 from twin.calibration.contact.parameters import PARAMETERS
 from twin.calibration.contact.report import summary_of, write_calibration
 from twin.calibration.contact.simulate import CalibrationSetup
@@ -48,7 +48,8 @@ def scale_forces(
         return assume_stiffness(sensor, "none was measured")
     labels = read_arm_labels(recording)
     rows = np.sort(np.random.default_rng([seed, 6]).permutation(rows)[:MOST_PRESSES])
-    return compare_forces(measured[rows], simulated_n(sensor, experiment, obj, [labels[row] for row in rows], across=across), sensor)
+    setup = ForceSetup(sensor, experiment, obj, across, parameters=())
+    return compare_forces(measured[rows], setup.forces([setup.start], [labels[row] for row in rows])[0, :, 2], sensor)
 
 
 def _part(measured: MeasuredFrames, rows: np.ndarray) -> MeasuredFrames:

@@ -1,22 +1,24 @@
 """The twin's forces against a table of poses and forces alone: a fit to some of its rows, an evaluation on the others, and a page.
 
 For the force f of the sensor on the object, the force sensor's reading is ``r = offset + gain * Rz(-turn) f`` (``ForceSensorSpec``). The
-sign of the arm's angles, the axes and the turn of the readings are found before the fit, unless the specification has a force sensor.
-With the error e = NOISE_N + NOISE_SHARE |force|, the parameters theta
+sign of the arm's angles, the axes, signs and turn of the readings are determined before the fit, unless the specification has a force
+sensor. With the error e = NOISE_N + NOISE_SHARE |force|, the parameters theta
 
     minimise  sum ((r(theta) - measured) / e)^2 / s^2 + sum ((theta - start) / prior)^2
 
-by Gauss-Newton steps with difference quotients, s being the root mean square of the errors relative to e before each step. A parameter of
-whose prior variance the rows leave more than half goes back to its start, and the others are fitted again without it. With s at the end,
+by Gauss-Newton steps with difference quotients. s is the root mean square of the errors relative to e before each step. A parameter of
+whose prior variance the rows leave more than half returns to its start, and the others are fitted again without it. With s at the end,
 and P parameters fitted to M rows, the 90 % interval of a force is ``t(M - P / 3) s e sqrt(1 + P / 3 M)`` to each side, t being the quantile
 of Student's distribution.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -28,18 +30,29 @@ from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.rig import ForceSensorSpec
 from scenes.sensor import SensorSpec
-from twin.calibration.contact.parameters import PARAMETERS, SIZE, FittedParameter, values_of, with_quantities
-from twin.errors import ContactError, FrameError
-from twin.frames.tables import called_here, numbers, read_columns
+from twin.calibration.contact.fit import shorten_step
+from twin.calibration.contact.newtons import COVERED, compare_forces
+from twin.calibration.contact.parameters import (
+    DETERMINED,
+    PARAMETERS,
+    SIZE,
+    FittedParameter,
+    describe_parameters,
+    values_of,
+    with_quantities,
+)
+from twin.calibration.contact.report import add_parameters
+from twin.errors import ContactError, FrameError, OptionError
+from twin.frames.tables import called_here, numbers, read_columns, unlikely_units
 from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.progress import Progress, Step, stage
 from twin.report.charts import new_figure, write_chart
 from twin.report.page import Page, PagePicture
-from twin.report.table import write_rows
+from twin.report.table import Column, write_rows
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
-from twin.rig.labels import ArmLabel
+from twin.rig.labels import ArmLabel, poses_and_moves
 from twin.store import made_by, write_json
 from twin.types import ReadableResult
 from twin.workers import in_processes
@@ -51,26 +64,28 @@ FORCE_PARAMETERS = (
     FittedParameter("skin.young_modulus_mpa", 0.5, 0.1, "log"),
     FittedParameter(SIZE, 0.3, 0.03, "log"),
 )
-"""Parameters of the sensor and its rig on which forces depend. The others move pins, and change forces little."""
-TURN = FittedParameter("rig.force_sensor.turn_deg", 10.0, 1.0)
-CELL = (*(FittedParameter(f"rig.force_sensor.offset_n[{axis}]", 0.1, 0.1) for axis in range(3)), TURN)
+"""Parameters of the sensor and its rig on which forces depend. The others move pins, and hardly change forces."""
+CELL = (
+    *(FittedParameter(f"rig.force_sensor.offset_n[{axis}]", 0.1, 0.1) for axis in range(3)),
+    FittedParameter("rig.force_sensor.turn_deg", 10.0, 1.0),
+)
 """The force sensor's own parameters, which come last in every vector of values."""
 FILES = ("index.html", "forces.json", "rows.csv", "forces.png", "forces-dark.png")
 """Files of a comparison of forces."""
+POSES = tuple(f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7))
 FEWEST_ROWS = 8
 NOISE_N, NOISE_SHARE = 0.05, 0.05
 """Error of a force: a constant, and a share of the force."""
 LEAST_VARIANCE = 1e-4
-"""Least square of s: exact forces have errors, too."""
-TOLD = 0.5
-"""Least share of a parameter's prior variance that the rows must remove for it to count as determined."""
-ROUNDS, SHORTEST, ENOUGH = 8, 1 / 8, 0.02
-"""Most Gauss-Newton steps, the least share of one, and the relative decrease of the cost below which the fit ends."""
+"""Least square of s, because exact forces have errors, too."""
+ROUNDS, ENOUGH = 8, 0.02
+"""Most Gauss-Newton steps, and the relative decrease of the cost below which the fit ends."""
 UNLIKE, CLEARER = 0.6, 1.1
-"""Largest share of the forces' square that the twin may leave unexplained before any fit, up to a factor and a turn. The sign of the angles
-counts as found if the other sign leaves ``CLEARER`` times as much."""
-Z90 = 1.645
-"""Half a 90 % interval of the normal distribution, in standard deviations."""
+"""Largest share of the forces' variance that the twin may leave unexplained before any fit, up to a factor and a turn. The sign of the
+angles counts as determined if the other sign leaves ``CLEARER`` times as much."""
+LARGEST_SCALE, UNTARED, SIDEWAYS = 8.0, 0.5, 0.05
+"""Largest ratio of measured to simulated forces in newtons; least reading without contact, relative to the range of the
+forces, that is not left to the fit; least ratio of side force to normal force at which the turn of the force sensor can be determined."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -101,7 +116,7 @@ class ForceComparison(ReadableResult):
             lines.append(
                 f"{of['rows']} rows {part}: mean absolute error of Fx, Fy, Fz {errors} N; {of['inside']:.0%} in the 90 % intervals"
             )
-        lines += [f"convention: {each}" for each in self.summary["conventions"]]
+        lines += [f"note: {each}" for each in self.summary["notes"]]
         for p in self.summary["parameters"]:
             doubt = f"{p['low']:.3g} to {p['high']:.3g}" if p["known"] else "left at its start: these rows do not determine it"
             lines.append(f"{p['name']:30s} {p['start']:9.4g} -> {p['value']:9.4g}  {doubt}")
@@ -129,11 +144,16 @@ class ForceSetup:
         """Values (P + 4,) of the parameters and of ``CELL`` at the start."""
         return np.array([*values_of(self.sensor, self.experiment, self.parameters), *self.reads.offset_n, self.reads.turn_deg])
 
+    def with_rig(self, **changes: Any) -> "ForceSetup":
+        """The setup with other values of the rig."""
+        rig = rig_of(self.sensor, self.obj.name).model_copy(update=changes)
+        return replace(self, sensor=self.sensor.model_copy(update={"rig": rig}))
+
     def sensor_of(self, values: np.ndarray) -> SensorSpec:
         """The sensor with other values (P + 4,)."""
         cell = {"offset_n": tuple(values[-4:-1].round(4).tolist()), "turn_deg": round(float(values[-1]), 2)}
         sensor = with_quantities(self.sensor, self.experiment, values[:-4], rig_of(self.sensor).turn_sign, self.parameters)
-        return sensor.model_copy(update={"rig": rig_of(sensor).model_copy(update={"force_sensor": self.reads.model_copy(update=cell)})})
+        return replace(self, sensor=sensor).with_rig(force_sensor=self.reads.model_copy(update=cell)).sensor
 
     def forces(self, values: Sequence[np.ndarray], labels: Sequence[ArmLabel], step: Step | None = None) -> np.ndarray:
         """(V, M, 7) for V vectors of values and M labels; a contact that fails is NaN.
@@ -141,8 +161,8 @@ class ForceSetup:
         Force on the object in the axes of the work frame and in those of the tool, N, and the share of the normal force that slips.
         """
         found = np.empty((len(values) * len(labels), 7))
-        tasks = [(each, label) for each in values for label in labels]
-        for done, (k, each) in enumerate(in_processes(partial, (_force, self), list(enumerate(tasks)), processes=self.workers), 1):
+        tasks = list(enumerate(product(values, labels)))
+        for done, (k, each) in enumerate(in_processes(partial, (_force, self), tasks, processes=self.workers), 1):
             found[k] = each
             if step:
                 step(done, len(found))
@@ -171,18 +191,19 @@ def _force(setup: ForceSetup, task: tuple[int, tuple[np.ndarray, ArmLabel]]) -> 
 
 def noise_of(force_n: np.ndarray) -> np.ndarray:
     """NOISE_N + NOISE_SHARE of the force, (M, 1), for forces (M, 3)."""
-    return cast(np.ndarray, NOISE_N + NOISE_SHARE * np.linalg.norm(force_n, axis=1, keepdims=True))
+    noise: np.ndarray = NOISE_N + NOISE_SHARE * np.linalg.norm(force_n, axis=1, keepdims=True)
+    return noise
 
 
 def is_table(frames: Path) -> bool:
-    """Whether a path names a table, and no frames."""
+    """Whether a path is a table, and not a recording."""
     return frames.suffix.casefold() in (".csv", ".tsv") and frames.is_file()
 
 
-def read_forces(path: Path, setup: ForceSetup, columns: Mapping[str, str]) -> tuple[list[ArmLabel], np.ndarray]:
-    """Labels of a table's rows, and forces (M, 3), N. Poses and moves without a column (see ``called_here``) count as zero.
+def read_forces(path: Path, setup: ForceSetup, columns: Mapping[str, str]) -> tuple[list[ArmLabel], np.ndarray, list[str]]:
+    """Labels of a table's rows, forces (M, 3), N, and doubts about units. Poses and moves without a column count as zero.
 
-    ``columns`` maps the names that are used here to the table's own.
+    ``columns`` maps the names that are used here to the table's own, with a sign or a factor before them: ``-z``, ``0.001*Fz_mN``.
 
     Raises
     ------
@@ -190,25 +211,25 @@ def read_forces(path: Path, setup: ForceSetup, columns: Mapping[str, str]) -> tu
         The approach is not along z, a column is missing or constant, or a cell is no number.
     """
     if setup.experiment.approach != "z":
-        raise FrameError(
-            f"experiment {setup.experiment.name}: a table of forces has its depth along z; give one that has, too (surface-3d)"
-        )
-    table, forces = read_columns(path), setup.reads.columns
-    known = called_here(table | {key: table[name] for key, name in columns.items() if name in table})
-    if missing := [key for key in ("pose_3", *forces, *columns) if key not in known or columns.get(key, key) not in known]:
-        own = columns.get(missing[0], missing[0])
-        raise FrameError(f"{path}: no column {own}; name it by `column` ({missing[0]}=NAME); the table has {', '.join(table)}")
-    used = [f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7)]
-    values = {key: numbers(known[key]) for key in (*used, *forces) if key in known}
+        raise FrameError(f"experiment {setup.experiment.name}: a table of forces needs an approach along z; give such an experiment")
+    table, forces, factors = called_here(read_columns(path)), setup.reads.columns, {}
+    if unknown := [key for key in columns if key not in (*POSES, *forces)]:
+        raise OptionError(f"`column` {unknown[0]}: no such key; known: {', '.join((*POSES, *forces))}")
+    names = {key: columns.get(key, key) for key in (*POSES, *forces) if key in ("pose_3", *forces, *columns) or key in table}
+    for key, name in names.items():
+        factor, own = ("1", name) if name in table else re.fullmatch(r"(?:(-|[-+.\de]+(?=\*))\*?)?(.*)", name).groups("1")  # type: ignore[union-attr]
+        if own not in table:
+            raise FrameError(f"{path}: no column {own}; name it by `column` ({key}=NAME); the table has {', '.join(table)}")
+        names[key], factors[key] = own, -1.0 if factor == "-" else float(factor)
+    values = {key: factors[key] * numbers(table[own]) for key, own in names.items()}
     count = len(values["pose_3"])
     for key, cells in values.items():
-        known_cells, own = np.isfinite(cells), columns.get(key, key)
-        if not known_cells.all():
-            raise FrameError(f"{path}: column {own}, row {np.argmin(known_cells) + 1}: no number; repair or remove the row")
+        if not (known := np.isfinite(cells)).all():
+            raise FrameError(f"{path}: column {names[key]}, row {np.argmin(known) + 1}: no number; repair or remove the row")
         if key in ("pose_3", forces[2]) and (count < FEWEST_ROWS or not np.ptp(cells)):
-            raise FrameError(f"{path}: column {own} has {count} rows or is constant; give {FEWEST_ROWS} presses or more that differ")
-    labels = np.stack([values.get(key, np.zeros(count)) for key in used], axis=1)
-    return [ArmLabel(row[:6], row[6:]) for row in labels], np.stack([values[key] for key in forces], axis=1)
+            raise FrameError(f"{path}: column {names[key]} has {count} rows or is constant; give {FEWEST_ROWS} different presses or more")
+    at = np.stack([values.get(key, np.zeros(count)) for key in POSES], axis=1)
+    return [ArmLabel(row[:6], row[6:]) for row in at], np.stack([values[key] for key in forces], axis=1), unlikely_units(values)
 
 
 def find_conventions(
@@ -219,42 +240,63 @@ def find_conventions(
     Raises
     ------
     FrameError
-        The measured forces do not follow the simulated ones, up to a factor and a turn.
+        Most contacts do not touch in the simulation, or the measured forces do not follow the simulated ones, up to a factor and a turn.
     """
-    rig, side, columns, tried = rig_of(setup.sensor), measured[:, 0] + 1j * measured[:, 1], setup.reads.columns, []
+    rig, columns, tried = rig_of(setup.sensor), setup.reads.columns, []
+    for sign in (rig.turn_sign,) if rig.force_sensor else (1, -1):
+        there = setup.with_rig(turn_sign=sign)
+        found = there.forces([there.start], labels, step)[0]
+        touching = np.isfinite(found[:, 2]) & (found[:, 2] != 0)
+        if touching.sum() <= len(labels) / 2:
+            raise FrameError(
+                f"pose_3: in the simulation {touching.sum()} of {len(labels)} contacts are possible and touch; it must be the depth "
+                "past the first touch in mm: convert it by `column` (pose_3=-NAME, pose_3=1000*NAME), or set rig.contact_offset_mm"
+            )
+        for (frame, f), mirror in product((("work", found[touching, :3]), ("tool", found[touching, 3:6])), (1, -1)):
+            flat, side, real = f[:, 0] + 1j * f[:, 1], measured[touching, 0] + 1j * mirror * measured[touching, 1], measured[touching, 2]
+            turn, left, rest = _regress(flat, side) if flat.std() > SIDEWAYS * f[:, 2].std() else (1.0, 0.0, side.mean())
+            scale, left_z, rest_z = _regress(f[:, 2], real)
+            turn_deg = round(-float(np.degrees(np.angle(turn))), 1)
+            gain, offset_n = (1.0, float(mirror), float(np.sign(scale.real))), np.array([rest.real, mirror * rest.imag, rest_z.real])
+            tried.append((left + left_z, mirror < 0, sign, frame, left, left_z, scale.real, gain, turn_deg, offset_n))
     if rig.force_sensor:
-        return setup, [f"given by rig.force_sensor: {_in_words(rig.force_sensor, rig.turn_sign)}"]
-    for sign in (1, -1):
-        there = replace(setup, sensor=setup.sensor.model_copy(update={"rig": rig.model_copy(update={"turn_sign": sign})}))
-        found = np.nan_to_num(there.forces([there.start], labels, step)[0])
-        for frame, f in (("work", found[:, :3]), ("tool", found[:, 3:6])):
-            flat, r = f[:, 0] + 1j * f[:, 1], float(np.corrcoef(f[:, 2], measured[:, 2])[0, 1])
-            turn = np.vdot(flat, side) / max(np.vdot(flat, flat).real, 1e-12)
-            left = float(np.sum(abs(side - turn * flat) ** 2) / max(np.sum(abs(side) ** 2), 1e-12))
-            tried.append((left + 1 - r**2, left, r, sign, frame, round(-float(np.degrees(np.angle(turn))), 1)))
-    total, left, r, sign, frame, turn_deg = min(tried)
-    if odd := columns[2] if 1 - r**2 > UNLIKE else ", ".join(columns[:2]) if left > UNLIKE else "":
+        return setup, [f"given by rig.force_sensor: {describe_conventions(rig.force_sensor, rig.turn_sign)}"]
+    total, _, sign, frame, left, left_z, scale, gain, turn_deg, offset_n = min(tried, key=lambda each: each[:2])
+    if odd := columns[2] if left_z > UNLIKE else ", ".join(columns[:2]) if left > UNLIKE else "":
         raise FrameError(
-            f"{odd}: does not follow the simulated force (correlation of the normal force {r:.2f}, {left:.0%} of the side force left); "
-            "is it newtons, and pose_3 the depth? Name the right columns by `column`, or state rig.turn_sign and rig.force_sensor"
+            f"{odd}: does not follow the simulated force (share of the variance left: normal force {left_z:.0%}, side force {left:.0%}); "
+            "is pose_3 the depth? Name the right columns by `column`, or state rig.turn_sign and rig.force_sensor"
         )
-    reads = ForceSensorSpec.model_validate(
-        {"columns": columns, "frame": frame, "gain": (1.0, 1.0, float(np.sign(r))), "turn_deg": turn_deg}
-    )
-    notes = [f"found, as the specification has no rig.force_sensor: {_in_words(reads, sign)}"]
-    if min(each[0] for each in tried if each[3] != sign) < CLEARER * total:
-        notes.append("the rows hardly show the sign of the angles: state rig.turn_sign and rig.force_sensor if you know them")
-    rig = rig.model_copy(update={"turn_sign": sign, "force_sensor": reads})
-    return replace(setup, sensor=setup.sensor.model_copy(update={"rig": rig})), notes
+    if not 1 / LARGEST_SCALE < abs(scale) < LARGEST_SCALE:
+        raise FrameError(
+            f"{columns[2]}: {abs(scale):.2g} times the simulated force; if it is not in N, convert it by `column` "
+            f"({columns[2]}=0.001*NAME for mN, 0.00981*NAME for g), or correct the stiffness of the specification"
+        )
+    offset_n = np.where(abs(offset_n) > UNTARED * np.ptp(measured, axis=0).max(), offset_n, 0.0).round(3)
+    reads = ForceSensorSpec(columns=columns, frame=frame, gain=gain, turn_deg=turn_deg, offset_n=tuple(offset_n.tolist()))
+    notes = [f"determined, as the specification has no rig.force_sensor: {describe_conventions(reads, sign)}"]
+    if min(each[0] for each in tried if each[2] != sign) < CLEARER * total:
+        notes.append("the rows hardly determine the sign of the angles: state rig.turn_sign and rig.force_sensor if you know them")
+    return setup.with_rig(turn_sign=sign, force_sensor=reads), notes
 
 
-def _in_words(reads: ForceSensorSpec, sign: int) -> str:
-    hands, z = ("right", "left")[::sign], "" if reads.gain[2] > 0 else ", with z reversed"
+def _regress(x: np.ndarray, y: np.ndarray) -> tuple[complex, float, complex]:
+    """Slope, share of the variance that is left, and intercept of a straight line through (M,) real or complex numbers."""
+    slope = np.vdot(x - x.mean(), y - y.mean()) / max(len(x) * x.var(), 1e-12)
+    rest = y.mean() - slope * x.mean()
+    return complex(slope), float((y - slope * x).var() / max(y.var(), 1e-12)), complex(rest)
+
+
+def describe_conventions(reads: ForceSensorSpec, sign: int) -> str:
+    """The conventions of a table in words."""
+    hands, reversed_axes = ("right", "left")[::sign], [axis for axis, gain in zip("xyz", reads.gain, strict=True) if gain < 0]
     return (
         f"the sensor is pressed at pose - shear along z of the work frame, then moved to pose, by {hands[0]}-handed static xyz "
-        f"angles (a plate can't tell this from a press at pose + shear by {hands[1]}-handed ones, with the force sensor turned by 180 deg "
-        f"more); {', '.join(reads.columns)} are the force on the object in the axes of the {reads.frame} frame, turned by "
-        f"{reads.turn_deg:.1f} deg about z{z}"
+        f"angles (a plate can't distinguish this from a press at pose + shear by {hands[1]}-handed ones, with the force sensor turned by "
+        f"180 deg more); {', '.join(reads.columns)} are the force on the object in N in the axes of the {reads.frame} frame, turned by "
+        f"{reads.turn_deg:.1f} deg about z"
+        + (f", then with {' and '.join(reversed_axes)} reversed" if reversed_axes else "")
+        + (f"; without contact they are {', '.join(f'{each:.3g}' for each in reads.offset_n)} N" if any(reads.offset_n) else "")
     )
 
 
@@ -263,14 +305,13 @@ def fit_forces(setup: ForceSetup, labels: Sequence[ArmLabel], measured: np.ndarr
 
     Returns
     -------
-    value, sd, told : (P + 4,) float
+    value, sd, determined : (P + 4,) float
         Fitted quantities, their standard deviations, and the shares of the priors' variances that the rows removed.
     spread : (3,) float
         s of each axis.
     """
     every, start = (*setup.parameters, *CELL), setup.start
     prior, by = np.array([p.prior for p in every]), np.array([p.step for p in every])
-    least = np.array([p.least if p.scale == "plain" else -np.inf for p in every])
 
     def errors(values: np.ndarray) -> np.ndarray:
         """(V, 3 M) errors relative to ``noise_of`` for (V, P + 4); a contact that fails counts as one without force."""
@@ -279,34 +320,32 @@ def fit_forces(setup: ForceSetup, labels: Sequence[ArmLabel], measured: np.ndarr
         off = np.stack([setup.readings(forces[k], each) - measured for k, each in zip(of.ravel(), values, strict=True)])
         return (np.where(np.isfinite(off), off, -measured) / noise_of(measured)).reshape(len(values), -1)
 
-    def cost(off: np.ndarray, at: np.ndarray, variance: float) -> float:
-        return float(off @ off / variance + np.sum(((at - start) / prior) ** 2))
+    def cost(at: np.ndarray, variance: float) -> tuple[float, np.ndarray]:
+        there = errors(at[None])[0]
+        return float(there @ there / variance + np.sum(((at - start) / prior) ** 2)), there
 
-    value, sd, told, free = start.copy(), prior.copy(), np.zeros(len(start)), np.full(len(start), bool(setup.parameters))
+    value, sd, determined, free = start.copy(), prior.copy(), np.zeros(len(start)), np.full(len(start), bool(setup.parameters))
     off = errors(value[None])[0]
     while free.any():
         for _ in range(ROUNDS):
             slopes = ((errors(value + np.diag(by)[free]) - off) / by[free, None]).T
             variance = max(off @ off / max(len(off) - free.sum(), 1), LEAST_VARIANCE)
-            matrix, move, share = slopes.T @ slopes / variance + np.diag(prior[free] ** -2.0), np.zeros(len(value)), 1.0
+            matrix, move = slopes.T @ slopes / variance + np.diag(prior[free] ** -2.0), np.zeros(len(value))
             move[free] = -np.linalg.solve(matrix, slopes.T @ off / variance + ((value - start) / prior**2)[free])
-            before = now = cost(off, value, variance)
-            while share >= SHORTEST and now >= before:
-                tried, share = np.maximum(value + share * move, least), share / 2
-                there = errors(tried[None])[0]
-                now = cost(there, tried, variance)
-            if now < before:
-                value, off = tried, there
-            if now > (1 - ENOUGH) * before:
+            now = float(off @ off / variance + np.sum(((value - start) / prior) ** 2))
+            if (shorter := shorten_step(value, move, now, partial(cost, variance=variance))) is None:
+                break
+            value, lower, off = shorter
+            if lower > (1 - ENOUGH) * now:
                 break
         sd[free] = np.sqrt(np.diag(np.linalg.inv(matrix)))
-        told[free] = 1 - (sd[free] / prior[free]) ** 2
-        if (told[free] >= TOLD).all():
+        determined[free] = 1 - (sd[free] / prior[free]) ** 2
+        if (determined[free] >= DETERMINED).all():
             break
-        free &= told >= TOLD
+        free &= determined >= DETERMINED
         value = np.where(free, value, start)
         off = errors(value[None])[0]
-    return value, sd, told, np.sqrt((off.reshape(-1, 3) ** 2).sum(axis=0) / max(len(labels) - free.sum() / 3, 1))
+    return value, sd, determined, np.sqrt((off.reshape(-1, 3) ** 2).sum(axis=0) / max(len(labels) - free.sum() / 3, 1))
 
 
 def compare_table(
@@ -316,84 +355,104 @@ def compare_table(
 
     Without ``labels`` nothing is fitted, and all rows are evaluated. See ``read_forces`` and ``find_conventions`` for columns and errors.
     """
-    own = setup.sensor.model_copy(update={"rig": rig_of(setup.sensor, setup.obj.name)})
-    setup = replace(setup, sensor=own, parameters=setup.parameters if labels else ())
-    arm, measured = read_forces(table, setup, columns or {})
+    setup = replace(setup.with_rig(), parameters=setup.parameters if labels else ())
+    arm, measured, doubts = read_forces(table, setup, columns or {})
     fitted = np.isin(np.arange(len(arm)), np.random.default_rng(seed).permutation(len(arm))[:labels])
     chosen = np.flatnonzero(fitted if labels else ~fitted)
-    seen = [arm[k] for k in chosen], measured[chosen]
+    some = [arm[k] for k in chosen], measured[chosen]
     with stage(progress, "conventions") as step:
-        setup, conventions = find_conventions(setup, *seen, step)
+        setup, notes = find_conventions(setup, *some, step)
     with stage(progress, "forces") as step:
-        value, sd, told, spread = fit_forces(setup, *seen, step)
+        value, sd, determined, spread = fit_forces(setup, *some, step)
         both = setup.forces([setup.start, value], arm, step)
     first, simulated = (setup.readings(f, of) for f, of in zip(both, (setup.start, value), strict=True))
-    each_row = int((told >= TOLD).sum()) / 3
-    wider = student.ppf(0.95, max(len(chosen) - each_row, 1)) * np.sqrt(1 + each_row / len(chosen))
-    half, at = wider * spread * noise_of(simulated), np.array([[*label.pose, *label.move] for label in arm])
-    by = {"depth": at[:, 2], "tilt": np.hypot(*at.T[3:5]), "shear": np.hypot(*at.T[6:8]), "twist": abs(at[:, 11]), "slip": both[1, :, 6]}
-    left = [
-        {"force": f"F{axis}"} | {key: _correlation(of, (simulated - measured)[:, k]) for key, of in by.items()}
-        for k, axis in enumerate("xyz")
-    ]
-    by["side_over_normal"] = np.hypot(*(measured - value[-4:-1]).T[:2]) / np.maximum(abs(measured[:, 2]), 1e-9)
-    for key, of in (("measured", measured), ("simulated", simulated), ("half", half)):
-        by |= {f"{key}_{axis}": of[:, k] for k, axis in enumerate("xyz")}
-    parts: dict[str, dict[str, Any]] = {}
+    each_row, offset_n = int((determined >= DETERMINED).sum()) / 3, value[-4:-1]
+    half = student.ppf(COVERED, max(len(chosen) - each_row, 1)) * np.sqrt(1 + each_row / len(chosen)) * spread * noise_of(simulated)
+    poses, moves = poses_and_moves(arm)
+    of = {"depth": poses[:, 2:3], "tilt": poses[:, 3:5], "shear": moves[:, :2], "twist": moves[:, 5:], "slip": both[1, :, 6:]}
+    by = {key: np.linalg.norm(each, axis=1) if key != "depth" else each[:, 0] for key, each in of.items()}
+    error, solved = simulated - measured, np.isfinite(simulated).all(axis=1)
+    parts = {}
     for part, mine in (("fitted", fitted), ("evaluated", ~fitted)):
         if mine.any():
-            errors = {
-                key: np.nanmean(abs(of - measured)[mine], axis=0).tolist() for key, of in (("before_n", first), ("error_n", simulated))
+            before, after = (np.nanmean(abs(of - measured)[mine], axis=0).tolist() for of in (first, simulated))
+            lines = [_regress(simulated[mine & solved, k], measured[mine & solved, k])[:2] for k in range(3)]
+            parts[part] = {
+                "rows": int(mine.sum()),
+                "before_n": before,
+                "error_n": after,
+                "inside": float((abs(error) <= half)[mine].mean()),
             }
-            parts[part] = errors | {"rows": int(mine.sum()), "inside": float((abs(simulated - measured) <= half)[mine].mean())}
-    parameters = []
-    for k, p in enumerate((*setup.parameters, *CELL) if labels else ()):
-        low, high = sorted(p.number(value[k] + z * sd[k]) for z in (-Z90, Z90))
-        ends = {"low": low, "high": high, "told": float(told[k]), "known": bool(told[k] >= TOLD)}
-        parameters.append({"name": p.name, "start": p.number(setup.start[k]), "value": p.number(value[k])} | ends)
-    summary = {"sensor": setup.sensor.name, "conventions": conventions, "parameters": parameters, "parts": parts, "left": left}
+            parts[part] |= {"scale": [slope.real for slope, _ in lines], "correlation": [float(np.sqrt(1 - left)) for _, left in lines]}
+    evaluated = ~fitted & solved if (~fitted & solved).sum() > FEWEST_ROWS else solved
+    left = [
+        {"force": f"F{axis}"} | {key: _explained(error[evaluated, k], np.column_stack([by[key], of[key]])[evaluated]) for key in of}
+        for k, axis in enumerate("xyz")
+    ]
+    by["side_over_normal"] = np.hypot(*(measured - offset_n).T[:2]) / np.maximum(abs(measured - offset_n)[:, 2], NOISE_N)
+    for key, forces in (("measured", measured), ("simulated", simulated), ("half", half)):
+        by |= {f"{key}_{axis}": forces[:, k] for k, axis in enumerate("xyz")}
     rows = [{"row": k + 1, "fitted": bool(fitted[k])} | {key: float(each[k]) for key, each in by.items()} for k in range(len(arm))]
-    result = ForceComparison(setup.sensor_of(value), summary, rows, [])
+    notes += doubts + ([] if (~fitted).any() else ["no row is left to evaluate: give more rows, or a smaller `num_labelled`"])
+    notes += [f"row {row + 1}: its contact can't be simulated" for row in np.flatnonzero(~solved)]
+    parameters = describe_parameters((*setup.parameters, *CELL) if labels else (), setup.start, value, sd, determined)
+    summary = {"sensor": setup.sensor.name, "notes": notes, "parameters": parameters, "parts": parts, "left": left}
+    sensor = setup.sensor_of(value)
+    if labels:  # the stiffness is known as well as the mean ratio of measured to simulated normal forces
+        factor = compare_forces((measured - offset_n)[chosen, 2], (simulated - offset_n)[chosen, 2], sensor).factor
+        sensor = sensor.model_copy(update={"skin": sensor.skin.model_copy(update={"stiffness_factor": factor})})
+    result = ForceComparison(sensor, summary, rows, [])
     return replace(result, written=[_write_page(folder, result)])
 
 
-def _correlation(x: np.ndarray, y: np.ndarray) -> float:
-    """Correlation of two columns (M,) where both are known; 0 if one is constant."""
-    known = np.isfinite(x) & np.isfinite(y)
-    return float(np.corrcoef(x[known], y[known])[0, 1]) if np.ptp(x[known]) and np.ptp(y[known]) else 0.0
+def _explained(error: np.ndarray, label: np.ndarray) -> float:
+    """Share of the variance of errors (M,) that a linear function of a label (M, K) explains, adjusted for chance."""
+    known = np.column_stack([np.ones(len(error)), label])
+    fit, _, rank, _ = np.linalg.lstsq(known, error, rcond=None)
+    left = (error - known @ fit).var() / max(error.var(), 1e-12)
+    return max(0.0, float(1 - left * (len(error) - 1) / max(len(error) - rank, 1)))
 
 
 def _write_page(folder: Path, result: ForceComparison) -> Path:
     summary, lead = result.summary, ". ".join(result.lines()[: len(result.summary["parts"])])
     command = f"twin {'calibrate contact' if summary['parameters'] else 'validate'}"
-    page = Page(f"Forces of {summary['sensor']} against a load cell", command, lead=lead)
-    page.notice("Conventions of the table", summary["conventions"])
-    page.section("Measured and simulated", "What is left correlates with the labels and the slip as follows.")
-    page.table(summary["left"], ["force", "depth", "tilt", "shear", "twist", "slip"])
-    page.figures(
-        PagePicture(write_chart(folder / "forces.png", lambda: draw_forces(result.rows)), "Simulated and measured forces; errors; slip")
-    )
+    page = Page(f"Forces of {summary['sensor']} against a force sensor", command, topic="TacTip twin: forces", lead=f"{lead}.")
+    page.notice("Conventions of the table, and notes", summary["notes"])
+    page.section("Measured and simulated")
+    chart = write_chart(folder / "forces.png", partial(draw_forces, result.rows))
+    page.figures(PagePicture(chart, "Simulated against measured forces, errors by depth, tilt and shear, and slip"))
+    page.section("What remains", "Share of the variance of the errors that each label explains, in percent, adjusted for chance.")
+    labels = [Column(key, key, "%", decimals=0, scale=100) for key in ("depth", "tilt", "shear", "twist", "slip")]
+    page.table(summary["left"], [Column("force", "error of"), *labels])
     if summary["parameters"]:
-        page.section("Parameters", "What the rows do not determine is left at its start. Low and high are the ends of 90 % intervals.")
-        page.table(summary["parameters"], ["name", "start", "value", "low", "high", "known"])
+        page.section(
+            "Parameters",
+            "Low and high are the ends of the 90 % interval. A parameter that the rows do not determine (red) is at its start.",
+        )
+        add_parameters(page, summary["parameters"], "rows", low="low", high="high")
     page.download(write_json(folder / "forces.json", summary | {"made_by": made_by(__name__)}), "all figures of this page")
     page.download(write_rows(folder / "rows.csv", result.rows), "labels, forces and 90 % intervals of each contact")
     return page.write(folder / "index.html")
 
 
 def draw_forces(rows: list[dict[str, Any]]) -> Figure:
-    """Simulated against measured force, errors by depth, tilt and shear, and the measured ratio of side force to normal force by slip."""
+    """Simulated against measured forces, errors by depth, tilt and shear, normal force by depth, and the measured friction by slip."""
     of = {key: np.array([row[key] for row in rows]) for key in rows[0]}
-    figure, axes = new_figure(4, 2, panel_inch=3.2)
-    for axis, ax, below, (label, unit) in zip("xyz", axes[:3], axes[4:7], (("depth", "mm"), ("tilt", "deg"), ("shear", "mm")), strict=True):
+    figure, axes = new_figure(4, 2, panel_inch=3.4)
+    for axis, ax in zip("xyz", axes, strict=False):
         for part, mine in (("fitted", of["fitted"]), ("evaluated", ~of["fitted"])):
-            ax.errorbar(*(of[f"{key}_{axis}"][mine] for key in ("measured", "simulated", "half")), fmt="o", ms=3, lw=0.6, label=part)
-            below.plot(of[label][mine], (of["simulated_z"] - of["measured_z"])[mine], "o", ms=3)
+            if mine.any():
+                ax.errorbar(*(of[f"{key}_{axis}"][mine] for key in ("measured", "simulated", "half")), fmt="o", ms=3, lw=0.6, label=part)
         ax.axline((0, 0), slope=1, lw=0.6)
         ax.set(xlabel=f"measured F{axis}, N", ylabel=f"simulated F{axis}, N")
-        below.set(xlabel=f"{label}, {unit}", ylabel="simulated - measured Fz, N")
-    axes[0].legend()
-    axes[3].plot(of["slip"], of["side_over_normal"], "o", ms=3)
-    axes[3].set(xlabel="share that slips in the twin", ylabel="measured side force over normal force")
-    axes[7].set_axis_off()
+        for below, (label, unit) in zip(axes[4:], (("depth", "mm"), ("tilt", "deg"), ("shear", "mm")), strict=False):
+            below.plot(of[label], of[f"simulated_{axis}"] - of[f"measured_{axis}"], "o", ms=3, label=f"F{axis}")
+            below.set(xlabel=f"{label}, {unit}", ylabel="simulated - measured, N")
+    axes[3].plot(of["depth"], of["measured_z"], "o", ms=3, label="measured")
+    axes[3].plot(of["depth"], of["simulated_z"], "x", ms=4, label="simulated")
+    axes[3].set(xlabel="depth, mm", ylabel="Fz, N")
+    axes[7].plot(of["slip"], of["side_over_normal"], "o", ms=3)
+    axes[7].set(xlabel="share that slips in the twin", ylabel="measured side force / normal force", ylim=(0, None))
+    for ax in axes[[0, 3, 4]]:
+        ax.legend()
     return figure

@@ -1,7 +1,8 @@
 """The parameters of the contact calibration."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,6 +14,10 @@ from twin.rig.kinematics import TURNING, rig_of
 LEAST = 1e-3
 """Least number of which a logarithm is computed; for a Poisson's ratio nu the least 1 - 2 nu."""
 
+DETERMINED = 0.5
+"""Least share of a parameter's prior variance that the data must remove for it to count as determined."""
+Z90 = 1.645
+"""Half a 90 % interval of the normal distribution, in standard deviations."""
 SIZE = "skin.outer_radius_mm"
 """Key of the radius of a dome. If it is fitted, all lengths of the sensor and its rig are scaled with it (see ``of_radius``) before the
 other parameters are set."""
@@ -112,3 +117,16 @@ def with_quantities(
         else:
             plain[section][key] = number
     return SensorSpec.model_validate(plain)
+
+
+def describe_parameters(
+    parameters: Sequence[FittedParameter], start: np.ndarray, value: np.ndarray, sd: np.ndarray, determined: np.ndarray
+) -> list[dict[str, Any]]:
+    """Start, value, standard deviation, 90 % interval, and determined share of each parameter, from fitted quantities (P,)."""
+    rows = []
+    for k, p in enumerate(parameters):
+        low, high = sorted(p.number(value[k] + z * sd[k]) for z in (-Z90, Z90))
+        ends = {"sd": float(sd[k] * p.slope(value[k])), "low": low, "high": high}
+        shares = {"told": float(determined[k]), "known": bool(determined[k] >= DETERMINED)}
+        rows.append({"name": p.name, "start": p.number(start[k]), "value": p.number(value[k])} | ends | shares)
+    return rows

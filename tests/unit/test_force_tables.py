@@ -17,6 +17,7 @@ from twin.calibration.contact.forces import (
     noise_of,
     read_forces,
 )
+from twin.calibration.contact.parameters import Z90
 from twin.errors import FrameError, OptionError
 from twin.rig.labels import ArmLabel
 
@@ -25,6 +26,7 @@ NOISE_N = 0.004
 EXPERIMENT, PLANE = load_experiment("surface-3d-sheared"), load_object("plane")
 TURN_DEG, OFFSET_N = 150.0, (0.05, -0.03, 0.02)
 TRUTH = {"rig.contact_offset_mm": -0.2, "rig.friction": 0.6}
+ROWS, FITS = 20, 40
 SLACK_SD = 4.0  # standard deviations by which a value may be off
 
 
@@ -101,6 +103,92 @@ def test_columns_that_are_no_forces_are_refused(monkeypatch, made):
         find_conventions(setup_of(), labels, np.column_stack([readings[::-1, :2] ** 2, readings[:, 2]]))
 
 
+def linear(monkeypatch, forces, parameters, slope):
+    """Forces that depend linearly on the fitted quantities, so that a fit costs nothing."""
+
+    def simulate(self, values, labels, step=None):
+        there = np.array(values)[:, : len(parameters)] - self.start[: len(parameters)]
+        return forces + np.einsum("vp,pmk->vmk", there, slope)
+
+    monkeypatch.setattr(ForceSetup, "forces", simulate)
+
+
+def test_ninety_percent_of_the_intervals_contain_the_true_parameters(monkeypatch):
+    """Parameters sampled from their prior, forces with the noise that the fit assumes."""
+    random = np.random.default_rng(5)
+    setup = setup_of(force_sensor=ForceSensorSpec())
+    prior = np.array([p.prior for p in (*setup.parameters, *module.CELL)])
+    labels, forces = [None] * ROWS, random.normal(scale=1.0, size=(ROWS, 7))
+    linear(monkeypatch, forces, setup.parameters, random.normal(scale=0.3, size=(len(setup.parameters), ROWS, 7)))
+    inside = []
+    for _ in range(FITS):
+        truth = setup.start + prior * random.normal(size=len(prior))
+        true = setup.readings(setup.forces([truth], labels)[0], truth)
+        value, sd, determined, _ = fit_forces(setup, labels, true + noise_of(true) * random.normal(size=true.shape))
+        inside.append((np.abs(value - truth) <= Z90 * sd)[determined >= 0.5])
+    assert 0.85 <= np.concatenate(inside).mean() <= 0.95
+
+
+@pytest.mark.parametrize(
+    ("read", "columns", "gain", "offset_n"),
+    [
+        ("mirrored", {}, (1, -1, 1), (0, 0, 0)),
+        ("left-handed cell", {}, (1, 1, -1), (0, 0, 0)),
+        ("not tared", {}, (1, 1, 1), (3.0, -4.0, 25.0)),
+    ],
+)
+def test_signs_and_zero_of_another_laboratorys_force_sensor_are_determined(monkeypatch, made, found, read, columns, gain, offset_n):
+    labels, forces, _ = made
+    reads = ForceSensorSpec(gain=gain, offset_n=offset_n, turn_deg=-40.0)
+    rig = setup_of(force_sensor=reads)
+    readings = rig.readings(forces, rig.start)
+    other = np.roll(forces, 1, axis=0)
+    monkeypatch.setattr(
+        ForceSetup, "forces", lambda self, values, labels, step=None: np.stack([forces if self.sensor.rig.turn_sign < 0 else other])
+    )
+    setup, notes = find_conventions(setup_of(), labels, readings)
+    assert setup.reads.gain == gain and setup.reads.turn_deg == pytest.approx(-40.0, abs=0.1)
+    assert setup.reads.offset_n == pytest.approx(offset_n, abs=0.05)
+    assert ("reversed" in notes[0], "without contact" in notes[0]) == (-1 in gain, any(offset_n))
+
+
+def test_a_table_in_other_units_and_signs_is_read_by_factors_or_refused(monkeypatch, tmp_path, made):
+    """A second laboratory: height in m that falls towards the plate, angles in rad, forces in mN."""
+    labels, forces, readings = made
+    lines = ["height m;rx rad;ry rad;dx;dy;f1;f2;f3"]
+    for label, reading in zip(labels, readings, strict=True):
+        cells = [-label.pose[2] / 1000, *np.radians(label.pose[3:5]), *label.move[:2] / 1000, *(1000 * reading)]
+        lines.append(";".join(f"{cell:.9g}" for cell in cells))
+    (tmp_path / "second.csv").write_text("\n".join(lines))
+    columns = {
+        "pose_3": "-1000*height m",
+        "pose_4": "57.29578*rx rad",
+        "pose_5": "57.29578*ry rad",
+        "move_1": "1000*dx",
+        "move_2": "1000*dy",
+    }
+    own = {"Fx": "0.001*f1", "Fy": "1e-3*f2", "Fz": "0.001*f3"}
+    arm, measured, doubts = read_forces(tmp_path / "second.csv", setup_of(), columns | own)
+    np.testing.assert_allclose([[*a.pose, *a.move] for a in arm], [[*a.pose, *a.move] for a in labels], atol=1e-6)
+    np.testing.assert_allclose(measured, readings, atol=1e-6)
+    assert not doubts
+    _, _, doubts = read_forces(tmp_path / "second.csv", setup_of(), {key: name.split("*")[1] for key, name in (columns | own).items()})
+    assert len(doubts) == 2 and "if they are in m" in doubts[0] and "if they are in rad" in doubts[1]
+    monkeypatch.setattr(ForceSetup, "forces", lambda self, values, labels, step=None: np.stack([forces]))
+    with pytest.raises(FrameError, match=r"Fz: 1e\+03 times the simulated force; .* \(Fz=0.001\*NAME for mN"):
+        find_conventions(setup_of(), labels, 1000 * readings)
+    monkeypatch.setattr(ForceSetup, "forces", lambda self, values, labels, step=None: np.zeros((1, len(labels), 7)))
+    with pytest.raises(FrameError, match=r"pose_3: in the simulation 0 of 8 contacts .* convert it by `column` \(pose_3=-NAME"):
+        find_conventions(setup_of(), labels, readings)
+
+
+def test_what_remains_is_explained_by_the_label_that_causes_it():
+    random = np.random.default_rng(1)
+    tilt, shear = random.normal(size=(2, 40, 2))
+    error = tilt @ [0.3, 0.1] + random.normal(scale=0.05, size=40)
+    assert module._explained(error, tilt) > 0.9 and module._explained(error, shear) < 0.2
+
+
 def table(path, rows=9, **changes):
     lines = ["name,depth,pose_Rx,shear_x,Fx,Fy,Fz"] + [f"p{k},{1 + 0.1 * k:.1f},{k},0.5,0.1,0,{0.2 * k:.1f}" for k in range(rows)]
     for number, line in changes.get("lines", {}).items():
@@ -120,6 +208,7 @@ def test_a_table_needs_no_frames_and_its_columns_may_be_named(tmp_path):
     [
         ({}, {}, r"no column pose_3; name it by `column` \(pose_3=NAME\); the table has name, depth"),
         ({"pose_3": "deep"}, {}, "no column deep"),
+        ({"pose_3": ""}, {}, "no column"),
         ({"pose_3": "depth"}, {"lines": {2: "p1,1.1,1,0.5,0.1,0,-"}}, "column Fz, row 2: no number; repair or remove the row"),
         ({"pose_3": "depth"}, {"lines": {2: "p1,1.1,1,0.5"}}, "row 2 has 4 cells, the header 7"),
         ({"pose_3": "depth"}, {"rows": 5}, "column depth has 5 rows or is constant; give 8 different presses or more"),
@@ -129,6 +218,11 @@ def test_a_table_needs_no_frames_and_its_columns_may_be_named(tmp_path):
 def test_a_bad_table_is_refused_with_its_column_and_row(tmp_path, columns, changes, says):
     with pytest.raises(FrameError, match=says):
         read_forces(table(tmp_path / "t.csv", **changes), setup_of(), columns)
+
+
+def test_an_unknown_key_of_a_column_is_refused(tmp_path):
+    with pytest.raises(OptionError, match="`column` fz: no such key; known: pose_1"):
+        read_forces(table(tmp_path / "t.csv"), setup_of(), {"fz": "Fz"})
 
 
 def test_the_experiment_must_approach_along_z(tmp_path):

@@ -73,6 +73,8 @@ CELL = (
 FILES = ("index.html", "forces.json", "rows.csv", "forces.png", "forces-dark.png")
 """Files of a comparison of forces."""
 POSES = tuple(f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7))
+FACTOR = r"^(?:([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\*|(-))?(.*)"
+"""A column's name with a factor or a minus sign before it."""
 FEWEST_ROWS = 8
 NOISE_N, NOISE_SHARE = 0.05, 0.05
 """Error of a force: a constant, and a share of the force."""
@@ -217,10 +219,10 @@ def read_forces(path: Path, setup: ForceSetup, columns: Mapping[str, str]) -> tu
         raise OptionError(f"`column` {unknown[0]}: no such key; known: {', '.join((*POSES, *forces))}")
     names = {key: columns.get(key, key) for key in (*POSES, *forces) if key in ("pose_3", *forces, *columns) or key in table}
     for key, name in names.items():
-        factor, own = ("1", name) if name in table else re.fullmatch(r"(?:(-|[-+.\de]+(?=\*))\*?)?(.*)", name).groups("1")  # type: ignore[union-attr]
+        number, minus, own = (None, None, name) if name in table else re.findall(FACTOR, name)[0]
         if own not in table:
             raise FrameError(f"{path}: no column {own}; name it by `column` ({key}=NAME); the table has {', '.join(table)}")
-        names[key], factors[key] = own, -1.0 if factor == "-" else float(factor)
+        names[key], factors[key] = own, float(number or 1) * (-1 if minus else 1)
     values = {key: factors[key] * numbers(table[own]) for key, own in names.items()}
     count = len(values["pose_3"])
     for key, cells in values.items():

@@ -32,8 +32,17 @@ def load_cell(work: Path) -> Measured:
     fitted = calibrate_to_file(table, sensor, experiment, work / "fitted.toml", labels=ROWS, seed=SEED, workers=2, across=ACROSS).summary
     held = fitted["parts"]["evaluated"]
     errors = {"before": held["before_n"], "error": held["error_n"], "small": plain["error_n"]}
+    shapes = {
+        "correlation": held["correlation"],
+        "scale": held["scale"],
+        "small_correlation": plain["correlation"],
+        "small_scale": plain["scale"],
+    }
     found = {f"{key}_{axis}": Value(value, "N") for key, of in errors.items() for axis, value in zip("xyz", of, strict=True)}
+    found |= {f"{key}_{axis}": Value(value) for key, of in shapes.items() for axis, value in zip("xyz", of, strict=True)}
     found |= {"inside": Value(held["inside"]), "evaluated": Value(held["rows"]), "fitted": Value(fitted["parts"]["fitted"]["rows"])}
+    for name, each in zip(("sliding", "sticking"), fitted["slip"], strict=True):
+        found |= {f"{name}.rows": Value(each["rows"]), f"{name}.ratio": Value(each["ratio"])}
     for each in fitted["parameters"]:
         name = each["name"].replace(".", "_")
         found |= (

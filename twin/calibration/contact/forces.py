@@ -32,21 +32,13 @@ from scenes.rig import ForceSensorSpec
 from scenes.sensor import SensorSpec
 from twin.calibration.contact.fit import shorten_step
 from twin.calibration.contact.newtons import COVERED, compare_forces
-from twin.calibration.contact.parameters import (
-    DETERMINED,
-    PARAMETERS,
-    SIZE,
-    FittedParameter,
-    describe_parameters,
-    values_of,
-    with_quantities,
-)
-from twin.calibration.contact.report import add_parameters
+from twin.calibration.contact.parameters import DETERMINED, PARAMETERS, SIZE, FittedParameter, values_of, with_quantities
+from twin.calibration.contact.report import add_parameters, describe_parameters
 from twin.errors import ContactError, FrameError, OptionError
 from twin.frames.tables import called_here, numbers, read_columns, unlikely_units
 from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
-from twin.progress import Progress, Step, stage
+from twin.progress import Progress, Step, stage, unheard
 from twin.report.charts import new_figure, write_chart
 from twin.report.page import Page, PagePicture
 from twin.report.table import Column, write_rows
@@ -78,6 +70,8 @@ FACTOR = r"^(?:([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\*|(-))?(.*)"
 FEWEST_ROWS = 8
 NOISE_N, NOISE_SHARE = 0.05, 0.05
 """Error of a force: a constant, and a share of the force."""
+SLIDING = 0.99
+"""Share of the normal force that slips from which a contact counts as sliding."""
 LEAST_VARIANCE = 1e-4
 """Least square of s, because exact forces have errors, too."""
 ROUNDS, ENOUGH = 8, 0.02
@@ -157,7 +151,7 @@ class ForceSetup:
         sensor = with_quantities(self.sensor, self.experiment, values[:-4], rig_of(self.sensor).turn_sign, self.parameters)
         return replace(self, sensor=sensor).with_rig(force_sensor=self.reads.model_copy(update=cell)).sensor
 
-    def forces(self, values: Sequence[np.ndarray], labels: Sequence[ArmLabel], step: Step | None = None) -> np.ndarray:
+    def forces(self, values: Sequence[np.ndarray], labels: Sequence[ArmLabel], step: Step = unheard) -> np.ndarray:
         """(V, M, 7) for V vectors of values and M labels; a contact that fails is NaN.
 
         Force on the object in the axes of the work frame and in those of the tool, N, and the share of the normal force that slips.
@@ -166,8 +160,7 @@ class ForceSetup:
         tasks = list(enumerate(product(values, labels)))
         for done, (k, each) in enumerate(in_processes(partial, (_force, self), tasks, processes=self.workers), 1):
             found[k] = each
-            if step:
-                step(done, len(found))
+            step(done, len(found))
         return found.reshape(len(values), len(labels), 7)
 
     def readings(self, forces: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -193,8 +186,7 @@ def _force(setup: ForceSetup, task: tuple[int, tuple[np.ndarray, ArmLabel]]) -> 
 
 def noise_of(force_n: np.ndarray) -> np.ndarray:
     """NOISE_N + NOISE_SHARE of the force, (M, 1), for forces (M, 3)."""
-    noise: np.ndarray = NOISE_N + NOISE_SHARE * np.linalg.norm(force_n, axis=1, keepdims=True)
-    return noise
+    return np.asarray(NOISE_N + NOISE_SHARE * np.linalg.norm(force_n, axis=1, keepdims=True))
 
 
 def is_table(frames: Path) -> bool:
@@ -235,7 +227,7 @@ def read_forces(path: Path, setup: ForceSetup, columns: Mapping[str, str]) -> tu
 
 
 def find_conventions(
-    setup: ForceSetup, labels: Sequence[ArmLabel], measured: np.ndarray, step: Step | None = None
+    setup: ForceSetup, labels: Sequence[ArmLabel], measured: np.ndarray, step: Step = unheard
 ) -> tuple[ForceSetup, list[str]]:
     """The setup with the sign of the arm's angles and the force sensor's axes, and these in words. Those of the specification come first.
 
@@ -302,7 +294,7 @@ def describe_conventions(reads: ForceSensorSpec, sign: int) -> str:
     )
 
 
-def fit_forces(setup: ForceSetup, labels: Sequence[ArmLabel], measured: np.ndarray, step: Step | None = None) -> tuple[np.ndarray, ...]:
+def fit_forces(setup: ForceSetup, labels: Sequence[ArmLabel], measured: np.ndarray, step: Step = unheard) -> tuple[np.ndarray, ...]:
     """Fit the setup's parameters and those of its force sensor to measured forces (M, 3). Without parameters nothing is fitted.
 
     Returns
@@ -394,11 +386,15 @@ def compare_table(
     by["side_over_normal"] = np.hypot(*(measured - offset_n).T[:2]) / np.maximum(abs(measured - offset_n)[:, 2], NOISE_N)
     for key, forces in (("measured", measured), ("simulated", simulated), ("half", half)):
         by |= {f"{key}_{axis}": forces[:, k] for k, axis in enumerate("xyz")}
+    slip = [
+        {"group": group, "rows": int(mine.sum()), "ratio": float(np.median(by["side_over_normal"][mine])) if mine.any() else None}
+        for group, mine in (("all of the contact", by["slip"] > SLIDING), ("less", by["slip"] <= SLIDING))
+    ]
     rows = [{"row": k + 1, "fitted": bool(fitted[k])} | {key: float(each[k]) for key, each in by.items()} for k in range(len(arm))]
     notes += doubts + ([] if (~fitted).any() else ["no row is left to evaluate: give more rows, or a smaller `num_labelled`"])
     notes += [f"row {row + 1}: its contact can't be simulated" for row in np.flatnonzero(~solved)]
     parameters = describe_parameters((*setup.parameters, *CELL) if labels else (), setup.start, value, sd, determined)
-    summary = {"sensor": setup.sensor.name, "notes": notes, "parameters": parameters, "parts": parts, "left": left}
+    summary = {"sensor": setup.sensor.name, "notes": notes, "parameters": parameters, "parts": parts, "left": left, "slip": slip}
     sensor = setup.sensor_of(value)
     if labels:  # the stiffness is known as well as the mean ratio of measured to simulated normal forces
         factor = compare_forces((measured - offset_n)[chosen, 2], (simulated - offset_n)[chosen, 2], sensor).factor
@@ -426,6 +422,10 @@ def _write_page(folder: Path, result: ForceComparison) -> Path:
     page.section("What remains", "Share of the variance of the errors that each label explains, in percent, adjusted for chance.")
     labels = [Column(key, key, "%", decimals=0, scale=100) for key in ("depth", "tilt", "shear", "twist", "slip")]
     page.table(summary["left"], [Column("force", "error of"), *labels])
+    page.section("Slip", f"Where all of the contact slips, the ratio is the friction, {rig_of(result.sensor).friction:.2f} in the twin.")
+    page.table(
+        summary["slip"], [Column("group", "slips in the twin"), "rows", Column("ratio", "measured side force / normal force, median")]
+    )
     if summary["parameters"]:
         page.section(
             "Parameters",

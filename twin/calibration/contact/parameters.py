@@ -1,8 +1,7 @@
 """The parameters of the contact calibration."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -117,16 +116,3 @@ def with_quantities(
         else:
             plain[section][key] = number
     return SensorSpec.model_validate(plain)
-
-
-def describe_parameters(
-    parameters: Sequence[FittedParameter], start: np.ndarray, value: np.ndarray, sd: np.ndarray, determined: np.ndarray
-) -> list[dict[str, Any]]:
-    """Start, value, standard deviation, 90 % interval, and determined share of each parameter, from fitted quantities (P,)."""
-    rows = []
-    for k, p in enumerate(parameters):
-        low, high = sorted(p.number(value[k] + z * sd[k]) for z in (-Z90, Z90))
-        ends = {"sd": float(sd[k] * p.slope(value[k])), "low": low, "high": high}
-        shares = {"told": float(determined[k]), "known": bool(determined[k] >= DETERMINED)}
-        rows.append({"name": p.name, "start": p.number(start[k]), "value": p.number(value[k])} | ends | shares)
-    return rows

@@ -1,13 +1,15 @@
 """Page, figures and table of a contact calibration."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from twin.calibration.contact.fit import INDEPENDENT, ContactFit
-from twin.calibration.contact.parameters import describe_parameters
+from twin.calibration.contact.parameters import DETERMINED, Z90, FittedParameter
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.frames import distinct_stems
@@ -127,6 +129,19 @@ def _lead(summary: dict) -> str:
     )
 
 
+def describe_parameters(
+    parameters: Sequence[FittedParameter], start: np.ndarray, value: np.ndarray, sd: np.ndarray, determined: np.ndarray
+) -> list[dict[str, Any]]:
+    """Start, value, standard deviation, 90 % interval, and determined share of each parameter, from fitted quantities (P,)."""
+    rows = []
+    for k, p in enumerate(parameters):
+        low, high = sorted(p.number(value[k] + z * sd[k]) for z in (-Z90, Z90))
+        ends = {"sd": float(sd[k] * p.slope(value[k])), "low": low, "high": high}
+        shares = {"told": float(determined[k]), "known": bool(determined[k] >= DETERMINED)}
+        rows.append({"name": p.name, "start": p.number(start[k]), "value": p.number(value[k])} | ends | shares)
+    return rows
+
+
 def add_parameters(page: Page, parameters: list[dict], by: str, **spread: str) -> None:
     """Add a table of parameters (``describe_parameters``) to a page.
 
@@ -154,7 +169,7 @@ def _parameters_section(page: Page, summary: dict) -> None:
     )
     independent = f"{summary['independent_numbers_a_frame']:.0f}"
     page.text(
-        "Told: the share of the prior uncertainty that the frames took away. A parameter that they do not determine "
+        "Determined: the share of the prior variance that the frames removed. A parameter that they do not determine "
         "(red) stays near its start. "
         f"The sd counts a frame's pins as {independent} independent numbers, because all pins share the model's own errors."
     )

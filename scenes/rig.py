@@ -25,7 +25,8 @@ class ForceSensorSpec(Section):
     offset_n : three numbers
         Reading without contact.
     turn_deg : float
-        Right-handed rotation about z, from the axes ``frame`` to those of the force sensor: f is rotated by minus this angle first.
+        Right-handed rotation about z, from the axes ``frame`` to those of the force sensor: f is rotated by minus this angle first. It
+        applies to tables of forces, whose approach is z.
     """
 
     columns: tuple[str, str, str] = ("Fx", "Fy", "Fz")

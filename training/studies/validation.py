@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_object
-from twin.calibration.contact.forces import ForceComparison, ForceSetup, compare_table, is_table
+from twin.calibration.contact.forces import FILES, ForceComparison, ForceSetup, compare_table, is_table
 from twin.evaluation.labelled import ContactModel, compare, measure_frames
 from twin.evaluation.labelled.compare import Comparison
 from twin.evaluation.labelled.report import summary_of, write_validation
@@ -51,7 +51,7 @@ class Validation(ReadableResult):
         return lines
 
 
-@writes("index.html", "frames.csv", "validation.json", "forces.json", "rows.csv", "*.png")
+@writes("frames.csv", "validation.json", "errors*.png", "frames*.png", *FILES)
 def validate_contacts(
     sensor: SensorSpec,
     frames: Path,

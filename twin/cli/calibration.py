@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from twin.calibration.go_on import WholeSensor
     from twin.calibration.optics import OpticsCalibration
 
-Columns = Annotated[list[str] | None, typer.Option("--column", metavar="KEY=NAME", help="a table's name of a column: Fz=normal; repeated")]
+Columns = Annotated[list[str] | None, typer.Option("--column", metavar="KEY=NAME", help="a table's column: Fz=normal, pose_3=-height, Fz=0.001*mN; repeat it")]
 
 
 @app.command("new")
@@ -224,7 +224,7 @@ def calibrate_contact(
 
     With --frames TABLE.csv, a table of poses and forces of a load cell without frames, N rows are fitted (radius of the dome, stiffness,
     friction, zero of the depth, tool point, zero and turn of the cell), each parameter only if they determine it, and all other rows are
-    evaluated. It says which conventions of the table it found. The experiment must approach along z (surface-3d-sheared).
+    evaluated. The result states the conventions of the table. The experiment must approach along z (surface-3d-sheared).
 
     \b
     Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/

@@ -130,7 +130,8 @@ def calibrate_to_file(
     hold : collection of str
         Names of parameters that are not fitted.
     columns : mapping of str to str, optional
-        A table's own names of columns, by those that are used here (``pose_3``, ``move_1``, ``Fz``, ...).
+        A table's own names of columns, by those that are used here (``pose_3``, ``move_1``, ``Fz``, ...), with a minus sign or a factor
+        before them for another direction or unit (``-height``, ``0.001*Fz_mN``).
 
     Raises
     ------

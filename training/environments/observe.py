@@ -166,7 +166,7 @@ class Eye:
         """Observations (R, ...) from pins (R, N, 2), relative to the nominal layout, and from the light (R, N) on their caps."""
         if self.kind == "pins":
             return np.clip((pins_px - self.reference.pins_px) / self._spacing, -LARGEST, LARGEST).astype(np.float32)
-        graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost) for pins in pins_px]
+        graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost, net=self.reference.net) for pins in pins_px]
         if self.kind == "graph":
             seen = np.stack([node_features(graph, self.reference) for graph in graphs])
             return np.clip(seen, -LARGEST, LARGEST).astype(np.float32)

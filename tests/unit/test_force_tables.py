@@ -186,7 +186,7 @@ def test_what_remains_is_explained_by_the_label_that_causes_it():
     random = np.random.default_rng(1)
     tilt, shear = random.normal(size=(2, 40, 2))
     error = tilt @ [0.3, 0.1] + random.normal(scale=0.05, size=40)
-    assert module._explained(error, tilt) > 0.9 and module._explained(error, shear) < 0.2
+    assert module._share_explained(error, tilt) > 0.9 and module._share_explained(error, shear) < 0.2
 
 
 def table(path, rows=9, **changes):

@@ -49,7 +49,10 @@ if TYPE_CHECKING:
     from twin.calibration.go_on import WholeSensor
     from twin.calibration.optics import OpticsCalibration
 
-Columns = Annotated[list[str] | None, typer.Option("--column", metavar="KEY=NAME", help="a table's column: Fz=normal, pose_3=-height, Fz=0.001*mN; repeat it")]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--column", metavar="KEY=NAME", help="a table's column: Fz=normal, pose_3=-height, Fz=0.001*mN; repeat it"),
+]
 
 
 @app.command("new")

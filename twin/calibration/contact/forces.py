@@ -380,7 +380,7 @@ def compare_table(
             parts[part] |= {"scale": [slope.real for slope, _ in lines], "correlation": [float(np.sqrt(1 - left)) for _, left in lines]}
     evaluated = ~fitted & solved if (~fitted & solved).sum() > FEWEST_ROWS else solved
     left = [
-        {"force": f"F{axis}"} | {key: _explained(error[evaluated, k], np.column_stack([by[key], of[key]])[evaluated]) for key in of}
+        {"force": f"F{axis}"} | {key: _share_explained(error[evaluated, k], np.column_stack([by[key], of[key]])[evaluated]) for key in of}
         for k, axis in enumerate("xyz")
     ]
     by["side_over_normal"] = np.hypot(*(measured - offset_n).T[:2]) / np.maximum(abs(measured - offset_n)[:, 2], NOISE_N)
@@ -403,7 +403,7 @@ def compare_table(
     return replace(result, written=[_write_page(folder, result)])
 
 
-def _explained(error: np.ndarray, label: np.ndarray) -> float:
+def _share_explained(error: np.ndarray, label: np.ndarray) -> float:
     """Share of the variance of errors (M,) that a linear function of a label (M, K) explains, adjusted for chance."""
     known = np.column_stack([np.ones(len(error)), label])
     fit, _, rank, _ = np.linalg.lstsq(known, error, rcond=None)

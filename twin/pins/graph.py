@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from twin.pins.flips import Net
-from twin.pins.labelling.reference import Reference
+from twin.pins.labelling.reference import Reference, median_px
 from twin.pins.voronoi import directed_edges, triangulate, voronoi
 from twin.types import PinGraph
 
@@ -68,14 +68,13 @@ def node_features(graph: PinGraph, reference: Reference, kind: Literal["relative
     if len(graph.nodes_px) != len(reference.pins_px):
         told = f"the graph has {len(graph.nodes_px)} pins, the reference {len(reference.pins_px)}: they are of two sensors"
         raise ValueError(f"{told}; give the reference of the Pipeline that made the graph")
-    centred = graph.nodes_px - np.median(graph.nodes_px, axis=0)
+    centred = graph.nodes_px - median_px(graph.nodes_px)
     areas = graph.kind == "voronoi"
     if kind == "pixels":
         return np.column_stack([centred, graph.area_px2]) if areas else centred
     if kind != "relative":
         raise ValueError(f"kind must be relative or pixels, not {kind!r}")
     spacing = reference.spacing_px.mean()
-    columns = [centred / spacing, (graph.nodes_px - reference.pins_px) / spacing]
-    if areas:
-        columns.append(graph.area_px2 / reference.area_px2)
-    return np.column_stack(columns)
+    moved = (graph.nodes_px - reference.pins_px) / spacing
+    columns = [centred / spacing, moved, *([(graph.area_px2 / reference.area_px2)[:, None]] if areas else [])]
+    return np.concatenate(columns, axis=1)

@@ -343,10 +343,14 @@ class Pipeline:
 def _level(gray: np.ndarray, x: float, y: float) -> float:
     """Mean level of the 3 x 3 pixels around the one nearest to a place, rounded. The picture is mirrored beyond its border."""
     height, width = gray.shape
-    column, row, total = min(max(round(x), 0), width - 1), min(max(round(y), 0), height - 1), 0.0
+    column, row, total = min(max(round(x), 0), width - 1), min(max(round(y), 0), height - 1), 0
+    inside = 0 < column < width - 1 and 0 < row < height - 1
     for j in range(row - 1, row + 2):
         for i in range(column - 1, column + 2):
-            total += gray[abs(j) if j < height else 2 * height - 2 - j, abs(i) if i < width else 2 * width - 2 - i]
+            if inside:
+                total += gray[j, i]
+            else:
+                total += gray[abs(j) if j < height else 2 * height - 2 - j, abs(i) if i < width else 2 * width - 2 - i]
     return round(total / 9)
 
 

@@ -51,8 +51,7 @@ def circular_mask(size_px: tuple[int, int], center_px: tuple[float, float], radi
     x, y = center_px
     columns = slice(int(np.clip(np.ceil(x - radius_px), 0, width - 1)), int(np.clip(np.floor(x + radius_px) + 1, 1, width)))
     rows = slice(int(np.clip(np.ceil(y - radius_px), 0, height - 1)), int(np.clip(np.floor(y + radius_px) + 1, 1, height)))
-    grid_y, grid_x = np.mgrid[rows, columns]
-    inside = (grid_x - x) ** 2 + (grid_y - y) ** 2 <= radius_px**2
+    inside = (np.arange(columns.start, columns.stop) - x) ** 2 + ((np.arange(rows.start, rows.stop) - y) ** 2)[:, None] <= radius_px**2
     return Mask((rows, columns), np.array([columns.start, rows.start], float), (255 * inside).astype(np.uint8))
 
 

@@ -252,8 +252,11 @@ def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) 
     cell = reference.pitch_px
     buckets = fill_buckets(px, cell)
     grown: dict[bytes, np.ndarray] = {}
+    large: list[np.ndarray] = []  # a start that one of them holds would grow to the same one
     best = None
     for pin, blob in _seeds(reference, px):
+        if any(labels[pin] == blob for labels in large):
+            continue
         start = np.full(n, -1)
         start[pin] = blob
         labels = _grow(*layout[:3], px, start, buckets, cell)
@@ -269,6 +272,8 @@ def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) 
                 best = found
                 break
         grown[labels.tobytes()] = labels
+        if count >= NEARLY_ALL * n:
+            large.append(labels)
     if best is None:
         likely = sorted(grown.values(), key=lambda labels: -int((labels >= 0).sum()))[:REFINED]
         best = _leading(reference, px, [_refine(layout, px, area_px2, labels, buckets, cell) for labels in likely])
@@ -587,8 +592,8 @@ def _candidates(
     blob: np.ndarray,
     buckets: Buckets,
     cell: float,
-) -> tuple[list[int], list[int], list[float], bool]:
-    """Possible pairs within the gate (pins, blobs, costs), and whether a pin or blob is in more than one of them."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+    """Possible pairs within the gate: pins, blobs and costs (p,), and whether a pin or blob is in more than one of them."""
     n = len(predicted)
     # numba needs lists of a known type, also empty ones
     pins: list[int] = [0 for _ in range(0)]
@@ -623,13 +628,12 @@ def _candidates(
                         uses[k] += 1
                         contested = contested or mine > 1 or uses[k] > 1
                     k = following[k]
-    return pins, blobs, costs, contested
+    return np.array(pins), np.array(blobs), np.array(costs), contested
 
 
-def _assign(n: int, blob_count: int, pins_list: list[int], blobs_list: list[int], costs_list: list[float], contested: bool) -> np.ndarray:
-    """One-to-one assignment (N,) of possible pairs: as many pairs as possible, with the least cost."""
+def _assign(n: int, blob_count: int, pins: np.ndarray, blobs: np.ndarray, costs: np.ndarray, contested: bool) -> np.ndarray:
+    """One-to-one assignment (N,) of possible pairs (p,): as many pairs as possible, with the least cost."""
     blob = np.full(n, -1)
-    pins, blobs, costs = np.array(pins_list, int), np.array(blobs_list, int), np.array(costs_list, float)
     if not contested:
         blob[pins] = blobs
         return blob

@@ -103,7 +103,7 @@ LEARNT = {
     "GentlePress.pins": ("--no-state-estimator --minutes 15", 16),
 }
 """Options of ``twin learn``, and about how many minutes it takes with all evaluating, by task and what the policy sees."""
-WHERE = {"surrogate": "", "surrogate, friction remembers": "remembers_", "finite elements, rasterised frames": "fem_"}
+WHERE = {"surrogate": "", "surrogate, friction history": "remembers_", "finite elements, rasterised frames": "fem_"}
 """Beginnings of the figures' names, by where ``twin learn`` evaluated the policy."""
 
 

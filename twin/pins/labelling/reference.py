@@ -164,7 +164,7 @@ def nominal_reference(spec: SensorSpec, form: Form) -> Reference:
     FrameError
         The sensor has no processed form, or there is no such form.
     """
-    blob = spec.pipeline.raw if form_named(form) == Form.RAW else spec.pipeline.recording
+    blob = spec.pipeline.raw if form_named(form) == Form.RAW else spec.pipeline.processed
     if blob is not None and blob.rest_px:
         return make_reference(np.array(blob.rest_px), spec.pins)
     return make_reference(project_rest(spec, form), spec.pins)

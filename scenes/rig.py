@@ -24,12 +24,16 @@ class ForceSensorSpec(Section):
         Reading per N. It is negative if the reading has the opposite sign.
     offset_n : three numbers
         Reading without contact.
+    turn_deg : float
+        Right-handed rotation about z, from the axes ``frame`` to those of the force sensor: f is rotated by minus this angle first. It
+        applies to tables of forces, whose approach is z.
     """
 
     columns: tuple[str, str, str] = ("Fx", "Fy", "Fz")
     frame: Literal["work", "tool"] = "work"
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     offset_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn_deg: float = 0.0
 
 
 class PlacedSpec(Section):

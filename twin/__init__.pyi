@@ -31,6 +31,7 @@ from training.studies.realism import Realism as Realism
 from training.studies.train import TrainedRun as TrainedRun
 from training.studies.validation import Validation as Validation
 from twin.calibration.contact.calibrate import ContactCalibration as ContactCalibration
+from twin.calibration.contact.forces import ForceComparison as ForceComparison
 from twin.calibration.go_on import WholeSensor as WholeSensor
 from twin.calibration.optics import OpticsCalibration as OpticsCalibration
 from twin.mechanics.path import ContactPose as ContactPose
@@ -82,9 +83,10 @@ def calibrate_contact(
     table: Path | str | None = ...,
     no_contact: Path | str | None = ...,
     pipeline: Path | str | None = ...,
+    column: str | Sequence[str] | None = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
-) -> ContactCalibration: ...
+) -> ContactCalibration | ForceComparison: ...
 
 def calibrate_optics(
     *,
@@ -367,6 +369,7 @@ def validate(
     table: Path | str | None = ...,
     no_contact: Path | str | None = ...,
     pipeline: Path | str | None = ...,
+    column: str | Sequence[str] | None = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
-) -> Validation: ...
+) -> Validation | ForceComparison: ...

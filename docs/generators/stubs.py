@@ -31,7 +31,7 @@ def stub_of(module: ModuleType) -> str:
     commands = [name for name, place in places.items() if place.startswith("twin.cli.")]
     results = {name: inspect.signature(getattr(module, name)).return_annotation for name in commands}
     sources = dict(pair for name in commands for pair in _types_in(places[name]))
-    imports = {(sources[kind], kind) for kind in results.values()}
+    imports = {(sources[kind], kind) for several in results.values() for kind in several.split(" | ")}
     for name, place in places.items():
         if name not in commands:
             source, _, other = place.partition(":")

@@ -9,6 +9,7 @@ from figures import (  # noqa: F401  (each registers its jobs)
     forces,
     gpu,
     labels,
+    load_cell,
     mechanics,
     pictures,
     pins,

@@ -162,7 +162,7 @@ def contact_calibration(out: Path) -> Path:
         ],
         "independent_numbers_a_frame": 20,
         "problems": [HOSTILE],
-        "newtons": {"said": HOSTILE},
+        "newtons": {"explanation": HOSTILE},
     }
     return write_calibration(out, measured, moved, fit, summary)
 

@@ -73,7 +73,7 @@ def test_a_contact_says_what_it_does_not_know_and_where_it_is_worse():
     (worse,) = warnings_of(replace_after(fit, 3.0), (1.5, 0.7), 3)
     assert "worse than it began on the fitted frames" in worse
     summary = {"problems": [], "parameters": [], "fitted_px": {}, "held_out_px": {}, "distrusted": [], "warnings": [unknown]}
-    summary |= {"newtons": {"said": "the stiffness is assumed"}}
+    summary |= {"newtons": {"explanation": "the stiffness is assumed"}}
     lines = ContactCalibration(load_sensor("ur5-331"), summary, []).lines()
     assert unknown in lines and "the stiffness is assumed" in lines
 

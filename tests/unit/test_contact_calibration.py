@@ -13,7 +13,8 @@ from scenes.rig import ForceSensorSpec
 from training.generation.config import draw_label
 from twin.calibration.contact import PARAMETERS, fit_contact
 from twin.calibration.contact.fit import expect, held_out_px
-from twin.calibration.contact.newtons import assume_stiffness, compare_forces, pressed_n, simulated_n
+from twin.calibration.contact.forces import ForceSetup
+from twin.calibration.contact.newtons import assume_stiffness, compare_forces, pressed_n
 from twin.calibration.contact.parameters import values_of, with_quantities
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.errors import FrameError
@@ -75,7 +76,7 @@ def test_numbers_and_sign_are_found_again_within_their_uncertainty(calibrated):
     truth = np.array([TRUTH[p.name.split(".")[1]] for p in FITTED])
     assert fit.sensor.rig.turn_sign == TRUTH["turn_sign"]
     assert (np.abs(fit.value - truth) < 3 * fit.sd).all() and (np.abs(fit.value - truth) < 0.2 * np.abs(fit.start - truth)).all()
-    assert fit.sensor.rig.contact_offset_mm == fit.value[0] and (fit.told > 0.9).all()
+    assert fit.sensor.rig.contact_offset_mm == fit.value[0] and (fit.determined > 0.9).all()
 
 
 @pytest.mark.slow
@@ -130,15 +131,18 @@ def test_weighed_presses_fix_the_scale_of_forces_and_leave_the_pins_where_they_a
     config = small_config(tmp_path, experiment=load_experiment(telling(tmp_path)))
     sensor = config.sensor.model_copy(update={"rig": config.sensor.rig.model_copy(update={"compliance_mm_per_n": 0.1})})
     labels = [replace(draw_label(config.experiment, np.random.default_rng(seed)), executed=False) for seed in range(3)]
-    simulated = simulated_n(sensor, config.experiment, config.object, labels, across=ACROSS)
+
+    def simulate_n(sensor, labels):
+        setup = ForceSetup(sensor, config.experiment, config.object, ACROSS, parameters=())
+        return setup.forces([setup.start], labels)[0, :, 2]
+
+    simulated = simulate_n(sensor, labels)
     weighed = 1.4 * simulated * np.exp([0.02, -0.02, 0.0])
     found = compare_forces(weighed, simulated, sensor)
     assert found.presses == 3 and found.scale == pytest.approx(1.4, rel=0.02) and 1.0 < found.factor < 1.1
     stiffer = found.of(sensor)
     assert stiffer.skin.stiffness_factor == found.factor
-    np.testing.assert_allclose(
-        simulated_n(stiffer, config.experiment, config.object, labels[:1], across=ACROSS), found.scale * simulated[:1], rtol=SAME_FORCE
-    )
+    np.testing.assert_allclose(simulate_n(stiffer, labels[:1]), found.scale * simulated[:1], rtol=SAME_FORCE)
     models = [ContactModel(each, config.experiment, config.object, Form.PROCESSED, across=ACROSS) for each in (sensor, stiffer)]
     before, after = (model.displacement_px(labels[0]) for model in models)
     np.testing.assert_allclose(after, before, atol=SAME_PX)

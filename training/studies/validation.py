@@ -1,10 +1,12 @@
 """Validation: compares the twin's pins with those of labelled real frames. The results are tables and a page."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_object
+from twin.calibration.contact.forces import FILES, ForceComparison, ForceSetup, compare_table, is_table
 from twin.evaluation.labelled import ContactModel, compare, measure_frames
 from twin.evaluation.labelled.compare import Comparison
 from twin.evaluation.labelled.report import summary_of, write_validation
@@ -49,7 +51,7 @@ class Validation(ReadableResult):
         return lines
 
 
-@writes("index.html", "frames.csv", "validation.json", "errors*.png", "frames*.png")
+@writes("frames.csv", "validation.json", "errors*.png", "frames*.png", *FILES)
 def validate_contacts(
     sensor: SensorSpec,
     frames: Path,
@@ -62,14 +64,15 @@ def validate_contacts(
     seed: int = 0,
     across: int = FINE,
     form: Form | None = None,
+    columns: Mapping[str, str] | None = None,
     progress: Progress = silent,
-) -> Validation:
+) -> Validation | ForceComparison:
     """Simulate the contacts of labelled frames, compare the pins, and write the result to a folder.
 
     Parameters
     ----------
     frames : Path
-        A labelled recording.
+        A labelled recording, or a table of poses and forces alone (``.csv``), whose forces are then compared.
     experiment : ExperimentSpec
         The experiment that the recording was made with.
     obj : ObjectSpec, optional
@@ -80,12 +83,17 @@ def validate_contacts(
         Number of frames for which an individual friction is fitted.
     across : int
         Elements along each side of the skin's grid.
+    columns : mapping of str to str, optional
+        As for ``calibrate_to_file``.
 
     Raises
     ------
     FrameError
         The recording has no labels, or no frame with pins.
     """
+    if is_table(frames):
+        setup = ForceSetup(sensor, experiment, obj or load_object(experiment.object), across)
+        return compare_table(frames, setup, out, columns, 0, seed, progress)
     with stage(progress, "pins") as step:
         measured = measure_frames(frames, sensor, limit, seed, experiment=experiment, form=form, progress=step)
     model = ContactModel(sensor, experiment, obj or load_object(experiment.object), measured.form, across=across)

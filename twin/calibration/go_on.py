@@ -123,9 +123,11 @@ def whole_sensor(
     sensor = light.found.spec if light else sensor
     contact = None
     if labels is not None and experiment is not None:
-        contact = calibrate_to_file(
+        found = calibrate_to_file(
             at, sensor, experiment, out, labels=contacts, workers=workers, across=across, form=form, progress=progress
         )
+        assert isinstance(found, ContactCalibration)  # it is given frames
+        contact = found
     return WholeSensor(made, experiment, light, contact)
 
 

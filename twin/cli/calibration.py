@@ -45,8 +45,14 @@ if TYPE_CHECKING:
     from training.studies.realism import Realism
     from training.studies.validation import Validation
     from twin.calibration.contact.calibrate import ContactCalibration
+    from twin.calibration.contact.forces import ForceComparison
     from twin.calibration.go_on import WholeSensor
     from twin.calibration.optics import OpticsCalibration
+
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--column", metavar="KEY=NAME", help="a table's column: Fz=normal, pose_3=-height, Fz=0.001*mN; repeat it"),
+]
 
 
 @app.command("new")
@@ -186,7 +192,7 @@ def calibrate_optics(
 @calibrate_app.command("contact", goes_on=True)
 def calibrate_contact(
     sensor: Sensor,
-    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording with its no-contact frame")],
+    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording with init_0.png, or TABLE.csv of forces")],
     out: Annotated[Path, typer.Option("--out", metavar="SPEC.toml", help="the specification to write")],
     num_labelled: Annotated[
         int, typer.Option("--num-labelled", min=4, metavar="N", help="frames to fit to, chosen at random"), Formerly("labels")
@@ -203,10 +209,11 @@ def calibrate_contact(
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
+    column: Columns = None,
     *,
     progress: Progress,
-) -> "ContactCalibration":
-    """Fit the contact to labelled frames of the real sensor.
+) -> "ContactCalibration | ForceComparison":
+    """Fit the contact to labelled frames of the real sensor, or to a table of forces.
 
     It uses the no-contact frame (init_0.png) and N labelled frames. It fits contact offset, tool point, angle offset and sign, tilt of the
     surface, direction of the robot's axes in the image, friction, the arm's compliances, stiffness of the gel relative to the skin and its
@@ -217,6 +224,10 @@ def calibrate_contact(
     Pins do not determine newtons. If the table has a column of forces along the approach (N; Fz, or the column of rig.force_sensor) with 3
     or more presses, for example weighed with a kitchen scale, the stiffness of skin and gel is scaled to them; other rows may be empty. It
     prints the remaining uncertainty of forces (skin.stiffness_factor), or the assumed stiffness.
+
+    With --frames TABLE.csv, a table of poses and forces of a load cell without frames, N rows are fitted (radius of the dome, stiffness,
+    friction, zero of the depth, tool point, zero and turn of the cell), each parameter only if they determine it, and all other rows are
+    evaluated. The result states the conventions of the table. The experiment must approach along z (surface-3d-sheared).
 
     \b
     Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/
@@ -249,6 +260,7 @@ def calibrate_contact(
         workers=workers,
         across=elements,
         form=form,
+        columns=dict(pair.partition("=")[::2] for pair in column or ()),
         progress=progress,
     )
 
@@ -256,7 +268,7 @@ def calibrate_contact(
 @app.command("validate")
 def validate(
     sensor: Sensor,
-    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording")],
+    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording, or TABLE.csv of forces")],
     out: Out,
     experiment: Experiment = "surface-2d",
     obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the touched object; the experiment's own if not given")] = None,
@@ -272,9 +284,10 @@ def validate(
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
+    column: Columns = None,
     *,
     progress: Progress,
-) -> "Validation":
+) -> "Validation | ForceComparison":
     """Compare the twin's pins with those of real frames.
 
     The contact of each labelled frame is simulated along the arm's path, from the frame's label and the sensor's [rig] alone ('twin
@@ -283,8 +296,11 @@ def validate(
     executed and not executed moves, by depth, angle and shear. For some frames with an executed move the errors are also given with the
     friction that fits the frame best.
 
+    With --frames TABLE.csv, a table of poses and forces without frames, the simulated forces are compared with the measured ones.
+
     \b
-    Writes index.html, frames.csv (a row a frame), validation.json.
+    Writes index.html, frames.csv (a row a frame), validation.json; for a table
+    rows.csv and forces.json.
 
     \b
     Example:
@@ -306,6 +322,7 @@ def validate(
         seed=seed,
         across=elements,
         form=form,
+        columns=dict(pair.partition("=")[::2] for pair in column or ()),
         progress=progress,
     )
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.files import read_regular
+from twin.errors import FrameError
 from twin.frames.folders import IMAGE_SUFFIXES
 
 # Names of a recording's table, in the order in which they are tried.
@@ -144,6 +145,24 @@ def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are 
     rows = [row for row in rows[1:] if len(row) == len(header)]
     columns = {column: [row[k] for row in rows] for k, column in enumerate(distinct) if column}
     return LabelTable(path.name, columns, [[base_name(row[k]) for row in rows] for k in name_columns])
+
+
+def read_columns(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a table that need not name pictures. A column is float if every cell is a number, else text.
+
+    Raises
+    ------
+    FrameError
+        The file can't be read, or a row does not have the header's number of cells.
+    """
+    try:
+        header, *rows = _cells(_text(path)) or [[]]
+    except (OSError, csv.Error) as error:
+        raise FrameError(f"{path}: can't be read ({error}); give a table with a header and a row for each contact") from None
+    for number, row in enumerate(rows, 1):
+        if len(row) != len(header):
+            raise FrameError(f"{path}: row {number} has {len(row)} cells, the header {len(header)}; repair or remove the row")
+    return {name: _as_array([row[k] for row in rows]) for k, name in enumerate(_distinct(header)) if name}
 
 
 def _is_truncated(text: str, rows: list[list[str]]) -> bool:

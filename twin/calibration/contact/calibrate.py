@@ -1,6 +1,6 @@
 """Contact calibration from a folder of frames, with a page as its result."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,8 @@ from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.calibration.contact.fit import fit_contact, held_out_px, simulate
-from twin.calibration.contact.newtons import MOST_PRESSES, Newtons, assume_stiffness, compare_forces, pressed_n, simulated_n
+from twin.calibration.contact.forces import FILES, FORCE_PARAMETERS, ForceComparison, ForceSetup, compare_table, is_table
+from twin.calibration.contact.newtons import MOST_PRESSES, Newtons, assume_stiffness, compare_forces, pressed_n
 from twin.calibration.contact.parameters import PARAMETERS
 from twin.calibration.contact.report import summary_of, write_calibration
 from twin.calibration.contact.simulate import CalibrationSetup
@@ -47,7 +48,8 @@ def scale_forces(
         return assume_stiffness(sensor, "none was measured")
     labels = read_arm_labels(recording)
     rows = np.sort(np.random.default_rng([seed, 6]).permutation(rows)[:MOST_PRESSES])
-    return compare_forces(measured[rows], simulated_n(sensor, experiment, obj, [labels[row] for row in rows], across=across), sensor)
+    setup = ForceSetup(sensor, experiment, obj, across, parameters=())
+    return compare_forces(measured[rows], setup.forces([setup.start], [labels[row] for row in rows])[0, :, 2], sensor)
 
 
 def _part(measured: MeasuredFrames, rows: np.ndarray) -> MeasuredFrames:
@@ -83,7 +85,7 @@ class ContactCalibration(ReadableResult):
         for title, key in (("fitted frames", "fitted_px"), ("held-out frames", "held_out_px")):
             if part := self.summary[key]:
                 lines.append(f"{title}: {part['before']:.2f} -> {part['after']:.2f} px over {part['frames']}")
-        lines.append(self.summary["newtons"]["said"])
+        lines.append(self.summary["newtons"]["explanation"])
         lines += self.summary["warnings"]
         if self.summary["distrusted"]:
             lines.append(f"labels not trusted: {', '.join(self.summary['distrusted'])}")
@@ -104,8 +106,9 @@ def calibrate_to_file(
     workers: int = 1,
     across: int = FINE,
     form: Form | None = None,
+    columns: Mapping[str, str] | None = None,
     progress: Progress = silent,
-) -> ContactCalibration:
+) -> ContactCalibration | ForceComparison:
     """Fit the contact of a specification to labelled frames, and write it.
 
     The folder ``NAME-contact`` beside the specification holds the page and the simulated contacts, so that an interrupted run can be
@@ -114,7 +117,8 @@ def calibrate_to_file(
     Parameters
     ----------
     frames : Path
-        A labelled recording with its no-contact frame.
+        A labelled recording with its no-contact frame, or a table of poses and forces alone (``.csv``): parameters on which forces
+        depend are then fitted to ``labels`` of its rows, and evaluated on all others (see ``twin.calibration.contact.forces``).
     out : Path
         The ``.toml`` file to write.
     obj : ObjectSpec, optional
@@ -125,18 +129,29 @@ def calibrate_to_file(
         Seed of this choice.
     hold : collection of str
         Names of parameters that are not fitted.
+    columns : mapping of str to str, optional
+        A table's own names of columns, by those that are used here (``pose_3``, ``move_1``, ``Fz``, ...), with a minus sign or a factor
+        before them for another direction or unit (``-height``, ``0.001*Fz_mN``).
 
     Raises
     ------
     FrameError
         There are no labels, no pins or too few frames, a parameter is unknown, or ``out`` is not the name of a ``.toml`` file.
     """
-    names = [parameter.name for parameter in PARAMETERS]
+    names = [parameter.name for parameter in (*PARAMETERS, *FORCE_PARAMETERS)]
     if unknown := set(hold) - set(names):
         raise OptionError(f"`hold` {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
     folder = sibling_folder(out, "contact")
     parameters = tuple(parameter for parameter in PARAMETERS if parameter.name not in hold)
     obj = obj or load_object(experiment.object)
+    if is_table(frames):
+        free = tuple(parameter for parameter in FORCE_PARAMETERS if parameter.name not in hold)
+        with output(folder, *FILES):
+            forces = compare_table(
+                frames, ForceSetup(sensor, experiment, obj, across, workers, free), folder, columns, labels, seed, progress
+            )
+        write_sensor(out, forces.sensor, "\n".join([f"Contact fitted to {frames.name}, starting from {sensor.name}.", *forces.lines()]))
+        return replace(forces, written=[out, *forces.written])
     with output(folder, "index.html", "calibration.json", "*.png", "contacts"), stage(progress, "contacts") as step:
         measured = measure_frames(frames, sensor, labels + min(labels, MOST_HELD_OUT), seed, experiment=experiment, form=form)
         order = np.random.default_rng(seed).permutation(len(measured))  # the frames come in the order of the recording's table
@@ -152,5 +167,5 @@ def calibrate_to_file(
         page = write_calibration(folder, replace(fitted, no_contact_px=fit.rest_px), moved, fit, summary)
     found = newtons.of(fit.sensor)
     text = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."
-    write_sensor(out, found, "\n".join([text, summary["newtons"]["said"], *summary["warnings"]]))
+    write_sensor(out, found, "\n".join([text, summary["newtons"]["explanation"], *summary["warnings"]]))
     return ContactCalibration(found, summary, [out, page])

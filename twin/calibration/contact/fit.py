@@ -14,7 +14,9 @@ If no frame shows the pins at rest, their places are fitted, too. For every thet
 minus simulated displacements. Therefore errors and slopes are taken relative to their means over the frames.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -159,26 +161,39 @@ def _search_values(
         shift = 0.0 if seen_at_rest else _mean(target[:, None] - displacements, weights)
         return mean_squared(displacements, target - shift)
 
+    def cost(tried: np.ndarray, weights: Weights, solved: int) -> tuple[float, np.ndarray]:
+        there = simulate(setup, measured, [tried], sign, progress)[0]
+        squared = squared_of(there)
+        fewer = np.isfinite(squared).sum() < solved
+        return np.inf if fewer else weights.cost(squared) + float(np.sum(((tried - start) / prior) ** 2)), there
+
     for _ in range(ROUNDS):
         slopes = _slopes(setup, measured, value, sign, moved, progress)
         matrix, force = _normal(slopes, target[:, None] - moved, weights, seen_at_rest)
         step = np.linalg.solve(matrix + np.diag(prior**-2), force + (start - value) / prior**2)
         squared = squared_of(moved)
         now, solved = weights.cost(squared) + np.sum(((value - start) / prior) ** 2), np.isfinite(squared).sum()
-        length = 1.0
-        while length >= SHORTEST:
-            tried = value + length * step
-            there = simulate(setup, measured, [tried], sign, progress)[0]
-            squared = squared_of(there)
-            cost = weights.cost(squared) + np.sum(((tried - start) / prior) ** 2)
-            if cost < now and np.isfinite(squared).sum() >= solved:
-                value, moved = tried, there
-                break
-            length /= 2
+        found = shorten_step(value, step, now, partial(cost, weights=weights, solved=solved))
+        if found:
+            value, _, moved = found
         weights = expect(squared_of(moved))
-        if length < SHORTEST:
+        if not found:
             break
     return value, moved, weights
+
+
+def shorten_step(
+    value: np.ndarray, step: np.ndarray, now: float, cost: Callable[[np.ndarray], tuple[float, np.ndarray]]
+) -> tuple[np.ndarray, float, np.ndarray] | None:
+    """The values (P,) after a step that is halved until the cost is below ``now``, with their cost and what else ``cost`` returns."""
+    length = 1.0
+    while length >= SHORTEST:
+        tried = value + length * step
+        there, state = cost(tried)
+        if there < now:
+            return tried, there, state
+        length /= 2
+    return None
 
 
 def held_out_px(setup: CalibrationSetup, fit: ContactFit, measured: MeasuredFrames, *, progress: Step = unheard) -> tuple[float, float]:

@@ -7,7 +7,6 @@ divided by s, so that the pins do not move. Forces are then known within a facto
 Student's distribution: 90 % of such intervals contain the true force.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,17 +15,10 @@ from scipy.stats import t as student
 
 from scenes.body import ASSUMED_FACTOR
 from scenes.experiment import ExperimentSpec
-from scenes.object import ObjectSpec
 from scenes.rig import ForceSensorSpec
 from scenes.sensor import SensorSpec
-from twin.errors import ContactError
 from twin.frames import Recording
 from twin.frames.tables import numbers
-from twin.geometry.solid import Resolution
-from twin.mechanics.solver import SkinSolver
-from twin.rig.contact import RigContact
-from twin.rig.kinematics import rig_of
-from twin.rig.labels import ArmLabel
 
 FEWEST_PRESSES = 3
 """Fewest presses from which a scale is computed. Two presses do not show how large the random error is."""
@@ -123,17 +115,4 @@ def _project_forces(recording: Recording, reads: ForceSensorSpec, axis: int) -> 
     if name not in recording.labels:
         return np.full(len(recording), np.nan)
     found: np.ndarray = (numbers(recording.labels[name]) - reads.offset_n[axis]) / reads.gain[axis]
-    return found
-
-
-def simulated_n(sensor: SensorSpec, experiment: ExperimentSpec, obj: ObjectSpec, labels: Sequence[ArmLabel], *, across: int) -> np.ndarray:
-    """Simulated forces (K,) along the approach, N, of contacts with these labels; NaN where a contact fails."""
-    contact = RigContact(SkinSolver(sensor, resolution=Resolution(across)), experiment, obj, rig=rig_of(sensor))
-    found = np.full(len(labels), np.nan)
-    for k, label in enumerate(labels):
-        try:
-            state = contact.end(label)
-        except ContactError:
-            continue
-        found[k] = state.force_n @ state.T_sensor_object[:3, 2]
     return found

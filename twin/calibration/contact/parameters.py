@@ -7,10 +7,19 @@ import numpy as np
 
 from scenes.experiment import ExperimentSpec
 from scenes.sensor import SensorSpec
+from twin.calibration.size import of_radius
 from twin.rig.kinematics import TURNING, rig_of
 
 LEAST = 1e-3
 """Least number of which a logarithm is computed; for a Poisson's ratio nu the least 1 - 2 nu."""
+
+DETERMINED = 0.5
+"""Least share of a parameter's prior variance that the data must remove for it to count as determined."""
+Z90 = 1.645
+"""Half a 90 % interval of the normal distribution, in standard deviations."""
+SIZE = "skin.outer_radius_mm"
+"""Key of the radius of a dome. If it is fitted, all lengths of the sensor and its rig are scaled with it (see ``of_radius``) before the
+other parameters are set."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +103,9 @@ def with_quantities(
     ValidationError
         The values do not make a valid sensor.
     """
+    for parameter, value in zip(parameters, values, strict=True):
+        if parameter.name == SIZE:
+            sensor = of_radius(sensor.model_copy(update={"rig": rig_of(sensor)}), parameter.number(value))
     plain = sensor.model_dump(mode="json") | {"rig": rig_of(sensor).model_dump(mode="json")}
     plain["rig"]["turn_sign"] = int(turn_sign)
     for parameter, value in zip(parameters, values, strict=True):

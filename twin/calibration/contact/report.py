@@ -1,12 +1,15 @@
 """Page, figures and table of a contact calibration."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from twin.calibration.contact.fit import INDEPENDENT, ContactFit
+from twin.calibration.contact.parameters import DETERMINED, Z90, FittedParameter
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.frames import distinct_stems
@@ -18,8 +21,6 @@ from twin.report.table import Cell, Column
 from twin.rig.kinematics import rig_of
 from twin.store import made_by, write_json
 
-TOLD = 0.5
-"""Least share of a parameter's prior variance that the frames must remove for it to count as determined."""
 TRUSTED = 0.5
 """Trust below which a frame is listed as not trusted, and not drawn."""
 ALIKE = 0.9
@@ -28,14 +29,6 @@ ALIKE = 0.9
 
 def summary_of(setup: CalibrationSetup, measured: MeasuredFrames, fit: ContactFit, held_out: tuple | None, held_frames: int) -> dict:
     """All figures, as ``calibration.json`` holds them."""
-    parameters = []
-    for k, parameter in enumerate(setup.parameters):
-        start, value = (parameter.number(v[k]) for v in (fit.start, fit.value))
-        sd = float(fit.sd[k] * parameter.slope(fit.value[k]))
-        determined = float(fit.determined[k])
-        parameters.append(
-            {"name": parameter.name, "start": start, "value": value, "sd": sd, "told": determined, "known": determined >= TOLD}
-        )
     pairs = [
         [setup.parameters[i].name, setup.parameters[k].name, float(fit.correlation[i, k])]
         for i in range(len(setup.parameters))
@@ -49,7 +42,7 @@ def summary_of(setup: CalibrationSetup, measured: MeasuredFrames, fit: ContactFi
     return {
         "sensor": setup.sensor.name,
         "experiment": setup.experiment.name,
-        "parameters": parameters,
+        "parameters": describe_parameters(setup.parameters, fit.start, fit.value, fit.sd, fit.determined),
         "turn_sign": {"start": rig_of(setup.sensor).turn_sign, "value": rig_of(fit.sensor).turn_sign},
         "hardly_told_apart": pairs,
         "executed_share": fit.share,
@@ -97,7 +90,7 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
         tone="bad",
     )
     page.notice("Warnings", summary["warnings"], tone="bad")
-    page.notice("Notes", [summary["newtons"]["said"], *summary["problems"]])
+    page.notice("Notes", [summary["newtons"]["explanation"], *summary["problems"]])
     _parameters_section(page, summary)
     page.section("Frames")
     page.table(
@@ -135,29 +128,43 @@ def _lead(summary: dict) -> str:
     )
 
 
-def _parameters_section(page: Page, summary: dict) -> None:
-    page.section("Parameters")
-    rows: list[dict] = [
-        {
-            "name": Cell(p["name"], "" if p["known"] else "bad"),
-            "start": number(p["start"], 4),
-            "value": number(p["value"], 4),
-            "sd": number(p["sd"], 2),
-            "told": Cell(100 * p["told"], "" if p["known"] else "bad"),
-        }
-        for p in summary["parameters"]
-    ]
-    sign = summary["turn_sign"]
-    rows.append({"name": "rig.turn_sign", "start": number(sign["start"]), "value": number(sign["value"]), "sd": "", "told": ""})
+def describe_parameters(
+    parameters: Sequence[FittedParameter], start: np.ndarray, value: np.ndarray, sd: np.ndarray, determined: np.ndarray
+) -> list[dict[str, Any]]:
+    """Start, value, standard deviation, 90 % interval, and determined share of each parameter, from fitted quantities (P,)."""
+    rows = []
+    for k, p in enumerate(parameters):
+        low, high = sorted(p.number(value[k] + z * sd[k]) for z in (-Z90, Z90))
+        ends = {"sd": float(sd[k] * p.slope(value[k])), "low": low, "high": high}
+        shares = {"told": float(determined[k]), "known": bool(determined[k] >= DETERMINED)}
+        rows.append({"name": p.name, "start": p.number(start[k]), "value": p.number(value[k])} | ends | shares)
+    return rows
+
+
+def add_parameters(page: Page, parameters: list[dict], by: str, **spread: str) -> None:
+    """Add a table of parameters (``describe_parameters``) to a page.
+
+    ``by`` names what they were fitted to; ``spread`` holds the titles of the columns of their uncertainty by their keys.
+    """
+    texts = {"start": 4, "value": 4} | dict.fromkeys(spread, 2 if "sd" in spread else 3)
     page.table(
-        rows,
+        [
+            {key: number(p[key], digits) for key, digits in texts.items() if key in p}
+            | {key: Cell(value, "" if p["known"] else "bad") for key, value in (("name", p["name"]), ("told", p["told"]))}
+            for p in parameters
+        ],
         [
             Column("name", "parameter"),
-            Column("start", "start", align="right"),
-            Column("value", "fitted", align="right"),
-            Column("sd", "sd", align="right"),
-            Column("told", "determined by the frames", "%", decimals=0),
+            *(Column(key, title, align="right") for key, title in ({"start": "start", "value": "fitted"} | spread).items()),
+            Column("told", f"determined by the {by}", "%", decimals=0, scale=100),
         ],
+    )
+
+
+def _parameters_section(page: Page, summary: dict) -> None:
+    page.section("Parameters")
+    add_parameters(
+        page, [*summary["parameters"], {"name": "rig.turn_sign", "told": "", "known": True} | summary["turn_sign"]], "frames", sd="sd"
     )
     independent = f"{summary['independent_numbers_a_frame']:.0f}"
     page.text(

@@ -124,8 +124,7 @@ def pin_levels(image: np.ndarray, polarity: Polarity) -> np.ndarray:
 def levels_at(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
     """Gray levels (...,) of the pixels nearest to places (..., 2)."""
     column, row = np.moveaxis(np.clip(np.round(px), 0, np.array(gray.shape[::-1]) - 1).astype(int), -1, 0)
-    levels: np.ndarray = gray[row, column].astype(float)
-    return levels
+    return gray[row, column].astype(float)
 
 
 def polarity_of(pipeline: PipelineSpec, form: Form) -> Polarity:

@@ -347,8 +347,7 @@ def lower_levels(levels: np.ndarray, percent: float) -> np.ndarray:
     low = np.floor(rank).astype(int)
     ordered, row = np.sort(levels, axis=1), np.arange(len(levels))  # NaN come last
     below, above = ordered[row, low], ordered[row, np.ceil(rank).astype(int)]
-    lower: np.ndarray = below + (rank - low) * (above - below)
-    return lower
+    return below + (rank - low) * (above - below)
 
 
 def _extra(blobs: Blobs, found: Match) -> int:

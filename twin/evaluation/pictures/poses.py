@@ -217,8 +217,3 @@ def halves(count: int, seed: int = 0) -> np.ndarray:
     fitting = np.zeros(count, bool)
     fitting[np.random.default_rng(seed).permutation(count)[: count // 2]] = True
     return fitting
-
-
-def mean_pin_error_px(simulated_px: np.ndarray, seen_px: np.ndarray) -> np.ndarray:
-    """Mean distance over the pins (..., N, 2). Lost pins are ignored."""
-    return np.nanmean(np.linalg.norm(simulated_px - seen_px, axis=-1), axis=-1)

@@ -60,8 +60,7 @@ class PinsSpec(OpenSection):
     @property
     def shape(self) -> "Layout":
         """The layout with its keys."""
-        part: Layout = self.part
-        return part
+        return self.part
 
     @property
     def complete_count(self) -> int:

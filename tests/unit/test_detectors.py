@@ -12,7 +12,7 @@ from drawn_frames import draw_discs, drawn_frame, smooth_warp
 
 from scenes import load_sensor
 from twin.errors import FrameError, OptionError
-from twin.frames.forms import known_frames
+from twin.frames.forms import known_sizes
 from twin.geometry.pins import pin_lattice
 from twin.pins import METHODS, load_detector, make_detector, shipped_detector, tune, write_detector
 from twin.pins.detectors.own_finder import own_detector, own_name, own_places
@@ -87,7 +87,7 @@ def test_a_tuning_tells_what_it_left_out_and_frames_of_another_size(spec, tuned,
     told = tune_on_frames(tmp_path, spec, limit=3).odd
     assert any(note.startswith("skipped f_1.png: not a readable picture") for note in told)
     assert any("f_0.png: 320x240" in note and "mg400-127" in note for note in told)
-    width, height = known_frames(spec).size_px[Form.RAW]
+    width, height = known_sizes(spec)[Form.RAW]
     for k in range(3):
         cv2.imwrite(str(tmp_path / f"f_{k}.png"), np.full((height, width), 40 * k, np.uint8))
     assert not tune_on_frames(tmp_path, spec, limit=3).odd
@@ -222,7 +222,7 @@ def own_file(tmp_path):
 def test_a_function_of_the_user_is_a_detector_like_the_others(spec, own_file):
     detector = own_detector(f"{own_file}:my_pins", spec, Form.RAW)
     rest = nominal_reference(spec, Form.RAW).pins_px
-    frame = Frame(draw_discs(known_frames(spec).size_px[Form.RAW], rest, 4.0, level=(20, 140), blur_px=0.8), Form.RAW, "drawn")
+    frame = Frame(draw_discs(known_sizes(spec)[Form.RAW], rest, 4.0, level=(20, 140), blur_px=0.8), Form.RAW, "drawn")
     found = make_detector(spec, detector)(frame)
     assert detector.name == "my_pins" and found.valid
     np.testing.assert_allclose(found.pins_px, rest, atol=0.5)
@@ -231,7 +231,7 @@ def test_a_function_of_the_user_is_a_detector_like_the_others(spec, own_file):
 
 
 def test_a_failing_function_is_a_result_and_says_why(spec, own_file):
-    frame = Frame(np.full(known_frames(spec).size_px[Form.RAW][::-1], 128, np.uint8), Form.RAW, "gray")
+    frame = Frame(np.full(known_sizes(spec)[Form.RAW][::-1], 128, np.uint8), Form.RAW, "gray")
     for name, why in (
         ("by_rows", r"by_rows returned an array \(1, 3\)"),
         ("careless", "careless failed: ZeroDivisionError"),

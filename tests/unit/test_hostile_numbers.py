@@ -29,7 +29,7 @@ from training.estimate.estimator import PoseEstimator
 from twin.errors import ContactError, FrameError, OptionError, TwinError
 from twin.evaluation.degradation.plan import load_plan
 from twin.frames import open_recording
-from twin.frames.forms import form_of, known_frames
+from twin.frames.forms import form_of
 from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
@@ -179,7 +179,6 @@ def test_a_study_of_servos_in_which_nothing_moved_fails_with_the_first_reason(tm
 
 
 def test_frames_of_another_form_are_refused_without_the_name_of_an_option():
-    known = known_frames(load_sensor("mg400-127"))
     with pytest.raises(FrameError, match="f.png: expected 640x480 .raw form. of mg400-127, got 256x256 .processed form.") as caught:
-        form_of(np.zeros((256, 256), np.uint8), "f.png", known, Form.RAW)
+        form_of(np.zeros((256, 256), np.uint8), "f.png", load_sensor("mg400-127"), Form.RAW)
     assert "--" not in str(caught.value), "twin predict has no --form"

@@ -117,8 +117,7 @@ def _pin_motions(pipeline: Pipeline, frame: Frame) -> np.ndarray:
     seen = pipeline(frame)
     if not seen.valid:
         raise FrameError(f"{frame.name}: {seen.reason}; give another frame of this contact")
-    moved: np.ndarray = seen.pins_px - pipeline.reference.pins_px
-    return moved
+    return seen.pins_px - pipeline.reference.pins_px
 
 
 def _image_axes(spec: SensorSpec, form: Form) -> np.ndarray:

@@ -8,19 +8,19 @@ from scipy.spatial import Delaunay
 
 from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
-from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Polarity, RecordingSpec, SensorSpec
+from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Polarity, SensorSpec
 from twin.calibration.camera_pose import LEAST_PINS, MODEL_PX, CameraReport, fit_camera
 from twin.calibration.sensor_file import sibling_folder, write_sensor
 from twin.calibration.size import of_radius, require_radius
 from twin.errors import FrameError
 from twin.frames import Recording, evenly_read, frames_at, open_recording, spread_indices
-from twin.frames.forms import gray_levels, pin_levels
+from twin.frames.forms import blob_spec, gray_levels, pin_levels
 from twin.frames.images import write_image
 from twin.geometry.pins import rest_pins, usual_spacing
 from twin.optics.relief import cap_planes
 from twin.pins.batch import draw_overlay
 from twin.pins.check import CAPS_MEASURED, lost_in_view, usual_caps
-from twin.pins.detectors.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, with_detector
+from twin.pins.detectors.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, whole_recording, with_detector
 from twin.pins.detectors.tune import Tuned, tune
 from twin.pins.finding.caps import measure_caps
 from twin.pins.labelling.identify import STEADY, Candidate, Identified, identify, score_layout, unnamed_spots
@@ -246,8 +246,10 @@ def new_sensor(
         known, assumed, steps = _describe_result(sensor, found, rest, camera, others, tuned, health, recording, out)
         known, assumed = ((*known, size), assumed) if radius_mm is not None else (known, (size, *assumed))
         write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
-        page = _page(folder, sensor, found, health, pictures, known, assumed, steps, odd)
-        return NewSensor(sensor, found, rest, camera, tuned, health, size, known, assumed, steps, tuple(odd), [out, page])
+        files = [out, folder / "index.html"]
+        made = NewSensor(sensor, found, rest, camera, tuned, health, size, known, assumed, steps, tuple(odd), files)
+        _write_page(files[1], made, pictures)
+        return made
 
 
 def _holds_its_axis(places: np.ndarray) -> bool:
@@ -329,19 +331,8 @@ def _start_specification(name: str, frame: Frame, pins: PinsSpec, rest: Rest, so
         pins=turned,
         camera=camera,
         appearance=DARK_CAPS if polarity == "dark" else AppearanceSpec(),
-        recording=_whole(width, height, polarity) if thresholded else None,
+        recording=whole_recording((width, height), (width, height), polarity) if thresholded else None,
         pipeline=PipelineSpec(raw=anywhere, processed=anywhere if thresholded else None),
-    )
-
-
-def _whole(width: int, height: int, polarity: Polarity) -> RecordingSpec:
-    """A recorder that keeps the whole frame. The frames do not show how they were thresholded."""
-    return RecordingSpec(
-        crop_px=(0, 0, width, height),
-        width_px=width,
-        height_px=height,
-        threshold_block_px=UNKNOWN_BLOCK_PX,
-        threshold_offset=UNKNOWN_OFFSET if polarity == "bright" else -UNKNOWN_OFFSET,
     )
 
 
@@ -525,7 +516,7 @@ def _describe_result(
     out: Path,
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """What the frames determine, what is assumed, and how to find out more. The specification is written to ``out``."""
-    evidence = tuned.detector.evidence
+    evidence, blob = tuned.detector.evidence, blob_spec(sensor.pipeline, recording.form)
     known = (
         f"Layout: {found.best.line()}",
         rest.line(),
@@ -535,10 +526,9 @@ def _describe_result(
         + (f"; these fit about as well: {', or '.join(dict.fromkeys(other_cameras))}" if other_cameras else ""),
         f"pin detection: {evidence.sure if evidence else 'unsure'}; "
         + (
-            f"spots of {sensor_blob(sensor, tuned).spot_sigma_px:g} px"
-            if sensor_blob(sensor, tuned).spot_sigma_px
-            else f"threshold {sensor_blob(sensor, tuned).threshold:g}, which may change by "
-            f"{evidence.threshold_slack if evidence else 0:g} gray levels"
+            f"spots of {blob.spot_sigma_px:g} px"
+            if blob.spot_sigma_px
+            else f"threshold {blob.threshold:g}, which may change by {evidence.threshold_slack if evidence else 0:g} gray levels"
         ),
     )
     assumed = [
@@ -580,12 +570,6 @@ def _size(sensor: SensorSpec, *, given: bool) -> str:
     )
 
 
-def sensor_blob(sensor: SensorSpec, tuned: Tuned) -> BlobSpec:
-    """The pin detection's settings for the form of frames on which they were tuned."""
-    form = tuned.detector.form
-    return sensor.pipeline.processed if form == Form.PROCESSED and sensor.pipeline.processed else sensor.pipeline.raw
-
-
 def _comment(source: str, found: Identified, rest: Rest) -> str:
     """Lines above the specification."""
     return "\n".join(
@@ -616,29 +600,19 @@ def _notes(found: Identified, rest: Rest, camera: CameraReport) -> dict[str, str
     }
 
 
-def _page(
-    folder: Path,
-    sensor: SensorSpec,
-    found: Identified,
-    health: Health,
-    pictures: list[Path],
-    known: tuple[str, ...],
-    assumed: tuple[str, ...],
-    steps: tuple[str, ...],
-    problems: list[str],
-) -> Path:
-    """The page: what is known, what is assumed, what to do; overlay pictures; candidates."""
-    page = Page(f"New sensor {sensor.name}", "twin new", topic="TacTip twin: a new sensor", lead=" ".join(health.lines()[:1]))
-    page.notice("Unsure", list(found.doubts), tone="bad")
-    page.notice("Noted", problems + list(health.lines()[1:]))
+def _write_page(path: Path, made: NewSensor, pictures: list[Path]) -> None:
+    """Write the page: what is known, what is assumed, what to do; overlay pictures; candidates."""
+    page = Page(f"New sensor {made.sensor.name}", "twin new", topic="TacTip twin: a new sensor", lead=" ".join(made.health.lines()[:1]))
+    page.notice("Unsure", list(made.identified.doubts), tone="bad")
+    page.notice("Noted", [*made.odd, *made.health.lines()[1:]])
     page.section("Pins in the frames", "Green: found. Red: a lost pin's expected place. Yellow: spots that are no pins.")
     page.figures(*(PagePicture(path, f"Frame with its pins, {path.stem}", "", kind="frame") for path in pictures))
     page.section("What is known")
-    page.items(known)
+    page.items(made.known)
     page.section("What is assumed")
-    page.items(assumed)
+    page.items(made.assumed)
     page.section("How to find out more")
-    page.items(steps)
+    page.items(made.next_steps)
     page.section("Layouts that were considered")
     page.table(
         [
@@ -650,10 +624,10 @@ def _page(
                 "left_over": number(candidate.left_over, 3),
                 "misfit": number(candidate.misfit, 2),
             }
-            for candidate in found.candidates
+            for candidate in made.identified.candidates
         ],
         ["layout", "explained", "agreeing", "not_seen", "left_over", "misfit"],
         caption="Explained: of the pins in view and the pin-like spots, the share that belong together (median). Misfit: distance of the "
         "pins at rest from a smooth view of the layout, in spacings.",
     )
-    return page.write(folder / "index.html")
+    page.write(path)

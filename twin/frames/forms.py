@@ -5,7 +5,7 @@ size (w, h), and pixel centres at integers, ``x_rec = (x_raw - x0 + 0.5) w / (x1
 """
 
 from collections import Counter
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -88,10 +88,10 @@ def frame_size(spec: SensorSpec, form: Form) -> tuple[int, int]:
     FrameError
         The sensor has no processed form, or there is no such form.
     """
-    known, form = known_frames(spec), form_named(form)
-    if form not in known.size_px:
+    sizes, form = known_sizes(spec), form_named(form)
+    if form not in sizes:
         raise FrameError(f"sensor '{spec.name}' has no processed form: its recordings are raw frames; use the raw form")
-    return known.size_px[form]
+    return sizes[form]
 
 
 def blob_spec(pipeline: PipelineSpec, form: Form) -> BlobSpec:
@@ -124,8 +124,7 @@ def pin_levels(image: np.ndarray, polarity: Polarity) -> np.ndarray:
 def levels_at(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
     """Gray levels (...,) of the pixels nearest to places (..., 2)."""
     column, row = np.moveaxis(np.clip(np.round(px), 0, np.array(gray.shape[::-1]) - 1).astype(int), -1, 0)
-    levels: np.ndarray = gray[row, column].astype(float)
-    return levels
+    return gray[row, column].astype(float)
 
 
 def polarity_of(pipeline: PipelineSpec, form: Form) -> Polarity:
@@ -134,20 +133,12 @@ def polarity_of(pipeline: PipelineSpec, form: Form) -> Polarity:
     return (blob or pipeline.raw).polarity
 
 
-@dataclass(frozen=True)
-class KnownFrames:
-    """A sensor's name, and (width, height) in px of its frames of each form."""
-
-    sensor: str
-    size_px: Mapping[Form, tuple[int, int]]
-
-
-def known_frames(spec: SensorSpec) -> KnownFrames:
-    """Name and frame sizes of the sensor that a specification describes."""
+def known_sizes(spec: SensorSpec) -> dict[Form, tuple[int, int]]:
+    """(width, height) in px of the sensor's frames of each form that it has."""
     sizes = {Form.RAW: (spec.camera.width_px, spec.camera.height_px)}
     if spec.recording:
         sizes[Form.PROCESSED] = (spec.recording.width_px, spec.recording.height_px)
-    return KnownFrames(spec.name, sizes)
+    return sizes
 
 
 @dataclass(frozen=True)
@@ -190,7 +181,7 @@ def is_two_level(image: np.ndarray) -> bool:
     return away < FEW_AWAY or 1 - away / float(np.mean(gray)) > AT_EDGES
 
 
-def recognise_form(known: KnownFrames, image: np.ndarray) -> Form:
+def recognise_form(spec: SensorSpec, image: np.ndarray) -> Form:
     """Recognise the form of a sensor's frame by its size. If both forms have this size, the content decides.
 
     Raises
@@ -199,16 +190,16 @@ def recognise_form(known: KnownFrames, image: np.ndarray) -> Form:
         The frame has the size of neither form.
     """
     size = _size_px(image)
-    fitting = [form for form, expected in known.size_px.items() if expected == size]
+    fitting = [form for form, expected in known_sizes(spec).items() if expected == size]
     if not fitting:
-        expected = " or ".join(f"{times(expected)} ({form})" for form, expected in known.size_px.items())
-        raise FrameError(f"expected {expected} for {known.sensor}, got {times(size)}; use the matching `sensor` or the unresized frame")
+        expected = " or ".join(f"{times(expected)} ({form})" for form, expected in known_sizes(spec).items())
+        raise FrameError(f"expected {expected} for {spec.name}, got {times(size)}; use the matching `sensor` or the unresized frame")
     if len(fitting) == 1:
         return fitting[0]
     return Form.PROCESSED if is_two_level(image) else Form.RAW
 
 
-def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form | None) -> Form:
+def form_of(image: np.ndarray, name: str, spec: SensorSpec | None, form: Form | None) -> Form:
     """Form of a frame: the given one if the frame has its size; if none is given, the form is recognised by size and content.
 
     Raises
@@ -218,25 +209,25 @@ def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form 
     """
     if form is not None:
         form = form_named(form)
-    if known is None:
+    if spec is None:
         return form or (Form.PROCESSED if is_two_level(image) else Form.RAW)
     try:
-        told = recognise_form(known, image)
+        told = recognise_form(spec, image)
     except FrameError as error:
         raise FrameError(f"{name}: {error}") from None
     if form is None:
         return told
-    expected = known.size_px.get(form)
+    expected = known_sizes(spec).get(form)
     if expected is None:
-        raise FrameError(f"{name}: sensor {known.sensor} has no {form} form (no [{form}] section); give frames of its {told} form as such")
+        raise FrameError(f"{name}: sensor {spec.name} has no {form} form (no [{form}] section); give frames of its {told} form as such")
     if expected != _size_px(image):
         wanted, got = f"{times(expected)} ({form} form)", f"{times(_size_px(image))} ({told} form)"
         remedy = "give frames of this form, or the form, sensor or weights that suit these frames"
-        raise FrameError(f"{name}: expected {wanted} of {known.sensor}, got {got}; {remedy}")
+        raise FrameError(f"{name}: expected {wanted} of {spec.name}, got {got}; {remedy}")
     return form
 
 
-def common_kind(files: list[Path], known: KnownFrames | None, form: Form | None) -> FrameKind:
+def common_kind(files: list[Path], spec: SensorSpec | None, form: Form | None) -> FrameKind:
     """The most frequent kind among up to ``VOTES`` usable frames spread over a recording; of equally frequent kinds the first.
 
     Raises
@@ -250,7 +241,7 @@ def common_kind(files: list[Path], known: KnownFrames | None, form: Form | None)
     for k in [*spread, *(k for k in range(len(files)) if k not in spread)]:
         try:
             stored = decode(files[k])
-            votes[k] = FrameKind(form_of(to_eight_bits(stored)[0], files[k].name, known, form), _size_px(stored), bits_used(stored))
+            votes[k] = FrameKind(form_of(to_eight_bits(stored)[0], files[k].name, spec, form), _size_px(stored), bits_used(stored))
         except FrameError as error:
             reasons[k] = str(error)
         if len(votes) == VOTES:

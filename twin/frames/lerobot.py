@@ -5,6 +5,7 @@ Each number of a feature becomes a column, named after the feature and the numbe
 
 import json
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -94,10 +95,8 @@ class LeRobotFrames:
     def _read_encoded(self, path: Path, group: int, row: int) -> bytes:
         """The encoded bytes of a picture that a table holds or names."""
         if self._group != (path, group):
-            columns = [self._feature]
-            table = _read_table(
-                path, lambda parquet: parquet.ParquetFile(path, page_checksum_verification=True).read_row_group(group, columns)
-            )
+            with _parquet(path) as file:
+                table = file.read_row_group(group, [self._feature])
             if self._feature not in table.column_names:
                 raise FrameError(f"{path}: has no column {self._feature}, though {INFO} names it; {DAMAGED}")
             self._group, self._cells = (path, group), table.column(self._feature).to_pylist()
@@ -184,14 +183,9 @@ def _rows(path: Path, info: dict[str, Any], numbered: list[str]) -> tuple[dict[s
     places: list[tuple[Path, int, int]] = []
     total = info.get("total_episodes")
     for file in sorted(path.glob(DATA)):
-        groups = _read_table(file, lambda parquet, file=file: parquet.ParquetFile(file).num_row_groups)
-        for group in range(groups):
-            table = _read_table(
-                file,
-                lambda parquet, file=file, group=group: parquet.ParquetFile(file, page_checksum_verification=True).read_row_group(
-                    group, columns=columns
-                ),
-            )
+        with _parquet(file) as parquet:
+            tables = [parquet.read_row_group(group, columns) for group in range(parquet.num_row_groups)]
+        for group, table in enumerate(tables):
             if missing := [name for name in columns if name not in table.column_names]:
                 raise FrameError(f"{file}: has no column {', '.join(missing[:3])}, though {INFO} names it; {DAMAGED}")
             cells = {name: table.column(name).to_pylist() for name in columns}
@@ -210,10 +204,8 @@ def _in_videos(path: Path, info: dict[str, Any], feature: str, rows: dict[str, l
     at = f"videos/{feature}"
     keys = [f"{at}/chunk_index", f"{at}/file_index", f"{at}/from_timestamp"]
     for file in sorted(path.glob(EPISODES)):
-        table = _read_table(
-            file, lambda parquet, file=file: parquet.read_table(file, columns=["episode_index", *keys], page_checksum_verification=True)
-        )
-        episodes |= {row["episode_index"]: row for row in table.to_pylist()}
+        with _parquet(file) as parquet:
+            episodes |= {row["episode_index"]: row for row in parquet.read(["episode_index", *keys]).to_pylist()}
     try:
         files = {
             number: (
@@ -248,11 +240,12 @@ def _columns(feature: str, names: object, cells: list[Any]) -> dict[str, np.ndar
     return {f"{feature}.{names[k] if named else k}": values[:, k] for k in range(values.shape[1])}  # type: ignore[index]
 
 
-def _read_table(file: Path, how: Any) -> Any:
-    """The result of ``how``, applied to pyarrow's module for tables; a damaged file raises ``FrameError``."""
+@contextmanager
+def _parquet(file: Path) -> Iterator[Any]:
+    """An open file of tables. If it turns out to be damaged, ``FrameError`` is raised."""
     parquet, arrow = _library("pyarrow.parquet"), _library("pyarrow")
     try:
-        return how(parquet)
+        yield parquet.ParquetFile(file, page_checksum_verification=True)
     except (OSError, KeyError, ValueError, arrow.ArrowException) as error:
         raise FrameError(f"{file}: damaged ({str(error).splitlines()[0]}); {DAMAGED}") from error
 

@@ -12,7 +12,7 @@ from scenes.files import LONGEST_PATH, quote
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, odd_entries, references_in, the_video_in
-from twin.frames.forms import FrameKind, KnownFrames, common_kind, form_named, form_of, known_frames, times
+from twin.frames.forms import FrameKind, common_kind, form_named, form_of, times
 from twin.frames.images import read_image
 from twin.frames.lerobot import INFO, RESTS, LeRobotFrames, is_lerobot, open_lerobot
 from twin.frames.tables import TABLES, describe_count, order_by_table, read_metadata, unlikely_units
@@ -214,19 +214,19 @@ class Recording:
                 self.metadata[file.name] = content
 
 
-def _open_video(path: Path, known: KnownFrames | None, form: Form | None) -> Recording:
+def _open_video(path: Path, spec: SensorSpec | None, form: Form | None) -> Recording:
     video = open_video(path)
     names = [f"{path.stem}_{k:06d}" for k in range(video.count)]
     size_px = (video.first.shape[1], video.first.shape[0])
-    return Recording(path, form_of(video.first, path.name, known, form), names, size_px, problems=video.problems, _video=video)
+    return Recording(path, form_of(video.first, path.name, spec, form), names, size_px, problems=video.problems, _video=video)
 
 
-def _open_dataset(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
+def _open_dataset(path: Path, spec: SensorSpec | None, form: Form | None, table: Path | None) -> Recording:
     if table is not None and not Path(table).is_relative_to(path):
         raise FrameError(f"{path}: a LeRobot data set holds its own labels; leave out {table}")
     found = open_lerobot(path)
     size_px = (found.first.shape[1], found.first.shape[0])
-    told = form_of(found.first, path.name, known, form)
+    told = form_of(found.first, path.name, spec, form)
     recording = Recording(path, told, found.names, size_px, found.labels, problems=found.problems, _dataset=found)
     recording.take_metadata([path / INFO.parent])
     recording.take_reference([*references_in(path), *sorted((path / RESTS).glob("*.png"))])
@@ -234,14 +234,14 @@ def _open_dataset(path: Path, known: KnownFrames | None, form: Form | None, tabl
 
 
 def _choose_folder(
-    path: Path, folders: list[Path], known: KnownFrames | None, form: Form | None, problems: list[str]
+    path: Path, folders: list[Path], spec: SensorSpec | None, form: Form | None, problems: list[str]
 ) -> tuple[Path, list[Path], FrameKind]:
     """The first folder with a usable frame, its frames and their kind."""
     reasons = []
     for folder in folders:
         files = frames_in(folder)
         try:
-            kind = common_kind(files, known, form)
+            kind = common_kind(files, spec, form)
         except FrameError as error:
             reasons.append((folder, error))
             continue
@@ -254,13 +254,13 @@ def _choose_folder(
     raise FrameError(f"{first}: {reason}")
 
 
-def _open_folder(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
+def _open_folder(path: Path, spec: SensorSpec | None, form: Form | None, table: Path | None) -> Recording:
     if not any(path.iterdir()):
         raise FrameError(f"{path}: the folder is empty; give a folder of frames")
     problems: list[str] = []
     folders = image_folders(path, form)
     if folders:
-        folder, files, kind = _choose_folder(path, folders, known, form, problems)
+        folder, files, kind = _choose_folder(path, folders, spec, form, problems)
         problems += odd_entries(folder)
         # if ``path`` is the inner folder of a recording, table and no-contact frame lie in the folder above
         inner = folder == path and path.name in IMAGE_FOLDERS
@@ -273,7 +273,7 @@ def _open_folder(path: Path, known: KnownFrames | None, form: Form | None, table
         recording = Recording(path, kind.form, names, kind.size_px, labels, problems=problems, _files=files, _bits=kind.bits)
     else:
         homes = [path]
-        recording = _open_video(the_video_in(path), known, form)
+        recording = _open_video(the_video_in(path), spec, form)
     recording.take_metadata(homes)
     recording.take_reference([file for home in homes for file in references_in(home)])
     return recording
@@ -306,29 +306,29 @@ def open_recording(
     path = Path(path)
     if table is not None and not table.is_file() and not is_lerobot(table):
         raise FrameError(f"{quote(table, LONGEST_PATH)}: no such table; give the path of a CSV file (`table` or `label_table`)")
-    recording = _open_with_table(path, None if spec is None else known_frames(spec), form, table)
+    recording = _open_with_table(path, spec, form, table)
     if no_contact is not None:
         recording.must_take_reference(no_contact)
     recording.problems += unlikely_units(recording.labels)
     return recording
 
 
-def _open_with_table(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
+def _open_with_table(path: Path, spec: SensorSpec | None, form: Form | None, table: Path | None) -> Recording:
     """The recording at ``path``, with the table and the other files that lie beside its frames."""
     if not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
         link = "a broken link" if os.path.islink(path) else "no such file or folder"
         raise FrameError(f"{quote(path, LONGEST_PATH)}: {link}; give a picture, a folder of frames, a recording or a video")
     if path.is_dir() and is_lerobot(path):
-        return _open_dataset(path, known, form, table)
+        return _open_dataset(path, spec, form, table)
     if path.is_dir():
-        return _open_folder(path, known, form, table)
+        return _open_folder(path, spec, form, table)
     if not path.is_file():
         raise FrameError(f"{path}: a named pipe or a device, not a file; give a picture, a folder of frames, a recording or a video")
     if table is not None:
         raise FrameError(f"{path}: a table needs a folder of frames; give the folder, or leave out `table`")
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return _open_video(path, known, form)
-    kind = common_kind([path], known, form)
+        return _open_video(path, spec, form)
+    kind = common_kind([path], spec, form)
     return Recording(path, kind.form, [path.name], kind.size_px, _files=[path], _bits=kind.bits)
 
 

@@ -105,21 +105,18 @@ class ContactMaps:
         """Outward unit normals (G, 3) of the deformed skin."""
         places = self.nodes_mm.reshape(SIDE, SIDE, 3)
         across = np.cross(np.gradient(places, axis=1), np.gradient(places, axis=0)).reshape(-1, 3)
-        unit: FloatArray = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-        return unit
+        return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
 
     @property
     def pressure_mpa(self) -> FloatArray:
         """Pressure (G,), N per mm2 of skin at rest; a node that pulls has the pressure 0."""
-        pressure: FloatArray = np.maximum((self.force_n * self.normal).sum(axis=1), 0.0) / self.area_mm2
-        return pressure
+        return np.maximum((self.force_n * self.normal).sum(axis=1), 0.0) / self.area_mm2
 
     @property
     def traction_mpa(self) -> FloatArray:
         """Shear traction (G, 3) of the skin on the object, tangential to the skin, N per mm2 of skin at rest."""
         along = (self.force_n * self.normal).sum(axis=1, keepdims=True)
-        traction: FloatArray = (self.force_n - along * self.normal) / self.area_mm2[:, None]
-        return traction
+        return (self.force_n - along * self.normal) / self.area_mm2[:, None]
 
     @property
     def least_mpa(self) -> float:
@@ -129,14 +126,12 @@ class ContactMaps:
     @property
     def patch(self) -> BoolArray:
         """Mask (G,) of the nodes in contact."""
-        patch: BoolArray = self.pressure_mpa >= self.least_mpa
-        return patch
+        return self.pressure_mpa >= self.least_mpa
 
     @property
     def resultant_n(self) -> FloatArray:
         """Sum (3,) of the forces."""
-        total: FloatArray = self.force_n.sum(axis=0)
-        return total
+        return self.force_n.sum(axis=0)
 
     @property
     def torque_z_nmm(self) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from twin.compiled import compiled
 from twin.geometry.solid import rotations
 from twin.mechanics.balance import Body
+from twin.mechanics.body.elements import deformation, gather
 from twin.types import FloatArray, IntArray
 
 
@@ -49,17 +50,8 @@ def _mean_gradient(elements: IntArray, gradients: FloatArray, control: FloatArra
     out = np.empty((len(elements), 3, 3))
     x = np.empty((3, elements.shape[1]))
     for m in range(len(elements)):
-        for a in range(elements.shape[1]):
-            for i in range(3):
-                x[i, a] = control[elements[m, a], i]
-        for j in range(3):
-            f0, f1, f2 = 0.0, 0.0, 0.0
-            for a in range(elements.shape[1]):
-                slope = gradients[m, j, a]
-                f0 += x[0, a] * slope
-                f1 += x[1, a] * slope
-                f2 += x[2, a] * slope
-            out[m, 0, j], out[m, 1, j], out[m, 2, j] = f0, f1, f2
+        gather(control, elements[m], x)
+        deformation(x, gradients[m], out[m])
     return out
 
 

@@ -4,7 +4,6 @@ Every solid has ``probe`` (and therefore ``distance`` and ``gradient``) and ``un
 (k, 2) in mm along the surface below a point, with their gradients (k, 2, 3) and their Hessians (k, 2, 3, 3) in 1/mm.
 """
 
-from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
@@ -29,9 +28,9 @@ class CompiledSolid(Wrapped):
     kernel: ClassVar[Callable[..., Probe]]
 
     @property
-    @abstractmethod
     def sizes(self) -> tuple[float, ...]:
-        """The numbers that ``kernel`` takes."""
+        """The numbers that ``kernel`` takes: the solid's fields, in their order."""
+        return tuple(vars(self).values())
 
     def probe(self, points_mm: FloatArray) -> Probe:
         return type(self).kernel(rows(points_mm), *self.sizes)
@@ -42,10 +41,6 @@ class Plane(CompiledSolid):
     """Half space z >= 0."""
 
     kind, kernel = kernels.PLANE, staticmethod(kernels.plane)
-
-    @property
-    def sizes(self) -> tuple[float, ...]:
-        return ()
 
 
 @dataclass(frozen=True)
@@ -85,10 +80,6 @@ class Edge(CompiledSolid):
 
     kind, kernel = kernels.EDGE, staticmethod(kernels.edge)
 
-    @property
-    def sizes(self) -> tuple[float, ...]:
-        return (self.fillet_mm,)
-
 
 @dataclass(frozen=True)
 class Prism(CompiledSolid):
@@ -104,10 +95,6 @@ class Prism(CompiledSolid):
     taper_rad: float
 
     kind, kernel = kernels.PRISM, staticmethod(kernels.prism)
-
-    @property
-    def sizes(self) -> tuple[float, ...]:
-        return self.sides, self.inradius_mm, self.fillet_mm, self.taper_rad
 
     def unroll(self, points_mm: FloatArray) -> Probe:
         return kernels.unroll_prism(rows(points_mm), self.sides, self.inradius_mm)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scenes.sensor import Polarity, SensorSpec, UsualCapsSpec
 from twin.camera.capture import expose
 from twin.frames import spread_indices
-from twin.frames.forms import blob_spec, gray_levels, known_frames, pin_levels
+from twin.frames.forms import blob_spec, gray_levels, known_sizes, pin_levels
 from twin.optics.preview import Preview
 from twin.pins.detectors.detector_spec import DetectorSpec, shipped_detector, with_detector
 from twin.pins.detectors.tune import other_layout
@@ -56,6 +56,31 @@ STRAY_PERCENTILE = 97
 """Percentile of the skin's levels around the caps that is compared with their median. Stray light falls on a part of the skin only."""
 GLARE_CAPS = 2
 """Area of a white patch, in cap areas, above which it counts as glare."""
+REPLACED = "fix the camera, or calibrate again ('twin calibrate optics'); 'twin tune' moves the mask"
+"""What to do if the camera is not at its calibrated place."""
+CHECKS = {
+    "brightness": (0.6, 0.3, "raise exposure or gain; look for dead LEDs, dirt, a foggy window"),
+    "saturation": (0.02, 0.2, "lower exposure or gain"),
+    "focus": (1.35, 2.0, "focus the camera; clean the window; hold still"),
+    "glare": (0.003, 0.03, "shade the sensor; move or dim the LED"),
+    "stray light": (0.2, 0.6, "keep room light off the tip there; look for a leak between skin and housing, or an LED that is bent"),
+    "layout": (0.9, 0.75, "give the `sensor` that these frames are of, or make one with 'twin new'; look for stray light"),
+    "pins": (0.002, 0.05, "look at these places: caps may be off, dirty or hidden by glare"),
+    "specks": (0.02, 0.2, "bubbles, dust or LED reflections: clean the window, turn the sensor's LEDs, or mask them"),
+    "place": (0.0, 0.0, "see the other findings first"),
+    "shift": (0.2, 1.0, REPLACED),
+    "turn": (1.5, 6.0, REPLACED),
+    "scale": (0.02, 0.1, REPLACED),
+    "stretch": (MOST_STRETCH, 2 * MOST_STRETCH, "give frames as the camera took them"),
+    "mirror": (0.0, 0.5, "turn mirroring off where the frames are taken, or see `push`"),
+    "twin": (
+        0.2,
+        0.5,
+        "lengths in mm, camera and rest_px do not belong together: the twin's pictures are not of this sensor; make the specification "
+        "again ('twin new', with `radius_mm` for a tip of another size)",
+    ),
+}
+"""Values of each check above which (below which, if the second is smaller) a sensor is degraded and has failed, and what to do then."""
 
 
 class Grade(StrEnum):
@@ -109,7 +134,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
     detector = detector or shipped_detector(spec, form)
     tuned = with_detector(spec, detector)
     pipeline = Pipeline(tuned, form)
-    if known_frames(tuned) != known_frames(spec):  # tuned for another size: the calibrated pins are those of the view scaled to it
+    if known_sizes(tuned) != known_sizes(spec):  # tuned for another size: the calibrated pins are those of the view scaled to it
         blob = blob_spec(tuned.pipeline, form).model_copy(update={"rest_px": ()})
         spec = tuned.model_copy(update={"pipeline": tuned.pipeline.model_copy(update={str(form): blob})})
     seen = []
@@ -182,10 +207,11 @@ def _verdict(value: float, degraded: float, failed: float) -> Grade:
     return Grade.DEGRADED if sign * value > sign * degraded else Grade.HEALTHY
 
 
-def _finding(name: str, value: float, limits: tuple[float, float], text: str, remedy: str) -> Finding:
-    """A finding with its verdict by the limits (watch, bad). If the verdict is good, there is no remedy."""
-    verdict = _verdict(value, *limits)
-    return Finding(name, verdict, float(value), text, "" if verdict is Grade.HEALTHY else remedy)
+def _finding(name: str, value: float, text: str, remedy: str = "") -> Finding:
+    """A finding with its verdict by the limits of ``CHECKS``. If the verdict is good, there is no remedy."""
+    degraded, failed, usual = CHECKS[name]
+    verdict = _verdict(value, degraded, failed)
+    return Finding(name, verdict, float(value), text, "" if verdict is Grade.HEALTHY else remedy or usual)
 
 
 def _layout(frames: list[Frame], spec: SensorSpec, polarity: Polarity) -> Finding:
@@ -196,8 +222,7 @@ def _layout(frames: list[Frame], spec: SensorSpec, polarity: Polarity) -> Findin
     doubts = [f"the frames do not show {spec.pins.in_words()}"] if layout is None else other_layout(layout, images)
     text = f"of the pins in view and the pin-like spots, {100 * share:.1f} % belong together" + (f"; {doubts[0]}" if doubts else "")
     wrong = bool(doubts) and "rather than" in doubts[0]
-    remedy = "give the `sensor` that these frames are of, or make one with 'twin new'; look for stray light"
-    return _finding("layout", 0.0 if wrong else share, (0.9, 0.75), text, remedy)
+    return _finding("layout", 0.0 if wrong else share, text)
 
 
 def lost_in_view(seen: list[Observation], pipeline: Pipeline) -> tuple[np.ndarray, np.ndarray]:
@@ -224,12 +249,7 @@ def _pins(frames: list[Frame], seen: list[Observation], pipeline: Pipeline) -> F
     if outside:
         text += f"; {outside} of {lost.shape[1]} pins lie outside the picture"
     unusable = next((o.reason for o in seen if not o.valid), "")
-    remedy = (
-        "look at these places: caps may be off, dirty or hidden by glare"
-        if not unusable
-        else f"{unusable}; run 'twin tune' on these frames"
-    )
-    return _finding("pins", share, (0.002, 0.05), text, remedy)
+    return _finding("pins", share, text, f"{unusable}; run 'twin tune' on these frames" if unusable else "")
 
 
 def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
@@ -242,8 +262,7 @@ def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
         hits = np.array([[len(p) and cKDTree(p).query(spot)[0] < within for p in places] for spot in places[0]], float)
         steady = int((hits.mean(axis=1) >= STEADY).sum())
     kind = pipeline.blob_spec.polarity
-    remedy = "bubbles, dust or LED reflections: clean the window, turn the sensor's LEDs, or mask them"
-    return _finding("specks", steady / len(pipeline.reference.pins_px), (0.02, 0.2), f"{steady} steady {kind} spots among the pins", remedy)
+    return _finding("specks", steady / len(pipeline.reference.pins_px), f"{steady} steady {kind} spots among the pins")
 
 
 def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> list[Finding]:
@@ -251,15 +270,7 @@ def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> lis
     pitch, bulge = float(np.mean(nominal.spacing_px)), BULGE if spec.skin.shape == "cap" else 0.0
     drifts = [(d, o) for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost, bulge=bulge))]
     if not drifts:
-        return [
-            Finding(
-                "place",
-                Grade.FAILED,
-                np.nan,
-                "the camera's place can't be determined: too few pins at the rim",
-                "see the other findings first",
-            )
-        ]
+        return [_finding("place", np.nan, "the camera's place can't be determined: too few pins at the rim")]
     drifts = sorted(drifts, key=lambda each: each[0].contact)[: max(round(LEAST_DEFORMED * len(drifts)), 1)]
     found = [d for d, _ in drifts]
     with np.errstate(invalid="ignore"):
@@ -272,20 +283,13 @@ def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> lis
     turn = view.turn_deg if view.sure else turn
     grown = f" ({seen_scale:.3f} with the bulge of the contact)" if seen_scale - scale > TOLD_BULGE else ""
     away = float(np.linalg.norm(shift))
-    again = "fix the camera, or calibrate again ('twin calibrate optics'); 'twin tune' moves the mask"
     mirror = "the picture is mirrored" if view.mirrored else "the picture is not mirrored" if view.sure else view.describe_ambiguity()
     return [
-        _finding("shift", away / pitch, (0.2, 1.0), f"displaced by ({shift[0]:.1f}, {shift[1]:.1f}) px, {away / pitch:.2f} pitches", again),
-        _finding("turn", abs(turn), (1.5, 6.0), f"turned by {turn:.2f} deg", again),
-        _finding("scale", abs(scale - 1), (0.02, 0.1), f"{scale:.3f} times its calibrated size{grown}", again),
-        _finding(
-            "stretch",
-            view.stretch,
-            (MOST_STRETCH, 2 * MOST_STRETCH),
-            f"stretched by {view.stretch:.1%}",
-            "give frames as the camera took them",
-        ),
-        _finding("mirror", float(view.mirrored), (0.0, 0.5), mirror, "turn mirroring off where the frames are taken, or see `push`"),
+        _finding("shift", away / pitch, f"displaced by ({shift[0]:.1f}, {shift[1]:.1f}) px, {away / pitch:.2f} pitches"),
+        _finding("turn", abs(turn), f"turned by {turn:.2f} deg"),
+        _finding("scale", abs(scale - 1), f"{scale:.3f} times its calibrated size{grown}"),
+        _finding("stretch", view.stretch, f"stretched by {view.stretch:.1%}"),
+        _finding("mirror", float(view.mirrored), mirror),
     ]
 
 
@@ -301,12 +305,7 @@ def _twin(spec: SensorSpec, form: Form, nominal: Reference) -> list[Finding]:
     off_px = nominal.pins_px - project_rest(spec, form)
     rms, pitch = float(np.sqrt(np.mean(np.sum(off_px**2, axis=1)))), float(np.mean(nominal.spacing_px))
     text = f"the specification's camera sees its pins at rest {rms:.1f} px (rms), {rms / pitch:.2f} pitches, from where they were measured"
-    remedy = (
-        "lengths in mm, camera and rest_px do not belong together: the twin's pictures are not of this sensor; make "
-        "the specification again "
-        "('twin new', with `radius_mm` for a tip of another size)"
-    )
-    return [_finding("twin", rms / pitch, (0.2, 0.5), text, remedy)]
+    return [_finding("twin", rms / pitch, text)]
 
 
 def _around_pins(pipeline: Pipeline) -> np.ndarray:
@@ -342,28 +341,14 @@ def _light(frames: list[Frame], seen: list[Observation], expected: UsualCapsSpec
         else f"brightest percent at {brightest:.0f} gray levels"
     )
     return [
-        _finding("brightness", contrast / promised, (0.6, 0.3), dark, "raise exposure or gain; look for dead LEDs, dirt, a foggy window"),
-        _finding("saturation", white, (0.02, 0.2), f"{100 * white:.1f} % of the {part} white", "lower exposure or gain"),
-        _finding(
-            "focus",
-            edge / sharp,
-            (1.35, 2.0),
-            f"caps' edges {edge:.2f} px wide ({sharp:.2f} px expected)",
-            "focus the camera; clean the window; hold still",
-        ),
-        _finding(
-            "glare",
-            glare,
-            (0.003, 0.03),
-            f"{100 * glare:.2f} % of the area of the pins in white patches larger than caps",
-            "shade the sensor; move or dim the LED",
-        ),
+        _finding("brightness", contrast / promised, dark),
+        _finding("saturation", white, f"{100 * white:.1f} % of the {part} white"),
+        _finding("focus", edge / sharp, f"caps' edges {edge:.2f} px wide ({sharp:.2f} px expected)"),
+        _finding("glare", glare, f"{100 * glare:.2f} % of the area of the pins in white patches larger than caps"),
         _finding(
             "stray light",
             stray - usual,
-            (0.2, 0.6),
             f"skin brighter by {100 * stray:.0f} % of the caps' contrast{where} ({100 * usual:.0f} % expected)",
-            "keep room light off the tip there; look for a leak between skin and housing, or an LED that is bent",
         ),
     ]
 

@@ -1,7 +1,5 @@
 """Page, table and figures of a comparison with real frames."""
 
-import csv
-import io
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,8 +11,8 @@ from twin.report.charts import new_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, PagePicture
 from twin.report.plots import draw_displacement, enlargement
-from twin.report.table import Column
-from twin.store import made_by, write_json, write_text
+from twin.report.table import Column, write_table
+from twin.store import made_by, write_json
 
 
 def summary_of(found: Comparison, sensor: str) -> dict:
@@ -59,7 +57,7 @@ def write_validation(out: Path, found: Comparison, description: str, summary: di
     list of Path
         The files, the page first.
     """
-    table = write_text(out / "frames.csv", _frames_csv(found))
+    table = write_table(out / "frames.csv", _frame_rows(found))
     figures = write_json(out / "validation.json", summary | {"made_by": made_by("twin.evaluation.labelled.compare")})
     errors = write_chart(out / "errors.png", lambda: _draw_errors(found))
     frames = write_chart(out / "frames.png", lambda: _draw_worst(found))
@@ -110,16 +108,14 @@ def _binned_table(page: Page, rows: list[dict], key: str, title: str) -> None:
     page.table(shown, [Column("group", "error in px"), *bins], caption=f"By {name}")
 
 
-def _frames_csv(found: Comparison) -> str:
-    text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow(["image_name", "executed", *MEASURES, "error_px", "own_friction", "error_own_friction_px", "failure"])
+def _frame_rows(found: Comparison) -> list[dict[str, object]]:
+    rows: list[dict[str, object]] = []
     for k, name in enumerate(found.measured.names):
-        values = [found.by[key][k] for key in MEASURES]
-        own = [found.error_px[k], found.friction[k], found.friction_error_px[k]]
-        numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*values, *own)]
-        writer.writerow([name, int(found.executed[k]), *numbers, found.failures.get(name, "")])
-    return text.getvalue()
+        numbers = {key: found.by[key][k] for key in MEASURES} | {"error_px": found.error_px[k], "own_friction": found.friction[k]}
+        numbers["error_own_friction_px"] = found.friction_error_px[k]
+        known = {key: value if np.isfinite(value) else None for key, value in numbers.items()}
+        rows.append({"image_name": name, "executed": int(found.executed[k]), **known, "failure": found.failures.get(name, "")})
+    return rows
 
 
 def _draw_errors(found: Comparison) -> Figure:

@@ -9,6 +9,7 @@ from scenes.rig import RigSpec
 from scenes.sensor import Polarity, SensorSpec
 from twin.camera.capture import expose
 from twin.camera.projection import Disc, project
+from twin.evaluation.labelled.compare import pin_errors
 from twin.evaluation.pictures.fixed import cap_patches, fixed_share
 from twin.evaluation.pictures.frames import RealFrame
 from twin.evaluation.pictures.images import ImageFigures, compare_images
@@ -21,7 +22,6 @@ from twin.evaluation.pictures.poses import (
     fit_rig,
     halves,
     labels_of_rows,
-    mean_pin_error_px,
 )
 from twin.evaluation.pictures.statistics import FrameStatistics, Statistics, compare_statistics, measure_frame
 from twin.frames.forms import gray_levels
@@ -115,7 +115,7 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
     with bar("press and render from the labels") as progress:
         for number, (real, label) in enumerate(zip(frames, labels, strict=True)):
             state = contact.end(label)
-            error_px = mean_pin_error_px(project(spec.view, state.caps_mm), real.pins_px)
+            error_px = pin_errors(project(spec.view, state.caps_mm), real.pins_px)
             pairs.append(shoot(real, state, float(error_px), seed=number))
             progress(number + 1, len(frames))
     return PoseAligned(rig, fitted, contacts_of(rig, experiment, labels, apex_mm), pairs)

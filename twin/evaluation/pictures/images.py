@@ -5,7 +5,7 @@ The figures are PSNR, SSIM (Wang et al. 2004, computed by scikit-image) and FLIP
 that these pixels do not affect SSIM and FLIP near the disc's edge.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import flip_evaluator
 import numpy as np
@@ -30,10 +30,6 @@ class ImageFigures:
     ssim_gray: float
     flip: float
     psnr_whole_db: float
-
-    def as_dict(self) -> dict[str, float]:
-        """Figures by name."""
-        return asdict(self)
 
 
 def compare_images(real: np.ndarray, rendered: np.ndarray, inside: np.ndarray) -> ImageFigures:

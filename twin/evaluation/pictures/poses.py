@@ -116,13 +116,11 @@ class TapBank:
 
     def pins_px(self, contacts: np.ndarray) -> np.ndarray:
         """Pins (m, N, 2) px of contacts (m, 3)."""
-        pins_px: np.ndarray = (self._terms(contacts) @ self._coefficients).reshape(len(contacts), -1, 2)
-        return pins_px
+        return (self._terms(contacts) @ self._coefficients).reshape(len(contacts), -1, 2)
 
     def _terms(self, contacts: np.ndarray) -> np.ndarray:
         powers = [p for p in product(range(DEGREE + 1), repeat=3) if sum(p) <= DEGREE]
-        terms: np.ndarray = np.prod((contacts / self._scale)[:, None] ** np.array(powers), axis=2)
-        return terms
+        return np.prod((contacts / self._scale)[:, None] ** np.array(powers), axis=2)
 
 
 def bank_labels(rig: RigSpec, experiment: ExperimentSpec, labels: list[ArmLabel], radius_mm: float) -> list[ArmLabel]:
@@ -181,11 +179,9 @@ def fit_rig(
     def solve(rig: RigSpec, wanted_px: np.ndarray) -> OptimizeResult:
         def residuals(x: np.ndarray) -> np.ndarray:
             contacts = contacts_of(_with_parameters(rig, experiment, x), experiment, labels, radius_mm)
-            left_px: np.ndarray = (bank.pins_px(contacts) - wanted_px)[seen]
-            return left_px
+            return (bank.pins_px(contacts) - wanted_px)[seen]
 
-        found: OptimizeResult = least_squares(residuals, np.zeros(PARAMETERS))
-        return found
+        return least_squares(residuals, np.zeros(PARAMETERS))
 
     tries = [
         start.model_copy(update={"turn_sign": sign, "image_turn_deg": start.image_turn_deg + turn})
@@ -221,9 +217,3 @@ def halves(count: int, seed: int = 0) -> np.ndarray:
     fitting = np.zeros(count, bool)
     fitting[np.random.default_rng(seed).permutation(count)[: count // 2]] = True
     return fitting
-
-
-def mean_pin_error_px(simulated_px: np.ndarray, seen_px: np.ndarray) -> np.ndarray:
-    """Mean distance over the pins (..., N, 2). Lost pins are ignored."""
-    error: np.ndarray = np.nanmean(np.linalg.norm(simulated_px - seen_px, axis=-1), axis=-1)
-    return error

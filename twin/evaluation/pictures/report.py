@@ -49,7 +49,7 @@ def write_pictures(folder: Path, pairs: list[Pair], kind: str) -> list[dict]:
 def image_summary(pairs: list[Pair]) -> dict:
     """Mean, median, smallest and largest value of each figure over the pairs, and fraction of renders with exactly all pins found."""
     out = {}
-    for name in pairs[0].figures.as_dict():
+    for name in vars(pairs[0].figures):
         values = np.array([getattr(pair.figures, name) for pair in pairs])
         out[name] = {"mean": values.mean(), "median": np.median(values), "min": values.min(), "max": values.max()}
     remainder = np.array([pair.remainder_px for pair in pairs])
@@ -106,7 +106,7 @@ def write_tables(out: Path, pairs: list[Pair], found: Statistics, poses: PoseAli
 
 def _frame_row(pair: Pair, alignment: str) -> dict:
     pins = {"pin_px": pair.remainder_px, "exact": pair.exact}
-    return {"image_name": pair.real.frame.name, "alignment": alignment, **pair.figures.as_dict(), **pins}
+    return {"image_name": pair.real.frame.name, "alignment": alignment, **vars(pair.figures), **pins}
 
 
 def write_plots(folder: Path, found: Statistics) -> dict[str, Path]:

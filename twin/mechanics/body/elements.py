@@ -78,15 +78,13 @@ class Elements:
         """Volume at rest, in the unit of ``add_volume``."""
         return float(self.cells.weights_mm3.sum())
 
-    def distortion_stress(self, control_mm: FloatArray) -> FloatArray:
-        """Second Piola-Kirchhoff stress of the law's distortion part at the Gauss points, (m, 8, 3, 3) in MPa."""
+    def relaxing_stress(self, control_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Second Piola-Kirchhoff stress of the law's distortion part at the Gauss points, (m, 8, 3, 3) in MPa, and the stress of the
+        difference: kappa_d times half the difference of the levels' volume strains, (m,) in MPa.
+        """
         cells = self.cells
-        return _distortion_stress(cells.controls, cells.gradients, cells.weights_mm3, self.law, np.ascontiguousarray(control_mm))
-
-    def difference_stress(self, control_mm: FloatArray) -> FloatArray:
-        """kappa_d times half the difference of the levels' volume strains, (m,) in MPa."""
-        cells = self.cells
-        return self.law[5] * _half_difference(cells.controls, cells.gradients, cells.weights_mm3, np.ascontiguousarray(control_mm))
+        stress, half = _relaxing(cells.controls, cells.gradients, cells.weights_mm3, self.law, np.ascontiguousarray(control_mm))
+        return stress, self.law[5] * half
 
     def stiffness(
         self, control_mm: FloatArray, stress: FloatArray, pressure_mpa: float, out: FloatArray, *, which: IntArray | None = None
@@ -150,17 +148,24 @@ class KeptStiffness:
 
 
 @compiled(fastmath=True)
-def _gradient(x: FloatArray, grad: FloatArray, f: FloatArray) -> None:
-    """Write F at all Gauss points into ``f``."""
-    for q in range(8):
-        for j in range(3):
-            f0, f1, f2 = 0.0, 0.0, 0.0
-            for a in range(x.shape[1]):
-                slope = grad[q, j, a]
-                f0 += x[0, a] * slope
-                f1 += x[1, a] * slope
-                f2 += x[2, a] * slope
-            f[q, 0, j], f[q, 1, j], f[q, 2, j] = f0, f1, f2
+def gather(control: FloatArray, which: IntArray, x: FloatArray) -> None:
+    """Write the positions of the controls ``which`` (b,) into ``x`` (3, b)."""
+    for a in range(len(which)):
+        for i in range(3):
+            x[i, a] = control[which[a], i]
+
+
+@compiled(fastmath=True)
+def deformation(x: FloatArray, slopes: FloatArray, f: FloatArray) -> None:
+    """Write F at a place where the splines have ``slopes`` (3, b) into ``f`` (3, 3)."""
+    for j in range(3):
+        f0, f1, f2 = 0.0, 0.0, 0.0
+        for a in range(x.shape[1]):
+            slope = slopes[j, a]
+            f0 += x[0, a] * slope
+            f1 += x[1, a] * slope
+            f2 += x[2, a] * slope
+        f[0, j], f[1, j], f[2, j] = f0, f1, f2
 
 
 @compiled(fastmath=True)
@@ -168,10 +173,9 @@ def _find_changed(elements: IntArray, gradients: FloatArray, control: FloatArray
     x, f = np.zeros((3, elements.shape[1])), np.zeros((8, 3, 3))
     out = np.zeros(len(elements), np.bool_)
     for m in range(len(elements)):
-        for a in range(elements.shape[1]):
-            for i in range(3):
-                x[i, a] = control[elements[m, a], i]
-        _gradient(x, gradients[m], f)
+        gather(control, elements[m], x)
+        for q in range(8):
+            deformation(x, gradients[m, q], f[q])
         last = at[m].ravel()
         new = f.ravel()
         most = 0.0
@@ -207,7 +211,8 @@ def _kinematics(x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatAr
     The first volume is negative if the element is inside out.
     """
     v0, v1, r0, r1 = 0.0, 0.0, 0.0, 0.0
-    _gradient(x, grad, f)
+    for q in range(8):
+        deformation(x, grad[q], f[q])
     for q in range(8):
         det[q] = determinant(f[q])
         if det[q] <= 0:
@@ -262,9 +267,7 @@ def _forces(
     f, det, stress = np.zeros((8, 3, 3)), np.zeros(8), np.zeros((8, 3, 3))
     energy = 0.0
     for m in range(len(elements)):
-        for a in range(count):
-            for i in range(3):
-                x[i, a] = control[elements[m, a], i]
+        gather(control, elements[m], x)
         r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det)
         if r0 < 0:
             return np.inf
@@ -308,9 +311,7 @@ def _stiffness(
     swell, product = np.zeros((2, 3, count), out.dtype), np.zeros((6 * count, count), out.dtype)
     scale = np.zeros(2, out.dtype)
     for m in which:
-        for a in range(count):
-            for i in range(3):
-                x[i, a] = control[elements[m, a], i]
+        gather(control, elements[m], x)
         grad = gradients[m].reshape(24, count)
         r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det)
         rest = r0 + r1
@@ -355,17 +356,18 @@ def _stiffness(
 
 
 @compiled(fastmath=True)
-def _distortion_stress(elements: IntArray, gradients: FloatArray, weights: FloatArray, law: FloatArray, control: FloatArray) -> FloatArray:
+def _relaxing(
+    elements: IntArray, gradients: FloatArray, weights: FloatArray, law: FloatArray, control: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     count = elements.shape[1]
     x = np.zeros((3, count))
     f, det, stress = np.zeros((8, 3, 3)), np.zeros(8), np.zeros((8, 3, 3))
     g = np.zeros((3, 3))
-    out = np.zeros((len(elements), 8, 3, 3))
+    out, half = np.zeros((len(elements), 8, 3, 3)), np.zeros(len(elements))
     for m in range(len(elements)):
-        for a in range(count):
-            for i in range(3):
-                x[i, a] = control[elements[m, a], i]
-        _kinematics(x, gradients[m], weights[m], f, det)
+        gather(control, elements[m], x)
+        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det)
+        half[m] = (v0 / r0 - v1 / r1) / 2
         for q in range(8):
             first_piola(law, f[q], det[q], 0.0, stress[q])
         if law[1] != 0:
@@ -376,19 +378,4 @@ def _distortion_stress(elements: IntArray, gradients: FloatArray, weights: Float
                 for j in range(3):
                     for k in range(3):  # S = F^-1 P, and g is F^-T
                         out[m, q, i, j] += g[k, i] * stress[q, k, j]
-    return out
-
-
-@compiled(fastmath=True)
-def _half_difference(elements: IntArray, gradients: FloatArray, weights: FloatArray, control: FloatArray) -> FloatArray:
-    count = elements.shape[1]
-    x = np.zeros((3, count))
-    f, det = np.zeros((8, 3, 3)), np.zeros(8)
-    out = np.zeros(len(elements))
-    for m in range(len(elements)):
-        for a in range(count):
-            for i in range(3):
-                x[i, a] = control[elements[m, a], i]
-        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det)
-        out[m] = (v0 / r0 - v1 / r1) / 2
-    return out
+    return out, half

@@ -29,7 +29,7 @@ class History:
     branches : (terms, m, 8, 3, 3) float
         H at the last state.
     difference : (m,) float
-        Stress of the kappa_d part at the last state (see ``Elements.difference_stress``).
+        Stress of the kappa_d part at the last state (see ``Elements.relaxing_stress``).
     difference_branches : (terms, m) float
         Stress in the Maxwell elements of the kappa_d part.
     """
@@ -62,8 +62,7 @@ class History:
         if not terms:
             return self
         share, fade, late = _decay(terms, step_s)
-        stress = kind.distortion_stress(control_mm)
-        difference = kind.difference_stress(control_mm)
+        stress, difference = kind.relaxing_stress(control_mm)
         grown = share * late
         return History(
             stress,

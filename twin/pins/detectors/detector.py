@@ -15,7 +15,7 @@ from scipy.spatial import QhullError, cKDTree
 from skimage.feature import blob_dog, blob_doh, blob_log
 
 from scenes.pins import PinsSpec
-from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
+from scenes.sensor import RecordingSpec, SensorSpec
 from twin.camera.capture import record
 from twin.errors import FrameError
 from twin.frames.forms import frame_size, from_raw, pin_levels, recording_to_raw
@@ -102,10 +102,6 @@ def make_detector(sensor: SensorSpec, detector: DetectorSpec, *, second_look: bo
     FrameError
         The method can't be used for the frames' form, or the parameters are those of a sensor with another number of pins.
     """
-    if detector.pins_px and len(detector.pins_px) != sensor.pins.count:
-        raise FrameError(
-            f"'{detector.name}' was tuned for {len(detector.pins_px)} pins, {sensor.name} has {sensor.pins.count}: tune it for this sensor"
-        )
     sensor = with_detector(sensor, detector)
     if detector.method == "legacy":
         return LegacyDetector(sensor.pins, sensor.recording, detector)
@@ -149,16 +145,15 @@ class MatchedDetector:
 
     def __call__(self, frame: Frame) -> Found:
         count = len(self._reference.pins_px)
-        lost = np.full((count, 2), np.nan)
+        pins_px = np.full((count, 2), np.nan)
         try:
             px, area = self._places(frame)
         except FrameError as error:
-            return Found(np.zeros((0, 2)), lost, None, count, False, str(error))
+            return Found(np.zeros((0, 2)), pins_px, None, count, False, str(error))
         if len(px) > MOST_BLOBS * count:
-            return Found(px, lost, None, count, False, f"too many blobs: {len(px)}")
+            return Found(px, pins_px, None, count, False, f"too many blobs: {len(px)}")
         found = match(self._reference, px, area)
         paired = found.blob >= 0
-        pins_px = np.full((count, 2), np.nan)
         pins_px[paired] = px[found.blob[paired]]
         nodes_px = np.where(paired[:, None], pins_px, found.predicted_px)
         valid = bool(paired.sum() >= MIN_FOUND * count) and bool(np.isfinite(nodes_px).all())
@@ -203,7 +198,7 @@ class LegacyDetector:
 def _find_blobs(detector: DetectorSpec, mask: Mask, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Places and areas of the blobs in a frame's mask."""
     window = pin_levels(np.ascontiguousarray(frame.image[mask.window]), detector.blob.polarity)
-    return find(np.ascontiguousarray(window), mask, detector)
+    return FINDERS[detector.method](np.ascontiguousarray(window), mask, detector)
 
 
 def _own(detector: DetectorSpec, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
@@ -212,14 +207,9 @@ def _own(detector: DetectorSpec, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     return px, np.full(len(px), np.pi * detector.radius_px[0] * detector.radius_px[1])
 
 
-def find(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Places (K, 2), px of the frame, and areas (K,) of the blobs in a mask's window (h, w) uint8."""
-    return FINDERS[detector.method](window, mask, detector)
-
-
 def _components(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
     """Connected components above a fixed or adaptive threshold."""
-    blob = detector.blob if detector.method == "adaptive" else _with_fixed_threshold(detector.blob)
+    blob = detector.blob if detector.method == "adaptive" else detector.blob.model_copy(update={"threshold_block_px": 0})
     binary = threshold(window, mask.disc, blob)
     if blob.erosion_px > 1:
         binary = cv2.erode(binary, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
@@ -227,11 +217,6 @@ def _components(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple
     area = stats[1:, cv2.CC_STAT_AREA].astype(float)
     keep = (area >= blob.min_area_px2) & (area <= MOST_CAPS * np.pi * detector.radius_px[1] ** 2)
     return centroids[1:][keep] + mask.corner_px, area[keep]
-
-
-def _with_fixed_threshold(blob: BlobSpec) -> BlobSpec:
-    """The same parameters with a fixed threshold."""
-    return blob.model_copy(update={"threshold_block_px": 0})
 
 
 def _simple(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:

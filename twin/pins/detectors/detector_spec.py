@@ -9,10 +9,10 @@ from pydantic import Field, model_validator
 
 from scenes.base import Fraction, Name, Positive, Section, SpecError
 from scenes.load import read_section
-from scenes.sensor import BlobSpec, CameraSpec, RecordingSpec, SensorSpec
+from scenes.sensor import BlobSpec, CameraSpec, Polarity, RecordingSpec, SensorSpec
 from twin.camera.projection import project
 from twin.errors import FrameError
-from twin.frames.forms import blob_spec, known_frames
+from twin.frames.forms import blob_spec, known_sizes
 from twin.geometry.pins import rest_pins
 from twin.store import write_result
 from twin.types import Form
@@ -146,7 +146,7 @@ def with_detector(spec: SensorSpec, detector: DetectorSpec) -> SensorSpec:
     pipeline = spec.pipeline.model_copy(update={str(detector.form): blob})
     changed: dict[str, Section | None] = {"pipeline": pipeline}
     size = detector.size_px
-    if size is not None and size != known_frames(spec).size_px.get(detector.form):
+    if size is not None and size != known_sizes(spec).get(detector.form):
         width, height = size
         if detector.form == Form.RAW:
             changed["pipeline"] = pipeline.model_copy(update={"usual_caps": None})  # caps have another edge width in frames of this size
@@ -157,15 +157,19 @@ def with_detector(spec: SensorSpec, detector: DetectorSpec) -> SensorSpec:
         elif spec.recording is not None:
             changed["recording"] = spec.recording.model_copy(update={"width_px": width, "height_px": height})
         else:
-            whole = (0, 0, spec.camera.width_px, spec.camera.height_px)
-            changed["recording"] = RecordingSpec(
-                crop_px=whole,
-                width_px=width,
-                height_px=height,
-                threshold_block_px=UNKNOWN_BLOCK_PX,
-                threshold_offset=UNKNOWN_OFFSET if blob.polarity == "bright" else -UNKNOWN_OFFSET,
-            )
+            changed["recording"] = whole_recording((spec.camera.width_px, spec.camera.height_px), size, blob.polarity)
     return spec.model_copy(update=changed)
+
+
+def whole_recording(camera_px: tuple[int, int], size_px: tuple[int, int], polarity: Polarity) -> RecordingSpec:
+    """A recorder that keeps the camera's whole frame. Thresholded frames do not show how they were thresholded."""
+    return RecordingSpec(
+        crop_px=(0, 0, *camera_px),
+        width_px=size_px[0],
+        height_px=size_px[1],
+        threshold_block_px=UNKNOWN_BLOCK_PX,
+        threshold_offset=UNKNOWN_OFFSET if polarity == "bright" else -UNKNOWN_OFFSET,
+    )
 
 
 def camera_seeing(spec: SensorSpec, pins_px: np.ndarray, known: np.ndarray) -> CameraSpec:

@@ -114,5 +114,4 @@ def _function(path: Path, name: str, digest: str) -> Callable[[np.ndarray], Any]
     if not callable(function):
         there = [key for key, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__ and callable(value)]
         raise OptionError(f"{path}: has no function '{name}'; it has: {', '.join(there) or 'none'}")
-    found: Callable[[np.ndarray], Any] = function
-    return found
+    return function

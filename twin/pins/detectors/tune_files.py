@@ -6,7 +6,7 @@ from pathlib import Path
 from scenes import SensorSpec
 from twin.errors import OptionError
 from twin.frames import Recording, evenly_read, open_recording
-from twin.frames.forms import known_frames, times
+from twin.frames.forms import known_sizes, times
 from twin.pins.detectors.detector_spec import Evidence, Method, write_detector
 from twin.pins.detectors.tune import Tuned, tune
 from twin.pins.pipeline import Pipeline
@@ -109,7 +109,7 @@ def tune_on_frames(
 
 def _worse(evidence: Evidence, recording: Recording, frames: list[Frame], sensor: SensorSpec) -> list[str]:
     """A note if the specification's own detection finds all pins in more of the frames; none for frames of another size."""
-    if known_frames(sensor).size_px.get(recording.form) != recording.size_px:
+    if known_sizes(sensor).get(recording.form) != recording.size_px:
         return []
     own = Pipeline(sensor, recording.form)
     rate = sum(own(frame).complete for frame in frames) / len(frames)
@@ -123,7 +123,7 @@ def _worse(evidence: Evidence, recording: Recording, frames: list[Frame], sensor
 
 def _of_another_size(recording: Recording, sensor: SensorSpec) -> list[str]:
     """A note if the frames have the size of none of the sensor's forms."""
-    sizes = known_frames(sensor).size_px.values()
+    sizes = known_sizes(sensor).values()
     if recording.size_px in sizes:
         return []
     own = " or ".join(times(size) for size in sizes)

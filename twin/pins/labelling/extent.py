@@ -75,8 +75,7 @@ def filled_area(images: Sequence[np.ndarray]) -> np.ndarray | None:
 def _flat(high: np.ndarray, low: np.ndarray) -> np.ndarray:
     """Pixels (H, W) in whose neighbourhood all frames have one level; ``high`` and ``low`` are the frames' largest and smallest levels."""
     square = np.ones((FLAT_SIDE_PX, FLAT_SIDE_PX), np.uint8)
-    same: np.ndarray = cv2.dilate(high, square) == cv2.erode(low, square)
-    return same
+    return cv2.dilate(high, square) == cv2.erode(low, square)
 
 
 def with_view(spots: Bumps, filled: np.ndarray | None) -> Bumps:

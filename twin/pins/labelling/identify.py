@@ -550,8 +550,7 @@ def symmetries(pins: PinsSpec) -> list[np.ndarray]:
 def _map(pins: PinsSpec, order: np.ndarray) -> np.ndarray:
     """Linear map (2, 2) from the places of a layout to those of its pins in another order."""
     places = pin_lattice(pins).places
-    found: np.ndarray = np.linalg.lstsq(places, places[order], rcond=None)[0]
-    return found
+    return np.linalg.lstsq(places, places[order], rcond=None)[0]
 
 
 def _turned_alike(pins: PinsSpec, seen: list[LayoutInFrame]) -> list[LayoutInFrame]:

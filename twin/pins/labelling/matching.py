@@ -120,6 +120,15 @@ class LayoutArrays(NamedTuple):
     ring_ends: np.ndarray
 
 
+class FrameBlobs(NamedTuple):
+    """Blobs of a frame: places (K, 2) px, areas (K,), the cells in which they are looked up, and the side of a cell, px."""
+
+    px: np.ndarray
+    area: np.ndarray
+    buckets: Buckets
+    cell: float
+
+
 @dataclass(frozen=True)
 class Match:
     """A labelling of the blobs.
@@ -247,10 +256,7 @@ def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) 
     nothing = Match(np.full(n, -1), np.full((n, 2), np.nan), -1.0)
     if len(px) < 3:
         return nothing
-    px = np.ascontiguousarray(px)
-    layout = _layout(reference)
-    cell = reference.pitch_px
-    buckets = fill_buckets(px, cell)
+    layout, blobs = _layout(reference), _put_in_cells(reference, px, area_px2)
     grown: dict[bytes, np.ndarray] = {}
     large: list[np.ndarray] = []  # a start that one of them holds would grow to the same one
     best = None
@@ -259,13 +265,13 @@ def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) 
             continue
         start = np.full(n, -1)
         start[pin] = blob
-        labels = _grow(*layout[:3], px, start, buckets, cell)
-        unwound = _unwound(layout.rest, px, labels, layout.slots, layout.ring_ends)
+        labels = _grow(layout, blobs, start)
+        unwound = _unwound(layout, blobs.px, labels)
         if (unwound >= 0).any() and not np.array_equal(unwound, labels):
-            labels = _grow(*layout[:3], px, unwound, buckets, cell)
+            labels = _grow(layout, blobs, unwound)
         count = int((labels >= 0).sum())
         if count >= NEARLY_ALL * n or (count >= NEARLY_ALL**2 * len(px) and count > MIN_SETTLED * n):
-            found = _refine(layout, px, area_px2, labels, buckets, cell)
+            found = _refine(layout, blobs, labels)
             away = _rim_displacement(reference, px, found.blob)
             settled = found.score >= SETTLED * count and (count >= NEARLY_ALL * n or away < NEAR_REST)
             if settled or (away < HARDLY_MOVED and (found.blob >= 0).sum() == len(px) == n and proven(reference, px, found.blob)):
@@ -276,7 +282,7 @@ def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) 
             large.append(labels)
     if best is None:
         likely = sorted(grown.values(), key=lambda labels: -int((labels >= 0).sum()))[:REFINED]
-        best = _leading(reference, px, [_refine(layout, px, area_px2, labels, buckets, cell) for labels in likely])
+        best = _leading(reference, px, [_refine(layout, blobs, labels) for labels in likely])
         if best.score < nothing.score:
             return nothing
     return best
@@ -309,10 +315,7 @@ def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np
     """Refine a labelling ``blob`` (N,) of nearly all pins for a slightly different set of blobs, in the way that ``match`` found it."""
     if found is not None and found.drifted:
         return look_again(reference, px, area_px2, replace(found, blob=np.full(len(blob), -1)))
-    px = np.ascontiguousarray(px)
-    cell = reference.pitch_px
-    layout = _layout(reference)
-    return _refine(layout, px, area_px2, blob, fill_buckets(px, cell), cell)
+    return _refine(_layout(reference), _put_in_cells(reference, px, area_px2), blob)
 
 
 def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: Match) -> Match:
@@ -328,10 +331,8 @@ def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: M
     main = part == np.bincount(part[part >= 0]).argmax()
     if main[blob >= 0].all():
         return found
-    px = np.ascontiguousarray(px)
-    cell = reference.pitch_px
-    layout, buckets = _layout(reference), fill_buckets(px, cell)
-    again = _refine(layout, px, area_px2, _grow(*layout[:3], px, np.where(main, blob, -1), buckets, cell), buckets, cell)
+    layout, blobs = _layout(reference), _put_in_cells(reference, px, area_px2)
+    again = _refine(layout, blobs, _grow(layout, blobs, np.where(main, blob, -1)))
     across = (blob >= 0) & (again.blob < 0) & ~np.isin(blob, again.blob)
     if across.any():
         nodes_px = complete(reference, np.where(again.blob[:, None] >= 0, px[again.blob], np.nan))
@@ -342,7 +343,7 @@ def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: M
             pins = np.flatnonzero(across & (part == one))
             if np.median(away[pins[np.argsort(gap[pins])[:NEAR]]]) < FINAL_GATE:
                 start[pins] = blob[pins]
-        again = _refine(layout, px, area_px2, start, buckets, cell)
+        again = _refine(layout, blobs, start)
     renamed = (again.blob != blob) & (again.blob >= 0) & (blob >= 0)
     return replace(again, lead=0.0 if renamed.any() and again.score <= found.score else found.lead)
 
@@ -368,7 +369,7 @@ def complete(reference: Reference, pins_px: np.ndarray) -> np.ndarray:
     nodes_px = np.where(found[:, None], pins_px, reference.pins_px)
     known = found.astype(float)
     while known.any() and not known.all():  # from the edge of a gap inwards
-        predicted = predict_all(reference.pins_px, reference.neighbours, reference.spacing_px, nodes_px, known)
+        predicted = predict_all(_layout(reference), nodes_px, known)
         new = (known == 0) & np.isfinite(predicted[:, 0])
         if not new.any():
             break
@@ -378,9 +379,7 @@ def complete(reference: Reference, pins_px: np.ndarray) -> np.ndarray:
 
 
 @compiled()
-def predict(
-    i: int, rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, moved: np.ndarray, weight: np.ndarray
-) -> tuple[float, float, int]:
+def predict(i: int, layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray) -> tuple[float, float, int]:
     """Displacement of pin ``i`` as predicted from its neighbours alone, and the number of neighbours that were used.
 
     u(x) = a + G (x - x_i) is fitted by weighted least squares to the neighbours with ``weight`` > 0. A small penalty of the gradient G
@@ -389,9 +388,7 @@ def predict(
     Parameters
     ----------
     i : int
-    rest : (N, 2) float
-    neighbours : (N, k) int
-    spacing : (N,) float
+    layout : LayoutArrays
     moved : (N, 2) float
         Current positions, px.
     weight : (N,) float
@@ -403,6 +400,7 @@ def predict(
         Displacement, px.
     count : int
     """
+    rest, neighbours, spacing = layout.rest, layout.neighbours, layout.spacing
     s2 = spacing[i] * spacing[i]
     m00 = m01 = m02 = 0.0
     m11 = m22 = RIDGE
@@ -440,32 +438,40 @@ def predict(
 
 
 @compiled()
-def predict_all(rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, moved: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def predict_all(layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Each pin's position (N, 2) as predicted from its neighbours; NaN if no neighbour has a weight."""
+    rest = layout.rest
     out = np.empty_like(rest)
     for i in range(len(rest)):
-        ux, uy, count = predict(i, rest, neighbours, spacing, moved, weight)
+        ux, uy, count = predict(i, layout, moved, weight)
         out[i, 0] = rest[i, 0] + ux if count else np.nan
         out[i, 1] = rest[i, 1] + uy if count else np.nan
     return out
 
 
 @compiled()
-def _grow(
-    rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, px: np.ndarray, start: np.ndarray, buckets: Buckets, cell: float
-) -> np.ndarray:
+def _pairs(px: np.ndarray, blob: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 2) of the pairs of a labelling (N,), and their weights (N,): 1, and 0 for a pin without a blob."""
+    moved, weight = np.zeros((len(blob), 2)), np.zeros(len(blob))
+    for i in range(len(blob)):
+        if blob[i] >= 0:
+            moved[i, 0], moved[i, 1] = px[blob[i], 0], px[blob[i], 1]
+            weight[i] = 1.0
+    return moved, weight
+
+
+@compiled()
+def _grow(layout: LayoutArrays, blobs: FrameBlobs, start: np.ndarray) -> np.ndarray:
     """Grow a labelling (N,) from ``start`` (N,), which has at least one pair. Each round labels pins next to labelled ones."""
+    rest, neighbours, spacing, px = layout.rest, layout.neighbours, layout.spacing, blobs.px
     n = len(rest)
     blob = start.copy()
-    moved = np.zeros((n, 2))
-    weight = np.zeros(n)
+    moved, weight = _pairs(px, blob)
     taken = np.zeros(len(px), np.bool_)
     near = min(6, neighbours.shape[1])
     labelled = 0
     for i in range(n):
         if blob[i] >= 0:
-            moved[i, 0], moved[i, 1] = px[blob[i], 0], px[blob[i], 1]
-            weight[i] = 1.0
             taken[blob[i]] = True
             labelled += 1
     claim = np.full(len(px), -1)
@@ -486,12 +492,12 @@ def _grow(
                     touching += blob[neighbours[i, k]] >= 0
                 if touching == 0:
                     continue
-                ux, uy, count = predict(i, rest, neighbours, spacing, moved, weight)
+                ux, uy, count = predict(i, layout, moved, weight)
                 if count == tried[i] or count < min(least, labelled):
                     continue
                 tried[i] = count
                 x, y = rest[i, 0] + ux, rest[i, 1] + uy
-                k, d2 = nearest_free(x, y, GROW_GATES[level] * spacing[i], px, taken, buckets, cell)
+                k, d2 = nearest_free(x, y, GROW_GATES[level] * spacing[i], px, taken, blobs.buckets, blobs.cell)
                 if k >= 0:
                     cost = d2 / (spacing[i] * spacing[i])
                     if claim[k] < 0 or cost < claim_cost[k]:
@@ -510,10 +516,9 @@ def _grow(
 
 
 @compiled()
-def _ring_turns(
-    rest: np.ndarray, px: np.ndarray, blob: np.ndarray, slots: np.ndarray, ring_ends: np.ndarray, winding: int
-) -> tuple[np.ndarray, int]:
+def _ring_turns(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray, winding: int) -> tuple[np.ndarray, int]:
     """Turn of each ring (R,) as a unit complex number (0: unknown) after its labels are shifted back by ``winding``; number known."""
+    rest, slots, ring_ends = layout.rest, layout.slots, layout.ring_ends
     turns = np.zeros(len(ring_ends) - 1, np.complex128)
     known = 0
     for ring in range(len(turns)):
@@ -539,14 +544,15 @@ def _ring_turns(
 
 
 @compiled()
-def _unwound(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, slots: np.ndarray, ring_ends: np.ndarray) -> np.ndarray:
+def _unwound(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray) -> np.ndarray:
     """A labelling (N,) whose rings are shifted back by the number of pins with which they turn most alike.
 
     If anything is shifted, the innermost rings lose their labels.
     """
-    best, most_alike = 0, abs(_ring_turns(rest, px, blob, slots, ring_ends, 0)[0][BROKEN_RINGS:].sum())
+    slots, ring_ends = layout.slots, layout.ring_ends
+    best, most_alike = 0, abs(_ring_turns(layout, px, blob, 0)[0][BROKEN_RINGS:].sum())
     for winding in range(-MAX_WINDING, MAX_WINDING + 1):
-        alike = abs(_ring_turns(rest, px, blob, slots, ring_ends, winding)[0][BROKEN_RINGS:].sum())
+        alike = abs(_ring_turns(layout, px, blob, winding)[0][BROKEN_RINGS:].sum())
         if alike > most_alike:
             best, most_alike = winding, alike
     if best == 0:
@@ -562,21 +568,14 @@ def _unwound(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, slots: np.ndarr
 
 
 @compiled()
-def _trust(
-    rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, px: np.ndarray, blob: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _trust(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions (N, 2) of the pairs, and their weights (N,), which decrease with the distance from the place predicted by neighbours."""
-    n = len(rest)
-    moved, weight = np.zeros((n, 2)), np.zeros(n)
-    for i in range(n):
-        if blob[i] >= 0:
-            moved[i, 0], moved[i, 1] = px[blob[i], 0], px[blob[i], 1]
-            weight[i] = 1.0
-    predicted = predict_all(rest, neighbours, spacing, moved, weight)
-    for i in range(n):
+    moved, weight = _pairs(px, blob)
+    predicted = predict_all(layout, moved, weight)
+    for i in range(len(blob)):
         if weight[i] > 0:
             r2 = (predicted[i, 0] - moved[i, 0]) ** 2 + (predicted[i, 1] - moved[i, 1]) ** 2
-            weight[i] = 1.0 / (1.0 + r2 / (SOFT_RESIDUAL * spacing[i]) ** 2)
+            weight[i] = 1.0 / (1.0 + r2 / (SOFT_RESIDUAL * layout.spacing[i]) ** 2)
             if not np.isfinite(weight[i]):
                 weight[i] = 0.0
     return moved, weight
@@ -584,22 +583,15 @@ def _trust(
 
 @compiled()
 def _candidates(
-    predicted: np.ndarray,
-    neighbours: np.ndarray,
-    spacing: np.ndarray,
-    px: np.ndarray,
-    area: np.ndarray,
-    blob: np.ndarray,
-    buckets: Buckets,
-    cell: float,
+    layout: LayoutArrays, of_frame: FrameBlobs, predicted: np.ndarray, blob: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
     """Possible pairs within the gate: pins, blobs and costs (p,), and whether a pin or blob is in more than one of them."""
-    n = len(predicted)
+    neighbours, spacing, px, area, cell, n = layout.neighbours, layout.spacing, of_frame.px, of_frame.area, of_frame.cell, len(predicted)
     # numba needs lists of a known type, also empty ones
     pins: list[int] = [0 for _ in range(0)]
     blobs: list[int] = [0 for _ in range(0)]
     costs: list[float] = [0.0 for _ in range(0)]
-    head, following, x0, y0, columns, rows = buckets
+    head, following, x0, y0, columns, rows = of_frame.buckets
     uses = np.zeros(len(px), np.int64)
     contested = False
     for i in range(n):
@@ -649,22 +641,21 @@ def _assign(n: int, blob_count: int, pins: np.ndarray, blobs: np.ndarray, costs:
     return blob
 
 
-def _refine(layout: LayoutArrays, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: Buckets, cell: float) -> Match:
+def _refine(layout: LayoutArrays, blobs: FrameBlobs, blob: np.ndarray) -> Match:
     """Re-assign every pin to the blobs near where its neighbours predict it, until nothing changes."""
-    rest, neighbours, spacing, slots, ring_ends = layout
+    px = blobs.px
     for _ in range(REFINE_ROUNDS):
-        moved, weight = _trust(rest, neighbours, spacing, px, blob)
-        predicted = predict_all(rest, neighbours, spacing, moved, weight)
+        predicted = predict_all(layout, *_trust(layout, px, blob))
         before = blob
-        blob = _assign(len(rest), len(px), *_candidates(predicted, neighbours, spacing, px, area, blob, buckets, cell))
+        blob = _assign(len(blob), len(px), *_candidates(layout, blobs, predicted, blob))
         if np.array_equal(blob, before):
             break
-    blob = _adopt(layout, px, area, blob, predicted)
+    blob = _adopt(layout, px, blobs.area, blob, predicted)
     found = blob >= 0
-    residual2 = ((px[blob[found]] - predicted[found]) ** 2).sum(axis=1) / (FINAL_GATE * spacing[found]) ** 2
-    turns, count = _ring_turns(rest, px, blob, slots, ring_ends, 0)
+    residual2 = ((px[blob[found]] - predicted[found]) ** 2).sum(axis=1) / (FINAL_GATE * layout.spacing[found]) ** 2
+    turns, count = _ring_turns(layout, px, blob, 0)
     turned = 1.0 - turns.real.sum() / max(count, 1)
-    return Match(blob, predicted, float(found.sum() - residual2.sum() - TURN_WEIGHT * len(rest) * turned))
+    return Match(blob, predicted, float(found.sum() - residual2.sum() - TURN_WEIGHT * len(blob) * turned))
 
 
 def _adopt(layout: LayoutArrays, px: np.ndarray, area: np.ndarray, blob: np.ndarray, predicted: np.ndarray) -> np.ndarray:
@@ -715,3 +706,8 @@ def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
 
 def _layout(reference: Reference) -> LayoutArrays:
     return LayoutArrays(reference.pins_px, reference.neighbours, reference.spacing_px, reference.slots, reference.ring_ends)
+
+
+def _put_in_cells(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> FrameBlobs:
+    px, cell = np.ascontiguousarray(px), reference.pitch_px
+    return FrameBlobs(px, area_px2, fill_buckets(px, cell), cell)

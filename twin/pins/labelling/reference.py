@@ -99,8 +99,7 @@ class Reference:
     def map_to(self, other: "Reference") -> np.ndarray:
         """Linear map (2, 2) of the same pins about their middle in another view: ``displacements @ map`` are those in that view."""
         here, there = (each.pins_px - each.pins_px.mean(axis=0) for each in (self, other))
-        linear: np.ndarray = np.linalg.lstsq(here, there, rcond=None)[0]
-        return linear
+        return np.linalg.lstsq(here, there, rcond=None)[0]
 
 
 def mean_radius(px: np.ndarray) -> float:
@@ -125,8 +124,7 @@ def spread_out(pins_px: np.ndarray) -> bool:
 def together(pins_px: np.ndarray) -> np.ndarray:
     """Pins (N,) bool of pins (N, 2) that are at the place of another one: nearer to it than ``FOLDED`` median spacings."""
     spacing = cKDTree(pins_px).query(pins_px, k=2)[0][:, 1]
-    at_another: np.ndarray = spacing <= FOLDED * np.median(spacing)
-    return at_another
+    return spacing <= FOLDED * np.median(spacing)
 
 
 def make_reference(pins_px: np.ndarray, pins: PinsSpec) -> Reference:

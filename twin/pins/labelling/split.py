@@ -100,9 +100,12 @@ def _parts(blobs: Blobs, label: int, seeds_px: np.ndarray) -> tuple[np.ndarray, 
     return middle + centers, share / weight.sum()
 
 
-def _with_parts(blobs: Blobs, split: list[int], px: list[np.ndarray], area_px2: list[float], label: list[int]) -> Blobs:
-    """The blobs, in which those with the labels ``split`` are replaced by parts with places (2,), areas and labels."""
-    rest = ~np.isin(blobs.label, split)
+def _with_parts(blobs: Blobs, parts: dict[int, tuple[np.ndarray, np.ndarray]]) -> Blobs:
+    """The blobs, in which those with the labels of ``parts`` are replaced by their parts at places (n, 2) with areas (n,)."""
+    if not parts:
+        return blobs
+    rest, (px, area_px2) = ~np.isin(blobs.label, list(parts)), map(np.concatenate, zip(*parts.values(), strict=True))
+    label = np.repeat(list(parts), [len(places) for places, _ in parts.values()])
     return replace(
         blobs,
         px=np.concatenate([blobs.px[rest], px]),
@@ -127,10 +130,7 @@ def split_chains(blobs: Blobs) -> Blobs:
     around = np.argpartition(distance2, AROUND - 1, axis=1)[:, :AROUND]
     odd = blobs.elongation[long] > ODD_ELONGATION * np.median(blobs.elongation[around], axis=1)
     caps_in = blobs.area_px2[long] / np.median(blobs.area_px2[around], axis=1)
-    split: list[int] = []
-    px: list[np.ndarray] = []
-    part_area: list[float] = []
-    part_label: list[int] = []
+    parts: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     odd &= (caps_in > MIN_CAPS_NECKED) & (caps_in < MAX_CAPS)
     for k, caps in zip(long[odd], caps_in[odd], strict=True):
         pixels, level = blobs.pixels(int(blobs.label[k]))
@@ -148,11 +148,8 @@ def split_chains(blobs: Blobs) -> Blobs:
             seeds = middle + np.outer(np.quantile(along, (np.arange(count) + 0.5) / count), axis)
             centers, share = _parts(blobs, int(blobs.label[k]), seeds)
         if share.min() > MIN_PART / count:
-            split.append(int(blobs.label[k]))
-            px += list(centers)
-            part_area += list(share * blobs.area_px2[k])
-            part_label += [int(blobs.label[k])] * count
-    return _with_parts(blobs, split, px, part_area, part_label) if split else blobs
+            parts[int(blobs.label[k])] = centers, share * blobs.area_px2[k]
+    return _with_parts(blobs, parts)
 
 
 def _bright_around(reference: Reference, blobs: Blobs, found: Match, pins: list[int], centers: np.ndarray) -> bool:
@@ -186,10 +183,7 @@ def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
     owned_label = np.where(labelled, blobs.label[found.blob], 0)
     area = np.full(len(found.blob), np.nan)
     area[labelled] = blobs.area_px2[found.blob[labelled]]
-    split: list[int] = []
-    px: list[np.ndarray] = []
-    part_area: list[float] = []
-    part_label: list[int] = []
+    parts: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for label, pins in claims.items():
         pins += np.flatnonzero(owned_label == label).tolist()
         around = area[reference.neighbours[pins]]
@@ -204,10 +198,5 @@ def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
         apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.diag(np.full(len(pins), np.inf))
         separate = apart.min() > MIN_SEPARATION * 2 * np.sqrt(expected / np.pi) and share.min() > MIN_PART / len(pins)
         if separate and away.max() < REACH and not _bright_around(reference, blobs, found, pins, centers):
-            split.append(label)
-            px += list(centers)
-            part_area += list(share * whole)
-            part_label += [label] * len(pins)
-    if not split:
-        return blobs
-    return _with_parts(blobs, split, px, part_area, part_label)
+            parts[label] = centers, share * whole
+    return _with_parts(blobs, parts)

@@ -232,5 +232,4 @@ def uneven_dent(pins: PinsSpec, pins_px: np.ndarray) -> float:
 def _mean(moved: np.ndarray) -> np.ndarray:
     """Means (N, 2) of motions (N, k, 2) without NaN; 0 where all are NaN."""
     known = np.isfinite(moved[..., :1])
-    mean: np.ndarray = np.where(known, moved, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    return mean
+    return np.where(known, moved, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)

@@ -42,8 +42,7 @@ def turned_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray
 
 
 def _turn(degrees: float, shape: tuple[int, ...]) -> np.ndarray:
-    matrix: np.ndarray = cv2.getRotationMatrix2D(((shape[1] - 1) / 2, (shape[0] - 1) / 2), -degrees, 1.0)
-    return matrix
+    return cv2.getRotationMatrix2D(((shape[1] - 1) / 2, (shape[0] - 1) / 2), -degrees, 1.0)
 
 
 def mirrored(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:

@@ -35,6 +35,7 @@ from twin.cli.options import (
     Threads,
     Tuning,
     Workers,
+    call,
     each_once,
     finite,
     load_if_named,
@@ -128,18 +129,10 @@ def make_dataset(
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.generation.run import config_for, simulate_dataset
 
-    config = config_for(
-        with_residual_if(residual, load_sensor(sensor)),
-        load_experiment(experiment, wide=wide),
-        obj=load_if_named(load_object, obj),
-        images=images,
-        states=states,
-        randomisation=load_if_named(load_randomisation, randomise),
-        seed=seed,
-        quality=quality,
-        across=elements,
-    )
-    return simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, also=tuple(also or ()), progress=progress)
+    spec, of = with_residual_if(residual, load_sensor(sensor)), load_experiment(experiment, wide=wide)
+    touched, randomisation = load_if_named(load_object, obj), load_if_named(load_randomisation, randomise)
+    config = call(config_for, locals(), sensor=spec, experiment=of, obj=touched)
+    return call(simulate_dataset, locals())
 
 
 @app.command("train", goes_on=True)
@@ -218,25 +211,8 @@ def train(
     """
     from training.studies.train import train_model
 
-    return train_model(
-        model,
-        sensor_with(sensor, pipeline),
-        require_one_recording(data, table, no_contact),
-        out,
-        target=target,
-        labels=label_kind,
-        seed=seed,
-        split=None if split < 0 else split,
-        epochs=epochs,
-        batch=batch,
-        members=members,
-        kernel=kernel,
-        max_minutes=max_minutes,
-        threads=threads,
-        device=device,
-        form=form,
-        progress=progress,
-    )
+    recordings, kept_out = require_one_recording(data, table, no_contact), None if split < 0 else split
+    return call(train_model, locals(), sensor=sensor_with(sensor, pipeline), split=kept_out)
 
 
 @app.command("evaluate")
@@ -284,7 +260,7 @@ def evaluate(
     from training.studies.evaluation import evaluate_run
 
     recordings = require_one_recording(data, table, no_contact)
-    return evaluate_run(run, recordings, out, rows=rows, labels=label_kind, robustness=robustness, progress=progress)
+    return call(evaluate_run, locals())
 
 
 @app.command("predict")
@@ -369,7 +345,7 @@ def make_surrogate(
     from scenes import load_sensor
     from training.surrogate.fit import distil
 
-    return distil(load_sensor(sensor), out, paths=paths, processes=workers, seed=seed, progress=progress)
+    return call(distil, locals(), sensor=load_sensor(sensor))
 
 
 @app.command("learn")
@@ -420,15 +396,6 @@ def learn(
     from training.environments.batch import Options
     from training.environments.learn import LearnPlan, learn_policy
 
-    asked = {
-        "sensor": sensor,
-        "observation": observation,
-        "randomise": randomise,
-        "friction_history": friction_history,
-        "surrogate": surrogate,
-        "objects": names_in(objects) if objects else None,
-    }
-    plan = LearnPlan(
-        task, Options.from_keywords(asked), minutes=minutes, environments=environments, fem_episodes=fem, seed=seed, sight=state_estimator
-    )
+    options = call(Options, locals(), objects=names_in(objects) if objects else None)
+    plan = call(LearnPlan, locals(), fem_episodes=fem, sight=state_estimator)
     return learn_policy(plan, out, progress=progress)

@@ -1,9 +1,10 @@
 """Options that several commands share, and the printing of results."""
 
+import inspect
 import math
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 Given = TypeVar("Given", str, Path)
 Spec = TypeVar("Spec")
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,36 @@ def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
     if any(not least <= number <= MOST_SEED for number in numbers):
         raise typer.BadParameter(f"takes whole numbers from {least} to {MOST_SEED}, got {text!r}", param_hint=option)
     return numbers
+
+
+# Names that functions have for an option, if they have no argument of the option's own name.
+INSIDE = {
+    "data": "recordings",
+    "elements": "across",
+    "label_kind": "labels",
+    "label_table": "labels",
+    "max_frames": "limit",
+    "model": "models",
+    "num_labelled": "labels",
+    "pipeline": "pipelines",
+    "push": "pushes",
+    "safety": "limits",
+    "sim": "simulated",
+    "workers": "processes",
+}
+
+
+def call(function: Callable[..., Made], given: Mapping[str, Any], **others: Any) -> Made:
+    """Call a function, or make a plan, with those of a command's options (its ``locals()``) that are arguments of it.
+
+    An option that was not given leaves the function's default. ``others`` are arguments that differ from the option.
+    """
+    takes, arguments = inspect.signature(function).parameters, {}
+    for name, value in given.items():
+        name = name if name in takes else INSIDE.get(name, name)
+        if name in takes and value is not None:
+            arguments[name] = tuple(value) if isinstance(value, list) else value
+    return function(**arguments | others)
 
 
 def load_if_named(load: Callable[[Given], Spec], name: Given | None) -> Spec | None:

@@ -29,7 +29,6 @@ from twin.cli.options import (
     Out,
     Residual,
     Sensor,
-    Split,
     Table,
     Target,
     Threads,
@@ -41,10 +40,10 @@ from twin.cli.options import (
     load_if_named,
     names_in,
     print_lines,
-    require_one_recording,
     sensor_with,
     with_residual_if,
 )
+from twin.errors import OptionError
 from twin.progress import Progress
 from twin.types import FINE, Quality
 
@@ -135,6 +134,15 @@ def make_dataset(
     return call(simulate_dataset, locals())
 
 
+def require_one_recording(folders: list[Path], table: Path | None, no_contact: Path | None) -> list[Path]:
+    """The recordings. A table or a no-contact frame from elsewhere is allowed for a single recording only, and is attached to it."""
+    from twin.frames import frames_at
+
+    if len(folders) > 1 and (table or no_contact):
+        raise OptionError("`table` and `no_contact` belong to one recording; with several `data` put each table beside its frames")
+    return [frames_at(folder, table, no_contact) for folder in folders]
+
+
 @app.command("train", goes_on=True)
 def train(
     model: Annotated[str, typer.Option("--model", help="vgnn, touch, steered, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
@@ -144,7 +152,7 @@ def train(
     target: Target = "surface-2d",
     label_kind: Annotated[str, typer.Option("--label-kind", help="corrected or raw"), Formerly("labels")] = "corrected",
     seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and order")] = 0,
-    split: Split = 0,
+    split: Annotated[int, typer.Option("--split", min=-1, max=MOST_SEED, help="seed of the held-out fifth; -1: nothing is held out")] = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", help="epochs of training, instead of the model's own number")] = None,
     batch: Annotated[int | None, typer.Option("--batch", help="batch size, instead of the model's own")] = None,
     members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,

@@ -14,29 +14,7 @@ import typer
 
 from twin.cli import FewCommands, app
 from twin.cli.command import App
-from twin.cli.options import (
-    SHIPPED_MODEL,
-    Also,
-    ArmOption,
-    AtRest,
-    Camera,
-    DryRun,
-    Experiment,
-    FormOrAuto,
-    KnownPlace,
-    Limits,
-    Model,
-    NoiseSeed,
-    Object,
-    Out,
-    PlainLight,
-    Record,
-    Sensor,
-    ServoName,
-    Steps,
-    call,
-    print_lines,
-)
+from twin.cli.options import Also, Experiment, Formerly, FormOrAuto, Object, Out, PlainLight, Sensor, ServoName, call, print_lines
 from twin.progress import Progress
 from twin.signals import signals_as_ctrl_c
 from twin.types import FIRST, NONE
@@ -45,6 +23,27 @@ if TYPE_CHECKING:
     from hardware.collect.collect import Collected
     from hardware.live.live import WatchResult
     from hardware.servo.following import Followed
+
+# Sensor whose trained weights are shipped with the package.
+SHIPPED_MODEL = Path("mg400-331")
+Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights are shipped")]
+Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
+Steps = Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")]
+Record = Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")]
+NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")]
+KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stands exactly at --servo: measure errors against it")]
+ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS, magician:PORT")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, without motion")]
+Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, or a TOML file"), Formerly("limits")]
+AtRest = Annotated[
+    str,
+    typer.Option(
+        "--at-rest",
+        metavar="FRAME|first|none",
+        help="frame without contact, the zero of displacements: a file, the first frame (an error if it shows a contact), "
+        "or none (positions at rest of the model, or estimated from some forty contacts)",
+    ),
+]
 
 
 @app.command("live")

@@ -32,7 +32,6 @@ from twin.cli.options import (
     finite,
     load_if_named,
     names_in,
-    numbers_in,
 )
 from twin.progress import Progress
 from twin.types import FINE
@@ -213,6 +212,17 @@ def study_sim_to_real(
     of, wider = load_experiment(experiment), load_if_named(load_experiment, contacts)
     plan = call(sim_to_real.SimToRealPlan, locals(), sensor=load_sensor(sensor), experiment=of, contacts=wider)
     return sim_to_real.run(plan, out, progress=progress)
+
+
+def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
+    """The comma-separated whole numbers, each at least ``least`` and at most the largest seed."""
+    try:
+        numbers = tuple(int(part) for part in names_in(text))
+    except ValueError as error:
+        raise typer.BadParameter(f"takes whole numbers with commas between, got {text!r}", param_hint=option) from error
+    if any(not least <= number <= MOST_SEED for number in numbers):
+        raise typer.BadParameter(f"takes whole numbers from {least} to {MOST_SEED}, got {text!r}", param_hint=option)
+    return numbers
 
 
 MODELS = "gnn,tac-vgnn,vgnn,cnn-v2,cnn-v1"

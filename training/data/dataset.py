@@ -184,10 +184,8 @@ def join_datasets(parts: list[Dataset]) -> Dataset:
                 raise FrameError(f"{part.folder}: its {what} ({mine}) differs from that of {first.folder} ({others}); train on one kind")
     tables = [part.pins.relative_to(first.pins.reference) for part in parts]
     columns = {key: np.concatenate([getattr(table, key) for table in tables]) for key in PIN_COLUMNS}
-    called = shortest_distinct_ends([part.folder.resolve() for part in parts])
-    columns["image_name"] = np.concatenate(
-        [np.char.add(f"{name}/", part.pins.image_name) for name, part in zip(called, parts, strict=True)]
-    )
+    named = zip(name_prefixes([part.folder for part in parts]), parts, strict=True)
+    columns["image_name"] = np.concatenate([np.char.add(prefix, part.pins.image_name) for prefix, part in named])
     pins = replace(first.pins.with_columns(columns), measured=all(table.measured for table in tables))
     targets = joined_targets([part.targets for part in parts])
     groups: list[np.ndarray] = []
@@ -215,10 +213,12 @@ def with_common_labels(parts: Sequence[Dataset]) -> list[Dataset]:
     return [replace(part, targets=part.targets.only(common)) for part in parts]
 
 
-def shortest_distinct_ends(folders: list[Path]) -> list[str]:
-    """The shortest ends of the paths that are all different: mostly the folders' names."""
-    longest = max(len(folder.parts) for folder in folders)
-    ends = (["/".join(folder.parts[-count:]) for folder in folders] for count in range(1, longest + 1))
+def name_prefixes(folders: Sequence[Path]) -> list[str]:
+    """Text before the names of each folder's frames in a joined data set: the shortest distinct end of its path; of one folder none."""
+    if len(folders) == 1:
+        return [""]
+    parts = [folder.resolve().parts for folder in folders]
+    ends = (["/".join((*each[-count:], "")) for each in parts] for count in range(1, max(map(len, parts)) + 1))
     return next(names for names in ends if len(set(names)) == len(names))
 
 

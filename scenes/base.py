@@ -60,11 +60,14 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
+    former_keys: ClassVar[Mapping[str, str]] = {}
+    """Present keys by their names in files of version 1."""
+
     @model_validator(mode="before")
     @classmethod
-    def _lists_as_tuples(cls, data: object) -> object:
-        """Turn the lists of a file into tuples, because a section is frozen."""
-        return _as_tuples(data)
+    def _read_keys(cls, data: object) -> object:
+        """Keys under their present names, and the lists of a file as tuples, because a section is frozen."""
+        return _as_tuples({cls.former_keys.get(key, key): value for key, value in data.items()} if isinstance(data, dict) else data)
 
     @classmethod
     def file_keys(cls) -> dict[str, FieldInfo]:

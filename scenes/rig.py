@@ -1,6 +1,6 @@
 """Specification of a rig: how a robot holds a sensor, and where the object is. It relates labels in robot coordinates to contacts."""
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import model_validator
 
@@ -115,6 +115,8 @@ class RigSpec(Section):
     """
 
     contact_offset_mm: float = 0.0
+    former_keys = {"tcp_aside_mm": "tcp_binormal_mm"}
+
     tcp_to_dome_mm: float
     tcp_lateral_mm: float = 0.0
     tcp_binormal_mm: float = 0.0
@@ -130,14 +132,6 @@ class RigSpec(Section):
     turn_compliance_deg_per_n: float = 0.0
     force_sensor: ForceSensorSpec | None = None
     placed: tuple[PlacedSpec, ...] = ()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _read_former_keys(cls, keys: Any) -> Any:
-        """The keys; files of version 1 call ``tcp_binormal_mm`` ``tcp_aside_mm``."""
-        return (
-            {"tcp_binormal_mm" if key == "tcp_aside_mm" else key: value for key, value in keys.items()} if isinstance(keys, dict) else keys
-        )
 
     def for_object(self, name: str) -> "RigSpec":
         """The rig in front of the object with this name, without ``placed``."""

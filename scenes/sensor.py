@@ -579,14 +579,16 @@ class PipelineSpec(Section):
     ----------
     raw : BlobSpec
         Detection in the camera's own frames.
-    recording : BlobSpec, optional
-        Detection in the recordings' cropped and thresholded frames.
+    processed : BlobSpec, optional
+        Detection in processed frames, which are cropped and thresholded.
     usual_caps : UsualCapsSpec, optional
         Light and focus of the unit's raw frames. Without it 'twin check' uses the values of a frame that the twin draws.
     """
 
+    former_keys = {"recording": "processed"}
+
     raw: BlobSpec
-    recording: BlobSpec | None = None
+    processed: BlobSpec | None = None
     usual_caps: UsualCapsSpec | None = None
 
 
@@ -747,11 +749,11 @@ class SensorSpec(Section):
             raise ValueError(
                 f"appearance.relief needs one tile for each of the {pins.count} pins; give it a pattern above 0 to draw tiles at random"
             )
-        for form, blob in (("raw", self.pipeline.raw), ("recording", self.pipeline.recording)):
+        for form, blob in (("raw", self.pipeline.raw), ("processed", self.pipeline.processed)):
             if blob is not None and blob.rest_px and len(blob.rest_px) != pins.count:
                 raise ValueError(f"pipeline.{form}.rest_px needs one place for each of the {pins.count} pins, or none at all")
-        if (self.recording is None) != (self.pipeline.recording is None):
-            raise ValueError("recording and pipeline.recording go together: give both or neither")
+        if (self.recording is None) != (self.pipeline.processed is None):
+            raise ValueError("recording and pipeline.processed belong together: give both or neither")
         return self
 
     def _check_reach(self) -> None:

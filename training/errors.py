@@ -4,4 +4,4 @@ from twin.errors import TwinError
 
 
 class TrainingError(TwinError):
-    """A training run can't be started, continued or used as asked."""
+    """A training run can't be started, continued or used as requested."""

@@ -176,7 +176,7 @@ def make_dataset(
     out: Path | str,
     wide: bool = ...,
     obj: str | Path | ObjectSpec | None = ...,
-    images: Literal['raw', 'gray', 'recording', 'none'] = ...,
+    images: Literal['raw', 'gray', 'processed', 'none'] = ...,
     states: Literal['all', 'end'] = ...,
     randomise: str | None = ...,
     seed: int | None = ...,

@@ -312,7 +312,7 @@ class ModelContract:
 
     def test_it_trains_estimates_and_is_loaded_again(self, tmp_path: Path) -> None:
         made: dict[str, Any] = {"experiment": "surface-2d", "sensor": "mg400-127", "count": 12, "states": "all", "elements": 6}
-        twin.make_dataset(**made, workers=1, images="recording", quality="rasterised", out=tmp_path / "sim")
+        twin.make_dataset(**made, workers=1, images="processed", quality="rasterised", out=tmp_path / "sim")
         twin.train(model=self.name, sensor="mg400-127", data=tmp_path / "sim", split=-1, out=tmp_path / "run", **self.options)
         first, again = ([estimate for _, estimate in twin.predict(tmp_path / "run", tmp_path / "sim")] for _ in range(2))
         assert first and [each.reason for each in first] == [each.reason for each in again]

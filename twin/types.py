@@ -20,7 +20,7 @@ ImageArray: TypeAlias = NDArray[np.uint8]
 
 Quality = Literal["rasterised", "preview", "standard", "high"]
 """Quality of a render: rasterised with exact edges and without noise, or path-traced with an increasing number of samples."""
-FORMER_VALUES = {"drawn": "rasterised"}
+FORMER_VALUES = {"drawn": "rasterised", "recording": "processed"}
 """Present names of values of options, by their names in version 1."""
 
 
@@ -60,7 +60,11 @@ class Form(StrEnum):
     """The two forms of a sensor's frames."""
 
     RAW = "raw"  # the camera's own frame
-    PROCESSED = "recording"  # cropped, thresholded and resized at capture, as files and options call the frames of the recordings
+    PROCESSED = "processed"  # cropped, thresholded and resized at capture
+
+    @classmethod
+    def _missing_(cls, value: object) -> Any:
+        return cls._value2member_map_.get(present_value(value))
 
 
 @dataclass(frozen=True)

@@ -187,13 +187,13 @@ class BaseArm(Connection):
             rest_since = (rest_since or state.time_s) if known and not state.moving else None
             if rest_since is not None and state.time_s - rest_since > min(max(BELIEVE_REST_S, 0.1 * timeout_s), MOST_REST_S):
                 raise DeviceError(
-                    f"{self.name}: at rest {off_mm:.2f} mm and {off_deg:.2f} deg from where it was sent; the move was not executed. "
+                    f"{self.name}: at rest {off_mm:.2f} mm and {off_deg:.2f} deg from the commanded pose; the move was not executed. "
                     "Check for a stop button, a brake or an obstacle, call clear_error(), then move again"
                 )
             if time.monotonic() > deadline:
                 raise DeviceError(
-                    f"{self.name}: not there after {timeout_s:g} s ({off_mm:.2f} mm and {off_deg:.2f} deg to go) and stopped; "
-                    "give more time or more speed"
+                    f"{self.name}: not there after {timeout_s:g} s ({off_mm:.2f} mm and {off_deg:.2f} deg left) and stopped; allow more "
+                    "time or more speed"
                 )
             time.sleep(POLL_S)
 
@@ -210,7 +210,7 @@ class BaseArm(Connection):
     def _require_possible(self, pose: np.ndarray) -> None:
         """Raise ``StaleDataError`` if a reported pose (6,) is impossible, because the arm's real pose is then unknown."""
         if not (np.abs(pose) < FARTHEST).all():  # also true for NaN
-            raise StaleDataError(f"{self.name}: says that it is at {pose}, a place that no arm reaches; stop it, then restart it")
+            raise StaleDataError(f"{self.name}: reports the pose {pose}, which no arm reaches; stop it, then restart it")
 
     def _may_move(self) -> bool:
         """Whether a move that was sent may still be in progress."""
@@ -230,8 +230,8 @@ class BaseArm(Connection):
 
     def _too_long(self, timeout_s: float) -> DeviceError:
         return DeviceError(
-            f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; give more time or more speed, "
-            "or look for what holds the arm"
+            f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; allow more time or more speed, or look for an "
+            "obstacle"
         )
 
     def _require_speeds(self, linear_mm_s: float, angular_deg_s: float) -> None:

@@ -28,7 +28,7 @@ _REMEDIES = {
 def explain(alarms: list[int]) -> str:
     """One line on the given alarms, with the remedy."""
     if not alarms:
-        return "alarm (the arm does not say which); call clear_error(), then enable()"
+        return "alarm (the arm does not report which); call clear_error(), then enable()"
     said = "; ".join(dict.fromkeys(f"alarm {alarm}: {ALARMS.get(alarm, 'see the vendor manual')}" for alarm in alarms))
     first = next((_REMEDIES[alarm] for alarm in alarms if alarm in _REMEDIES), "move away from the limit")
     return f"{said}; {first}, then call clear_error() and enable()"

@@ -129,7 +129,7 @@ class LinkageKinematics:
         rows = np.vstack([np.c_[np.sin(j2), np.cos(j3), one, none], np.c_[np.cos(j2), -np.sin(j3), none, one]])
         (l1, l2, r0, z0), _, rank, _ = np.linalg.lstsq(rows, np.r_[rho, z], rcond=None)
         if rank < 4:
-            raise ValueError(f"{len(rho)} pairs leave the lengths open; give some of different J2 and J3")
+            raise ValueError(f"{len(rho)} pairs do not determine the lengths; give pairs of different J2 and J3")
         return replace(self, l1_mm=float(l1), l2_mm=float(l2), r0_mm=float(r0), z0_mm=float(z0))
 
 

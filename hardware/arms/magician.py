@@ -225,7 +225,7 @@ class Magician(LinkageArm):
                 except PORT_ERRORS as error:
                     self._close()
                     self._lost = (
-                        f"{self.name}: the port vanished ({error}). The arm goes on with what is queued: switch it off if it moves! "
+                        f"{self.name}: the port vanished ({error}). The arm executes the moves in its queue: switch it off if it moves! "
                         "Plug the cable in, then connect() again"
                     )
                     raise DeviceNotConnectedError(self._lost) from error
@@ -259,8 +259,8 @@ class Magician(LinkageArm):
             while message is not None:
                 if (message.id, message.ctrl) == (id, ctrl) and wanted not in (None, len(message.params)):
                     raise DeviceError(
-                        f"{self.name}: replied {len(message.params)} bytes to command {int(id)} instead of {wanted}: what is attached "
-                        "echoes what it is sent, or is no Magician. Name the port of the arm"
+                        f"{self.name}: replied {len(message.params)} bytes to command {int(id)} instead of {wanted}: the device echoes its "
+                        "input, or is no Magician. Give the port of the arm"
                     )
                 if (message.id, message.ctrl) == (id, ctrl):
                     return message

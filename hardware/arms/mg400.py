@@ -147,7 +147,7 @@ class MG400(LinkageArm):
             raise DeviceError(f"{self.name}: {self._alarm()}")
         if self._mode() in ENABLED_MODES and not self._enabled:
             LOG.warning(
-                "%s: is enabled already, so another program may use it; what one of the two stops or disables stands for both", self.name
+                "%s: is enabled already, so another program may use it; a stop or disable of one program is one for both", self.name
             )
         if self._supervised and not self._enabled:
             self._dashboard.supervise(*LAST_WORDS)
@@ -169,7 +169,7 @@ class MG400(LinkageArm):
         with contextlib.suppress(DeviceError):
             self._ask("ResetRobot()")
         self._ask("ClearError()")
-        self._await_mode(lambda mode: mode != Mode.ERROR, "the alarm stays; remove its cause (release the emergency stop, free the arm)")
+        self._await_mode(lambda mode: mode != Mode.ERROR, "the alarm remains; remove its cause (release the emergency stop, free the arm)")
         self._alarm_text = None
 
     def stop(self) -> None:
@@ -187,7 +187,7 @@ class MG400(LinkageArm):
                 except DeviceError:
                     raise error from None
                 raise DeviceError(
-                    f"{self.name}: would not stop and was switched off by its emergency stop; call clear_error() and enable(). {error}"
+                    f"{self.name}: did not stop, so its emergency stop was used; call clear_error() and enable(). {error}"
                 ) from error
         self._unstopped = self._under_way = False
 

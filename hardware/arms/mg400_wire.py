@@ -118,7 +118,7 @@ def why_refused(error_id: int, request: str) -> str:
         )
     if error_id == ErrorId.NO_SUCH_COMMAND:
         return (
-            f"the arm knows no {request} (-10000). If it says so to everything, the motion port 30003 is not open or another client "
+            f"the arm knows no {request} (-10000). If every command has this reply, the motion port 30003 is not open or another client "
             "holds it: close other programs (DobotStudio Pro, scripts), then connect again; else its firmware is too old"
         )
     if error_id == ErrorId.PARAMETER_COUNT:
@@ -223,11 +223,11 @@ def describe_bytes(came: bytes) -> str:
 def why_no_packet(came: bytes, *, closed: bool) -> str:
     """Reason why the bytes from a feedback port hold no packet of an MG400, with the remedy."""
     if not came and closed:
-        return "it hung up at once: another program holds the arm (DobotStudio Pro, a script). Close it, then connect again"
+        return "it closed the connection at once: another program holds the arm (DobotStudio Pro, a script). Close it, then connect again"
     if not came:
         return (
             "connected, but nothing came: the controller hangs, another program holds the feedback, or this is no MG400 "
-            "(a server that waits to be asked). Check the address, close other programs, else restart the arm"
+            "(a server that waits for a request). Check the address, close other programs, else restart the arm"
         )
     packet, _ = newest_packet(came, lenient=True)
     if packet is not None:

@@ -1,7 +1,7 @@
 """Moves an arm towards the newest target of a stream.
 
 The Dobots queue all moves and execute every one of them. If targets came faster than the arm moves, the arm would still execute old ones
-long after the stream has ended. So the way to a target is divided into short moves (pieces), and the arm gets the next piece only when it
+long after the stream has ended. So the path to a target is divided into short moves (pieces), and the arm gets the next piece only when it
 has nearly reached the end of the present one.
 """
 
@@ -66,7 +66,7 @@ class NewestTarget:
     def go(self, target: np.ndarray) -> np.ndarray:
         """Take a new target (6,), clipped to the limits of a ``SafeArm``.
 
-        Returns the end (6,) of the newest piece that was sent to the arm: the target, or a pose on the way to it.
+        Returns the end (6,) of the newest piece that was sent to the arm: the target, or a pose on the path to it.
 
         Raises
         ------

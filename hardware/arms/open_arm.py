@@ -13,7 +13,7 @@ from scenes.plugins import others
 KINDS = ("simulated", "mg400", "mg400-lenient", "magician")
 ARM_SPECS = (
     "mg400 or mg400:ADDRESS[:DASHBOARD_PORT] (an arm, or 127.0.0.1 with 'twin emulate mg400'), mg400-lenient:ADDRESS[:DASHBOARD_PORT] "
-    "(a controller that is only alike), magician or magician:/dev/ttyUSB0, "
+    "(a controller that is not an MG400's), magician or magician:/dev/ttyUSB0, "
     "simulated (six axes) or simulated:4"
 )
 

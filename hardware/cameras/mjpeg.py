@@ -164,7 +164,7 @@ def decode_jpeg(data: bytes) -> tuple[np.ndarray, str]:
     An incomplete or damaged one raises ``TornPicture``, because decoders guess the rest.
     """
     if not data.startswith(START) or not data.rstrip(b"\0\r\n").endswith(END):
-        raise TornPicture(f"a torn JPEG ({len(data)} bytes, without its {'end' if data.startswith(START) else 'start'})")
+        raise TornPicture(f"an incomplete JPEG ({len(data)} bytes, without its {'end' if data.startswith(START) else 'start'})")
     try:
         return picture_of(data)
     except FrameError as error:

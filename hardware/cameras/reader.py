@@ -63,7 +63,7 @@ class DevicePicture:
     note : str
         What was irregular in its file ("" if nothing).
     again : bool
-        Whether the device says that it sent this picture before.
+        Whether the device reports that it sent this picture before.
     """
 
     image: np.ndarray
@@ -152,7 +152,7 @@ class LiveSource(Connection):
             spent = f"{sum(outages_s):.1f} s in all, the longest {max(outages_s):.1f} s: no new picture came"
             found.append(f"{len(outages_s)} {'outage' if len(outages_s) == 1 else 'outages'} of the camera, {spent}")
         if torn:
-            found.append(f"{len(torn)} pictures came torn or damaged and were left out; the last: {torn[-1]}")
+            found.append(f"{len(torn)} pictures arrived incomplete or damaged and were left out; the last: {torn[-1]}")
         if self._repeated:
             found.append(f"{self._repeated} of {self.arrived} pictures repeat the one before them")
         return found
@@ -173,7 +173,7 @@ class LiveSource(Connection):
                 return ""
             quiet_s = awake_s() - self._fresh_s
             if len(self._periods_s) < RATE_N and quiet_s < START_S:
-                return "has given too few pictures so far"
+                return "has delivered too few pictures so far"
             return "" if quiet_s <= max(BLIND_S, BLIND_PERIODS * self._usual_s()) else f"no new picture for {quiet_s:.1f} s"
 
     def connect(self) -> None:
@@ -316,7 +316,7 @@ class LiveSource(Connection):
             return "the picture is black; check the sensor's lamps and the camera's exposure"
         if self.notices_late and (age_s := time.monotonic() - picture.time_s) > LATE_S:
             return (
-                f"the picture says that it is {age_s:.0f} s old; set the clock of the camera's computer to that of this one, "
+                f"the picture's time stamp is {age_s:.0f} s old; set the clock of the camera's computer to that of this one, "
                 "or look for what delays the pictures"
             )
         if self._still is None or not np.array_equal(self._still[0], picture.image):

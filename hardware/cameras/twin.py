@@ -110,8 +110,8 @@ class TwinCamera(LiveSource):
         self._end.wait(max(0.0, self._due_s - time.monotonic()))
         self._due_s = time.monotonic() + self._period_s
         try:
-            told = self._pose()
-            self.state = follower.move(self._placed.object_from(told.pose), told.time_s)
+            state = self._pose()
+            self.state = follower.move(self._placed.object_from(state.pose), state.time_s)
         except (ContactError, DeviceError) as error:
             self._end.wait(RETRY_S)
             self._asked.set()
@@ -120,14 +120,14 @@ class TwinCamera(LiveSource):
         self._drawn += 1
         rng = np.random.default_rng((self._seed, self._drawn))
         image = expose(light, self._spec.capture, rng, origin_px=preview.window_px[:2])
-        return DevicePicture(steady(image, self._spec.response, rng), told.time_s)
+        return DevicePicture(steady(image, self._spec.response, rng), state.time_s)
 
     def _pose(self) -> ArmState:
         """The arm's newest state. A camera that waits for its arm reports when the arm is lost and when it is back."""
         lost = False
         while True:
             try:
-                told = self._arm()
+                state = self._arm()
             except DeviceError as error:
                 if not self._waits_for_arm or self._end.is_set():
                     raise
@@ -138,7 +138,7 @@ class TwinCamera(LiveSource):
             else:
                 if lost:
                     LOG.warning("%s: its arm is back", self.name)
-                return told
+                return state
 
     def _require_open(self) -> tuple[Follower, Preview]:
         """The objects that ``_open`` made; raises ``DeviceNotConnectedError`` before it."""

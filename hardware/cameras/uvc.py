@@ -64,12 +64,10 @@ class UvcCamera(LiveSource):
         with quiet():
             device = cv2.VideoCapture(self._node, cv2.CAP_V4L2)
         if not device.isOpened():
-            raise DeviceError(
-                f"{self.name}: can't be opened; see 'twin doctor' for the cameras there are, and whether another program uses it"
-            )
+            raise DeviceError(f"{self.name}: can't be opened; 'twin doctor' lists the cameras; check whether another program uses it")
         self.report = apply_settings(device, self.settings)
-        told = next(told for name, _, told in self.report if name == "fps")
-        self.fps = told if told > 0 else self.settings.fps  # a camera may be slower than requested
+        reported = next(reported for name, _, reported in self.report if name == "fps")
+        self.fps = reported if reported > 0 else self.settings.fps  # a camera may be slower than requested
         self._device = device
 
     def _close(self) -> None:
@@ -98,7 +96,7 @@ def exposed_s(position_ms: float) -> float:
 
 def apply_settings(device: cv2.VideoCapture, settings: UvcSettings) -> list[tuple[str, float, float]]:
     """Apply the settings in the order that cameras need. Returns the name, the requested value and the value read back of each."""
-    asked = [
+    wanted = [
         ("fourcc", cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")),
         ("width", cv2.CAP_PROP_FRAME_WIDTH, settings.width_px),
         ("height", cv2.CAP_PROP_FRAME_HEIGHT, settings.height_px),
@@ -106,13 +104,13 @@ def apply_settings(device: cv2.VideoCapture, settings: UvcSettings) -> list[tupl
         ("buffers", cv2.CAP_PROP_BUFFERSIZE, BUFFERS),
     ]
     if settings.exposure is not None:
-        asked += [("auto exposure", cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE), ("exposure", cv2.CAP_PROP_EXPOSURE, settings.exposure)]
+        wanted += [("auto exposure", cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE), ("exposure", cv2.CAP_PROP_EXPOSURE, settings.exposure)]
     if settings.gain is not None:
-        asked.append(("gain", cv2.CAP_PROP_GAIN, settings.gain))
-    asked.append(("auto white balance", cv2.CAP_PROP_AUTO_WB, 0))
+        wanted.append(("gain", cv2.CAP_PROP_GAIN, settings.gain))
+    wanted.append(("auto white balance", cv2.CAP_PROP_AUTO_WB, 0))
     if settings.white_balance_k is not None:
-        asked.append(("white balance", cv2.CAP_PROP_WB_TEMPERATURE, settings.white_balance_k))
-    asked.append(("autofocus", cv2.CAP_PROP_AUTOFOCUS, 0))
-    for _, key, value in asked:  # set() does not report failures
+        wanted.append(("white balance", cv2.CAP_PROP_WB_TEMPERATURE, settings.white_balance_k))
+    wanted.append(("autofocus", cv2.CAP_PROP_AUTOFOCUS, 0))
+    for _, key, value in wanted:  # set() does not report failures
         device.set(key, value)
-    return [(name, float(value), float(device.get(key))) for name, key, value in asked]
+    return [(name, float(value), float(device.get(key))) for name, key, value in wanted]

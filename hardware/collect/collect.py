@@ -104,7 +104,7 @@ class Collection:
                 write_json(meta, about | {"made_by": made_by(collect, inputs=about)})
             elif other:
                 raise DeviceError(
-                    f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another `out`"
+                    f"{self.folder}: holds a collection with other settings ({', '.join(other)}); repeat them or give another `out`"
                 )
         elif contents(self.folder):
             raise DeviceError(f"{self.folder}: holds something else; give an empty or a new folder")
@@ -279,9 +279,9 @@ def collect(
         Another run collects into the folder, or the folder can't be written to.
     """
     if experiment.tap_frame != "work":
-        raise DeviceError(f"{experiment.name}: its tap follows the tool's axes; the arm taps along those of the work frame here")
+        raise DeviceError(f"{experiment.name}: its tap follows the tool's axes, but a collection taps along the work frame's; give another")
     if not rig.source.is_live:
-        raise DeviceError(f"{rig.source.name}: a recording shows nothing of this arm; give a live `camera`")
+        raise DeviceError(f"{rig.source.name}: a recording does not show this arm; give a live `camera`")
     timeout_s = rig.frame_timeout_s if frame_timeout_s is None else frame_timeout_s
     stops = _Stops(Mover(rig, speed, clear_mm=CLEAR_MM, patience_s=timeout_s), WorkFrame(experiment, rig.placed), timeout_s)
     with output(collection.folder), stops.mover.watching():
@@ -307,29 +307,29 @@ def collect(
     return collection.count
 
 
-def _collect_one(stops: "_Stops", experiment: ExperimentSpec, collection: Collection, index: int, asked: PlannedContact) -> None:
+def _collect_one(stops: "_Stops", experiment: ExperimentSpec, collection: Collection, index: int, contact: PlannedContact) -> None:
     """Make one contact and keep its frame: go above the place, tap, move along the surface, take the frame, lift off.
 
     A frame is awaited at every stop, because the skin's state depends on where the arm has been.
     """
     clear, tap = np.array(experiment.clear), np.array(experiment.tap)
-    before = asked.pose - asked.move + clear
+    before = contact.pose - contact.move + clear
     stops.go_around(before, LIFT_MM)
     stops.frame_after(stops.go(before))
     stops.frame_after(stops.go(before + tap))
-    confirmed = stops.go(asked.pose + clear + tap)
+    confirmed = stops.go(contact.pose + clear + tap)
     frame = stops.frame_after(confirmed)
     after = stops.mover.arm.state()
     log = {
-        "asked": [*asked.pose.tolist(), *asked.move.tolist()],
+        "asked": [*contact.pose.tolist(), *contact.move.tolist()],
         "confirmed_pose": confirmed.pose.tolist(),
         "confirmed_s": confirmed.time_s,
         "frame_s": frame.time_s,
         "sequence": frame.sequence,
         "moved_meanwhile_mm": float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3])),
     }
-    collection.keep(index, frame, stops.work.label(confirmed.pose), asked.move, log)
-    stops.frame_after(stops.go(asked.pose + clear + tap, LIFT_MM))
+    collection.keep(index, frame, stops.work.label(confirmed.pose), contact.move, log)
+    stops.frame_after(stops.go(contact.pose + clear + tap, LIFT_MM))
 
 
 @dataclass(frozen=True)
@@ -355,7 +355,7 @@ class _Stops:
         try:
             return self.mover.frame_after(state.time_s, timeout_s=self.frame_timeout_s)
         except TimeoutError as error:
-            raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
+            raise DeviceError(f"the arm stands still, but {error}; check the camera, then repeat the command to continue") from error
 
     def _pose(self, label: np.ndarray, away_mm: float) -> np.ndarray:
         return self.work.base_pose(label, self.mover.arm.state().pose, away_mm=away_mm)
@@ -466,7 +466,7 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
         try:
             measure_reference(plan.sensor, rig.source.form, frame)
         except FrameError as error:
-            raise FrameError(f"{error}; remove {collection.rest} and give the same command again, which takes it again") from error
+            raise FrameError(f"{error}; remove {collection.rest} and repeat the command, which takes it again") from error
 
     def report_contact(done: float, total: float = 1.0, note: str = "") -> None:
         kept.catch_up()  # each contact is kept in the further formats before the next one is made
@@ -488,10 +488,10 @@ def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
     """Check the plan and report it. Of the contacts the next ``CHECKED_CONTACTS`` are checked."""
     work, near = WorkFrame(plan.experiment, rig.placed), rig.arm.state().pose
     pressed = np.array(plan.experiment.clear) + np.array(plan.experiment.tap)
-    asked = [
+    contacts = [
         draw_contact(plan.experiment, plan.sampling_seed, n, plan.design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))
     ]
-    planned = [work.base_pose(one.pose + pressed, near) for one in asked]
+    planned = [work.base_pose(one.pose + pressed, near) for one in contacts]
     clear = work.base_pose(np.zeros(6), near, away_mm=CLEAR_MM)
     spent_s = (plan.count - made) * CONTACT_S
     form = rig.source.form

@@ -65,7 +65,7 @@ def gather_frames(
             sleep(2 * every_s)
             first = source.read(timeout_s=MOST_WAIT_S)
             write_image(folder / "init_0.png", first.image)
-            say(f"now press it: here and there, lightly and firmly, for {count * every_s:.0f} s")
+            say(f"now press the sensor in different places, lightly and firmly, for {count * every_s:.0f} s")
             changed = 0.0
             for number in range(1, count):
                 sleep(every_s)
@@ -76,5 +76,5 @@ def gather_frames(
         finally:
             source.disconnect()
         if not changed:
-            raise DeviceError(f"all {count} frames of the camera are the same; look whether it is frozen, and press the sensor")
+            raise DeviceError(f"all {count} frames of the camera are the same; check whether it is frozen, and press the sensor")
     return folder

@@ -33,7 +33,7 @@ FAULTS = {
     "stall": (0.5, "each move stops after this share of its time, and its command never ends"),
     "ignore-moves": (None, "moves are accepted and not executed"),
     "slow": (0.1, "moves at this share of the speed"),
-    "wide-queue-space": (None, "the queue's space is told in 8 bytes instead of 4"),
+    "wide-queue-space": (None, "the queue's space is reported in 8 bytes instead of 4"),
 }
 # The values that the faults may have.
 RANGES = {
@@ -102,9 +102,7 @@ class MagicianEmulator(Emulator):
                 self._link.symlink_to(self.device)
             except OSError as error:
                 self.unplug()
-                raise TwinError(
-                    f"{self._link}: can't make the link ({error.strerror}); remove what is there or give another `link`"
-                ) from error
+                raise TwinError(f"{self._link}: can't make the link ({error.strerror}); remove it or give another `link`") from error
         self._thread = Thread(target=self._serve, daemon=True, name="magician-emulator")
         self._thread.start()
         self.faults.after("unplugged", self.unplug)

@@ -106,7 +106,7 @@ class Machine(ReadableResult):
         missing = [name for name, version in self.packages.items() if not version and name not in EXTRAS]
         if missing or not self.can_render:
             lacking = [*(["a way to render (see above)"] if not self.can_render else []), *missing]
-            return f"Not ready: this machine lacks {', '.join(lacking)}."
+            return f"Not ready: this machine does not have {', '.join(lacking)}."
         plain = " Pictures of the deformed skin are plain ones." if self.plain_pictures else ""
         models = "" if self.packages.get("torch") else " Models need PyTorch (torch): pip install 'tactip-twin[models]'."
         return f"Ready: frames can be rendered and read.{models}{plain} Next: twin demo --out out/demo"

@@ -70,7 +70,7 @@ def examine_sensor(
         As ``rest``, ``pushes``, ``twist`` and ``out`` of ``twin.calibration.camera_view.register_files``: the camera's turn and mirror are
         found, and the frames are compared with the corrected copy of the specification.
     contacts : callable, optional
-        Finding whether a model of the sensor knows the contacts in the frames; for the specification's own detector.
+        Finding whether the contacts in the frames are in the domain of a model of the sensor; for the specification's own detector.
 
     Raises
     ------

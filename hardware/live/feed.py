@@ -123,7 +123,7 @@ class WatchedArm:
         if not self._armed or self._eyes is None:
             raise DeviceError(f"{self.name}: read only; arm it first")
         if not self._moves.acquire(blocking=False):
-            raise DeviceError(f"{self.name}: moves already; wait for its end")
+            raise DeviceError(f"{self.name}: is already moving; wait until it stops")
         try:
             target = np.array(self._arm.state().pose, float)
             target[axis] += by_mm
@@ -224,7 +224,7 @@ class CameraFeed:
                 self._session.on_estimate = deliver
                 self._session.run(going=lambda: not self._end.is_set())
                 if not self._end.is_set():
-                    on_end(f"{self.name}: at its end")
+                    on_end(f"{self.name}: has ended")
             except Exception as error:  # any error must be reported, because otherwise the picture would just stand still
                 on_end(str(error) if isinstance(error, TwinError) else f"{self.name}: ended by a fault of this program ({error!r})")
 

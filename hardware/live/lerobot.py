@@ -239,7 +239,7 @@ class LeRobotArm:
 
         Only the newest action counts. The arm moves in short pieces, and turns to a newer action after at most 0.2 s without executing the
         older ones. An action beyond the limits of a ``SafeArm`` is clipped to them. Returns the pose that was really sent to the arm: the
-        pose of the action, or the end of the present piece on the way to it.
+        pose of the action, or the end of the present piece on the path to it.
         """
         unknown = set(action) - set(_POSE) - set(self.observation_features)
         if unknown:

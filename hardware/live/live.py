@@ -196,7 +196,7 @@ class Shower:
         if isinstance(self._error, TwinError):
             raise self._error
         if self._error is not None:
-            raise DeviceError(f"the view broke ({self._error}); without `rerun`, `headless` shows nothing") from self._error
+            raise DeviceError(f"the view failed ({self._error}); without `rerun`, `headless` shows nothing") from self._error
 
     def _run(self) -> None:
         try:
@@ -263,13 +263,11 @@ class WatchPlan:
 
     def __post_init__(self) -> None:
         if self.also and self.record is None:
-            raise OptionError("`also` goes with `record`: it keeps that session in a further format")
+            raise OptionError("`also` needs `record`: it keeps the recorded session in a further format")
         if bool(self.camera) == (self.replay is not None):
             raise OptionError("give either `camera` or `replay`")
         if self.replay is not None and self.at_rest != NONE:
-            raise OptionError(
-                "`at_rest` goes with `camera`: a replay counts pins from the frame that was kept with its session; leave `at_rest` out"
-            )
+            raise OptionError("`at_rest` needs `camera`: a replay measures displacements from its session's own frame; leave `at_rest` out")
 
 
 @dataclass(frozen=True)
@@ -310,10 +308,10 @@ class WatchResult:
         lines += [f"note: {note}" for note in self.notes]
         lines += self.timing.lines()
         if self.frames:
-            why = "" if self.valid == self.frames or not self.invalid else f"; the last that was not: {self.invalid}"
+            why = "" if self.valid == self.frames or not self.invalid else f"; the last invalid one: {self.invalid}"
             lines.append(f"{self.valid} of {self.frames} frames valid{why}")
         if self.same is not None:
-            lines.append(f"{self.same[0]} of {self.same[1]} estimates are those that were recorded")
+            lines.append(f"{self.same[0]} of {self.same[1]} estimates equal the recorded ones")
         if self.record is not None:
             lines.append(f"wrote {self.record} ({self.frames} frames)")
         return lines

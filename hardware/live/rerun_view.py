@@ -42,7 +42,7 @@ class RerunView:
         if target != VIEWER and "://" not in target and not target.endswith(SUFFIX):
             raise OptionError(f"`rerun` {target}: expected '{VIEWER}', a file *{SUFFIX} or an address rerun+http://...")
         if target.endswith(SUFFIX) and "://" not in target and Path(target).exists():
-            raise DeviceError(f"`rerun` {target}: is there already; give a new file, or remove it")
+            raise DeviceError(f"`rerun` {target}: exists already; give a new file, or remove it")
         try:
             import rerun
         except ImportError as error:
@@ -80,7 +80,7 @@ class RerunView:
         try:
             stream.flush(timeout_sec=ANSWER_S)
         except RuntimeError as error:
-            raise DeviceError(f"`rerun` {self._target}: gone before the end ({error}); the last pictures are missing there") from error
+            raise DeviceError(f"`rerun` {self._target}: closed before the end ({error}); the last pictures are missing there") from error
         finally:
             stream.disconnect()
 

@@ -64,8 +64,8 @@ def _require_in_front(placed: PlacedObject, start: np.ndarray, clear: np.ndarray
     gap_mm = min(placed.distance_mm(ends[0] + share * (ends[1] - ends[0])) for share in np.linspace(0.0, 1.0, samples))
     if gap_mm < 0.0:
         raise DeviceError(
-            f"the straight way to the {placed.spec.name} leads {-gap_mm:.0f} mm behind its surface, which has no known end; jog the arm "
-            "to the side from which the sensor is to touch it, or correct the object's place ('placement' in the file for `servo`)"
+            f"the straight path to the {placed.spec.name} leads {-gap_mm:.0f} mm behind its surface, whose extent is not known; jog the "
+            "arm to the side from which the sensor is to touch it, or correct the object's place ('placement' in the file for `servo`)"
         )
 
 

@@ -99,7 +99,7 @@ class SafetyLimits(Section):
 def load_limits(name_or_path: str | Path) -> SafetyLimits:
     """Limits by name (``mg400``, ``magician``) or by the path of their TOML file.
 
-    A text is a path if it is no name, and has a suffix or something is there.
+    A text that is no name is a path if it has a suffix, or if a file has this path.
 
     Raises
     ------
@@ -110,8 +110,8 @@ def load_limits(name_or_path: str | Path) -> SafetyLimits:
     shipped |= other_files("limits", shipped)
     path, example = shipped.get(str(name_or_path), Path(name_or_path)), SHIPPED_LIMITS / "mg400.toml"
     if not str(name_or_path) or not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
-        told = f"{quote(path, LONGEST_PATH)}: no such file" if path.suffix else f"no limits are called '{quote(name_or_path)}'"
-        raise DeviceError(f"{told}; give one of {', '.join(shipped)}, or the path of a TOML file like {example}")
+        problem = f"{quote(path, LONGEST_PATH)}: no such file" if path.suffix else f"no limits are called '{quote(name_or_path)}'"
+        raise DeviceError(f"{problem}; give one of {', '.join(shipped)}, or the path of a TOML file like {example}")
     try:
         return read_section(path, SafetyLimits)
     except SpecError as error:
@@ -208,39 +208,38 @@ class Sensed:
 
         They are ``force_x, force_y, force_z`` or ``Fx, Fy, Fz``, ``torque_z`` or ``Tz``, ``slip_share`` and ``slip_begins``.
         """
-        told = dict(zip(names, np.asarray(value, float).tolist(), strict=True))
+        known = dict(zip(names, np.asarray(value, float).tolist(), strict=True))
         missing = float("nan")
-        force = [told.get(f"force_{axis}", told.get(f"F{axis}", missing)) for axis in "xyz"]
-        torque = told.get("torque_z", told.get("Tz", missing))
-        return cls(
-            depth_mm, frame_time_s, float(np.linalg.norm(force)), torque, told.get("slip_share", missing), told.get("slip_begins", missing)
-        )
+        force = [known.get(f"force_{axis}", known.get(f"F{axis}", missing)) for axis in "xyz"]
+        torque = known.get("torque_z", known.get("Tz", missing))
+        slip = [known.get(name, missing) for name in ("slip_share", "slip_begins")]
+        return cls(depth_mm, frame_time_s, float(np.linalg.norm(force)), torque, *slip)
 
 
 @dataclass(frozen=True)
 class _ReadingRule:
     """The reaction of the arm if a value of the contact exceeds a limit. Both are named by their attributes. NaN never exceeds a limit."""
 
-    felt: str
+    name: str
     limit: str
     action: Action
     code: DecisionCode
-    said: str
+    text: str
 
     def limit_decision(self, sensed: Sensed, limits: SafetyLimits) -> Decision | None:
         """The decision if the limit is exceeded."""
-        felt, limit = getattr(sensed, self.felt), getattr(limits, self.limit)
-        return None if limit is None or not felt > limit else Decision(self.action, self.code, self.said.format(felt=felt, limit=limit))
+        reading, limit = getattr(sensed, self.name), getattr(limits, self.limit)
+        return None if limit is None or not reading > limit else Decision(self.action, self.code, self.text.format(reading, limit))
 
 
-_TURNED, _STILL = "the sensor feels {felt:.0f} N mm about its axis", "the arm holds still beyond {limit:g}"
-_SLIDES = "the contact begins to slide (probability {felt:.0%}, allowed {limit:.0%}); press harder"
+_TURNED, _STILL = "the torque about the sensor's axis is {0:.0f} N mm", "the arm holds still above {1:g}"
+_SLIDES = "the contact begins to slide (probability {0:.0%}, allowed {1:.0%}); press harder"
 # The rules, in the order of their priority.
-_FELT = (
-    _ReadingRule("depth_mm", "contact_mm", Action.RETRACT, DecisionCode.TOO_DEEP, "{felt:.1f} mm deep in contact (allowed {limit:g} mm)"),
-    _ReadingRule("force_n", "force_n", Action.RETRACT, DecisionCode.TOO_STRONG, "the sensor feels {felt:.1f} N (allowed {limit:g} N)"),
-    _ReadingRule("turning_nmm", "torque_nmm", Action.RETRACT, DecisionCode.TOO_TWISTED, f"{_TURNED} (allowed {{limit:g}} N mm)"),
-    _ReadingRule("force_n", "hold_force_n", Action.HOLD, DecisionCode.HELD_FORCE, f"the sensor feels {{felt:.1f}} N ({_STILL} N)"),
+_RULES = (
+    _ReadingRule("depth_mm", "contact_mm", Action.RETRACT, DecisionCode.TOO_DEEP, "the contact is {0:.1f} mm deep (allowed {1:g} mm)"),
+    _ReadingRule("force_n", "force_n", Action.RETRACT, DecisionCode.TOO_STRONG, "the force on the sensor is {0:.1f} N (allowed {1:g} N)"),
+    _ReadingRule("turning_nmm", "torque_nmm", Action.RETRACT, DecisionCode.TOO_TWISTED, f"{_TURNED} (allowed {{1:g}} N mm)"),
+    _ReadingRule("force_n", "hold_force_n", Action.HOLD, DecisionCode.HELD_FORCE, f"the force on the sensor is {{0:.1f}} N ({_STILL} N)"),
     _ReadingRule("turning_nmm", "hold_torque_nmm", Action.HOLD, DecisionCode.HELD_FORCE, f"{_TURNED} ({_STILL} N mm)"),
     _ReadingRule("slip_begins", "slip_begins", Action.HOLD, DecisionCode.SLIPPING, _SLIDES),
     _ReadingRule(
@@ -248,7 +247,7 @@ _FELT = (
         "slip_share",
         Action.HOLD,
         DecisionCode.SLIPPING,
-        "{felt:.0%} of the contact slides (allowed {limit:.0%}); press harder",
+        "{0:.0%} of the contact slides (allowed {1:.0%}); press harder",
     ),
 )
 
@@ -365,7 +364,7 @@ def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed
     if (age_s := now_s - state.time_s) > limits.feedback_age_s:
         return Decision(Action.HOLD, DecisionCode.STALE_FEEDBACK, f"feedback is {age_s:.2f} s old (allowed {limits.feedback_age_s:g} s)")
     if not (np.isfinite(state.pose).all() and np.isfinite(state.joints_deg).all()):
-        return Decision(Action.HOLD, DecisionCode.NOT_A_NUMBER, f"the arm says that it is at {state.pose}; restart it")
+        return Decision(Action.HOLD, DecisionCode.NOT_A_NUMBER, f"the arm reports the impossible pose {state.pose}; restart it")
     if state.error:
         return Decision(Action.HOLD, DecisionCode.ARM_ERROR, state.error)
     if not state.enabled:
@@ -376,7 +375,7 @@ def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed
         return Decision(
             Action.HOLD, DecisionCode.STALE_FRAME, f"the sensor's frame is {age_s:.2f} s old (allowed {limits.frame_age_s:g} s)"
         )
-    return next(filter(None, (rule.limit_decision(sensed, limits) for rule in _FELT)), None)
+    return next(filter(None, (rule.limit_decision(sensed, limits) for rule in _RULES)), None)
 
 
 def _place(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits) -> Decision | None:

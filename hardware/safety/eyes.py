@@ -1,7 +1,7 @@
 """The rule for every motion that can end in contact or nearer to an object: it needs fresh frames.
 
 A motion leaves standstill only after a fresh frame, and a thread stops the arm as soon as no fresh frame comes (``FrameSource.blind``). On
-the way to a contact the last millimetres are made in pieces. Each piece follows a frame that shows the end of the piece before it.
+the path to a contact the last millimetres are made in pieces. Each piece follows a frame that shows the end of the piece before it.
 Therefore no fault leads the sensor farther than one piece, not even the end of this program.
 """
 
@@ -132,7 +132,7 @@ class FreshFrames:
 
 
 def pieces_to(start: np.ndarray, target: np.ndarray, near_mm: float) -> list[np.ndarray]:
-    """Poses (6,) of a straight way to a target (6,): the last ``near_mm`` are divided into pieces of at most ``PIECE_MM``."""
+    """Poses (6,) of a straight path to a target (6,): the last ``near_mm`` are divided into pieces of at most ``PIECE_MM``."""
     way_mm = float(np.linalg.norm(target[:3] - start[:3]))
     near_mm = min(near_mm, way_mm)
     pieces = int(np.ceil(near_mm / PIECE_MM))

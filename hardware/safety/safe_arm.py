@@ -66,7 +66,7 @@ class RefusedMoveError(DeviceError):
 
 
 class NoWayBackError(DeviceError):
-    """The limits allow no straight way back from an object."""
+    """The limits allow no straight path back from an object."""
 
 
 @dataclass(frozen=True)

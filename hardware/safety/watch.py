@@ -51,12 +51,12 @@ class ArmWatch:
     Parameters
     ----------
     arm : Arm
-    tell : callable
+    report : callable
         Called with each message that a person should see at once. By default the message is logged, and so goes to stderr.
     """
 
-    def __init__(self, arm: Arm, *, tell: Callable[[str], None] = LOG.warning) -> None:
-        self._arm, self._tell = arm, tell
+    def __init__(self, arm: Arm, *, report: Callable[[str], None] = LOG.warning) -> None:
+        self._arm, self._report = arm, report
         self._states: deque[ArmState] = deque(maxlen=KEPT_STATES)
         self._lost, self._looking = "", threading.Lock()
         self._doing: tuple[str, float] | None = None  # what the program waits for, and since when
@@ -127,7 +127,7 @@ class ArmWatch:
                 said = doing, doing[1] + WORD_S
             if time.monotonic() > said[1]:
                 waited_s = time.monotonic() - doing[1]
-                self._tell(f"{self._arm.name}: {doing[0]}, {waited_s:.0f} s so far")
+                self._report(f"{self._arm.name}: {doing[0]}, {waited_s:.0f} s so far")
                 said = doing, time.monotonic() + waited_s
 
     def _look(self) -> None:
@@ -144,11 +144,11 @@ class ArmWatch:
     def _lose(self, error: DeviceError) -> None:
         """Stop an arm that no longer answers. It is reported before and after the stop, because a stop may take some time."""
         self._lost = str(error)
-        self._tell(f"{error}. Stopping the arm: press its emergency stop if it moves")
+        self._report(f"{error}. Stopping the arm: press its emergency stop if it moves")
         try:
             self._arm.stop()
         except DeviceError as failed:
             self._lost += f"; {failed}"
-            self._tell(str(failed))
+            self._report(str(failed))
         else:
-            self._tell(f"{self._arm.name}: stopped")
+            self._report(f"{self._arm.name}: stopped")

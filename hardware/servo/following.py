@@ -102,14 +102,14 @@ class FollowPlan:
 
     def __post_init__(self) -> None:
         if self.also and not self.record:
-            raise OptionError("`also` goes with `record`: it keeps that session in a further format")
+            raise OptionError("`also` needs `record`: it keeps the recorded session in a further format")
         if self.stream_hz is not None and not SLOWEST_HZ <= self.stream_hz <= FASTEST_HZ:
             raise DeviceError(f"`rate` {self.stream_hz:g}: expected {SLOWEST_HZ:g} to {FASTEST_HZ:g} decisions a second")
         if self.steps is not None and not 1 <= self.steps <= MOST_STEPS:
             raise DeviceError(f"`steps` {self.steps}: expected 1 to {MOST_STEPS}")
         if not self.camera:
             if kind_of(self.arm) != "simulated":
-                open_arm(self.arm)  # an arm that does not exist is said first; nothing is opened
+                open_arm(self.arm)  # an arm that does not exist is reported first; nothing is opened
                 raise OptionError(
                     f"`arm` {quote(self.arm)} needs a camera: give the sensor's with `camera`; `camera=twin` renders frames for the pose "
                     "that the arm reports, and these do not show the real contact"
@@ -154,10 +154,10 @@ class Followed:
             *(f"note: {note}" for note in self.notes),
         ]
         if np.isfinite(m.completed):
-            out[0] += f", {m.completed:.0%} of the way, contact lost {m.lost_contacts:g} times"
-            told = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
+            out[0] += f", {m.completed:.0%} of the path, contact lost {m.lost_contacts:g} times"
+            entries = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
             out[2:2] = [
-                f"{told if np.isfinite(m.path_error_mm) else ''}"  # a policy gives no estimate
+                f"{entries if np.isfinite(m.path_error_mm) else ''}"  # a policy gives no estimate
                 f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
             ]
         else:
@@ -194,7 +194,7 @@ def follow(
     steps = plan.steps or round_steps
     if plan.steps:
         wanted_mm = min(wanted_mm, plan.steps * plan.servo.feed_mm)
-    told = _result_entries(plan, model) | (about or {})
+    entries = _result_entries(plan, model) | (about or {})
     failure, followed = "", None
     with rig, stage(progress, f"following the {plan.obj.name}") as step, ExitStack() as stack:
         takes_rest = plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live
@@ -206,7 +206,7 @@ def follow(
         _say_turns(rig, plan.servo, wanted_mm)
         if plan.dry_run:
             return DryRunDone()
-        session = stack.enter_context(SessionWriter(out / SESSION, told)) if plan.record else None
+        session = stack.enter_context(SessionWriter(out / SESSION, entries)) if plan.record else None
         if session is not None and rest is not None:
             session.keep_rest(rest)
         take_rest = partial(_take_rest, session, model) if takes_rest else None
@@ -223,7 +223,7 @@ def follow(
         finally:  # also after Ctrl-C, so that the steps so far are stored
             if loop.records:
                 followed = _results(plan, rig, loop, wanted_mm, failure)
-                followed.written.extend(_write(out, plan, model, followed, told))
+                followed.written.extend(_write(out, plan, model, followed, entries))
                 with kept:
                     kept.catch_up()
     if followed is None:
@@ -310,10 +310,10 @@ def _results(plan: FollowPlan, rig: Rig, loop: ServoLoop, wanted_mm: float, fail
     return Followed(measures, loop.timing(), path, flat @ turn.T + origin, failure, loop.notes)
 
 
-def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, told: dict[str, Any]) -> list[Path]:
+def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, entries: dict[str, Any]) -> list[Path]:
     figure = trajectory_figure(followed.path, followed.measures, f"{plan.obj.name}, {model.sensor.name}", outline_mm=followed.outline_mm)
     content = {
-        **told,
+        **entries,
         "measures": asdict(followed.measures),
         "timing": asdict(followed.timing),
         "failure": followed.failure,

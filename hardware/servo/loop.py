@@ -261,8 +261,8 @@ class ServoLoop:
         behind_s = now_s - (now_s if self._behind_since is None else self._behind_since)
         if behind_s > MOVE_TIMEOUT_S:
             raise DeviceError(
-                f"{self.arm.name}: reports that it moves, but has not come near its target for {behind_s:.1f} s; "
-                "look for what holds it, call clear_error(), then begin again"
+                f"{self.arm.name}: reports that it moves, but has not come near its target for {behind_s:.1f} s; look for an obstacle, "
+                "call clear_error(), then begin again"
             )
 
     def _record(self, state: ArmState, from_pose: np.ndarray, sent: np.ndarray, *, fresh: bool, taken_s: float) -> None:

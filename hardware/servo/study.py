@@ -24,7 +24,7 @@ SHOWN = {
     "path_error_mm": "path mm",
     "depth_error_mm": "depth mm",
     "angle_error_deg": "angle deg",
-    "completed": "way",
+    "completed": "completed",
     "lost_contacts": "lost",
 }
 
@@ -103,17 +103,17 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
     """
     found: dict[tuple[str, str], Followed | str] = {}
     for label, model in plan.models.items():
-        for thing in plan.objects:
-            asked = FollowPlan(thing, plan.servo, steps=plan.steps, seed=plan.seed, plain_light=plan.plain_light)
-            folder = out / folder_name(label) / thing.name
+        for obj in plan.objects:
+            run_plan = FollowPlan(obj, plan.servo, steps=plan.steps, seed=plan.seed, plain_light=plan.plain_light)
+            folder = out / folder_name(label) / obj.name
             try:
-                followed = follow(asked, model, folder, about={"model": label})
+                followed = follow(run_plan, model, folder, about={"model": label})
                 assert isinstance(followed, Followed)
-                found[label, thing.name] = followed
+                found[label, obj.name] = followed
             except StoreError:
                 raise
             except TwinError as error:
-                found[label, thing.name] = str(error)
+                found[label, obj.name] = str(error)
             progress("objects followed", len(found), len(plan.models) * len(plan.objects))
     reasons = [said for said in found.values() if isinstance(said, str)]
     if reasons and len(reasons) == len(found):

@@ -36,11 +36,11 @@ class Timing:
         Steps per second.
     fresh_hz : float
         Steps per second on a frame that was not used before.
-    latency_s : Spread
+    latency_s : TimeSpread
         Time from a fresh frame's exposure to the command that it led to.
-    age_s : Spread
+    age_s : TimeSpread
         Age of the frame behind each decision at the time of the decision.
-    compute_s : Spread
+    compute_s : TimeSpread
         Time from receiving the frame to the command.
     dropped : int
         Number of frames that nobody read.

@@ -68,7 +68,7 @@ class Measures:
     smoothness : float
         The paper's S: mean of |dy / dx| over neighbouring points, without pairs of equal x. It depends on the axes.
     local_smoothness : float
-        Mean of S over windows of points, each turned so that its ends lie along x.
+        Mean of S over windows of points, each rotated so that its ends are on the x axis.
     path_error_mm : float
         Root mean square distance of the estimated surface from the true one.
     depth_error_mm, angle_error_deg : float
@@ -170,7 +170,7 @@ def smoothness(points_mm: np.ndarray) -> float:
 
 
 def local_slopes(points_mm: np.ndarray) -> np.ndarray:
-    """Smoothness (M - LOCAL_N + 1,) of each window of points, turned so that its ends lie along x."""
+    """Smoothness (M - LOCAL_N + 1,) of each window of points, rotated so that its ends are on the x axis."""
     slopes = []
     for window in (points_mm[k : k + LOCAL_N] for k in range(len(points_mm) - LOCAL_N + 1)):
         chord = window[-1] - window[0]
@@ -228,7 +228,7 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
     figure, (whole, zoom, depth, angle) = new_figure(2, 2, panel_inch=4.6)
     figure.suptitle(
         f"{title}: S = {measures.smoothness:.3f}, path error {measures.path_error_mm:.2f} mm, "
-        f"{measures.completed:.0%} of the way, contact lost {measures.lost_contacts:g} times"
+        f"{measures.completed:.0%} of the path, contact lost {measures.lost_contacts:g} times"
     )
     for ax in (whole, zoom):
         if outline_mm is not None:

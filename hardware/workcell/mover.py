@@ -168,7 +168,7 @@ class Mover:
         except NoWayBackError as error:
             if not self._came:
                 raise
-            self.notes.append(f"{error}; went back the way it came instead")
+            self.notes.append(f"{error}; returned on its own path instead")
             LOG.warning("%s: %s", self.arm.name, self.notes[-1])
             self.forget()
             for there in reversed(self._came):

@@ -78,7 +78,7 @@ def check_plan(
     way_mm = sum(float(np.linalg.norm(end[:3] - start[:3])) for start, end in pairwise(way))
     back = f"a path back from all {len(planned)} planned poses"
     if blocked:
-        back = f"no straight path back from {len(blocked)} of {len(planned)} planned poses: from there the arm returns the way it came"
+        back = f"no straight path back from {len(blocked)} of {len(planned)} planned poses: from there the arm returns on its own path"
     return [
         *seen,
         f"path: {len(way) - 1} moves, {way_mm:.0f} mm, to {' '.join(f'{value:.1f}' for value in planned[0])} (mm, deg)",

@@ -77,8 +77,8 @@ def test_a_contact_that_slides_is_held_still_where_slip_is_limited():
 @pytest.mark.parametrize(
     ("odd", "limited", "said"),
     [
-        ({"force_z": 8.0}, {"hold_force_n": 5.0}, "feels 8.0 N .*holds still beyond 5 N"),
-        ({"torque_z": -90.0}, {"hold_torque_nmm": 60.0}, "feels 90 N mm .*holds still beyond 60 N mm"),
+        ({"force_z": 8.0}, {"hold_force_n": 5.0}, "is 8.0 N .*holds still above 5 N"),
+        ({"torque_z": -90.0}, {"hold_torque_nmm": 60.0}, "is 90 N mm .*holds still above 60 N mm"),
         ({"slip_begins": 0.9}, {"slip_begins": 0.5}, "begins to slide .probability 90%"),
     ],
 )

@@ -78,7 +78,7 @@ def silent(connection):
     [
         (http, "nothing came|HTTP/1.1 400"),
         (talks_first, "SSH-2.0-OpenSSH_9.2p1.*no MG400"),
-        (hangs_up, "hung up at once: another program"),
+        (hangs_up, "closed the connection at once: another program"),
         (other_packets, "bytes that begin with .*Check the address"),
         (silent, "nothing came.*close other programs"),
     ],

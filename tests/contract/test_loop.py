@@ -231,7 +231,7 @@ def test_an_arm_that_is_held_is_not_awaited_for_ever(rig, monkeypatch):
                 monkeypatch.setattr("hardware.servo.loop.MOVE_TIMEOUT_S", 1.0)
 
         loop.hooks = LoopHooks(on_step=hold)
-        with pytest.raises(DeviceError, match="look for what holds it"):
+        with pytest.raises(DeviceError, match="look for an obstacle"):
             loop.run(start((placed, arm)))
         assert_let_go((placed, arm))
 

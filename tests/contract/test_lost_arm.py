@@ -86,7 +86,7 @@ def test_a_loop_tells_a_lost_arm_at_once(emulator, placed, fault, blocking):
         settings = LoopSettings(1000, blocking=blocking, period_s=0.05)
         with pytest.raises(DeviceError) as raised, arm:
             loop = ServoLoop(Rig(source, arm, placed, False), servo, truth, settings)
-            loop.mover.watch._tell = clock.tell
+            loop.mover.watch._report = clock.tell
             loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: record.index == 3 and clock.lose())
             loop.run(placed.start_pose(2.0))
     clock.check(raised.value)
@@ -102,7 +102,7 @@ def test_a_lost_arm_is_told_while_a_frame_is_waited_for(emulator, placed, tmp_pa
     clock = Clock(emulator, "frozen=0")
     arm = SafeArm(mg400_of(emulator), FREE)
     with pytest.MonkeyPatch.context() as patch, Blind() as source:
-        patch.setattr("hardware.workcell.mover.ArmWatch", lambda arm: ArmWatch(arm, tell=clock.tell))
+        patch.setattr("hardware.workcell.mover.ArmWatch", lambda arm: ArmWatch(arm, report=clock.tell))
         with pytest.raises(DeviceError) as raised, arm:
             about = Collection(tmp_path, {"seed": 1}, Form.RAW)
             collect(Rig(source, arm, placed, False), load_experiment("surface-2d"), about, 3, seed=1, speed=(200.0, 200.0))

@@ -262,5 +262,5 @@ def test_a_pose_that_can_not_be_is_no_pose(monkeypatch):
     with MagicianEmulator() as emulator, Magician(emulator.device) as arm:
         arm.enable()
         monkeypatch.setattr(emulator.arm.track, "pose", lambda time_s: np.full(6, np.nan))
-        with pytest.raises(StaleDataError, match="a place that no arm reaches"):
+        with pytest.raises(StaleDataError, match="which no arm reaches"):
             arm.state()

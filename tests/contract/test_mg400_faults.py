@@ -164,7 +164,7 @@ def test_an_arm_that_will_not_stop_is_switched_off():
         arm.set_speed_percent(linear=SLOW_SHARE_PERCENT)
         arm.move_linear(AWAY, wait=False)
         emulator._commands.dashboard["resetrobot"] = refuse
-        with pytest.raises(DeviceError, match="would not stop and was switched off"):
+        with pytest.raises(DeviceError, match="did not stop, so its emergency stop was used"):
             arm.stop()
         stopped = emulator.pose()
         time.sleep(0.1)
@@ -496,7 +496,7 @@ def test_a_pose_that_can_not_be_is_no_pose(monkeypatch, told):
         broken.set()
         time.sleep(0.1)
         begun_s = time.monotonic()
-        with pytest.raises(DeviceError, match="a place that no arm reaches"):
+        with pytest.raises(DeviceError, match="which no arm reaches"):
             arm.move_linear(HOME)
         assert time.monotonic() - begun_s < 1.0
         stands = emulator.pose()

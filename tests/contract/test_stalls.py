@@ -57,7 +57,7 @@ def emulated(request):
 
 def test_a_stall_is_no_silence_and_silence_is_noticed(emulated):
     arm, home, child, silent = emulated
-    watch = ArmWatch(arm, tell=lambda line: None)
+    watch = ArmWatch(arm, report=lambda line: None)
     with watch.watching():
         arm.set_speed(50.0, 50.0)
         arm.move_linear(home)

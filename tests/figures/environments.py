@@ -103,7 +103,7 @@ LEARNT = {
     "GentlePress.pins": ("--no-state-estimator --minutes 15", 16),
 }
 """Options of ``twin learn``, and about how many minutes it takes with all evaluating, by task and what the policy sees."""
-WHERE = {"surrogate": "", "surrogate, friction remembers": "remembers_", "finite elements, rasterised frames": "fem_"}
+WHERE = {"surrogate": "", "surrogate, friction history": "remembers_", "finite elements, rasterised frames": "fem_"}
 """Beginnings of the figures' names, by where ``twin learn`` evaluated the policy."""
 
 
@@ -132,24 +132,32 @@ for name, (options, minutes) in LEARNT.items():
         beside=DRAWN,
     )(partial(learnt, name=name))
 
-BASELINE_SEEDS, BASELINE_STEPS = (0, 1, 2), 200_000
+BASELINE_SEEDS, BASELINE_STEPS, BASELINE_SAC = (0, 1, 2), 200_000, ("SurfaceFollow", "EdgeFollow")
 
 
-def baseline(work: Path, *, task: str, seed: int) -> Measured:
-    """What stable-baselines3's PPO with its default settings learns, and the share of new episodes that it solves."""
-    learner, _, used_s = bench_baselines.learnt(task, seed, BASELINE_STEPS)
+def baseline(work: Path, *, task: str, seed: int, algorithm: str = "PPO", blind: bool = False) -> Measured:
+    """What stable-baselines3 learns with default settings, and the share of new episodes that it solves."""
+    learner, _, used_s = bench_baselines.learnt(task, seed, BASELINE_STEPS, algorithm, blind)
     share = bench_baselines.solved(learner)
     return {"success": Value(share), "steps": Value(learner.num_timesteps), "core_minutes": Value(used_s / 60, "min")}
 
 
+def baseline_job(name: str, task: str, seed: int, options: str = "", **given: object) -> None:
+    """Register what one run of a bench measures."""
+    job(
+        f"baselines.{name}",
+        f"tests/bench/bench_baselines.py --task {task} --seed {seed}{options}",
+        sensors=("mg400-331",),
+        code=("bench_baselines", "training.environments.baselines"),
+        shipped=("training/surrogates/mg400-331.safetensors",),
+        minutes=6,
+        beside=DRAWN,
+    )(partial(baseline, task=task, seed=seed, **given))
+
+
 for task in OWN:
     for seed in BASELINE_SEEDS:
-        job(
-            f"baselines.{task}.seed{seed}",
-            f"tests/bench/bench_baselines.py --task {task} --seed {seed}",
-            sensors=("mg400-331",),
-            code=("bench_baselines", "training.environments.baselines"),
-            shipped=("training/surrogates/mg400-331.safetensors",),
-            minutes=6,
-            beside=DRAWN,
-        )(partial(baseline, task=task, seed=seed))
+        baseline_job(f"{task}.seed{seed}", task, seed)
+    baseline_job(f"{task}.blind", task, 0, " --blind", blind=True)
+for task in BASELINE_SAC:
+    baseline_job(f"{task}.sac", task, 0, " --algorithm SAC", algorithm="SAC")

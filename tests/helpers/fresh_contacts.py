@@ -16,7 +16,7 @@ def simulate_contacts(
     """A data set of pins alone, contacts randomised as 'contact'; goes on where it was. ``raw``: in px of raw frames."""
     spec, plan = load_sensor(sensor), load_experiment(experiment)
     if raw:
-        spec = spec.model_copy(update={"recording": None, "pipeline": spec.pipeline.model_copy(update={"recording": None})})
+        spec = spec.model_copy(update={"recording": None, "pipeline": spec.pipeline.model_copy(update={"processed": None})})
     config = GenerationConfig(
         sensor=spec,
         object=load_object(plan.object),

@@ -746,7 +746,7 @@ def _sessions() -> list[Entry]:
         ("steps.jsonl", "without a frame", given.with_bytes(lambda data: b'{"step": 0}\n'), (REFUSED,)),
         ("steps.jsonl", "a picture elsewhere", given.text(lambda t: t.replace("frame_000000.png", "../../../frames/f_0.png")), (REFUSED,)),
         ("steps.jsonl", "an absolute path", given.text(lambda t: t.replace("frame_000000.png", "/dev/zero")), (REFUSED,)),
-        ("steps.jsonl", "another form", given.text(lambda t: t.replace('"recording"', '"cooked"')), (REFUSED,)),
+        ("steps.jsonl", "another form", given.text(lambda t: t.replace('"processed"', '"cooked"')), (REFUSED,)),
         ("steps.jsonl", "missing", Path.unlink, (REFUSED,)),
         ("session.json", "empty", given.with_bytes(lambda data: b""), (REFUSED,)),
         ("session.json", "a list", given.with_json(lambda about: [1]), (REFUSED,)),

@@ -82,7 +82,7 @@ def test_graph_of_a_frame_and_of_its_pins(rendered, pins, tmp_path, kind, edges)
 
 @pytest.mark.slow
 def test_the_releases_method_on_a_frame_in_the_recordings_form(tmp_path):
-    drawn = ("--form", "recording", "--quality", "rasterised")
+    drawn = ("--form", "processed", "--quality", "rasterised")
     done = twin("render", "--sensor", "mg400-127", "--object", "plane", "--indent-mm", 0, *drawn, "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     assert cv2.imread(str(tmp_path / "frame.png"), cv2.IMREAD_UNCHANGED).shape == (256, 256)
@@ -146,7 +146,7 @@ def test_no_good_frame_is_a_failure_that_still_leaves_its_summary(tmp_path):
     frames = tmp_path / "frames"
     frames.mkdir()
     cv2.imwrite(str(frames / "black.png"), np.zeros((256, 256), np.uint8))
-    done = twin("preprocess", frames, "--sensor", "mg400-127", "--form", "recording", "--out", tmp_path / "out")
+    done = twin("preprocess", frames, "--sensor", "mg400-127", "--form", "processed", "--out", tmp_path / "out")
     one_line_error(done, "frames")
     with np.load(tmp_path / "out" / "pins.npz") as pins:
         assert pins["found"].tolist() == [0] and not pins["valid"].any()
@@ -157,7 +157,7 @@ def test_a_sensor_without_recording_form_says_so_before_it_presses(tmp_path):
     text = (SHIPPED / "sensors" / "mg400-127.toml").read_text()
     own = re.sub(r"\n\[(pipeline\.)?recording\].*?(?=\n\[)", "", text, flags=re.DOTALL)
     (tmp_path / "own.toml").write_text(own)
-    asked = ("--sensor", tmp_path / "own.toml", "--object", "plane", "--indent-mm", 2, "--form", "recording", "--out", tmp_path)
+    asked = ("--sensor", tmp_path / "own.toml", "--object", "plane", "--indent-mm", 2, "--form", "processed", "--out", tmp_path)
     one_line_error(twin("render", *asked), "own", "raw form")
 
 

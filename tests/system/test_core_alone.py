@@ -13,7 +13,7 @@ from twin.store import code_of
 
 CORE = Path(__file__).parents[1] / "helpers" / "core_alone.py"
 WORKING = {
-    "render": f"render --sensor {SENSOR} --object sphere --indent-mm 2 --quality rasterised --form recording --out frames",
+    "render": f"render --sensor {SENSOR} --object sphere --indent-mm 2 --quality rasterised --form processed --out frames",
     "preprocess": f"preprocess frames/frame.png --sensor {SENSOR} --out pins",
     "graph": f"graph frames/frame.png --sensor {SENSOR} --out graph",
     "new": "new frames/frame.png --layout hexagon:6 --out mine.toml",
@@ -35,7 +35,7 @@ NEEDING = {
 def ended(tmp_path_factory):
     """By command: its exit code and its errors. All run in one process, beside a small labelled recording."""
     work = tmp_path_factory.mktemp("core")
-    generate(work / "taps", small_config(work, images="recording", quality="rasterised"), 4)
+    generate(work / "taps", small_config(work, images="processed", quality="rasterised"), 4)
     (work / "torn.toml").write_text('steps = [1.0]\n[[condition]]\nname = "picture-torn"\n')
     commands = [*WORKING.values(), *NEEDING.values()]
     done = subprocess.run([sys.executable, str(CORE), *commands], cwd=work, capture_output=True, text=True)

@@ -140,7 +140,7 @@ def test_pins_are_counted_from_a_frame_taken_clear_of_the_object_and_so_they_are
     pipeline = Pipeline(load_sensor("mg400-331"), Form.PROCESSED)
     seen = pipeline(rest)
     assert seen.valid and np.linalg.norm(seen.graph.nodes_px - pipeline.reference.pins_px, axis=1).max() < 1.0  # px: nothing is touched
-    assert "4 of 4 estimates are those that were recorded" in run("live", "--replay", out / "session", "--headless")
+    assert "4 of 4 estimates equal the recorded ones" in run("live", "--replay", out / "session", "--headless")
     (out / "session" / "rest.png").unlink()
     assert "4 of 4 estimates" not in run("live", "--replay", out / "session", "--headless")
 
@@ -212,7 +212,7 @@ def test_live_records_and_replays_the_same(stand_in, tmp_path):
     told = run("live", "--camera", folder, "--model", "any", "--headless", "--record", tmp_path / "s", "--also", "lerobot")
     assert "5 steps" in told and "5 of 5 frames valid" in told
     assert [episode.length for episode in open_records(tmp_path / "s" / "lerobot").episodes] == [5]
-    with pytest.raises(OptionError, match="`also` goes with `record`"):
+    with pytest.raises(OptionError, match="`also` needs `record`"):
         run("live", "--camera", folder, "--model", "any", "--headless", "--also", "lerobot")
     assert "5 of 5 estimates" in run("live", "--replay", tmp_path / "s", "--model", "any", "--headless")
 

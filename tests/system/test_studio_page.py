@@ -131,7 +131,7 @@ def test_sliders_undo_and_what_is_shown(client):
     since = len(client.updates)
     client.set("Undo", True)
     client.wait(lambda u: abs(u.depth_mm - 1.0) < 1e-4, WAIT_S, since=since)
-    for label, value, word in (("colour pins by", "pressure", "MPa"), ("frame", "recording", "mm"), ("frame", "raw", "mm")):
+    for label, value, word in (("colour pins by", "pressure", "MPa"), ("frame", "processed", "mm"), ("frame", "raw", "mm")):
         since = len(client.updates)
         client.set(label, value)
         client.wait(lambda u, word=word: word in u.html, WAIT_S, since=since)
@@ -240,7 +240,7 @@ def test_degrade_shows_the_same_contact_with_its_limits(client):
     since = len(client.updates)
     client.set("mode", "Degrade")
     html = wait_html(client, "<th>limit</th>")
-    assert "as it is" in html
+    assert "not degraded" in html
     client.set("severity 1", 1.0)
     html = wait_html(client, "class='bad'")
     assert since < len(client.updates)
@@ -357,7 +357,7 @@ def test_a_specification_is_proposed_corrected_and_used(studio, client, tmp_path
     client.set("Propose a specification", True)
     html = wait_html(client, "127 pins in a hexagon of 6 rings")
     assert "UNSURE" not in html and "mine_0.png (1 of 4)" in html and "127 of 127" in html
-    client.set("make the layout", "one smaller")
+    client.set("correct the layout", "one smaller")
     assert "UNSURE" in wait_html(client, "91 pins in a hexagon of 5 rings")
     client.set("Use this sensor", True)
     client.wait(lambda update: update.number > 0 and "my-sensor" in str(client.value("sensor")), 2 * WAIT_S)

@@ -67,7 +67,7 @@ def run(recording, tmp_path_factory):
 def test_a_trained_run_is_judged_and_used(recording, run, tmp_path):
     said = twin("evaluate", run, "--data", recording, "--out", tmp_path, "--robustness")
     assert "2 px shift: pose_2" in said and len(list(csv.DictReader((tmp_path / "robustness.csv").open()))) == 5
-    assert "pose_2: mean error" in said and "ms per frame" in said
+    assert "depth: mean error" in said and "ms per frame" in said
     rows = list(csv.DictReader((tmp_path / "predictions.csv").open()))
     assert len(rows) == FRAMES / 5 and all(float(row["pose_2_lo90"]) < float(row["pose_2_hi90"]) and row["valid"] == "1" for row in rows)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
@@ -113,14 +113,14 @@ def test_objects_never_seen_are_one_command_and_go_on_where_they_were(tmp_path):
         *(("mixed", "plane", "True"), ("mixed", "sphere", "True"), ("mixed", "cylinder", "False")),
         *(("plane", "plane", "True"), ("plane", "sphere", "False"), ("plane", "cylinder", "False")),
     ]
-    assert "cylinder, never seen: pose_2" in said and "cylinder, never seen" in (tmp_path / "study" / "index.html").read_text()
+    assert "cylinder, unseen: depth" in said and "cylinder, unseen" in (tmp_path / "study" / "index.html").read_text()
     weights = [(tmp_path / "study" / name / "weights.pt").stat().st_mtime_ns for name in ("mixed", "plane")]
     results = [line for line in said.splitlines() if "times" in line]
     assert len(results) == 7 and [line for line in twin(*command).splitlines() if "times" in line] == results
     assert weights == [(tmp_path / "study" / name / "weights.pt").stat().st_mtime_ns for name in ("mixed", "plane")], "trained once"
     sets = [option for name in ("plane", "sphere") for option in ("--data", tmp_path / "study" / "sim" / name)]
     twin("train", "--model", "vgnn", "--sensor", SENSOR, *sets, "--epochs", 1, "--no-kernel", "--members", 1, "--out", tmp_path / "run")
-    assert "pose_2: mean error" in twin("evaluate", tmp_path / "run", *sets, "--out", tmp_path / "judged")
+    assert "depth: mean error" in twin("evaluate", tmp_path / "run", *sets, "--out", tmp_path / "judged")
 
 
 WITHOUT_ONE = (
@@ -161,7 +161,7 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
     assert "averaged with a Gaussian process" in (tmp_path / "study" / "index.html").read_text()
     trained = [tmp_path / "study" / run / "weights.pt" for run in (*(["sim_bare"] if left_out else []), "real_10", "real_all")]
     written = [weights.stat().st_mtime_ns for weights in trained]
-    judged = [line for line in said.splitlines() if "labelled" in line and "pose_2" in line]
+    judged = [line for line in said.splitlines() if "labelled" in line and "depth" in line]
     assert len(judged) == len(rows) and [line for line in twin(*command).splitlines() if line in judged] == judged
     assert [weights.stat().st_mtime_ns for weights in trained] == written, "trained once"
     plan = SimToRealPlan(
@@ -176,7 +176,7 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
         assert_labels_of_frames_without_are_not_used(plan, tmp_path)
     for run in ("sim_only", "sim_plus_real", "sim_taught"):
         told = twin("evaluate", tmp_path / "study" / run, "--data", tmp_path / "frames", "--rows", "all", "--out", tmp_path / run)
-        assert "pose_6: mean error" in told
+        assert "angle: mean error" in told
 
 
 def test_an_audit_of_few_frames_says_that_they_are_too_few(recording, tmp_path):

@@ -124,5 +124,5 @@ def test_the_verdict_needs_every_label_of_an_unseen_object(tmp_path):
     row = {"model": MIXED, "object": "edge", "pose_2_times": 1.2, "pose_6_times": 1.4}
     rows = [row, {**row, "model": "plane", "pose_2_times": 9.0}, {**row, "object": "sphere", "pose_2_times": 9.0}]
     (line,) = verdicts(plan_of(tmp_path), rows, ("pose_2", "pose_6"))
-    assert "pose_2 1.20, pose_6 1.40 times" in line and "(within 1.5)" in line
+    assert "depth 1.20, angle 1.40 times" in line and "(within 1.5)" in line
     assert "not within" in verdicts(plan_of(tmp_path), [row | {"pose_6_times": 1.6}], ("pose_2", "pose_6"))[0]

@@ -40,7 +40,7 @@ def known():
         response={"blur_sigma_px": 0.8, "sharpening": 0.0, "jpeg_quality": 0},
         pipeline={
             "raw": plain().pipeline.raw.model_copy(update={"mask_center_px": (99.0, 80.0), "mask_radius_px": 70.0}),
-            "recording": plain().pipeline.recording.model_copy(update={"rest_px": ()}),
+            "processed": plain().pipeline.processed.model_copy(update={"rest_px": ()}),
         },
     )  # fmt: skip
 

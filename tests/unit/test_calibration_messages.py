@@ -67,9 +67,9 @@ def test_a_contact_says_what_it_does_not_know_and_where_it_is_worse():
     fit = SimpleNamespace(before_px=np.array([1.0, 2.0]), after_px=np.array([0.5, 0.6]))
     assert warnings_of(fit, (1.5, 0.7), 3) == []
     (unknown,) = warnings_of(fit, None, 0)
-    assert "no frame was left to keep out" in unknown
+    assert "no held-out frame is left" in unknown
     (worse,) = warnings_of(fit, (1.5, 1.7), 3)
-    assert "worse than it began on the 3 frames kept out: 1.50 -> 1.70 px" in worse
+    assert "worse than it began on the 3 held-out frames: 1.50 -> 1.70 px" in worse
     (worse,) = warnings_of(replace_after(fit, 3.0), (1.5, 0.7), 3)
     assert "worse than it began on the fitted frames" in worse
     summary = {"problems": [], "parameters": [], "fitted_px": {}, "held_out_px": {}, "distrusted": [], "warnings": [unknown]}

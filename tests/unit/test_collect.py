@@ -132,7 +132,7 @@ def test_a_start_that_failed_before_the_first_frame_keeps_no_folder_for_itself(t
     assert Collection(tmp_path, {"seed": 1, "camera": "another"}, Form.RAW).count == 0
     assert json.loads((tmp_path / META).read_text())["camera"] == "another"
     Collection(tmp_path, {"seed": 1, "camera": "another"}, Form.RAW).keep_rest(Frame(np.zeros((4, 4), np.uint8), Form.RAW))
-    with pytest.raises(DeviceError, match="made otherwise \\(camera\\)"):
+    with pytest.raises(DeviceError, match="with other settings \\(camera\\)"):
         Collection(tmp_path, {"seed": 1, "camera": "none"}, Form.RAW)
 
 

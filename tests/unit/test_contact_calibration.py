@@ -172,6 +172,6 @@ def test_pins_at_rest_that_no_frame_shows_are_fitted_with_the_contact(calibrated
     fit = fit_contact(setup, seen)
     away_px = np.linalg.norm(fit.rest_px - measured.no_contact_px - off_px, axis=1)
     assert np.median(away_px) < 0.1 * np.median(np.linalg.norm(off_px, axis=1))
-    assert np.allclose(fit.sensor.pipeline.recording.rest_px, fit.rest_px, atol=1e-3)
+    assert np.allclose(fit.sensor.pipeline.processed.rest_px, fit.rest_px, atol=1e-3)
     before, after = held_out_px(setup, fit, replace(held, pins_px=held.pins_px + off_px, at_rest_seen=False))
     assert after < 0.25 * before

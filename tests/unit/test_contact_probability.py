@@ -93,7 +93,7 @@ def test_a_frame_without_contact_gives_no_pose_and_says_why():
     trained = replace(estimator._trained, pipeline=Seeing(seen, **vars(pipeline)), touched=answer)
     found = estimator.part.estimate_frame(trained, frame)
     assert isinstance(found, Unseen) and found.touched < 0.5
-    assert "nothing is touched" in found.reason
+    assert "no contact" in found.reason
     unsure = estimator.part.estimate_frame(replace(trained, touched=None), frame)
     assert np.isfinite(unsure.mean).all() and np.isnan(unsure.touched)
 

@@ -122,7 +122,7 @@ def test_thresholded_frames_of_dark_pins_are_recognised(tmp_path):
     for k, image in enumerate(white):
         cv2.imwrite(str(tmp_path / f"frame_{k}.png"), image)
     found = new_sensor(tmp_path, tmp_path / "out" / "dark.toml")
-    assert found.sensor.pipeline.recording is not None and found.sensor.pipeline.recording.polarity == "dark"
+    assert found.sensor.pipeline.processed is not None and found.sensor.pipeline.processed.polarity == "dark"
     assert found.health.all_pins == 1 and found.sensor.recording is not None and found.sensor.recording.threshold_offset > 0
 
 

@@ -163,7 +163,7 @@ def test_frames_of_a_sensor_without_a_recording_form_are_raw(spec, foreign, tmp_
     """Whatever they look like: these are thresholded."""
     for frame in foreign[0]:
         cv2.imwrite(str(tmp_path / f"{frame.name}.png"), np.where(frame.image > 70, 255, 0).astype(np.uint8))
-    alone = spec.model_copy(update={"recording": None, "pipeline": spec.pipeline.model_copy(update={"recording": None})})
+    alone = spec.model_copy(update={"recording": None, "pipeline": spec.pipeline.model_copy(update={"processed": None})})
     assert tune_on_frames(tmp_path, alone, limit=2).tuned.detector.form == Form.RAW
 
 

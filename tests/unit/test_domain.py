@@ -121,7 +121,7 @@ def test_lost_pins_are_filled_in_and_what_is_not_known_of_them_widens():
 
 def test_an_estimate_far_outside_the_trained_range_is_named():
     reason, _ = domain().outside_range(np.array([16.2, 0.0]), ("pose_2", "pose_6"), UNITS)
-    assert "pose_2 comes out as 16.2 mm, trained from 1.0" in reason
+    assert "depth 16.2 mm, trained from 1.0" in reason
     reason, excess = domain().outside_range(np.array([3.2, 0.0]), ("pose_2", "pose_6"), UNITS)
     assert not reason and 0.15 < excess[0] < 0.25 and excess[1] == 0
 

@@ -83,7 +83,7 @@ GIVEN = {"model": "gnn", "sensor": "mg400-127", "data": "nowhere", "out": "nowhe
         ({"epochs": 1.5}, "`epochs`: expected a whole number"),
         ({"max_minutes": float("nan")}, "`max_minutes`: expected a number"),
         ({"kernel": "no"}, "`kernel`: expected True or False"),
-        ({"form": "cooked"}, "`form`: expected raw or recording, got 'cooked'"),
+        ({"form": "cooked"}, "`form`: expected raw or processed, got 'cooked'"),
         ({"target": ["pose_2", "pose_2"]}, "`target=pose_2,pose_2`: give one name"),
         ({"data": 3}, "`data`: expected a path"),
         ({"model": None}, "`model`: expected a name"),

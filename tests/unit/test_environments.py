@@ -285,7 +285,7 @@ def test_wrong_calls_are_named():
         env.step(np.array([np.nan, 0.0]))
     with pytest.raises(OptionError, match=r"an action of shape \(2,\) is expected .*, got \(3,\)"):
         env.step(np.zeros(3))
-    with pytest.raises(OptionError, match="autoreset_mode='foo' is not offered; give 'NextStep' or 'SameStep'"):
+    with pytest.raises(OptionError, match="autoreset_mode='foo' is not supported; give 'NextStep' or 'SameStep'"):
         TactileVectorEnv("SurfaceFollow", 2, autoreset_mode="foo")
     for given in ("up", [[1.0], [1.0, 2.0]], {"x": 1}):
         with pytest.raises(OptionError, match=r"an action of shape \(2,\) is expected .*, got "):
@@ -380,7 +380,7 @@ def test_a_learner_of_stable_baselines_gets_ends_as_it_expects_them():
         assert done.all() == (step == 3) and all({"is_success", "off_mm"} <= info.keys() for info in infos)
     assert all(info["TimeLimit.truncated"] for info in infos)
     assert all(not np.array_equal(info["terminal_observation"]["tactile"], seen["tactile"][row]) for row, info in enumerate(infos))
-    with pytest.raises(OptionError, match="is no vector"):
+    with pytest.raises(OptionError, match="is not a vector"):
         BaselinesVecEnv(gymnasium.make_vec("CartPole-v1", num_envs=2))
 
 

@@ -15,7 +15,7 @@ from twin.cli import command_line
 from twin.cli.command import App, as_function
 from twin.cli.options import Formerly
 from twin.errors import OptionError, warn_once
-from twin.types import Quality
+from twin.types import Form, Quality
 
 
 @pytest.fixture(autouse=True)
@@ -26,9 +26,11 @@ def each_warning_anew():
 def work(
     elements: Annotated[int, typer.Option("--elements", help="elements", min=6), Formerly("across")] = 20,
     quality: Annotated[Quality, typer.Option(help="quality")] = "standard",
+    form: Annotated[Form | None, typer.Option(help="form")] = None,
 ) -> None:
     """Work."""
-    print(elements, quality)
+    assert form is None or isinstance(form, Form)
+    print(elements, form or quality)
 
 
 def run(*arguments):
@@ -43,20 +45,21 @@ def run(*arguments):
     [
         (["--across", "8"], "`elements`", "8 standard"),
         (["--quality", "drawn"], "'rasterised'", "20 rasterised"),
+        (["--form", "recording"], "'processed'", "20 processed"),
     ],
 )
 def test_a_former_name_works_with_a_warning(former, present, shown):
     with pytest.warns(RuntimeWarning, match=f"is now called {present}; the old name still works"):
         ended = run(*former)
     assert ended.exit_code == 0 and ended.output.strip() == shown
-    assert former[0] not in run("--help").output or former[0] == "--quality"
+    assert former[0] not in run("--help").output or former[0] != "--across"
 
 
 def test_present_names_give_no_warning_and_others_are_refused():
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         assert run("--elements", "8", "--quality", "rasterised").output.strip() == "8 rasterised"
-    assert run("--quality", "nice").exit_code == 2 and run("--across", "2").exit_code == 2
+    assert run("--quality", "nice").exit_code == 2 and run("--form", "cooked").exit_code == 2 and run("--across", "2").exit_code == 2
 
 
 def test_functions_of_python_take_former_names(capsys):
@@ -64,15 +67,18 @@ def test_functions_of_python_take_former_names(capsys):
     with pytest.warns(RuntimeWarning, match="still works"):
         function(across=8, quality="drawn")
     assert capsys.readouterr().out.strip() == "8 rasterised"
+    with pytest.warns(RuntimeWarning, match="'processed'"):
+        function(form="recording")
     with pytest.raises(OptionError, match="expected rasterised or preview"):
         function(quality="nice")
 
 
 def test_a_data_set_of_version_1_has_the_present_quality():
     made = {"sensor": twin.load_sensor("mg400-127"), "object": twin.load_object("plane"), "friction": 0.3}
-    made |= {"experiment": twin.load_experiment("surface-2d"), "quality": "drawn"}
-    with pytest.warns(RuntimeWarning, match="'rasterised'"):
-        assert GenerationConfig(**made).quality == "rasterised"
+    made |= {"experiment": twin.load_experiment("surface-2d"), "quality": "drawn", "images": "recording"}
+    with pytest.warns(RuntimeWarning, match="'rasterised'|'processed'"):
+        config = GenerationConfig(**made)
+    assert config.quality == "rasterised" and config.images == config.form == "processed"
 
 
 def test_no_former_name_is_a_present_one_of_the_same_command():
@@ -89,4 +95,7 @@ def test_no_former_name_is_a_present_one_of_the_same_command():
 def test_keys_and_environment_options_of_version_1_are_read():
     rig = RigSpec.model_validate({"tcp_to_dome_mm": -17.0, "tcp_aside_mm": 0.4})
     assert rig.tcp_binormal_mm == 0.4
+    sensor = twin.load_sensor("mg400-331")
+    pipeline = sensor.model_dump(mode="json")["pipeline"]
+    assert type(sensor.pipeline).model_validate({"recording" if k == "processed" else k: v for k, v in pipeline.items()}) == sensor.pipeline
     assert Options.from_keywords({"friction_memory": False}).friction_history is False

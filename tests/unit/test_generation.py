@@ -208,7 +208,7 @@ def test_a_data_set_goes_on_only_with_the_same_mesh(tmp_path):
     generate(tmp_path / "set", config, 1)
     (label,) = load_dataset(tmp_path / "set", config.sensor).targets.corrected
     trimesh.creation.icosphere(subdivisions=2, radius=9.0).export(mesh)
-    with pytest.raises(DatasetError, match=r"made otherwise \(object\)"):
+    with pytest.raises(DatasetError, match=r"with other settings \(object\)"):
         generate(tmp_path / "set", small_config(tmp_path, object=load_object(mesh), randomisation=None), 2)
     with pytest.raises(MeshError, match="has changed since"):  # what it touched gives the labels, too
         load_dataset(tmp_path / "set", config.sensor)
@@ -295,13 +295,13 @@ def test_failed_contacts_are_listed_and_replaced(tmp_path, monkeypatch):
     labels = zarr.open_group(tmp_path / "set" / "truth.zarr", mode="r")["pose"][:]
     assert np.array_equal(labels[1], real(config, 1, 2).label.pose)
     monkeypatch.setattr(make, "draw_contact", lambda *_: (_ for _ in ()).throw(ContactError("always")))
-    with pytest.raises(DatasetError, match="contact 3: 20 draws failed one after another, the last: always"):
+    with pytest.raises(DatasetError, match="contact 3: 20 samples failed one after another, the last: always"):
         generate(tmp_path / "set", config, 4)
 
 
 def test_other_options_and_foreign_folders_are_refused(made, tmp_path):
     folder, config, _ = made
-    with pytest.raises(DatasetError, match=r"made otherwise \(seed\)"):
+    with pytest.raises(DatasetError, match=r"with other settings \(seed\)"):
         generate(folder, config.model_copy(update={"seed": 5}), COUNT)
     (tmp_path / "photo.txt").write_text("mine")
     with pytest.raises(DatasetError, match="holds something else"):
@@ -352,7 +352,7 @@ def test_a_full_disk_ends_the_run_in_one_line(made, tmp_path, monkeypatch):
 
 def test_pictures_are_those_of_the_states(tmp_path):
     """A rendered frame's pins are found where the truth says."""
-    config = small_config(tmp_path, images="recording", quality="preview", randomisation=None)
+    config = small_config(tmp_path, images="processed", quality="preview", randomisation=None)
     try:
         generate(tmp_path / "set", config, 1)
     except RenderError as error:

@@ -180,6 +180,6 @@ def test_a_study_of_servos_in_which_nothing_moved_fails_with_the_first_reason(tm
 
 def test_frames_of_another_form_are_refused_without_the_name_of_an_option():
     known = known_frames(load_sensor("mg400-127"))
-    with pytest.raises(FrameError, match="f.png: expected 640x480 .raw form. of mg400-127, got 256x256 .recording form.") as caught:
+    with pytest.raises(FrameError, match="f.png: expected 640x480 .raw form. of mg400-127, got 256x256 .processed form.") as caught:
         form_of(np.zeros((256, 256), np.uint8), "f.png", known, Form.RAW)
     assert "--" not in str(caught.value), "twin predict has no --form"

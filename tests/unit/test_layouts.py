@@ -10,7 +10,8 @@ from scipy.spatial import Delaunay
 from scenes import SpecError, load_sensor
 from scenes.pins import PinsSpec, layout_from
 from twin.geometry.pins import pin_lattice, rest_pins
-from twin.pins import Pipeline, make_reference, nominal_reference
+from twin.pins import Pipeline, make_graph, make_reference, nominal_reference
+from twin.pins.flips import flipped
 from twin.types import Form, Frame
 
 LAYOUTS = {
@@ -50,6 +51,18 @@ def test_missing_pins_leave_the_others_in_their_order():
     assert np.allclose(pin_lattice(less).places, places)
     slots = pin_lattice(less).slots
     assert len(slots) == 61 and slots[3] == slots[20] == -1 and np.array_equal(slots[slots >= 0], np.arange(59))
+
+
+@pytest.mark.parametrize("pins", LAYOUTS.values(), ids=LAYOUTS)
+def test_flips_from_the_rest_layout_find_the_delaunay_triangles(pins):
+    """Also where the outline is concave, and where pins on a circle or a line make the triangles ambiguous: Qhull then chooses."""
+    rest, rng, found = nominal_reference(sensor_with(pins), Form.RAW), np.random.default_rng(5), 0
+    assert rest.net is not None
+    for share in (0.0, 0.03, 0.06, 0.1, 0.2, 0.3) * 4:
+        nodes = rest.pins_px + rng.normal(0, share * rest.pitch_px, rest.pins_px.shape)
+        assert np.array_equal(make_graph("delaunay", nodes, net=rest.net).edges, make_graph("delaunay", nodes).edges)
+        found += len(flipped(nodes, *rest.net)) > 0
+    assert found >= 8
 
 
 @pytest.mark.parametrize("pins", LAYOUTS.values(), ids=LAYOUTS)

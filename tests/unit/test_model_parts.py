@@ -98,14 +98,14 @@ def test_a_new_model_trains_is_judged_estimates_and_is_kept_with_no_other_change
 
 
 def test_what_a_new_model_does_not_provide_it_says(data, toy, tmp_path):
-    with pytest.raises(TrainingError, match="line has no modes that a Gaussian process could see; train it with `kernel=False`"):
+    with pytest.raises(TrainingError, match="line has no modes for a Gaussian process; train it with `kernel=False`"):
         recipe_of(toy, kernel=True)
     with pytest.raises(TrainingError, match="line has no part that can be left out"):
         variant_named("line-without-pins")
     train_run(RunConfig(toy, recipe_of(toy, epochs=1)), data, tmp_path)
-    with pytest.raises(TrainingError, match="small copy of line"):
+    with pytest.raises(TrainingError, match="line has no small copy"):
         pack(tmp_path, tmp_path / "small")
-    with pytest.raises(FrameError, match="counts pins from rest, line does not"):
+    with pytest.raises(FrameError, match="line does not measure displacements from rest"):
         PoseEstimator.load(tmp_path).at_rest(Frame(np.zeros((256, 256), np.uint8), Form.PROCESSED))
 
 
@@ -127,7 +127,7 @@ def test_sizes_that_a_model_does_not_have_are_named(data):
     with pytest.raises(TrainingError, match="vgnn has no size layer; there are channels, layers"):
         model_named("vgnn").build(data.pins.reference, 2, {"layer": 1})
     for name in ("gnn", "cnn-v2"):
-        with pytest.raises(TrainingError, match=f"{name} has no size layers; it has none"):
+        with pytest.raises(TrainingError, match=f"{name} has no size layers; it has no sizes"):
             model_named(name).build(data.pins.reference, 2, {"layers": 1})
 
 
@@ -136,7 +136,7 @@ def test_a_model_of_pictures_refuses_pins_instead_of_guessing(data):
     content = {"networks": [model.build(reference, 2, {}).state_dict()], "kernels": [], "kernel_labels": [], "aside": {}}
     content |= {"shift": np.zeros(2), "scale": np.ones(2), "blend": np.zeros(2), "quantile": np.ones(2), "raw_quantile": np.ones((2, 2))}
     config = {"model": "cnn-v2", "size": {}, "columns": ["pose_2", "pose_6"], "units": ["mm", "deg"]}
-    config |= {"sensor": data.pins.sensor.model_dump(mode="json"), "pipeline": {"form": "recording", "graph": "voronoi"}}
+    config |= {"sensor": data.pins.sensor.model_dump(mode="json"), "pipeline": {"form": "processed", "graph": "voronoi"}}
     estimator = PoseEstimator(config, content | {"reference_px": torch.from_numpy(reference.pins_px)})
     with pytest.raises(TrainingError, match="cnn-v2 estimates from pictures, not from pins"):
         estimator.predict_table(data.pins)

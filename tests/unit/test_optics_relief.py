@@ -28,7 +28,7 @@ def spec() -> SensorSpec:
     half = {"width_px": 320, "height_px": 240, "fx_px": 245.0, "fy_px": 245.0, "cx_px": 152.0, "cy_px": 124.0}
     pins = PinsSpec(layout="hexagon", rings=2, max_polar_deg=35.0, length_mm=1.1, diameter_mm=0.8, cap_diameter_mm=3.0, cap_height_mm=0.1)
     whole = plain()
-    pipeline = whole.pipeline.model_copy(update={"recording": None})
+    pipeline = whole.pipeline.model_copy(update={"processed": None})
     return changed(whole, camera=half).model_copy(update={"pins": pins, "recording": None, "pipeline": pipeline})
 
 

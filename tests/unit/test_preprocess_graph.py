@@ -1,6 +1,7 @@
 """Laws of the graphs: the cells tile their region, edges are what geometry says, no node's order matters."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -99,7 +100,7 @@ def test_relative_features_don_t_know_the_scale(sensor):
     if sensor.recording is None:
         pytest.skip("has one form only")
     rest = nominal_reference(sensor, Form.PROCESSED)
-    scaled = type(rest)(**{**vars(rest), "pins_px": 2 * rest.pins_px, "spacing_px": 2 * rest.spacing_px, "area_px2": 4 * rest.area_px2})
+    scaled = replace(rest, pins_px=2 * rest.pins_px, spacing_px=2 * rest.spacing_px, area_px2=4 * rest.area_px2)
     moved = rest.pins_px + np.random.default_rng(0).normal(0, 1, rest.pins_px.shape)
     small, large = (make_graph("voronoi", scale * moved, outmost=rest.outmost) for scale in (1, 2))
     np.testing.assert_allclose(node_features(small, rest), node_features(large, scaled), rtol=1e-9, atol=1e-9)

@@ -11,14 +11,14 @@ from scenes import load_sensor
 from twin.camera.capture import record
 from twin.errors import FrameError
 from twin.frames import open_recording
-from twin.frames.forms import raw_to_recording
+from twin.frames.forms import levels_at, raw_to_recording
 from twin.pins import Pipeline, measure_reference, nominal_reference
 from twin.pins.detectors.legacy import LegacyPipeline
 from twin.pins.finding.blobs import SPECK_LEVELS, circular_mask, despeckle, find_blobs
 from twin.pins.labelling.matching import confirm, match, rematch
 from twin.pins.labelling.reference import folded_fraction
 from twin.pins.labelling.split import split_chains
-from twin.pins.pipeline import lower_levels
+from twin.pins.pipeline import LEAST_ABOVE, share_between
 from twin.types import Form, Frame
 
 CENTROID_RAW_PX = 0.05  # rms on a drawn gray cap with noise: a tenth of what rendering is held to
@@ -573,10 +573,16 @@ def test_published_method_throws_away_what_it_did(real_dir):
     assert 0.01 < np.mean(found != spec.pins.count) < 0.055  # published: 0.032; three standard errors of the sample
 
 
-def test_percentiles_of_rows_are_those_without_nan():
+def test_share_of_pins_between_caps_is_that_of_plain_arrays():
     rng = np.random.default_rng(0)
-    levels = rng.normal(size=(200, 6))
-    levels[rng.random(levels.shape) < 0.4] = np.nan
-    levels = levels[np.isfinite(levels).any(axis=1)]
-    for percent in (0.0, 30.0, 50.0, 100.0):
-        assert np.allclose(lower_levels(levels, percent), np.nanpercentile(levels, percent, axis=1))
+    gray = rng.integers(0, 255, (60, 80), np.uint8)
+    near = np.array([rng.permutation(40)[:6] for _ in range(40)])
+    for lost in (0.0, 0.3, 0.9):
+        px = rng.uniform(-2, (82, 62), (40, 2))
+        px[rng.random(40) < lost] = np.nan
+        middle, smooth = (px[:, None] + px[near]) / 2, cv2.blur(gray, (3, 3))
+        between = np.where(np.isfinite(middle[..., 0]), levels_at(smooth, np.nan_to_num(middle)), np.nan)
+        known = np.isfinite(between).any(axis=1)
+        above = levels_at(smooth, px[known]) - np.nanpercentile(between[known], 35, axis=1)
+        plain = np.mean(above <= LEAST_ABOVE * np.percentile(above, 75)) if known.any() else 0.0
+        assert share_between(gray, px, near, 35, 75) == plain

@@ -166,8 +166,8 @@ def test_form_is_told_by_size_and_can_be_given(tmp_path, spec):
 
 def test_a_form_may_be_given_by_its_name_and_an_unknown_one_names_the_known(tmp_path, spec):
     raw = drawn_frame(spec, Form.RAW, nominal_reference(spec, Form.RAW).pins_px)
-    assert Pipeline(spec, "raw").form is Form.RAW and frame_size(spec, "recording") == frame_size(spec, Form.PROCESSED)
-    assert np.array_equal(capture(raw.image, spec, "recording"), capture(raw.image, spec, Form.PROCESSED))
+    assert Pipeline(spec, "raw").form is Form.RAW and frame_size(spec, "processed") == frame_size(spec, Form.PROCESSED)
+    assert np.array_equal(capture(raw.image, spec, "processed"), capture(raw.image, spec, Form.PROCESSED))
     write_image(tmp_path / "raw.png", raw.image)
     for unknown in (
         lambda: Pipeline(spec, "foo"),
@@ -178,13 +178,13 @@ def test_a_form_may_be_given_by_its_name_and_an_unknown_one_names_the_known(tmp_
         lambda: nominal_reference(spec, "foo"),
         lambda: open_recording(tmp_path / "raw.png", spec, "foo"),
     ):
-        with pytest.raises(FrameError, match="^no form is called 'foo'; there are: raw, recording"):
+        with pytest.raises(FrameError, match="^no form is called 'foo'; there are: raw, processed"):
             unknown()
     with pytest.raises(FrameError, match=r"a twin.types.Frame is expected, got ndarray; give Frame\(image, Form.RAW\)"):
         Pipeline(spec, Form.RAW)(raw.image)
 
 
-@pytest.mark.parametrize(("form", "folder"), [("raw", "images"), ("recording", "frames_bw")])
+@pytest.mark.parametrize(("form", "folder"), [("raw", "images"), ("processed", "frames_bw")])
 def test_frames_of_a_form_that_is_given_by_its_name_get_that_forms_folder(tmp_path, form, folder):
     assert Collection(tmp_path / "collected", {}, form).pictures.name == folder
     with open_writer(tmp_path / "written", "recording", replace(ABOUT, form=form), 10) as writer:
@@ -194,7 +194,7 @@ def test_frames_of_a_form_that_is_given_by_its_name_get_that_forms_folder(tmp_pa
 
 def test_a_model_refuses_an_unknown_form_as_it_refuses_the_other_one():
     model = PoseEstimator.load("mg400-127")
-    model.check(model.sensor, "recording")
+    model.check(model.sensor, "processed")
     with pytest.raises(FrameError, match="these are raw frames of"):
         model.check(model.sensor, "raw")
     with pytest.raises(FrameError, match="no form is called 'foo'"):
@@ -508,7 +508,7 @@ def test_the_first_frame_decides_between_equal_numbers(tmp_path, spec, pictures)
 
 def test_a_form_that_no_frame_has_is_an_error(tmp_path, spec, pictures):
     write_pictures(tmp_path, {"a.png": pictures[1]})
-    with pytest.raises(FrameError, match=r"a.png: expected 640x480 \(raw form\).*got 256x256 \(recording form\)"):
+    with pytest.raises(FrameError, match=r"a.png: expected 640x480 \(raw form\).*got 256x256 \(processed form\)"):
         open_recording(tmp_path, spec, Form.RAW)
 
 

@@ -301,7 +301,7 @@ def test_a_time_before_the_first_frame_is_refused(tmp_path):
             yield replace(step, time_s=-float(k))
 
     for to in FORMATS:
-        with pytest.raises(RecordError, match="-1.0 s after its first"):
+        with pytest.raises(RecordError, match="-1.0 s after the first"):
             written(tmp_path / to, to, [replace(EPISODES[0], steps=back)])
 
 

@@ -105,7 +105,7 @@ def test_moves_that_were_not_executed_are_taken_out_and_said(tmp_path, to):
     source = recording(tmp_path / "r", pose_2=(1, 2, 3), pose_6=(10, 20, 30), move_1=(0.5, 1, 2), move_6=(4, 5, 6))
     (source / "move_executed.csv").write_text("image_name,executed\n" + "".join(f"{name},{k % 2}\n" for k, name in enumerate(NAMES)))
     done = convert([source], tmp_path / "out", to)
-    assert any("moves of 2 frames were not, or not surely, executed" in note for note in done.notes)
+    assert any("moves of 2 frames were not, or not certainly, executed" in note for note in done.notes)
     steps = [step.values for episode in open_records(tmp_path / "out").episodes for step in episode.steps()]
     assert [step["pose"][[0, 1, 5]].tolist() for step in steps] == [[-0.5, 1, 6], [0, 2, 20], [-2, 3, 24]]
     assert [step["move"][[0, 5]].tolist() for step in steps] == [[0, 0], [1, 5], [0, 0]]
@@ -140,7 +140,7 @@ def test_a_data_sets_truth_goes_with_it(tmp_path):
     rng = np.random.default_rng(0)
     arrays = {"pins_px": rng.normal(size=(3, 127, 2)), "force_n": rng.normal(size=(3, 3)), "torque_nmm": rng.normal(size=(3, 3))}
     truth.append(arrays | {"pose": rng.normal(size=(3, 6)), "path_id": np.array([0, 0, 1])})
-    truth.close({"sensor": "mg400-127", "form": "recording"})
+    truth.close({"sensor": "mg400-127", "form": "processed"})
     experiment = load_experiment("surface-2d")
     made = {"sensor": SENSOR.model_dump(mode="json"), "experiment": experiment.model_dump(mode="json")}
     (folder / "generation.json").write_text(json.dumps(made))
@@ -178,7 +178,7 @@ def test_a_collection_is_kept_in_further_formats_while_it_grows(tmp_path):
     for each in formats:
         steps = [step for episode in open_records(folder / each).episodes for step in episode.steps()]
         assert [step.values["action"].tolist() for step in steps] == [[k] * 6 for k in range(3)]
-    with pytest.raises(RecordError, match="no format bag"):
+    with pytest.raises(RecordError, match="no further format bag"):
         KeptAlso(folder, ("bag",), SENSOR)
 
 

@@ -66,7 +66,7 @@ def test_a_viewer_that_goes_is_an_error_at_the_end(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", SimpleNamespace(RecordingStream=Stream))
     with socket.create_server(("127.0.0.1", 0)) as server:
         view = RerunView("title", f"rerun+http://127.0.0.1:{server.getsockname()[1]}/proxy")
-        with pytest.raises(DeviceError, match="gone before the end .connection lost."), view:
+        with pytest.raises(DeviceError, match="closed before the end .connection lost."), view:
             pass
     assert view._stream.closed
 

@@ -41,7 +41,7 @@ def test_pauses_unread_frames_and_frames_that_are_used_again_are_said(tmp_path):
             session.append(frame(k), {})
     notes = "".join(open_records(tmp_path / "s").notes)
     assert "1 pause, 3.5 s in all, the longest 3.5 s after frame 3; usually 0.5 s" in notes
-    assert "6 frames of the camera between the recorded ones" in notes and "1 of 7 steps use the frame of the step before" in notes
+    assert "6 frames of the camera between the recorded ones" in notes and "1 of 7 steps use the same frame as the step before" in notes
     with SessionWriter(tmp_path / "even", {}) as session:
         for k in range(4):
             session.append(frame(k), {})
@@ -222,7 +222,7 @@ def test_missing_lines_are_not_passed_over(tmp_path):
             session.append(frame(k), {})
     lines = (folder / STEPS).read_text().splitlines(keepends=True)
     (folder / STEPS).write_text("".join(lines[:2]))
-    assert replayed(folder)[1] == ["2 pictures in frames/ have no step in steps.jsonl: the session was cut"]
+    assert replayed(folder)[1] == ["2 pictures in frames/ have no step in steps.jsonl: the session was interrupted"]
     (folder / STEPS).write_text("".join([*lines[:1], *lines[2:]]))
     with pytest.raises(FrameError, match="steps.jsonl, line 2 is of step 2: lines are missing"):
         SessionSource(folder)

@@ -256,12 +256,12 @@ def test_a_way_is_written_and_read(tmp_path):
     [
         (b"x_mm\n1\n", "expected the columns"),
         (b"time_s,up\n1,2\n", "expected the columns"),
-        (b"time_s,x_mm\n0,a\n", "not readable as a trajectory"),
+        (b"time_s,x_mm\n0,a\n", "no readable trajectory"),
         (b"time_s,x_mm\n0,1\n0,2\n", "time_s does not increase"),
         (b"time_s,x_mm\n", "0 rows"),
         (b"time_s,x_mm\n0,nan\n", "not a finite number"),
-        (b"time_s,x_mm\n0,1,2\n", "not readable as a trajectory"),
-        (b"\xff\xfe", "not readable as a trajectory"),
+        (b"time_s,x_mm\n0,1,2\n", "no readable trajectory"),
+        (b"\xff\xfe", "no readable trajectory"),
     ],
 )
 def test_what_is_no_way_is_refused(content, why):

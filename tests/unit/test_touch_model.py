@@ -82,5 +82,5 @@ def test_light_tells_what_pins_do_not(tmp_path):
     _, left_out = fit_smooth_processes(modes, told[:, None])
     assert np.abs(left_out[:, 0] - told).mean() < 0.1
     assert not np.array_equal(TOUCH.inputs_seen(lit)[1], TOUCH.inputs_seen(data)[1])
-    with pytest.raises(TrainingError, match="come without it; give it frames"):
+    with pytest.raises(TrainingError, match="which these pins do not contain; give it frames"):
         TOUCH.inputs(data.pins, prepared.learnt, data.pins.reference, together=False)

@@ -46,7 +46,7 @@ def model_of(name):
 
 
 def known_of(name):
-    return np.array(model_of(name).recorded_sensor.pipeline.recording.rest_px)
+    return np.array(model_of(name).recorded_sensor.pipeline.processed.rest_px)
 
 
 def drawn(model, px, name="init_0.png"):
@@ -226,7 +226,7 @@ def test_the_written_copy_is_a_sensor_and_wrong_sides_are_refused(tmp_path):
     made, _ = register_files(spec, rest, pushes, form=Form.PROCESSED, out=tmp_path / "mine.toml")
     again = load_sensor(tmp_path / "mine.toml")
     assert (
-        again.camera.turn_deg == pytest.approx(made.camera.turn_deg) and again.pipeline.recording.rest_px == made.pipeline.recording.rest_px
+        again.camera.turn_deg == pytest.approx(made.camera.turn_deg) and again.pipeline.processed.rest_px == made.pipeline.processed.rest_px
     )
     found = {each.name: each for each in examine([frames["rest"]], again)}
     assert all(found[name].verdict is Grade.HEALTHY for name in ("shift", "turn", "scale", "stretch", "mirror"))

@@ -128,6 +128,7 @@ PHRASES = {
     r"\bstand-in for (?:a sensor's |the )?finite elements\b": "surrogate model",
     r"\bwhere it ended\b": "resumes",
     r"\bframes (?:it was not|that were not) fitted(?: to)?\b": "held-out frames",
+    r"(?:--form|--images) recording\b|pipeline\.recording\b|\brecording form\b": "processed",
     r"--across\b|--no-sight\b|--sight\b|--no-memory\b|--memory\b|--labels\b|--limits?\b": "the present option",
 }
 PHRASES_ALLOWED = {}

@@ -300,7 +300,7 @@ def test_a_place_that_was_forgotten_is_asked_for():
         _compare_layout(PinsSpec(layout="positions", positions=tuple(map(tuple, of.tolist()))), images) for of in (places, short)
     )
     assert whole.sure and not whole.doubts
-    assert not found.sure and len(found.doubts) == 1 and "does the file lack its place?" in found.doubts[0]
+    assert not found.sure and len(found.doubts) == 1 and "is its position missing in the file?" in found.doubts[0]
     x, y = map(float, re.findall(r"-?\d+", found.doubts[0])[:2])
     assert np.hypot(*(rest_px[left_out] - (x, y))) < usual_spacing(rest_px) / 2
 
@@ -400,7 +400,7 @@ def test_strange_frames_give_a_right_answer_or_an_error_in_words(tmp_path, chang
 def test_without_a_no_contact_frame_shipped_weights_count_from_their_units_pins(tmp_path, name):
     """The frames show contacts of a unit whose pins stand a little beside the specification's, as the weights know."""
     model = PoseEstimator.load(name)
-    known = np.array(model.recorded_sensor.pipeline.recording.rest_px)
+    known = np.array(model.recorded_sensor.pipeline.processed.rest_px)
     image = drawn_frame(model.sensor, Form.PROCESSED, known).image
     cv2.imwrite(str(tmp_path / "f_0.png"), image)
     predictions = predict_frames(name, tmp_path)
@@ -414,12 +414,12 @@ def test_without_a_no_contact_frame_shipped_weights_count_from_their_units_pins(
 @pytest.mark.parametrize("inside", [False, True], ids=["beside the picture", "where a recording has it"])
 def test_a_single_picture_is_counted_from_the_frame_without_contact_of_its_folder(tmp_path, inside):
     model = PoseEstimator.load("mg400-127")
-    rest = np.array(model.recorded_sensor.pipeline.recording.rest_px) + [1.0, -2.0]  # this unit's camera looks a little elsewhere
+    rest = np.array(model.recorded_sensor.pipeline.processed.rest_px) + [1.0, -2.0]  # this unit's camera looks a little elsewhere
     folder = tmp_path / "frames_bw" if inside else tmp_path
     folder.mkdir(exist_ok=True)
     cv2.imwrite(str(tmp_path / "init_0.png"), drawn_frame(model.sensor, Form.PROCESSED, rest).image)
     cv2.imwrite(str(folder / "f_0.png"), drawn_frame(model.sensor, Form.PROCESSED, smooth_warp(rest, 3.0, np.random.default_rng(0))).image)
     alone, of_folder = predict_frames("mg400-127", folder / "f_0.png"), predict_frames("mg400-127", tmp_path)
-    assert "pins are counted from init_0.png, which lies beside the picture" in alone.recording.problems
+    assert "displacements of pins are measured from init_0.png, which is beside the picture" in alone.recording.problems
     ((_, one),), ((_, other),) = list(alone), list(of_folder)
     np.testing.assert_array_equal(one.value, other.value)

@@ -43,7 +43,7 @@ def simulated(sensor: str, folder: Path, *, raw: bool) -> list[Path]:
     """Folders of the simulated contacts of a sensor, made if they are missing; of frames of the camera if ``raw``."""
     spec, found = load_sensor(sensor), []
     if raw:
-        spec = spec.model_copy(update={"recording": None, "pipeline": spec.pipeline.model_copy(update={"recording": None})})
+        spec = spec.model_copy(update={"recording": None, "pipeline": spec.pipeline.model_copy(update={"processed": None})})
     for objects, count, seed in ((["plane"], 24, 71),) if raw else CONTACTS:
         for name in objects:
             out = folder / f"{sensor}-{name}-{seed}{'-raw' if raw else ''}"

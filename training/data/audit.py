@@ -78,7 +78,7 @@ class Audit:
 
 
 def audit_labels(pins: PinTable, pose: np.ndarray, move: np.ndarray) -> Audit:
-    """Find the hypothesis that fits each frame. If there are too few frames, no hypothesis is evaluated, and ``Audit.untold`` states this.
+    """Find the hypothesis that fits each frame. If there are too few frames, none is evaluated, and ``Audit.not_assessed`` states this.
 
     Parameters
     ----------

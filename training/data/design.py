@@ -12,7 +12,7 @@ def nearest_to_even(labels: np.ndarray, units: Sequence[str], count: int, *, see
     """Different rows (count,) of a recording that are nearest to contacts spread evenly over its labels (M, K). The first rows alone are
     also spread evenly.
 
-    In this way a random collection gives frames like those of ``twin collect --design even``.
+    So a random collection gives frames like those of ``twin collect --design even``.
 
     Parameters
     ----------

@@ -173,7 +173,7 @@ def voronoi_areas(nodes_px: np.ndarray, reference: Reference, *, progress: Step 
     def compute() -> dict[str, np.ndarray]:
         areas = np.empty(nodes_px.shape[:2])
         for k, pins_px in enumerate(nodes_px):
-            areas[k] = make_graph("voronoi", pins_px, outmost=reference.outmost).area_px2
+            areas[k] = make_graph("voronoi", pins_px, outmost=reference.outmost, net=reference.net).area_px2
             if progress:
                 progress(k + 1, len(nodes_px))
         return {"area_px2": areas}

@@ -58,7 +58,7 @@ def open_simulated(folder: Path, spec: SensorSpec, form: Form | None = None) -> 
     problems: list[str] = []
     table = read_table(folder / TABLE, problems) if (folder / TABLE).is_file() else None
     if table is None:
-        raise FrameError(f"{folder}: no {TABLE} of a finished data set; give the command that made it once more")
+        raise FrameError(f"{folder}: no {TABLE} of a finished data set; repeat the command that made it")
     _, labels = order_by_table([folder / TABLE], [folder / name for name in table.name_lists[0]], problems)
     names = table.name_lists[0]
     rows_by_name = row_of(truth)
@@ -160,7 +160,7 @@ def _draws(path: Path) -> dict[int, dict[str, float]]:
         rows = list(csv.DictReader(io.StringIO(read_regular(path, LARGEST_BYTES).decode(), newline=""), strict=True))
         return {int(row["path_id"]): {key: float(row[key]) for key in row if str(key).startswith("rig.")} for row in rows}
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        how = getattr(error, "strerror", None) or "no whole table of numbers"
+        how = getattr(error, "strerror", None) or "not a complete table of numbers"
         raise FrameError(f"{path}: damaged ({how}); {AGAIN}") from error
 
 

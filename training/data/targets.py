@@ -1,4 +1,4 @@
-"""The labels that a model learns: columns of a recording's table, as published (raw) and corrected.
+"""The labels that a model is trained on: columns of a recording's table, as published (raw) and corrected.
 
 Labels are corrected for this reason: about a third of the frames in the published Tac-VGNN recordings were taken before the shear move
 was executed. In these frames both shears are zero, and the angle is ``pose_6 - move_6``. Because the plate is slightly tilted, their
@@ -184,7 +184,7 @@ def contact_columns(recording: Recording) -> tuple[str, ...]:
             if np.ptp(values) > 0 and not twice:  # a column of another convention exists under two names and is used once
                 names.append(name)
     if not names:
-        raise FrameError(f"{recording.path}: no column that varies contains about the contacts; {recording.labels_found()}")
+        raise FrameError(f"{recording.path}: no column with different values describes the contacts; {recording.labels_found()}")
     return tuple(names)
 
 

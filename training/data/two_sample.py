@@ -5,8 +5,8 @@ others. Frame k of one set is always held out together with frame k of the other
 that knew one of them could recognise the other. An accuracy of 50 % means that the network can't distinguish the sets, 100 % that it
 assigns every patch to the right set.
 
-What one network does not see, a stronger one may see. There are two (`JUDGES`), and both can be asked to distinguish two halves of the
-real frames (`real_halves`), which shows what a test says where there is nothing to distinguish.
+A stronger network may see more. There are two (`JUDGES`), and both can also be applied to two halves of the
+real frames (`real_halves`), which shows the result where there is nothing to distinguish.
 """
 
 from collections.abc import Mapping
@@ -45,7 +45,7 @@ LEVEL_SCALE = 64.0
 
 @dataclass(frozen=True)
 class PatchClassifier:
-    """A network of the test, and how long it learns.
+    """A network of the test, and how long it is trained.
 
     Attributes
     ----------
@@ -204,7 +204,7 @@ def as_color(image: np.ndarray) -> np.ndarray:
 
 
 def patch_corners(inside: np.ndarray) -> np.ndarray:
-    """(k, 2) row and column of the first pixel of every patch that lies in the disc with at least nine tenths of its area.
+    """(k, 2) row and column of the first pixel of every patch with at least nine tenths of its area in the disc.
 
     Raises
     ------

@@ -31,9 +31,7 @@ class BaselinesVecEnv(VecEnv):
     def __init__(self, vector: VectorEnv[Any, Any, Any]) -> None:
         inner = vector.unwrapped
         if not isinstance(inner, TactileVectorEnv):
-            raise OptionError(
-                f"{inner!r} is no vector of this program's environments; give gymnasium.make_vec('twin:tactip/EdgeFollow-v0')"
-            )
+            raise OptionError(f"{inner!r} is not a vector environment of this program; use gymnasium.make_vec('twin:tactip/EdgeFollow-v0')")
         self.vector = inner
         self._actions: FloatArray = np.zeros(0)
         self.vector.metadata["autoreset_mode"] = AutoresetMode.SAME_STEP

@@ -30,8 +30,6 @@ PERIOD_S = 0.1
 """Duration of a step, s: an agent decides ten times per second."""
 LARGEST_MM, LARGEST_DEG = 1.0, 5.0
 """Motion of a step, along and about each axis, by an action of 1."""
-MOST_TRIALS = 2
-"""Most iterations in a step by which the place of a pushed object is found. A block's force is then within some 0.05 N of its friction."""
 MOST_STACK = 16
 """Most observations that can be stacked."""
 MOST_ORACLE = 100.0
@@ -70,8 +68,8 @@ class Options:
     sensor : str
         Name or file.
     observation : {"pins", "oracle", "graph", "image", "pose"}
-        Content of ``tactile``: displacements of the pins in spacings (N, 2); values that no sensor knows; the graph's node features (N, 5);
-        a small gray picture (128, 128); the pose of the shipped estimator.
+        Content of ``tactile``: displacements of the pins in spacings (N, 2); values that no sensor measures; the graph's node features
+        (N, 5); a small gray picture (128, 128); the pose of the shipped estimator.
     stack : int
         Number of newest observations that are given together, the newest last.
     axes : tuple of str, optional
@@ -134,9 +132,7 @@ class Options:
         if self.objects is not None and not self.objects:
             raise OptionError("objects=(): expected at least one object")
         if self.backend == "fem" and not self.friction_history:
-            raise OptionError(
-                "friction_history=False goes with backend='surrogate' alone: finite elements always have history-dependent friction"
-            )
+            raise OptionError("friction_history=False needs backend='surrogate': finite elements always have history-dependent friction")
 
     @classmethod
     def from_keywords(cls, options: Mapping[str, Any]) -> "Options":
@@ -162,7 +158,7 @@ def require_known(how: RandomisationSpec | None) -> None:
     drawn = [] if how is None else [key for key in how.sensor if is_mechanical(*key.split("."))]
     if how is not None and drawn:
         raise OptionError(
-            f"randomise={how.name!r} draws {drawn[0]}, which the surrogate holds fixed; use backend='fem', "
+            f"randomise={how.name!r} samples {drawn[0]}, which the surrogate keeps fixed; use backend='fem', "
             "or a randomisation of friction, camera and noise, such as 'moves'"
         )
 
@@ -208,16 +204,16 @@ class Batch:
         self.sensor = load_sensor(options.sensor)
         self.tool = Tool.of(self.sensor, load_experiment(self.task.experiment))
         self.objects = {name: load_object(name) for name in options.objects or self.task.objects}
-        for thing in self.objects.values():
-            self.task.require(thing)
+        for obj in self.objects.values():
+            self.task.require(obj)
         self.randomisation = load_randomisation(options.randomise) if options.randomise else None
         self.steps = options.steps or self.task.steps
         self._surfaces = Surfaces()
         self.backend = self._make_backend()
-        for name, thing in list(self.objects.items()):
+        for name, obj in list(self.objects.items()):
             try:
                 for friction in _ends(self.randomisation):
-                    self.backend.require(self._contact(self.sensor, thing, friction))
+                    self.backend.require(self._contact(self.sensor, obj, friction))
             except ContactError:
                 if options.objects is not None or len(self.objects) == 1:
                     raise
@@ -320,10 +316,8 @@ class Batch:
         self.T_object[rows] = carried[rows]
         self.steps_done[rows] += 1
         self._move(rows)
-        for _ in range(MOST_TRIALS):
-            pushed = self.task.push_object(self.backend.felt, self.T_work, self.T_object, self.tool)
-            if pushed is None:
-                break
+        pushed = self.task.push_object(self.backend.felt, self.T_work, self.T_object, self.tool)
+        if pushed is not None:
             self.T_object[rows] = pushed[rows]
             self._move(rows)
         self._look(rows, first=False)
@@ -340,7 +334,7 @@ class Batch:
         return self.task.goals_for_agents(self.goal, self.T_work)
 
     def oracle(self) -> FloatArray:
-        """Values of the newest states that no real sensor knows, (B, K), by the task's ``oracle_names``."""
+        """Values of the newest states that no real sensor measures, (B, K), by the task's ``oracle_names``."""
         return np.clip(self.task.oracle(self._observe_world()), -MOST_ORACLE, MOST_ORACLE)
 
     def picture(self, row: int) -> ImageArray:
@@ -365,9 +359,9 @@ class Batch:
         T = self.tool.object_poses(self.T_work, self.T_object)
         parts = {field.name: np.zeros((self.count, 3) if field.name == "place_mm" else self.count) for field in fields(TrueTouch)}
         things = [None if contact is None else contact.obj for contact in self.contacts]
-        for thing in {id(one): one for one in things if one is not None}.values():
-            rows = [row for row, one in enumerate(things) if one is thing]
-            found = self._surfaces[thing].depth_and_angle(self.tool.mounting, T[rows])
+        for obj in {id(one): one for one in things if one is not None}.values():
+            rows = [row for row, one in enumerate(things) if one is obj]
+            found = self._surfaces[obj].depth_and_angle(self.tool.mounting, T[rows])
             for key, values in parts.items():
                 values[rows] = getattr(found, key)
         return TrueTouch(**parts)

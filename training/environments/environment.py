@@ -135,7 +135,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
             print(f"open {self._page.url} in a browser: it shows the episode", file=sys.stderr, flush=True)
         T = batch.tool.object_poses(batch.T_work, batch.T_object)[0]
         place_mm, felt = batch.touch().place_mm[0], batch.backend.felt
-        told = {
+        shown = {
             "goal": ", ".join(
                 _in_units(name, value) for name, value in zip(batch.task.goal_names, batch.goals_for_agents()[0].tolist(), strict=True)
             ),
@@ -152,7 +152,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
                 felt.force_n[0].copy(),
                 T[:3, :3] @ place_mm + T[:3, 3],
                 reward,
-                {name: text for name, text in told.items() if text},
+                {name: text for name, text in shown.items() if text},
             )
         )
         time.sleep(max(0.0, self._shown_s + 1 / RENDER_FPS - time.monotonic()))
@@ -191,7 +191,7 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
         **options: Any,
     ) -> None:
         if autoreset_mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, "NextStep", "SameStep"):
-            raise OptionError(f"autoreset_mode={autoreset_mode!r} is not offered; give 'NextStep' or 'SameStep'")
+            raise OptionError(f"autoreset_mode={autoreset_mode!r} is not supported; give 'NextStep' or 'SameStep'")
         mode = AutoresetMode(autoreset_mode)
         if not isinstance(num_envs, int) or num_envs < 1:
             raise OptionError(f"num_envs={num_envs!r}: expected a whole number of at least 1")
@@ -289,10 +289,10 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
             raise OptionError("the environments are closed; make new ones")
 
 
-def _of_rows(told: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
+def _of_rows(shown: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
     """Entries of ``info`` for some rows (B,), as gymnasium gathers them: each array with the mask of the rows that have a value."""
     info: dict[str, Any] = {}
-    for name, values in told.items():
+    for name, values in shown.items():
         has = rows & np.array([value is not None for value in values]) if values.dtype == object else rows.copy()
         if has.any():
             info[name], info[f"_{name}"] = np.where(has, values, None if values.dtype == object else np.zeros_like(values)), has

@@ -1,7 +1,7 @@
 """Learning of a policy by proximal policy optimisation (stable-baselines3), and evaluating it on either backend.
 
 The network's input is not the displacement of some hundred pins, but its principal components in random motions. From the same motions, a
-second network, the state estimator, is trained to predict the values that only the simulation knows, such as place and force. Its estimates
+second network, the state estimator, is trained to predict the values that only the simulation has, such as place and force. Its estimates
 are also an input of the policy.
 """
 
@@ -72,11 +72,11 @@ class LearnPlan:
         Number of environments that are stepped together.
     seed : int
     episodes : int
-        Number of episodes in which the policy is evaluated at the end, on the backend on which it learnt.
+        Number of episodes in which the policy is evaluated at the end, on the backend of its training.
     fem_episodes : int
         Number of episodes on finite elements, with rasterised frames and the real pipeline; 0: none.
     sight : bool
-        First learn to estimate the values that only the simulation knows. This makes a policy precise on the backend on which it learnt.
+        First train to estimate the values that only the simulation has. This makes a policy precise on the backend of its training.
         But the policy then depends on small motions of the pins, in which a surrogate has errors.
     """
 
@@ -109,8 +109,8 @@ class Learnt(ReadableResult):
     def lines(self) -> list[str]:
         """The result as lines of text."""
         steps, seconds = self.curve[-1][:2] if self.curve else (0, 0.0)
-        told = ", ".join(f"{share:.0%} of the episodes on {where}" for where, share in self.success.items())
-        return [f"{steps} steps in {seconds / 60:.1f} min; solved {told}"]
+        results = ", ".join(f"{share:.0%} of the episodes on {where}" for where, share in self.success.items())
+        return [f"{steps} steps in {seconds / 60:.1f} min; solved {results}"]
 
 
 class SteppedTogether(BaselinesVecEnv):
@@ -199,13 +199,13 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
     }
     if not plan.options.friction_history:
         remembering = replace(plan.options, friction_history=True)
-        success["surrogate, friction remembers"] = evaluate_policy(made, plan.task, remembering, plan.episodes, seed=10_000 + plan.seed)
+        success["surrogate, friction history"] = evaluate_policy(made, plan.task, remembering, plan.episodes, seed=10_000 + plan.seed)
     if plan.fem_episodes:
         true = on_finite_elements(plan.options, tuple(vector.batch.objects))
         success["finite elements, rasterised frames"] = evaluate_policy(made, plan.task, true, plan.fem_episodes, seed=20_000 + plan.seed)
     steps, seconds = watch.curve[-1][:2] if watch.curve else (ppo.num_timesteps, time.monotonic() - begun_s)
-    told = {"success": success, "steps": steps, "minutes": round(seconds / 60, 2), "core_minutes": round(used_s / 60, 2)}
-    write_json(written[3], {"task": plan.task, "options": asdict(plan.options), **told})
+    results = {"success": success, "steps": steps, "minutes": round(seconds / 60, 2), "core_minutes": round(used_s / 60, 2)}
+    write_json(written[3], {"task": plan.task, "options": asdict(plan.options), **results})
     return Learnt(made, watch.curve, success, written)
 
 
@@ -238,10 +238,10 @@ def evaluate_policy(policy: Policy, task: str, options: Options, episodes: int, 
     share = np.array([len(range(row, episodes, rows)) for row in range(rows)])
     ended = solved = np.zeros(rows, int)
     while (ended < share).any():
-        seen, _, terminated, truncated, told = vector.step(policy.act(*_split_observation(seen)))
+        seen, _, terminated, truncated, results = vector.step(policy.act(*_split_observation(seen)))
         counted = (terminated | truncated) & (ended < share)
         if counted.any():
-            ended, solved = ended + counted, solved + (counted & told["final_info"]["is_success"])
+            ended, solved = ended + counted, solved + (counted & results["final_info"]["is_success"])
     return float(solved.sum() / episodes)
 
 

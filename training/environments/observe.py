@@ -74,7 +74,7 @@ class SensorView:
             return Pipeline(self.sensor, self.form, measure_reference(self.sensor, self.form, rest))
         except FrameError as error:
             raise OptionError(
-                f"the pins of {self.sensor.name} as drawn can't be found at rest ({error}); narrow the randomisation"
+                f"the pins of the sampled {self.sensor.name} can't be found at rest ({error}); narrow the randomisation"
             ) from error
 
 
@@ -103,14 +103,10 @@ class Eye:
         if kind == "pose":
             if sensor.name not in shipped_names():
                 known = ", ".join(shipped_names())
-                raise OptionError(
-                    f"observation 'pose' needs weights that go with the package; {sensor.name} has none (those of {known} have)"
-                )
+                raise OptionError(f"observation 'pose' needs shipped weights; {sensor.name} has none (there are those of {known} have)")
             self._estimator = PoseEstimator.load(sensor.name)
             if self._sees_light and pictures == "none":
-                raise OptionError(
-                    f"observation 'pose': the weights of {sensor.name} learnt from the light on the caps as well; give pictures='preview'"
-                )
+                raise OptionError(f"observation 'pose': the weights of {sensor.name} also need the light on caps; give pictures='preview'")
         self.form = self._estimator.form if self._estimator else Form.PROCESSED if sensor.recording else Form.RAW
         self.reference = nominal_reference(sensor, self.form)
         self._spacing = float(self.reference.spacing_px.mean())
@@ -166,7 +162,7 @@ class Eye:
         """Observations (R, ...) from pins (R, N, 2), relative to the nominal layout, and from the light (R, N) on their caps."""
         if self.kind == "pins":
             return np.clip((pins_px - self.reference.pins_px) / self._spacing, -LARGEST, LARGEST).astype(np.float32)
-        graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost) for pins in pins_px]
+        graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost, net=self.reference.net) for pins in pins_px]
         if self.kind == "graph":
             seen = np.stack([node_features(graph, self.reference) for graph in graphs])
             return np.clip(seen, -LARGEST, LARGEST).astype(np.float32)

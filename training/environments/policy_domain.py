@@ -1,6 +1,7 @@
-"""The domain of a policy: the patterns of displaced pins that it knows, so that it does not act on a frame that shows none of them.
+"""The domain of a policy: the patterns of displaced pins that it was trained on. The policy does not act on other frames.
 
-A policy for a sensor with shipped weights knows all contacts that these know, real ones among them. Another one knows what it met itself.
+The domain of a policy for a sensor with shipped weights is that of these weights, which contains real contacts. The domain of another
+policy contains the contacts of its own training.
 """
 
 from collections.abc import Callable

@@ -32,7 +32,7 @@ class Start:
     Attributes
     ----------
     T_work : (4, 4) float
-        Work frame of the tool in the world; the object's frame is the world's at the start, unless ``T_object`` says otherwise.
+        Work frame of the tool in the world; the object's frame is the world's at the start, unless ``T_object`` is given.
     goal : tuple of float
         The goal, by the task's ``goal_names``.
     T_object : (4, 4) float
@@ -145,11 +145,11 @@ class Task(ABC):
         """Evaluate the state after a step."""
 
     def push_object(self, reading: ContactReading, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
-        """Response of the object's pose to the skin's forces: poses (B, 4, 4) to try next, or None if the object is held."""
+        """The object's poses (B, 4, 4) after it gave way to the skin's forces, or None if no object moves."""
         return None
 
     def carry_object(self, reading: ContactReading, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
-        """The object's poses (B, 4, 4) after tools that felt ``reading`` moved from ``before`` to ``T_work``. Held objects do not move."""
+        """The object's poses (B, 4, 4) after tools with this ``reading`` moved from ``before`` to ``T_work``. Held objects do not move."""
         return T_object
 
     def goals_for_agents(self, goal: FloatArray, T_work: FloatArray) -> FloatArray:
@@ -410,8 +410,10 @@ class ObjectPush(Task):
     lever_mm = 15.0
     """Lever of the support's friction, mm: largest friction torque divided by the friction force."""
     give_mm_per_n = 1.0
-    """Displacement of a block, mm, per N by which the push exceeds the support's friction, in one iteration of a step: about what the skin
-    gives way, so that two iterations are enough."""
+    """Displacement of a block, mm, per N by which the push exceeds the support's friction: about what the skin gives way."""
+    ahead, sliding_share = 0.85, 0.9
+    """Share of the tool's motion along the push by which a sliding block moves before its contact is solved, and share of its friction from
+    which it counts as sliding. The contact's force then corrects the block once. Its force is within some 0.07 N of its friction."""
     columns = 2  # friction force of the support, and the least distance to the goal so far
     success_share = 0.0
     reached_reward = 10.0
@@ -419,12 +421,22 @@ class ObjectPush(Task):
     def begin(self, row: int, tool: Tool, obj: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
         T = standing_on(tool, surfaces[obj], 0.0, 0.5, rng.uniform(-8.0, 8.0))
         goal = np.array([rng.uniform(-12.0, 12.0), rng.uniform(40.0, 60.0)])
+        self._turn = tool.T_work_sensor[:3, :3]
         self.kept[row] = rng.uniform(*self.holds_n), np.linalg.norm(goal - self._middle(np.eye(4)[None])[0, [0, 2]])
         return Start(T, (float(goal[0]), float(goal[1])), np.eye(4))
 
     def goals_for_agents(self, goal: FloatArray, T_work: FloatArray) -> FloatArray:
-        """The goals' places relative to the tools, whose own poses a robot knows."""
+        """The goals' places relative to the tools, whose own poses a robot reports."""
         return _shift_in_plane(goal - T_work[:, [0, 2], 3], T_work)
+
+    def carry_object(self, reading: ContactReading, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
+        force = (before[:, :3, :3] @ self._turn @ reading.force_n[:, :, None])[:, :, 0] * [1.0, 0.0, 1.0]
+        size = np.maximum(np.linalg.norm(force, axis=1), 1e-9)
+        along = ((T_work - before)[:, :3, 3] * force).sum(axis=1) / size
+        shift = self.ahead * np.maximum(along, 0.0) * (size >= self.sliding_share * self.kept[:, 0]) / size
+        out = T_object.copy()
+        out[:, :3, 3] += shift[:, None] * force
+        return out
 
     def push_object(self, reading: ContactReading, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
         T_sensor = T_work @ tool.T_work_sensor

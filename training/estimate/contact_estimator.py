@@ -81,7 +81,7 @@ class ContactEstimator:
             kinds = {name: (str(kind.pop("model")), kind) for name, kind in json.loads(path.read_text(encoding="utf-8")).items()}
             unlike = [key for _, intervals in kinds.values() for key in intervals if key not in INTERVALS]
         except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-            raise damage_error(path, "it does not say which model is of which kind", AGAIN) from error
+            raise damage_error(path, "it does not state which model is of which kind", AGAIN) from error
         if unlike:
             raise damage_error(path, f"no intervals are called {unlike[0]}", AGAIN)
         models = {model: PoseEstimator.load(folder / model) for model, _ in kinds.values()}
@@ -165,7 +165,7 @@ class ContactEstimator:
         fitting = {name: len(part.names) for name, part in self.parts.items() if set(part.names) <= varied}
         if not fitting:
             needed = "; ".join(f"{name}: {', '.join(part.names)}" for name, part in self.parts.items())
-            raise TrainingError(f"{recording.path}: varies the labels of no kind of contact that the weights know ({needed}); give another")
+            raise TrainingError(f"{recording.path}: its varying labels fit no kind of contact of the weights ({needed}); give another")
         first = max(fitting, key=lambda name: fitting[name])
         return [name for name in fitting if self.parts[name].names == self.parts[first].names]
 
@@ -198,7 +198,7 @@ class KindOfContact:
     model : str
         Name of the run that estimates it.
     frames : sequence of Dataset
-        Frames of this kind, from which the classifier learns. Give the frames from which the run learnt.
+        Frames of this kind, on which the classifier is trained. Give the training frames of the run.
     intervals : dict of str to array
         The run's interval quantiles for this kind, from frames that it did not learn from (``training.studies.judging.intervals_on``). If
         empty, the run's own intervals are used.

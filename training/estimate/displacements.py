@@ -1,4 +1,4 @@
-"""Model of the possible displacements of the pins, learnt without labels, and the estimate of another unit's pins at rest from contacts.
+"""Model of the possible displacements of the pins, fitted without labels, and the estimate of another unit's pins at rest from contacts.
 
 A few numbers (depth, tilt, shear) determine nearly the whole displacement of the pins by a contact. With the leading principal
 coordinates a (D,) of the displacements, in standard deviations, the displacement u (2N,) is
@@ -48,8 +48,8 @@ SETTLE, MOST_ROUNDS, SETTLED = 6, 20, 3e-4
 LONGEST_STEP = 0.7
 """Largest change of a coordinate in a round."""
 OTHER_UNIT = (
-    "the pins at rest were found from the contacts: they are not where they were measured on the unit that the weights are for, so this is "
-    "another unit, or its camera or tip was touched; one frame without contact (init_0.png beside the frames) is more exact"
+    "the pins at rest were found from the contacts: they are not where they were measured on the unit of the weights, so this is another "
+    "unit, or its camera or tip was moved; a frame without contact (init_0.png beside the frames) is more exact"
 )
 """Note for contacts from which rest places follow that differ from the known ones."""
 

@@ -33,6 +33,7 @@ from training.data.label_code import HALF_CIRCLE_DEG, label_error
 from training.errors import TrainingError
 from training.models.vgnn.registration import align
 from training.runs.run_files import AGAIN
+from twin.estimate import readable_labels
 from twin.frames import spread_indices
 from twin.pins import Reference
 from twin.store import ArrayFile
@@ -273,7 +274,7 @@ class Domain:
             notes.append(f"the pins' pattern is {strange:.1f} times as far from the training frames as they are from each other")
         unknown = found.unknown
         if share > 0:
-            notes.append("the camera sits a little off its place at rest, which was taken out of the pins")
+            notes.append("the camera is slightly displaced; its displacement was removed from the pins")
             unknown += float(share * DOUBT * np.abs(found.camera) @ np.sqrt((self.motions**2).mean(axis=1)))
         if found.unknown > 0:
             notes.append("no training frame of known label is near")
@@ -309,7 +310,7 @@ class Domain:
         if excess[k] <= BEYOND_RANGE * (self.high[k] - self.low[k]):
             return "", excess
         return (
-            f"outside the trained range: {names[k]} comes out as {value[k]:.3g} {units[k]}, trained from {self.low[k]:.3g} to "
+            f"outside the trained range: {readable_labels(names)[k]} {value[k]:.3g} {units[k]}, trained from {self.low[k]:.3g} to "
             f"{self.high[k]:.3g} {units[k]}".rstrip(),
             excess,
         )
@@ -334,7 +335,7 @@ class Domain:
         if smooth > EXPLAINS:
             return (
                 f"displaced camera: the view is stretched by {200 * np.hypot(*stretch):.1f} %, or seen through another lens or at another "
-                "angle than at rest; check the picture's size and the camera's seat, then " + again
+                "angle than at rest; check the picture's size and the camera's mount, then " + again
             )
         far = f"{found.parts[:4].max():.1f} times as far from the training frames as they are from each other"
         return (

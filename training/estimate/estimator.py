@@ -107,11 +107,11 @@ class PoseEstimator:
     Attributes
     ----------
     learnt_from : (m, 2) int64 or None
-        Marks of the frames from which the model learnt (``training.runs.identity.frame_marks``); None if the run does not hold them.
+        Marks of the model's training frames (``training.runs.identity.frame_marks``); None if the run does not hold them.
     maps : MapModel or None
-        Model of contact maps; None unless the run learnt it.
+        Model of contact maps; None if the run did not train it.
     slip : SlipModel or None
-        Model of slip in a sequence of frames; None unless the run learnt it.
+        Model of slip in a sequence of frames; None if the run did not train it.
     displacements : Displacements or None
         Model of the pins' possible displacements, which gives the rest places of a unit without a no-contact frame; None unless the run
         learnt it.
@@ -202,7 +202,7 @@ class PoseEstimator:
         The returned model gives no estimate for a frame that shows no contact.
         """
         if not self.counts_from_rest:
-            raise FrameError(f"a no-contact frame serves only a model that counts pins from rest, {self.model} does not; leave it out")
+            raise FrameError(f"{self.model} does not measure displacements from rest, so it needs no no-contact frame; leave it out")
         reference, undecided = self.rest.measured(frame)
         return self.counted_from(reference, measured=True).noting(undecided)
 
@@ -266,7 +266,7 @@ class PoseEstimator:
         return self.with_rest_pins(rest).noting(undecided), rest is not None
 
     def with_rest_pins(self, rest: Reference | None) -> "PoseEstimator":
-        """The same model with the rest places that contacts told, or with the known ones."""
+        """The same model with the pins at rest that were estimated from contacts, or with the known ones."""
         return self.at_known_rest() if rest is None else self.counted_from(rest)
 
     def nodes_in(self, frames: Iterable[Frame]) -> np.ndarray:
@@ -383,8 +383,8 @@ class PoseEstimator:
         """The model of contact maps; raises ``TrainingError`` if the run has none."""
         if self.maps is None:
             raise TrainingError(
-                f"the model of '{self.sensor.name}' makes no contact maps; train touch on simulated contacts, which tell "
-                "what acts on the skin ('twin dataset', 'twin train --model touch --target contact')"
+                f"the model of '{self.sensor.name}' makes no contact maps; train touch on simulated contacts, which contain the forces on "
+                "the skin ('twin dataset', 'twin train --model touch --target contact')"
             )
         return self.maps
 
@@ -452,7 +452,7 @@ class PoseEstimator:
 
     @property
     def trained_reference(self) -> Reference:
-        """The pins at rest from which the training counted displacements."""
+        """The pins at rest from which the training measured displacements."""
         return self._trained.reference
 
     def knows(self, pins: PinTable) -> np.ndarray:

@@ -124,5 +124,5 @@ class RestPlaces:
             The picture ``name`` is displaced so far that estimates would be wrong.
         """
         view = view_of(pins_px, self.known, self.sensor.pins, camera_modes(self.sensor, self.form))
-        view.require_small(name, f"the unit that the weights of {self.sensor.name} are for", contacts=contacts)
+        view.require_small(name, f"the unit of the weights of {self.sensor.name}", contacts=contacts)
         return view

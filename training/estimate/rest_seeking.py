@@ -15,7 +15,7 @@ from twin.pins import Pipeline
 from twin.types import Form, Frame, Observation
 
 LOG = logging.getLogger(__name__)
-SAME_UNIT = "the pins at rest are, by more contacts, where they were measured on the unit that the weights are for"
+SAME_UNIT = "after more contacts, the pins at rest are where they were measured on the unit of the weights"
 UNLIKE = 0.05
 """Least rms difference, in spacings, between the pins of a frame and those of every collected contact, for the frame to count as another
 contact. Of 40 random contacts (331 and 127 pins), three of four differ by this much from the next one. A held contact differs by the pins'

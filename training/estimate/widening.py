@@ -23,7 +23,7 @@ SIMULATED_FORCES = ("force_x", "force_y", "force_z", "torque_z")
 
 @dataclass(frozen=True)
 class Widening:
-    """Widens the intervals of K labels, and says why.
+    """Widens the intervals of K labels, and states why.
 
     Attributes
     ----------
@@ -47,27 +47,28 @@ class Widening:
         found = []
         if self.domain is None:
             found.append(
-                "the run does not hold the patterns of pins that it learnt from (an earlier version, or fewer frames than "
-                f"{FEWEST}): a strange frame gets an estimate like any other; train it again"
+                f"the run does not contain the pin patterns of its training (an earlier version, or fewer frames than {FEWEST}), so frames "
+                "outside its domain are not recognised; train it again"
             )
         if self.unmeasured > 1:
             found.append(
-                f"no frame without contact shows where the camera sits: all intervals are {self.unmeasured:g} times wider; give one "
-                "(--no-contact, --at-rest)"
+                f"without a frame without contact the camera's position is not known: all intervals are {self.unmeasured:g} times wider; "
+                "give one (--no-contact, --at-rest)"
             )
         if self._assumes:
             mm = ASSUMED_MM * self.sensor.skin.outer_radius_mm
             found.append(
                 "the model was trained on simulated contacts of a sensor whose contacts were never calibrated: radius, skin and gel are "
-                f"assumed; for that the intervals hold {ASSUMED_RADIUS:.0%} of each length, {mm:.2g} mm and {ASSUMED_DEG:g} deg; "
-                "'twin calibrate contact' with labelled contacts knows it better"
+                f"assumed; for that the intervals contain {ASSUMED_RADIUS:.0%} of each length, {mm:.2g} mm and {ASSUMED_DEG:g} deg; "
+                "'twin calibrate contact' with labelled contacts determines them better"
             )
         stiffness = self.sensor.skin.stiffness_factor
         if self._force.any() and stiffness > 1:
             skin, gel = self.sensor.skin.young_modulus_mpa, self.sensor.gel.young_modulus_mpa
             found.append(
-                f"forces and torques assume a skin of {skin:.3g} MPa and a gel of {gel:.3g} MPa, and may be {stiffness:.3g} times "
-                "larger or smaller; their intervals hold that; 'twin calibrate contact' with 3 weighed presses or more knows it better"
+                f"forces and torques assume a skin of {skin:.3g} MPa and a gel of {gel:.3g} MPa, and may be {stiffness:.3g} times larger "
+                "or smaller; their intervals contain that; 'twin calibrate contact' with 3 or more presses of measured force determines "
+                "it better"
             )
         return found
 

@@ -18,7 +18,7 @@ from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
 from twin.types import FINE, Form, Quality, present_value
 
-Images = Literal["raw", "gray", "recording", "none"]
+Images = Literal["raw", "gray", "processed", "none"]
 States = Literal["end", "all"]
 
 MOST_CONTACTS = 1_000_000
@@ -38,10 +38,10 @@ class GenerationConfig(Section):
     ----------
     friction : float
         Coefficient of friction of every contact, unless the randomisation draws it.
-    images : {"raw", "gray", "recording", "none"}
-        Which pictures are rendered: the camera's frame, its luminance, the recordings' thresholded form, or none (pins alone).
+    images : {"raw", "gray", "processed", "none"}
+        Which pictures are rendered: the camera's frame, its luminance, the processed (thresholded) frame, or none (pins alone).
     states : {"end", "all"}
-        Which states of a contact are kept: the last one, or every converged state on the way to it.
+        Which states of a contact are kept: the last one, or every converged state on the path to it.
     across : int
         Elements along each side of the skin's grid.
     """
@@ -52,7 +52,7 @@ class GenerationConfig(Section):
     randomisation: RandomisationSpec | None = None
     friction: NonNegative
     seed: Annotated[int, Field(ge=0)] = 0
-    images: Images = "raw"
+    images: Annotated[Images, BeforeValidator(present_value)] = "raw"
     states: States = "end"
     quality: Annotated[Quality, BeforeValidator(present_value)] = "standard"
     across: Annotated[int, Field(ge=6, le=64, multiple_of=2)] = FINE
@@ -62,7 +62,7 @@ class GenerationConfig(Section):
         """Form of frame in whose pixels the pins are given. Without pictures it is the recordings' form if the sensor has one, else raw."""
         if self.images == "none":
             return Form.PROCESSED if self.sensor.recording else Form.RAW
-        return Form.PROCESSED if self.images == "recording" else Form.RAW
+        return Form.PROCESSED if self.images == "processed" else Form.RAW
 
     @property
     def image_folder(self) -> str:
@@ -133,14 +133,14 @@ def draw_friction(spread: FrictionSpread, rng: np.random.Generator) -> float:
 
 
 def draw_sensor(nominal: SensorSpec, how: RandomisationSpec, rng: np.random.Generator) -> tuple[SensorSpec, dict]:
-    """A copy of a sensor with randomly sampled values, and these values by key. They are drawn in the alphabetical order of the keys."""
+    """A copy of a sensor with randomly sampled values, and these values by key. They are sampled in the alphabetical order of the keys."""
     plain = nominal.model_dump(mode="json") | {"rig": rig_of(nominal).model_dump(mode="json")}
     values = {}
     for key, spread in sorted(how.sensor.items()):
         section, name = key.split(".")
         share, (low, high) = rng.random(), spread.ends
         if plain[section] is None:
-            raise DatasetError(f"randomisation {how.name}: {nominal.name} has no [{section}], so '{key}' can't be drawn; leave it out")
+            raise DatasetError(f"randomisation {how.name}: {nominal.name} has no [{section}], so '{key}' can't be sampled; leave it out")
         if spread.scale:
             value = plain[section][name] * (low ** (1 - share) * high**share)
         else:

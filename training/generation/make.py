@@ -37,11 +37,11 @@ class Outcome:
     index : int
         Index of the contact; ``REST`` for the frame without contact.
     images : list of bytes
-        PNG of each of the S states; empty if the configuration asks for no pictures.
+        PNG of each of the S states; empty if the configuration has no pictures.
     arrays : dict of str to (S, ...) array
         Truth and labels of each state.
     draw : dict of str to float
-        The values drawn in addition to the label.
+        The values sampled in addition to the label.
     failures : list of str
         Why earlier draws for this contact failed, in order.
     """
@@ -75,16 +75,16 @@ def make_contact(text: str, index: int) -> Outcome:
         except (ContactError, MeshError) as error:
             failures.append(str(error))
     raise DatasetError(
-        f"contact {index}: {MOST_ATTEMPTS} draws failed one after another, the last: {failures[-1]}; narrow the experiment's ranges"
+        f"contact {index}: {MOST_ATTEMPTS} samples failed one after another, the last: {failures[-1]}; narrow the experiment's ranges"
     )
 
 
 def _simulate(config: GenerationConfig, text: str, draw: Draw, index: int, failures: list) -> Outcome:
     simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor, _shading(config, text, draw.sensor))
     contact = RigContact(simulator.solver, config.experiment, config.object)
-    way = contact.commanded_path(draw.label)
-    found = list(contact.along(way, friction=draw.friction))
-    labels = [way.label(fraction) for fraction, _ in found[:-1]] + [draw.label]
+    path = contact.commanded_path(draw.label)
+    found = list(contact.along(path, friction=draw.friction))
+    labels = [path.label(fraction) for fraction, _ in found[:-1]] + [draw.label]
     kept = range(len(found)) if config.states == "all" else [len(found) - 1]
     images, rows = [], []
     for k in kept:

@@ -49,7 +49,7 @@ class Simulated(ReadableResult):
         """The result as lines of text."""
         lines = [f"{self.before} contacts were there before"] if self.before else []
         if self.failed:
-            lines.append(f"{self.failed} draws failed and were sampled again: see {self.folder / 'failures.csv'}")
+            lines.append(f"{self.failed} contacts failed and were sampled again: see {self.folder / 'failures.csv'}")
         return [*lines, f"{self.frames} frames of {self.contacts} contacts"]
 
 
@@ -129,13 +129,13 @@ def config_for(
     FrameError
         The sensor has no frames of the requested form.
     """
-    thing = obj or load_object(experiment.object)
+    target_object = obj or load_object(experiment.object)
     config = GenerationConfig(
         sensor=sensor,
-        object=thing,
+        object=target_object,
         experiment=experiment,
         randomisation=randomisation,
-        friction=friction_between(sensor.rig and sensor.rig.for_object(thing.name), thing).static,
+        friction=friction_between(sensor.rig and sensor.rig.for_object(target_object.name), target_object).static,
         seed=experiment.seed if seed is None else seed,
         images=images,
         states=states,
@@ -171,7 +171,7 @@ def simulate_dataset(
         There is no such format, or a library is missing.
     """
     if also and config.images == "none":
-        raise OptionError("`also` keeps pictures; give `images` raw, gray or recording with it")
+        raise OptionError("`also` needs pictures; give `images` raw, gray or processed")
     with KeptAlso(out, also, config.sensor, at_once=False) as kept:
         with stage(progress, f"{config.experiment.name}, {config.sensor.name}") as step:
             made = generate(out, config, count, workers=workers, scheduler=scheduler, progress=step)

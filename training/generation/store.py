@@ -57,7 +57,7 @@ UNITS = {  # unit and meaning of each array in this group
     "caps_px": "px of the frame: exact projection of each cap's centre",
     "rest_px": "px of the frame: the same sensor without contact",
     "pins_px": "px of the frame: caps_px with the noise of a measurement",
-    "visible": "whether the cap is inside the frame and no other pin stands before it",
+    "visible": "whether the cap is inside the frame and no other pin hides it",
     "force_n": "N, of the skin on the object, sensor frame",
     "torque_nmm": "N mm about the sensor's origin",
     "area_mm2": "mm2 of skin in contact: nearer to the object than 0.05 mm",
@@ -72,7 +72,7 @@ UNITS = {  # unit and meaning of each array in this group
     "move": "move_1..6 as in targets.csv: mm, deg",
     "executed": "whether the move had been made when the frame was taken",
     "path_id": "number of the contact that the state belongs to: split by it, never by row",
-    "fraction": "of the contact's way done",
+    "fraction": "share of the contact's path that is done",
 }
 
 
@@ -190,7 +190,7 @@ class Store:
             "num_frames": 1,
             "comments": f"simulated: {experiment.name}, {self.config.sensor.name}, {self.config.object.name}",
         }
-        if recording and self.config.images == "recording":
+        if recording and self.config.images == "processed":
             meta["threshold"] = [recording.threshold_block_px, recording.threshold_offset]
             meta["crop"] = list(recording.crop_px)
             meta["size"] = [recording.width_px, recording.height_px]
@@ -202,7 +202,7 @@ class Store:
             before, now = read_record(path), json.loads(text)
             if before != now:
                 other = ", ".join(key for key in {**now, **before} if before.get(key) != now.get(key))
-                raise DatasetError(f"{self.folder}: holds a data set made otherwise ({other}); repeat its options, or give another `out`")
+                raise DatasetError(f"{self.folder}: holds a data set with other settings ({other}); repeat them, or give another `out`")
             require_same_code(self.folder, make_contact, begun=True)
             return
         require_same_code(self.folder, make_contact, begun=False)

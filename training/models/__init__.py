@@ -27,7 +27,7 @@ def register(model: Model) -> None:
         Another model has this name, or the name contains ``WITHOUT``.
     """
     if model.name in MODELS or WITHOUT in model.name:
-        raise ValueError(f"a model can't be registered as '{model.name}': another one is called so, or it holds '{WITHOUT}'")
+        raise ValueError(f"a model can't be registered as '{model.name}': another one has this name, or it contains '{WITHOUT}'")
     MODELS[model.name] = model
 
 
@@ -92,5 +92,5 @@ def recipe_of(model: str, **changes: object) -> Recipe:
         if getattr(recipe, key) < 1:
             raise TrainingError(f"{key} must be at least 1, got {getattr(recipe, key)}")
     if recipe.kernel and not chosen.has_modes:
-        raise TrainingError(f"{model} has no modes that a Gaussian process could see; train it with `kernel=False`")
+        raise TrainingError(f"{model} has no modes for a Gaussian process; train it with `kernel=False`")
     return recipe

@@ -1,6 +1,6 @@
 """The interface of a model for the rest of the code. Each model is an object of a class below, in its own package.
 
-A run calls these methods in this order: ``prepare`` (makes inputs of frames, and learns from the training frames what the networks
+A run calls these methods in this order: ``prepare`` (makes inputs of frames, and fits to the training frames what the networks
 need), ``build`` (makes a network with random weights), ``initialise`` (sets a network's constants from the training rows before the
 first step), and ``modes`` if a Gaussian process is averaged with the networks (makes that process's inputs). A trained model estimates
 by ``estimate_frame`` and ``estimate_rows``. ``pack`` and ``unpack`` make and read its small copy. Ensembles and intervals are the same
@@ -70,7 +70,7 @@ class Prepared:
     inputs : Inputs
         ``views`` times M rows: row v M + k is frame k in view v. View 0 is the unchanged frame.
     learnt : dict
-        Arrays learnt from the training frames; they are stored with the weights.
+        Arrays fitted to the training frames; they are stored with the weights.
     views : int
         Number of versions of each frame that the network is trained on.
     """
@@ -281,7 +281,7 @@ class Model(ABC):
         TrainingError
             The model has none: see ``has_modes``.
         """
-        raise TrainingError(f"{self.name} has no modes that a Gaussian process could see; train it with `kernel=False`")
+        raise TrainingError(f"{self.name} has no modes for a Gaussian process; train it with `kernel=False`")
 
     @abstractmethod
     def estimate_frame(self, trained: Trained, frame: Frame) -> Prediction | Unseen:
@@ -305,7 +305,7 @@ class Model(ABC):
         TrainingError
             The model has no small copy.
         """
-        raise TrainingError(f"a small copy of {self.name} is not provided for: what half precision does to it was never measured")
+        raise TrainingError(f"{self.name} has no small copy: the effect of half precision on it was never measured")
 
     def unpack(self, packed: Weights, blank: Weights) -> Weights:
         """The weights of a network from its small copy ``packed``; ``blank`` are the weights of the network that ``build`` makes.
@@ -315,7 +315,7 @@ class Model(ABC):
         TrainingError
             The model has no small copy.
         """
-        raise TrainingError(f"a small copy of {self.name} is not provided for")
+        raise TrainingError(f"{self.name} has no small copy")
 
 
 class PinModel(Model):
@@ -373,7 +373,7 @@ class PinModel(Model):
         lost = np.isnan(seen.pins_px[:, 0])
         touched = trained.contact_probability(seen.graph.nodes_px, lost)
         if touched < LIKELY:
-            return Unseen(f"nothing is touched (probability of a contact {touched:.0%})", touched, seen)
+            return Unseen(f"no contact (its probability is {touched:.0%})", touched, seen)
         reference = trained.pipeline.reference
         pins = PinTable(
             trained.sensor,
@@ -418,5 +418,5 @@ def refuse_sizes(model: Model, size: Mapping[str, int], known: tuple[str, ...] =
     TrainingError
     """
     if odd := sorted(set(size) - set(known)):
-        there_are = f"there are {', '.join(known)}" if known else "it has none that can be chosen"
+        there_are = f"there are {', '.join(known)}" if known else "it has no sizes to choose"
         raise TrainingError(f"{model.name} has no size {', '.join(odd)}; {there_are}")

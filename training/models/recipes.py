@@ -14,7 +14,7 @@ class Recipe:
         Adam's learning rate, before the schedule changes it.
     schedule : {"cosine", "plateau", "constant"}
         Cosine: after a short rise the rate falls to 0 over all epochs. Plateau: it is halved after three epochs in which the loss of
-        the last training batch did not fall, as in the published code. Constant: it stays the same.
+        the last training batch did not fall, as in the published code. Constant: it does not change.
     patience : int
         Number of epochs without a smaller error on the held-out fold after which training stops. With 0 it never stops early, and the
         result are the last, averaged weights.

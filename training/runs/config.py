@@ -26,11 +26,11 @@ class RunConfig:
     split : int or None
         Seed of the validation fifth that is kept out of training; None trains on all rows.
     helpers : tuple of str
-        Label columns that are learnt only because they help to learn the others; they have less weight.
+        Auxiliary label columns, which are trained only because they improve the others; they have less weight.
     size : dict
         Sizes of the network that differ from the model's own.
     labelled : dict
-        ``identity_of`` the real frames from which the errors of simulated pins were learnt, and their ``image_names``; empty for other
+        ``identity_of`` the real frames from which the errors of simulated pins were fitted, and their ``image_names``; empty for other
         runs.
 
     Raises
@@ -55,10 +55,10 @@ class RunConfig:
 
 
 def training_rows(config: RunConfig, data: Dataset) -> np.ndarray:
-    """Rows (m,) of a data set in order (``Dataset.in_order``) from which a run learns."""
+    """Rows (m,) of a data set in order (``Dataset.in_order``) on which a run is trained."""
     return np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
 
 
 def training_labels(data: Dataset, config: RunConfig) -> np.ndarray:
-    """Labels (M, K) of the kind that a run learns, mm and deg."""
+    """Labels (M, K) of the kind that a run is trained on, mm and deg."""
     return data.targets.corrected if config.labels == "corrected" else data.targets.raw

@@ -76,7 +76,7 @@ CONSTANT_AND_SMOOTH = (Term("constant"), Term("smooth"))
 
 @dataclass(frozen=True)
 class Points:
-    """Rows of inputs: those that a process learns from, or those that it predicts labels of.
+    """Rows of inputs: those that a process is fitted to, or those whose labels it predicts.
 
     Attributes
     ----------
@@ -390,7 +390,7 @@ def fit_two_fidelities(
 def sample_rows(count: int, seed: int) -> np.ndarray:
     """Indices of at most ``FIT_ROWS`` of ``count`` rows, in random order.
 
-    They are drawn by PyTorch's generator. Another generator would draw other rows, so that the same seed would give another model.
+    They are sampled by PyTorch's generator. Another generator would sample other rows, so that the same seed would give another model.
     """
     return torch.randperm(count, generator=torch.Generator().manual_seed(seed))[:FIT_ROWS].numpy()
 

@@ -70,7 +70,7 @@ def trained_before(learnt: np.ndarray | None, data: Dataset) -> list[str]:
     """A line if a run was trained on frames of a data set, found by the run's marks (m, 2), or if the run does not hold its frames'
     marks."""
     if learnt is None:
-        return ["the run does not state from which frames it learnt: whether these are among them is not known; train again to know"]
+        return ["the run does not name its training frames, so it is not known whether these are among them; train again to know"]
     known = np.isin(frame_marks(data), learnt).any(axis=1)
     if not known.any():
         return []
@@ -85,8 +85,8 @@ def changed_since(config: Mapping, data: Dataset, model: Model) -> list[str]:
     rows = config["rows"]
     if "frames" not in rows:
         return [
-            "the run is of an earlier version and does not name its frames: whether these are the ones that it kept out of its training "
-            "can't be found out, if the table was sorted again, or frames or labels have changed since; train again to know"
+            "the run is of an earlier version and does not name its frames: if the table was sorted again, or frames or labels have "
+            "changed since, these may not be its held-out frames; train again to know"
         ]
     now = identity_of(data, model)
     return [f"the run was trained on {DIGESTS[key]}: something has changed since" for key in DIGESTS if now[key] != rows.get(key)]

@@ -152,12 +152,12 @@ def calibrate_residual(
     found = list(plain)
     halves = [np.arange(len(real))[k::2] for k in (0, 1)]
     for taught, unseen in (halves, halves[::-1]):
-        with stage(progress, "teach a network on half of the frames") as step:
+        with stage(progress, "train a network on half of the frames") as step:
             residual = teach([real[k] for k in taught], [light[k] for k in taught], sensor, disc, steps=steps, progress=step)
         own = with_residual(with_changes(sensor, response={"residual": residual.model_dump()}))
         for k in unseen:
             found[k] = expose(light[k], own.capture, np.random.default_rng(k))
-    with stage(progress, "teach the network on all frames") as step:
+    with stage(progress, "train the network on all frames") as step:
         residual = teach(real, light, sensor, disc, steps=steps, progress=step)
     with stage(progress, "train the two-sample test") as step:
         before, after = (evaluate_classifiers(real, shown, disc.inside, progress=step) for shown in (plain, found))
@@ -167,7 +167,7 @@ def calibrate_residual(
         float(np.mean([compare_images(a, b, disc.inside).psnr_db for a, b in zip(real, shown, strict=True)])) for shown in (plain, found)
     ]
     spec = with_changes(sensor, response={"residual": residual.model_dump()})
-    write_sensor(out, spec, f"With a residual network that was taught on {len(real)} frames of {frames.name}.")
+    write_sensor(out, spec, f"With a residual network that was trained on {len(real)} frames of {frames.name}.")
     return TaughtResidual(
         spec, len(real), before, after, real_told, (psnr[0], psnr[1]), _shift_px(sensor, plain, found), read.refused, [out]
     )

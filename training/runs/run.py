@@ -136,8 +136,8 @@ def train_run(
         said = f" ({'; '.join(data.problems[:3])})" if data.problems else ""
         what = "frames" if data.group is None else "contacts"
         raise TrainingError(
-            f"{', '.join(map(str, data.folders))}: {len(data)} usable frames, {parts} {what} of them to learn from, are too few; "
-            f"{FEWEST_PARTS} {what} to learn from are needed{said}"
+            f"{', '.join(map(str, data.folders))}: {parts} {what} for training in {len(data)} usable frames are too few; {FEWEST_PARTS} "
+            f"are needed{said}"
         )
     resolved = resolve(config, data, train)
     state = _open_checkpoint(out, resolved)
@@ -187,7 +187,7 @@ def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
         return False
     data = data.in_order()
     wanted = resolve(config, data, training_rows(config, data))
-    _require_same(out, wanted, read_config(out), "begun and not finished" if begun else "finished")
+    _require_same(out, wanted, read_config(out), "not finished" if begun else "finished")
     return not begun
 
 
@@ -221,7 +221,7 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
 
 
 def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: LabelCode) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
-    """Labels (M, E) as the network learns them, float32, and shift and scale (E,) for the code's numbers: ``number = shift + scale x``."""
+    """Labels (M, E) for the network, float32, and shift and scale (E,) for the code's numbers: ``number = shift + scale x``."""
     labels = code.encode(training_labels(data, config))
     known, k = labels[train], labels.shape[1]
     if config.recipe.scaling == "standard":
@@ -266,8 +266,8 @@ def _open_checkpoint(out: Path, resolved: dict) -> dict | None:
     try:
         before = dict(json.loads(state["identity"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise damage_error(path, "it does not say of which run it is", BEGIN_ANEW) from error
-    _require_same(out, resolved, before, "begun and not finished")
+        raise damage_error(path, "it does not state of which run it is", BEGIN_ANEW) from error
+    _require_same(out, resolved, before, "not finished")
     return state
 
 

@@ -100,7 +100,7 @@ def read_tensors(path: Path, remedy: str = AGAIN) -> dict[str, Any]:
     Parameters
     ----------
     remedy : str
-        What the message tells the user to do if the file can't be used.
+        The remedy in the message if the file can't be used.
 
     Raises
     ------

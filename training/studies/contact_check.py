@@ -1,4 +1,4 @@
-"""Finding of ``twin check`` about the contacts in frames: whether a model knows them, by its domain."""
+"""Finding of ``twin check`` about the contacts in frames: whether they are in a model's domain."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -46,14 +46,14 @@ def contact_finding(frames: list[Frame], sensor: SensorSpec, run: Path | None = 
         model.check(sensor, frames[0].form)
     if model.form != frames[0].form or model.domain is None:
         return None
-    model, judged, strange = model.at_known_rest(), 0, []
+    model, assessed, strange = model.at_known_rest(), 0, []
     for frame in frames:
         made = model(frame)
         if made.seen is not None and made.seen.valid:
-            judged += 1
+            assessed += 1
             strange += [] if made.valid else [f"{frame.name}: {made.reason}"]
-    share = len(strange) / max(judged, 1)
-    text = f"{judged - len(strange)} of {judged} frames with pins are contacts that the weights of {sensor.name} know"
+    share = len(strange) / max(assessed, 1)
+    text = f"{assessed - len(strange)} of {assessed} frames with pins are contacts that the weights of {sensor.name} know"
     if not strange:
         return Finding("contacts", Grade.HEALTHY, share, text, "")
     verdict = Grade.FAILED if share > MOST_STRANGE else Grade.DEGRADED

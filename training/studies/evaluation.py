@@ -18,6 +18,7 @@ from training.runs.packed import folder_of
 from training.studies.judging import measure_changes, measure_errors, rows_to_evaluate, time_frames, write_evaluation
 from training.touch.contact_maps import compare_maps
 from training.touch.slip import CapView, compare_slip, name_drags, random_places, resample_path
+from twin.estimate import readable_labels
 from twin.frames import open_recording
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
@@ -88,7 +89,7 @@ class Evaluation(ReadableResult):
         each kind. For simulated contacts and a run with contact maps it includes ``maps`` (see ``MapErrors``), and for a run that estimates
         slip ``slip`` (see ``SlipErrors``).
     changes : list of dict
-        Errors on changed images; empty if they were not asked for.
+        Errors on changed images; empty if they were not requested.
     units : dict of str to str
         Unit of each label.
     frames : int
@@ -108,14 +109,15 @@ class Evaluation(ReadableResult):
     def lines(self) -> list[str]:
         """The result as lines of text."""
         lines = [f"note: {problem}" for problem in self.problems]
-        for name, unit in self.units.items():
-            raw, corrected = self.metrics["raw"][name], self.metrics["corrected"][name]
+        labels = dict(zip(self.units, readable_labels(tuple(self.units)), strict=True))
+        for name, label in labels.items():
+            unit, raw, corrected = self.units[name], self.metrics["raw"][name], self.metrics["corrected"][name]
             if raw == corrected:
                 inside = f"{100 * raw['coverage_90']:.1f} % inside the 90 % intervals"
-                lines.append(f"{name}: mean error {raw['mae']:.4g} {unit}; {inside}")
+                lines.append(f"{label}: mean error {raw['mae']:.4g} {unit}; {inside}")
                 continue
             lines.append(
-                f"{name}: mean error {corrected['mae']:.4g} {unit} against corrected labels, {raw['mae']:.4g} against raw; "
+                f"{label}: mean error {corrected['mae']:.4g} {unit} against corrected labels, {raw['mae']:.4g} against raw; "
                 f"{100 * corrected['coverage_90']:.1f} % and {100 * raw['coverage_90']:.1f} % inside the 90 % intervals for them"
             )
         if taken := self.metrics.get("taken_for"):
@@ -124,20 +126,20 @@ class Evaluation(ReadableResult):
             lines.append(
                 f"contact maps of {maps['states']} states: patch's intersection over union {maps['patch_iou']:.2f}, correlation of the "
                 f"pressure {maps['pressure_correlation']:.2f} and of the shear {maps['shear_correlation']:.2f}, "
-                f"total force wrong by {100 * maps['resultant']:.1f} %"
+                f"error of the total force {100 * maps['resultant']:.1f} %"
             )
         if slip := self.metrics.get("slip"):
             lines.append(
-                f"slip of {slip['contacts']} contacts: slip of all of it told in {100 * slip['whole_accuracy']:.1f} % of the frames, "
-                f"alarm {slip['lead_mm']:.2f} mm of drag before it, in {100 * slip['false_alarms']:.1f} % of the frames without slip; "
-                f"sliding share wrong by {slip['share']:.2f}, way left by {slip['left_mm']:.2f} mm"
+                f"slip of {slip['contacts']} contacts: gross slip classified correctly in {100 * slip['whole_accuracy']:.1f} % of the "
+                f"frames, alarm {slip['lead_mm']:.2f} mm of drag before it, false alarm in {100 * slip['false_alarms']:.1f} % of the "
+                f"frames without slip; error of the sliding share {slip['share']:.2f}, of the remaining distance {slip['left_mm']:.2f} mm"
             )
         if self.metrics["leak_slope"] is not None:
-            lines.append(f"slope of the angle's error on move_6 where it was not executed: {self.metrics['leak_slope']:+.3f}")
+            lines.append(f"slope of the angle's error on a twist that was not executed: {self.metrics['leak_slope']:+.3f}")
         ms = self.metrics["ms_per_frame"]
         lines.append(f"{self.frames} frames" + ("" if ms is None else f", {ms:.1f} ms per frame (median, one thread)"))
         for row in self.changes:
-            said = (f"{name} {row[f'{name}_mae']:.4g} ({100 * row[f'{name}_more']:+.1f} %)" for name in self.units)
+            said = (f"{label} {row[f'{name}_mae']:.4g} ({100 * row[f'{name}_more']:+.1f} %)" for name, label in labels.items())
             lines.append(f"{row['change']}: {', '.join(said)}; {row['not_valid']} frames not valid")
         return lines
 

@@ -67,8 +67,8 @@ class LabelAudit(ReadableResult):
         drift = self.audit.drift["r2_of_row_number_beyond_labels"]
         return [
             *lines,
-            f"depth beyond the label where not executed: {self.audit.depth_per_move:+.4f} mm for each mm of move_1",
-            f"row number given by the outmost pins beyond the labels: R^2 {drift:.2f}",
+            f"depth beyond the label where not executed: {self.audit.depth_per_move:+.4f} mm for each mm of shear (move_1)",
+            f"drift, row number explained by the outmost pins beyond the labels: R^2 {drift:.2f}",
         ]
 
 
@@ -76,7 +76,7 @@ class LabelAudit(ReadableResult):
 def audit_recording(data: Path, sensor: SensorSpec, out: Path, *, form: Form | None = None, progress: Progress = silent) -> LabelAudit:
     """Audit the labels of a recording of one object, and write the result to a folder.
 
-    A recording with too few frames is not evaluated. The result states this (``Audit.untold``), and no corrected labels are written.
+    A recording with too few frames is not evaluated. The result states this (``Audit.not_assessed``), and no corrected labels are written.
 
     Raises
     ------
@@ -151,12 +151,12 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
         f"Audit of {data.folder.name}",
         "twin audit",
         topic="TacTip twin: audit",
-        lead="From pins and labels alone. Each frame is asked whether its pins fit the label with the shear move executed, or the state "
-        "before it; labels_corrected.csv holds the answer. Laid beside the recording's targets.csv, it is what training with corrected "
-        "labels uses.",
+        lead="From pins and labels alone. For each frame the audit decides whether its pins fit the label with the shear move executed, "
+        "or the state before the move. labels_corrected.csv contains the result. Put it beside the recording's targets.csv to "
+        "train with corrected labels.",
     )
     page.notice("Not assessed, and no corrected labels written", [audit.not_assessed] if audit.not_assessed else [], tone="bad")
-    page.notice("The reader says", summary["reader"])
+    page.notice("Notes on the recording", summary["reader"])
     evidence = [] if audit.not_assessed else _write_evidence(out, audit, data, page)
     page.section("Findings")
     page.table(_findings(summary), [Column("finding", "finding"), Column("value", "value", align="right")])
@@ -166,7 +166,7 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
         [Column("finding", "finding"), Column("count", "frames"), Column("frames", "which")],
     )
     for table in evidence[:1]:
-        page.download(table, "corrected labels, and what is said of each frame")
+        page.download(table, "corrected labels, and the findings of each frame")
     page.download(numbers, "all findings, with the names of all frames")
     return [*evidence[:1], numbers, *evidence[1:], page.write(out / "audit.html")]
 
@@ -231,7 +231,7 @@ def _evidence_figure(audit: Audit, data: Dataset, labels: dict[str, np.ndarray])
     axes[0].axhline(0, color=muted_colour(), linewidth=0.8)
     axes[0].set(title="which hypothesis fits better", xlabel="size of the move, mm and deg", ylabel="log10 chi² for (+) executed")
     axes[1].plot(raw[shown], raw[shown] - labels[shown], ".", markersize=2)
-    axes[1].set(title=f"{shown} less what the pins say", xlabel=f"{shown}, {unit_of(shown)}", ylabel=unit_of(shown))
+    axes[1].set(title=f"{shown}: label minus estimate from the pins", xlabel=f"{shown}, {unit_of(shown)}", ylabel=unit_of(shown))
     undone = audit.executed < 0.5
     width = max(len(data) // 40, 1)
     share = np.convolve(undone, np.ones(width) / width, mode="valid")

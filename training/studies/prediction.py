@@ -69,14 +69,14 @@ class Predictions:
         FrameError
             At the end, if no frame gave a pose.
         """
-        told, poses, reasons = len(self.recording.problems), 0, []
+        known, poses, reasons = len(self.recording.problems), 0, []
         yield from (f"note: {problem}" for problem in [*self.recording.problems, *self.estimator.caveats])
         for name, made in self:
             yield f"{name}: {_describe_estimate(made)}"
             poses += made.valid
             if not made.valid:
                 reasons.append(f"{name}: {made.reason}")
-        yield from (f"note: {problem}" for problem in self.recording.problems[told:])
+        yield from (f"note: {problem}" for problem in self.recording.problems[known:])
         for bad in self.recording.failed:
             yield f"skipped {bad['image_name']}: {bad['reason']}"
             reasons.append(f"{bad['image_name']}: {bad['reason']}")
@@ -160,7 +160,7 @@ def _find_rest_frame(recording: Recording, picture: Path) -> None:
     homes = [picture.parent, *([picture.parent.parent] if picture.parent.name in IMAGE_FOLDERS else [])]
     recording.take_reference([file for home in homes for file in references_in(home) if file.name != picture.name])
     if recording.reference is not None:
-        recording.problems.append(f"pins are counted from {recording.reference.name}, which lies beside the picture")
+        recording.problems.append(f"displacements of pins are measured from {recording.reference.name}, which is beside the picture")
 
 
 def _describe_estimate(made: PoseEstimate) -> str:

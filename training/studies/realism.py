@@ -32,7 +32,7 @@ class Realism(ReadableResult):
         lines.append(_image_line("pin-aligned", metrics["frames"], metrics["pin_aligned"]))
         if fixed := metrics["fixed_residual"]:
             share = f"{100 * fixed['share']:.1f} % of its power is fixed to each cap"
-            lines.append(f"on the caps the renders miss {fixed['levels']:.2f} gray levels (rms); {share}")
+            lines.append(f"on the caps the renders differ by {fixed['levels']:.2f} gray levels (rms); {share}")
         worst = ", ".join(f"{name} {100 * value:.1f} %" for name, value in found["worst_relative_difference"].items())
         lines.append(f"largest difference in a radial bin: {worst}")
         lines += [f"{name}: real {pair['real']:.2f}, rendered {pair['rendered']:.2f}" for name, pair in found["scalars"].items()]
@@ -41,12 +41,12 @@ class Realism(ReadableResult):
             f"spectra differ by {found['spectrum_db']:.2f} dB; {spots['paired']} of {spots['real']} bright spots have a counterpart"
         )
         lines.append(f"all pins found in {100 * metrics['pin_aligned']['exact_fraction']:.1f} % of the renders")
-        for name, told in metrics["two_sample"].items():
-            lines.append(f"two-sample accuracy, {name}: {accuracy_text(**told)}")
+        for name, made in metrics["two_sample"].items():
+            lines.append(f"two-sample accuracy, {name}: {accuracy_text(**made)}")
         if poses := metrics["pose_aligned"]:
             error = poses["pin_error_px"]
             lines.append(
-                f"pin error from the labels: {error['test']:.2f} px on unseen frames ({error['fitted']:.2f} px on those fitted to)"
+                f"pin error from the labels: {error['test']:.2f} px on unseen frames ({error['fitted']:.2f} px on the fitted ones)"
             )
             lines.append(_image_line("pose-aligned, unseen", metrics["frames"] // 2, poses["test_images"]))
         return [*lines, _verdict(**found["target"])]
@@ -128,7 +128,7 @@ def _quick(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarra
 
 def _thorough(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> dict[str, TwoSample]:
     halves = evaluate_halves(real, inside, progress=step)
-    return evaluate_classifiers(real, rendered, inside, progress=step) | {f"{name}, real halves": told for name, told in halves.items()}
+    return evaluate_classifiers(real, rendered, inside, progress=step) | {f"{name}, real halves": made for name, made in halves.items()}
 
 
 def _image_line(title: str, count: int, images: dict[str, Any]) -> str:

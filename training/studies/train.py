@@ -1,4 +1,4 @@
-"""Training of a model in one call: it reads and joins labelled recordings, and learns from them."""
+"""Training of a model in one call: it reads and joins labelled recordings, and trains on them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +26,7 @@ from training.touch.contact_maps import FEWEST_STATES, learn_maps, write_maps
 from training.touch.contact_probability import TouchAnswer
 from training.touch.slip import FEWEST_DRAGS, CapView, learn_slip, name_drags, write_slip
 from twin.errors import OptionError
+from twin.estimate import readable_labels
 from twin.progress import Progress, silent, stage
 from twin.store import writes
 from twin.types import Form, ReadableResult
@@ -69,7 +70,7 @@ class TrainedRun(ReadableResult):
     def lines(self) -> list[str]:
         """The result as lines of text."""
         lines = [f"note: {problem}" for problem in self.problems]
-        lines.append(f"{self.frames} usable frames; labels {', '.join(self.names)} ({self.labels})")
+        lines.append(f"{self.frames} usable frames; labels {', '.join(readable_labels(self.names))} ({self.labels})")
         if not self.finished:
             lines.append(f"time is up: the weights so far are in {self.out}; the same command resumes from here")
         return lines
@@ -165,7 +166,7 @@ def add_maps(run: Path, config: RunConfig, data: Dataset) -> list[str]:
     data = data.in_order()
     rows, estimator = training_rows(config, data), PoseEstimator.load(run)
     if len(rows) < FEWEST_STATES:
-        return [f"{len(rows)} contact states are too few to learn contact maps from ({FEWEST_STATES} are needed): the run has none"]
+        return [f"{len(rows)} contact states are too few to train contact maps ({FEWEST_STATES} are needed): the run has none"]
     write_maps(run / MAPS, learn_maps(estimator.modes_of(data.pins), data, rows, seed=config.seed))
     return []
 
@@ -217,7 +218,7 @@ def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str
     Returns
     -------
     list of str
-        The reason why slip was not learnt, at most one line.
+        The reason why slip was not trained, at most one line.
     """
     estimator = PoseEstimator.load(run)
     kept_out = set(estimator.config["rows"]["kept_out"])
@@ -225,7 +226,7 @@ def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str
     slide = sum(np.isfinite(drag.whole_mm) for drag in drags)
     if slide < FEWEST_DRAGS:
         return [
-            f"{slide} contacts are dragged until they slide ({FEWEST_DRAGS} are needed to learn slip from): slip is not "
+            f"{slide} contacts are dragged until they slide ({FEWEST_DRAGS} are needed to train slip): slip is not "
             f"estimated over time; "
             "'twin dataset --experiment drag --randomise drag --states all' makes such contacts"
         ]

@@ -67,12 +67,12 @@ class SurrogateContacts:
         if friction.kinetic != friction.static or np.isfinite(friction.shear_strength_mpa):
             raise outside(f"{touched.name} has a kinetic friction of its own or a shear strength")
         if not (contact.law.given_way is None or isinstance(contact.law.given_way, ArmTurning)):
-            raise outside(f"the arm gives way to {touched.name} in a way of its own")
+            raise outside(f"the arm has another compliance for {touched.name}")
         if friction.static > self._domain["friction"]:
             raise outside(f"a friction of {friction.static:g}, at most {self._domain['friction']:g} was trained")
         if contact.sensor is not self._sensor and unlike_parts(self._surrogate.about["mechanics"], contact.sensor):
             raise outside(
-                "the skin, gel, lens or pins of the sensor are sampled again; randomise friction, camera and noise only ('moves')"
+                "the skin, gel, lens or pins of the sensor are sampled again; randomise only friction, camera and noise ('moves')"
             )
 
     def begin(self, row: int, contact: EpisodeContact) -> None:

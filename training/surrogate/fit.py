@@ -100,7 +100,7 @@ class Distilled(ReadableResult):
         every = found["all"]
         lines = [
             f"{self.surrogate.about['states']} states of {self.surrogate.about['paths']} paths, {self.size_bytes / 1e3:.0f} kB",
-            f"on {found['paths']} paths that it has not seen: pins {every['pins_px']:.2f} px on average, "
+            f"on {found['paths']} unseen paths: pins {every['pins_px']:.2f} px on average, "
             f"{every['pins_share_95']:.1%} of the largest displacement at the 95 % quantile, force {every['force_share']:.1%}, "
             f"slip share {every['slip']:.3f}",
         ]
@@ -180,14 +180,14 @@ def require_dome(sensor: SensorSpec) -> None:
     low, high = RADII_MM
     if sensor.skin.shape != "cap" or sensor.skin.rim_z_mm != 0 or not low <= sensor.skin.outer_radius_mm <= high:
         raise OptionError(
-            f"{sensor.name}: a surrogate is of a half sphere of {low:g} to {high:g} mm radius, whose contacts and symmetries it knows; "
-            "use backend='fem'"
+            f"{sensor.name}: a surrogate is of a half sphere of {low:g} to {high:g} mm radius, whose contacts and symmetries it is trained "
+            "on; use backend='fem'"
         )
     for part in ("skin", "gel"):
         if getattr(sensor, part).relaxation:
             raise OptionError(f"{sensor.name}: its {part} relaxes, and a surrogate has no history in time; use backend='fem'")
     if sensor.gel.sealed:
-        raise OptionError(f"{sensor.name}: its gel is sealed, which a surrogate does not know; use backend='fem'")
+        raise OptionError(f"{sensor.name}: its gel is sealed, which a surrogate does not model; use backend='fem'")
 
 
 def fit(

@@ -81,7 +81,7 @@ def draw_shape(rng: np.random.Generator) -> Shape:
 def unlike_drawn(obj: ObjectSpec) -> str:
     """The reason why an object does not belong to the sampled family; "" for one that does.
 
-    Objects larger than the drawn ones are flatter, so they count as members of the family.
+    Objects larger than the sampled ones are flatter, so they count as members of the family.
     """
     shape = obj.shape
     if obj.texture is not None:

@@ -1,4 +1,4 @@
-"""Contact maps from the pins of one frame: the deformed skin, and pressure and shear over it. They are learnt from simulated contacts.
+"""Contact maps from the pins of one frame: the deformed skin, and pressure and shear over it. They are trained on simulated contacts.
 
 The finite elements give the force at every place of the skin, and the places themselves. Both are written as a mean and a few principal
 directions on the sensor's grid (``twin.mechanics.skin_map``). A small network computes their amplitudes from the model's modes of the pins.

@@ -1,4 +1,4 @@
-"""Detection of slip in a sequence of frames, learnt from simulated drags: whether slip has begun, whether the whole contact slides, and how
+"""Detection of slip in a sequence of frames, trained on simulated drags: whether slip has begun, whether the whole contact slides, and how
 far it is from that.
 
 Friction depends on the past, so one frame does not show slip. A small recurrent network gets the model's modes of the pins in each frame
@@ -385,25 +385,25 @@ def learn_slip(drags: Sequence[Drag], eyes: CapView, sensor: SensorSpec, *, seed
     turns = [] if rings is None else symmetries(sensor.pins.phase_deg)
     rng = np.random.default_rng([seed, 5])
     held = set(rng.permutation(len(drags))[::HELD_OUT].tolist())
-    ways: tuple[list[DragPath], list[DragPath]] = ([], [])
+    paths: tuple[list[DragPath], list[DragPath]] = ([], [])
     versions = max(1, round(WAYS / len(drags)))
     for k, drag in enumerate(drags):
         for _ in range(1 if k in held else versions):
             seen = drag if rings is None else drag.turn(turns[rng.integers(len(turns))], rings)
-            ways[k in held].append(resample_path(seen, random_places(len(drag.share), rng), eyes, rng))
-    known = np.concatenate([way.modes for way in ways[0]])
+            paths[k in held].append(resample_path(seen, random_places(len(drag.share), rng), eyes, rng))
+    known = np.concatenate([path.modes for path in paths[0]])
     gain = GAIN / max(float(known.std(axis=0).max()), 1e-12)
     torch.manual_seed(seed)
     model = SlipModel(SlipNetwork(2 * known.shape[1]), gain, HEADROOM * np.abs(known).max(axis=0), 0.5, 1.0, 1.0)
-    _fit_filter(model, ways[0], seed)
-    return _calibrate(model, ways[1])
+    _fit_filter(model, paths[0], seed)
+    return _calibrate(model, paths[1])
 
 
-def _fit_filter(model: SlipModel, ways: list[DragPath], seed: int) -> None:
+def _fit_filter(model: SlipModel, paths: list[DragPath], seed: int) -> None:
     """Train the network of a model. Each step uses sequences of similar lengths."""
     generator = torch.Generator().manual_seed(seed)
-    ways = sorted(ways, key=lambda way: len(way.modes))
-    groups = [_pad_sequences(model, ways[k : k + BATCH]) for k in range(0, len(ways), BATCH)]
+    paths = sorted(paths, key=lambda path: len(path.modes))
+    groups = [_pad_sequences(model, paths[k : k + BATCH]) for k in range(0, len(paths), BATCH)]
     optimiser = torch.optim.AdamW(model.network.parameters(), lr=RATE, weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=EPOCHS * len(groups))
     for _ in range(EPOCHS):
@@ -419,21 +419,21 @@ def _fit_filter(model: SlipModel, ways: list[DragPath], seed: int) -> None:
     model.network.eval()
 
 
-def _pad_sequences(model: SlipModel, ways: list[DragPath]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Inputs (B, T, 2 D), a mask of the existing frames (B, T), and targets (B, T, 8) of ways, padded to the longest one's T frames."""
-    longest = max(len(way.modes) for way in ways)
-    x = np.zeros((len(ways), longest, 2 * ways[0].modes.shape[1]), np.float32)
-    there = np.zeros((len(ways), longest), bool)
-    wanted = np.zeros((len(ways), longest, 8), np.float32)
-    for k, way in enumerate(ways):
-        count = len(way.modes)
-        x[k, :count] = model.inputs(way.modes, np.concatenate([way.modes[:1], way.modes[:-1]]))
+def _pad_sequences(model: SlipModel, paths: list[DragPath]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Inputs (B, T, 2 D), a mask of the existing frames (B, T), and targets (B, T, 8) of paths, padded to the longest one's T frames."""
+    longest = max(len(path.modes) for path in paths)
+    x = np.zeros((len(paths), longest, 2 * paths[0].modes.shape[1]), np.float32)
+    there = np.zeros((len(paths), longest), bool)
+    wanted = np.zeros((len(paths), longest, 8), np.float32)
+    for k, path in enumerate(paths):
+        count = len(path.modes)
+        x[k, :count] = model.inputs(path.modes, np.concatenate([path.modes[:1], path.modes[:-1]]))
         there[k, :count] = True
-        known = np.isfinite(way.left_mm) & ~way.whole
-        way_left = np.log(np.where(known, way.left_mm, 1.0) + LEAST_LEFT_MM)
-        shown = way.drag_mm > SEEN_DRAG_MM
-        direction = np.tile(way.direction, (count, 1))
-        wanted[k, :count] = np.column_stack([way.begins, way.whole, known, way_left, shown, direction, way.share])
+        known = np.isfinite(path.left_mm) & ~path.whole
+        log_left = np.log(np.where(known, path.left_mm, 1.0) + LEAST_LEFT_MM)
+        shown = path.drag_mm > SEEN_DRAG_MM
+        direction = np.tile(path.direction, (count, 1))
+        wanted[k, :count] = np.column_stack([path.begins, path.whole, known, log_left, shown, direction, path.share])
     return torch.from_numpy(x), torch.from_numpy(there), torch.from_numpy(wanted)
 
 
@@ -455,9 +455,9 @@ def _likelihood(off: torch.Tensor, log_error: torch.Tensor) -> torch.Tensor:
     return (off / log_error.exp()) ** 2 / 2 + log_error
 
 
-def _calibrate(model: SlipModel, ways: list[DragPath]) -> SlipModel:
-    """The model with threshold and intervals from ways from which it did not learn."""
-    x, there, wanted = _pad_sequences(model, ways)
+def _calibrate(model: SlipModel, paths: list[DragPath]) -> SlipModel:
+    """The model with threshold and intervals from held-out paths."""
+    x, there, wanted = _pad_sequences(model, paths)
     with torch.no_grad():
         out, _ = model.network(x)
     said, true = out[there].numpy(), wanted[there].numpy()
@@ -544,29 +544,29 @@ class SlipErrors:
 MEANS = ("whole_accuracy", "false_alarms", "lead_mm", "share", "share_covered", "left_mm", "left_covered")
 
 
-def compare_slip(model: SlipModel, ways: Sequence[DragPath]) -> SlipErrors:
-    """Compare the estimates for ways with the true values."""
+def compare_slip(model: SlipModel, paths: Sequence[DragPath]) -> SlipErrors:
+    """Compare the estimates for paths with the true values."""
     found: dict[str, list[float]] = {name: [] for name in MEANS}
     turned: list[float] = []
-    for way in ways:
+    for path in paths:
         tracker = SlipTracker(model)
-        told = [tracker(modes) for modes in way.modes]
-        found["whole_accuracy"] += [(slip.whole > 0.5) == whole for slip, whole in zip(told, way.whole.tolist(), strict=True)]
-        found["share"] += [abs(slip.share - share) for slip, share in zip(told, way.share.tolist(), strict=True)]
-        found["share_covered"] += [slip.share_low <= share <= slip.share_high for slip, share in zip(told, way.share.tolist(), strict=True)]
-        found["false_alarms"] += [slip.alarm for slip, begins in zip(told, way.begins.tolist(), strict=True) if not begins]
-        if way.whole.any():
-            at = next((k for k, slip in enumerate(told) if slip.alarm and way.drag_mm[k] > 0), len(told) - 1)
-            slides_mm = float(way.drag_mm[0] + way.left_mm[0])
-            found["lead_mm"].append(slides_mm - float(way.drag_mm[at]))
-        for k in np.flatnonzero(np.isfinite(way.left_mm) & ~way.whole).tolist():
-            found["left_mm"].append(abs(told[k].left_mm - float(way.left_mm[k])))
-            found["left_covered"].append(told[k].left_low_mm <= way.left_mm[k] <= told[k].left_high_mm)
-        true_deg = float(np.degrees(np.arctan2(way.direction[1], way.direction[0])))
-        turned += [abs((told[k].direction_deg - true_deg + 180) % 360 - 180) for k in np.flatnonzero(way.drag_mm > SEEN_DRAG_MM).tolist()]
+        slips = [tracker(modes) for modes in path.modes]
+        found["whole_accuracy"] += [(slip.whole > 0.5) == whole for slip, whole in zip(slips, path.whole.tolist(), strict=True)]
+        found["share"] += [abs(slip.share - share) for slip, share in zip(slips, path.share.tolist(), strict=True)]
+        found["share_covered"] += [s.share_low <= share <= s.share_high for s, share in zip(slips, path.share.tolist(), strict=True)]
+        found["false_alarms"] += [slip.alarm for slip, begins in zip(slips, path.begins.tolist(), strict=True) if not begins]
+        if path.whole.any():
+            at = next((k for k, slip in enumerate(slips) if slip.alarm and path.drag_mm[k] > 0), len(slips) - 1)
+            slides_mm = float(path.drag_mm[0] + path.left_mm[0])
+            found["lead_mm"].append(slides_mm - float(path.drag_mm[at]))
+        for k in np.flatnonzero(np.isfinite(path.left_mm) & ~path.whole).tolist():
+            found["left_mm"].append(abs(slips[k].left_mm - float(path.left_mm[k])))
+            found["left_covered"].append(slips[k].left_low_mm <= path.left_mm[k] <= slips[k].left_high_mm)
+        true_deg = float(np.degrees(np.arctan2(path.direction[1], path.direction[0])))
+        turned += [abs((slips[k].direction_deg - true_deg + 180) % 360 - 180) for k in np.flatnonzero(path.drag_mm > SEEN_DRAG_MM).tolist()]
     means = {name: _mean(values) for name, values in found.items()} | {"late": _mean([lead < 0 for lead in found["lead_mm"]])}
     direction_deg = float(np.median(turned)) if turned else float("nan")
-    return SlipErrors(contacts=len(ways), frames=len(found["whole_accuracy"]), direction_deg=direction_deg, **means)
+    return SlipErrors(contacts=len(paths), frames=len(found["whole_accuracy"]), direction_deg=direction_deg, **means)
 
 
 def _mean(values: Sequence[float]) -> float:

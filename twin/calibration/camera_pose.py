@@ -97,7 +97,7 @@ class CameraReport:
     sd : dict of str to float
         Standard deviation of each fitted parameter, in its own unit, from the Jacobian and the residuals.
     held : dict of str to str
-        Parameters that were asked for but are not determined: the reason, and what data are needed. They keep the specification's value.
+        Requested parameters that are not determined: the reason, and what data are needed. They keep the specification's value.
     """
 
     rms_px: float
@@ -133,7 +133,7 @@ def fit_camera(
         A parameter is unknown, or there are too few pins.
     """
     if unknown := set(free) - set(PARAMETERS):
-        raise FrameError(f"{sorted(unknown)[0]} is not a parameter of the camera's fit; choose of {', '.join(PARAMETERS)}")
+        raise FrameError(f"{sorted(unknown)[0]} is not a parameter of the camera's fit; choose from {', '.join(PARAMETERS)}")
     pins_px = np.asarray(pins_px, float).reshape(-1, 2)
     seen = np.flatnonzero(np.isfinite(pins_px).all(axis=1))
     pins_px = pins_px[seen]
@@ -282,6 +282,6 @@ def _list_undetermined(known: dict[str, float], sd: np.ndarray, correlation: np.
         why += [f"its standard deviation would be {sd[k]:.2g}, of a plausible range of {plausible:.2g}"] if unsure else []
         doubtful[name] = (
             f"{name} is not determined by this no-contact frame: {'; '.join(why)}. "
-            f"Held at the specification's {value:g}; to find it give in addition {PARAMETERS[name].instead}"
+            f"It keeps the specification's {value:g}; to determine it, also give {PARAMETERS[name].instead}"
         )
     return doubtful

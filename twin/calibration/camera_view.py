@@ -1,7 +1,7 @@
 """The camera's turn and mirror, from a frame at rest and contacts that push or twist the pins to known sides.
 
 A symmetric layout is seen alike under all its turns and mirror images. The motion of the pins decides: an object that is moved to the
-sensor's +x drags them along the image of +x, and one that is turned from x to y turns them that way round, unless the picture is mirrored.
+sensor's +x drags them along the image of +x, and one that is turned from x to y turns them likewise, unless the picture is mirrored.
 """
 
 from collections.abc import Mapping, Sequence

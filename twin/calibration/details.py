@@ -4,7 +4,7 @@ Both are linear in light. They are found by simultaneous iterative reconstructio
 captured render, divided by the slope of the response curve, are spread over the values that each pixel sees. The camera's blur makes
 fine structure converge last, so that few rounds also keep noise out.
 
-A pixel shows the background and tiles. If the same pixel lacks the same light in most frames, that light belongs to the background. Light
+A pixel shows the background and tiles. If most renders miss the same light at the same pixel, that light belongs to the background. Light
 that moves with the caps belongs to the tiles (the relief). The edges of caps that hardly move look like a background at first. Therefore
 the tiles are fitted to all pixels, also to those that have a background.
 """

@@ -84,7 +84,7 @@ class Health:
     found : float
         Mean share of the pins in view that are found.
     valid : float
-        Share of the frames that can be used.
+        Share of valid frames.
     extra : float
         Median number of pin-like spots that belong to no pin.
     steadily_lost : tuple of int
@@ -130,7 +130,7 @@ class NewSensor:
     size : str
         Where the size of the tip comes from, which frames do not determine.
     known, assumed, next_steps : tuple of str
-        What the frames determine, what is assumed instead, and how to learn more.
+        What the frames determine, what is assumed instead, and how to find out more.
     odd : tuple of str
         Irregularities of the recording.
     written : list of Path
@@ -192,7 +192,7 @@ def new_sensor(
     table : Path, optional
         A table of labels that also gives the frames' order.
     form : Form, optional
-        Thresholded (recording) or not (raw); recognised by the frames' content if not given.
+        Thresholded (processed) or not (raw); recognised by the frames' content if not given.
     limit : int
         Most frames from which the specification is made.
 
@@ -217,8 +217,8 @@ def new_sensor(
         images = [pin_levels(image, polarity) for image in images]
         if (enough := int((best.there >= STEADY).sum())) < LEAST_PINS:
             raise FrameError(
-                f"{enough} pins are seen in most frames, as {best.pins.in_words()}: too few, a camera is fitted to {LEAST_PINS} or more; "
-                "give frames in which more pins stand out, not thresholded if the light fades towards the rim"
+                f"{enough} pins are seen in most frames, as {best.pins.in_words()}: too few to fit a camera, which needs {LEAST_PINS}; "
+                "give frames in which more pins are visible, and do not threshold them if the light fades towards the rim"
             )
         given, names = recording.reference, [frame.name for frame in looked]
         known_name, known_gray = (given.name, pin_levels(given.image, polarity)) if given is not None else ("", None)
@@ -228,8 +228,8 @@ def new_sensor(
             if found.sure:
                 raise
             raise FrameError(
-                f"the layout is not recognised: the likeliest, {best.line()}, and {known_name} does not show it. If {known_name} shows no "
-                "contact, give the layout with `layout`; one of no known kind as `layout` positions:FILE.csv"
+                f"the layout is not recognised: the likeliest is {best.line()}, but {known_name} does not show it. If {known_name} shows "
+                "no contact, give the layout with `layout`; if it is of no known kind, as `layout` positions:FILE.csv"
             ) from error
         start = _start_specification(out.stem, looked[0], best.pins, rest, frames.name, polarity)
         start = start if radius_mm is None else of_radius(start, radius_mm)
@@ -272,7 +272,7 @@ def _compare_layout(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
     if shown is not None and shown.explained >= GIVEN_SHOWN:
         forgotten = unnamed_spots(shown.rest_px, shown.seen) if alone else []
         doubts = tuple(
-            f"a pin-like spot at ({x:.0f}, {y:.0f}) px is none of the {layout.in_words()}: does the file lack its place?"
+            f"a pin-like spot at ({x:.0f}, {y:.0f}) px is none of the {layout.in_words()}: is its position missing in the file?"
             for x, y in forgotten
         )
         return Identified((shown,), not doubts, doubts, 0.0, polarity)
@@ -287,12 +287,10 @@ def _compare_layout(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
             if alone
             else "give each pin's place, `layout` positions:FILE.csv"
         )
-        raise FrameError(
-            f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave `layout` out to have it identified, or {places}"
-        )
-    doubt = f"{layout.in_words()} were given, and explain only {100 * shown.explained:.1f} % of what is there"
+        raise FrameError(f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave `layout` out to identify it, or {places}")
+    doubt = f"{layout.in_words()} were given, but explain only {100 * shown.explained:.1f} % of the spots"
     if other is None or other.explained <= shown.explained:
-        return Identified((shown,), False, (f"{doubt}; look at the overlay: are these all pins?",), 0.0, polarity)
+        return Identified((shown,), False, (f"{doubt}; check in the overlay whether these are all pins",), 0.0, polarity)
     doubt += f"; {other.pins.in_words()} explain {100 * other.explained:.1f} %: leave `layout` out, or correct it"
     return Identified((shown, other), False, (doubt,), 0.0, polarity)
 
@@ -332,7 +330,7 @@ def _start_specification(name: str, frame: Frame, pins: PinsSpec, rest: Rest, so
         camera=camera,
         appearance=DARK_CAPS if polarity == "dark" else AppearanceSpec(),
         recording=_whole(width, height, polarity) if thresholded else None,
-        pipeline=PipelineSpec(raw=anywhere, recording=anywhere if thresholded else None),
+        pipeline=PipelineSpec(raw=anywhere, processed=anywhere if thresholded else None),
     )
 
 
@@ -502,13 +500,13 @@ def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
     away = camera.rms_px / usual_spacing(seen)
     if away > MOST_AWAY:
         notes.append(
-            f"no camera sees this layout as the frames show it: the best one misses the pins at rest by {camera.rms_px:.1f} px (rms), "
-            f"{away:.2f} of their spacing; were the frames stretched? Give them as the camera wrote them"
+            f"no camera fits this layout in these frames: the best one is off the pins at rest by {camera.rms_px:.1f} px (rms), "
+            f"{away:.2f} of their spacing; if the frames were stretched, give them as the camera wrote them"
         )
     elif away > USUALLY_AWAY and rest.source == "given":
         notes.append(
-            f"the camera misses the pins at rest by {camera.rms_px:.1f} px (rms), {away:.2f} of their spacing, which is much for a frame "
-            "without contact: look whether the layout's places are right, and whether that frame shows a contact"
+            f"the camera is off the pins at rest by {camera.rms_px:.1f} px (rms), {away:.2f} of their spacing, which is much for a frame "
+            "without contact: check the layout's positions, and whether that frame shows a contact"
         )
     if frames < FEW_FRAMES:
         notes.append(f"{frames} frames are few: kind and focal length of the camera are unsure; give about {LIMIT}, of different contacts")
@@ -526,7 +524,7 @@ def _describe_result(
     recording: Recording,
     out: Path,
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """What the frames determine, what is assumed, and how to learn more. The specification is written to ``out``."""
+    """What the frames determine, what is assumed, and how to find out more. The specification is written to ``out``."""
     evidence = tuned.detector.evidence
     known = (
         f"Layout: {found.best.line()}",
@@ -534,7 +532,7 @@ def _describe_result(
         *([] if found.polarity == "bright" else ["polarity: the pins are darker than the skin"]),
         f"camera: {_camera_words(sensor)}, middle ({sensor.camera.cx_px:.0f}, {sensor.camera.cy_px:.0f}) px; "
         f"it sees the {camera.pins} pins at rest within {camera.rms_px:.2f} px (rms)"
-        + (f"; about as well: {', or '.join(dict.fromkeys(other_cameras))}" if other_cameras else ""),
+        + (f"; these fit about as well: {', or '.join(dict.fromkeys(other_cameras))}" if other_cameras else ""),
         f"pin detection: {evidence.sure if evidence else 'unsure'}; "
         + (
             f"spots of {sensor_blob(sensor, tuned).spot_sigma_px:g} px"
@@ -547,7 +545,7 @@ def _describe_result(
         f"Outermost pins at {sensor.pins.max_polar_deg:g} deg from the axis, and the camera's distance {sensor.camera.distance_mm:.1f} mm: "
         "pins at rest fit many pairs of them.",
         "Stiffness of skin and gel: Shore A 26 to 30 rubber and a soft gel.",
-        "Light, colours, noise: those of another TacTip, until 'twin calibrate optics' has found this sensor's."
+        "Light, colours, noise: those of another TacTip, until 'twin calibrate optics' has fitted this sensor's."
         if found.polarity == "bright"
         else "Light, noise: those of another TacTip; a gray skin and black caps ([appearance]).",
         *camera.held.values(),
@@ -585,7 +583,7 @@ def _size(sensor: SensorSpec, *, given: bool) -> str:
 def sensor_blob(sensor: SensorSpec, tuned: Tuned) -> BlobSpec:
     """The pin detection's settings for the form of frames on which they were tuned."""
     form = tuned.detector.form
-    return sensor.pipeline.recording if form == Form.PROCESSED and sensor.pipeline.recording else sensor.pipeline.raw
+    return sensor.pipeline.processed if form == Form.PROCESSED and sensor.pipeline.processed else sensor.pipeline.raw
 
 
 def _comment(source: str, found: Identified, rest: Rest) -> str:
@@ -593,7 +591,7 @@ def _comment(source: str, found: Identified, rest: Rest) -> str:
     return "\n".join(
         (
             f"Made by 'twin new' from frames of {source}. Sections and keys that are not here have their defaults: a printed TacTip",
-            "(docs/your-own-sensor.md). The page beside this file says what is known, what is assumed, and what to do to know more.",
+            "(docs/your-own-sensor.md). The page beside this file states what is known, what is assumed, and how to find out more.",
             f"Layout: {'sure' if found.sure else 'UNSURE'}. {rest.line()}.",
         )
     )
@@ -639,7 +637,7 @@ def _page(
     page.items(known)
     page.section("What is assumed")
     page.items(assumed)
-    page.section("What to do to know more")
+    page.section("How to find out more")
     page.items(steps)
     page.section("Layouts that were considered")
     page.table(

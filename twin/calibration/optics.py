@@ -57,20 +57,20 @@ KINDS = {"real": "real", "before": "before", "after": "after", "residual": "what
 JUDGED = {"psnr_db": "PSNR, dB,", "ssim": "SSIM"}
 """Image figures that a fit may not make worse without a warning, with their names."""
 ALWAYS = (
-    "the response curve (gamma, black level): held; photograph a gray card at several exposures to know it",
+    "the response curve (gamma, black level): kept; to determine it, photograph a gray card at several exposures",
     "LED power, exposure and reflectance: only their product is seen; the caps' brightest channel is taken as white resin",
-    "the window's thickness and index, and the skin's thickness: held",
+    "the window's thickness and index, and the skin's thickness: kept",
     "caps' height and reflectance: only their product with the light is seen, which the relief's tiles hold; under lights from other "
     "directions a crest would look different",
 )
 """Parameters that no set of frames determines."""
 FEW_FRAMES_FITTED = 4
 """Least number of frames that separate the background from the relief of the caps."""
-RING_HELD = "ring, LEDs' places and reflections: held; the frames show no bright ring around the disc (a crop, or a sensor without one)"
+RING_HELD = "ring, LEDs' places and reflections: kept; the frames show no bright ring around the disc (a crop, or a sensor without one)"
 """Note for frames that show no ring."""
 REST_MADE = (
-    "the camera's kind, focal length and distance: held as 'twin new' chose them without a frame without contact; pictures of the same "
-    "contact are alike, depths in mm may not be; give `no_contact` FRAME"
+    "the camera's kind, focal length and distance: kept as 'twin new' assumed them without a frame without contact; pictures of the same "
+    "contact agree, but depths in mm may be wrong; give `no_contact` FRAME"
 )
 """Note for a camera that was fitted to rest places estimated from contacts."""
 Stage = Callable[[SensorSpec], SensorSpec]
@@ -178,8 +178,8 @@ def calibrate_optics(
     folder = sibling_folder(out, "calibration")
     with output(folder, "index.html", "pictures", KEPT):
         found = fit_optics(frames, sensor, folder, limit=limit, no_contact=no_contact, progress=progress)
-        said = [f"Fitted to {len(found.frames)} frames of {frames.name}, starting from {sensor.name}.", *found.warnings]
-        write_sensor(out, found.spec, "\n".join(said))
+        comment = [f"Fitted to {len(found.frames)} frames of {frames.name}, starting from {sensor.name}.", *found.warnings]
+        write_sensor(out, found.spec, "\n".join(comment))
         return OpticsCalibration(found, [out, write_page(folder, sensor, found, frames.name)])
 
 
@@ -235,8 +235,7 @@ def fit_optics(
         notes.append(f"the relief of {unseen} of {spec.pins.count} caps: fewer than two frames show them; use more frames")
     if len(frames) < FEW_FRAMES_FITTED:
         notes.append(
-            f"what moves with a cap and what stays in place: {len(frames)} frames hardly distinguish them; "
-            f"give {FRAMES} of different contacts"
+            f"what moves with a cap and what does not: {len(frames)} frames hardly distinguish them; give {FRAMES} of different contacts"
         )
     if spec.pipeline.raw.rest_origin == "contacts":
         notes.append(REST_MADE)
@@ -358,7 +357,8 @@ def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) ->
     page.section("Frames")
     for name, pictures in rows:
         shown = [
-            PagePicture(pictures[k], f"{name}: {said}", f"{name}, {said}" if k == "real" else said, "frame") for k, said in KINDS.items()
+            PagePicture(pictures[k], f"{name}: {comment}", f"{name}, {comment}" if k == "real" else comment, "frame")
+            for k, comment in KINDS.items()
         ]
         page.figures(*shown, layout="row")
     page.section("What changed")

@@ -165,14 +165,15 @@ def _hidden(old: str, option: Parameter) -> Parameter:
 
 def _with_former_values(option: Parameter) -> Parameter:
     """The option; a choice also takes the names that its values had in version 1."""
-    values = [value for part in (_plain(option), *get_args(_plain(option))) if get_origin(part) is Literal for value in get_args(part)]
+    kinds = (_plain(option), *get_args(_plain(option)))
+    values = [v for kind in kinds for v in (get_args(kind) if get_origin(kind) is Literal else getattr(kind, "__members__", {}).values())]
     if not set(values) & set(FORMER_VALUES.values()):
         return option
 
-    def parse(value: str) -> str:
-        if (chosen := present_value(value)) not in values:
-            raise typer.BadParameter(f"{value!r} is not one of {', '.join(map(repr, values))}.")
-        return chosen
+    def parse(value: str) -> Any:
+        if (value := present_value(value)) not in values:
+            raise typer.BadParameter(f"{value!r} is not one of {', '.join(repr(str(each)) for each in values)}.")
+        return values[values.index(value)]
 
     (mark,) = (copy(each) for each in option.annotation.__metadata__)
     mark.parser, mark.metavar, mark.autocompletion = parse, f"<{'|'.join(values)}>", lambda: values
@@ -240,8 +241,8 @@ def convert_option(name: str, kind: Any, value: Any) -> Any:
             raise OptionError(f"`{name}`: expected {len(parts)} numbers, got {value!r}")
         return tuple(convert_option(name, part, each) for part, each in zip(parts, value, strict=True))
     if get_origin(kind) is Literal or isinstance(kind, type) and issubclass(kind, Enum):
-        allowed, value = parts or list(kind), present_value(value)
-        if value not in allowed:
+        allowed = parts or list(kind)
+        if value not in allowed and (value := present_value(value)) not in allowed:
             raise OptionError(f"`{name}`: expected {' or '.join(map(str, allowed))}, got {value!r}")
         return value if parts else kind(value)
     if kind is Path and isinstance(value, str | os.PathLike):

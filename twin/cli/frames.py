@@ -136,7 +136,7 @@ def tune(
 
     It prints the reliability of the result: the share of frames in which all pins are found (recall), the range of the threshold in gray
     levels, and warnings. It writes a file for --pipeline of the other commands. You can copy the section [blob] of this file to
-    [pipeline.raw] or [pipeline.recording] of a sensor's specification. The file also contains the pins' positions at rest: from a frame
+    [pipeline.raw] or [pipeline.processed] of a sensor's specification. The file also contains the pins' positions at rest: from a frame
     without contact (init_*, --no-contact, or one among the frames), otherwise estimated from the contacts. It prints which.
 
     \b

@@ -66,7 +66,7 @@ def make_dataset(
     obj: Annotated[
         str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
     ] = None,
-    images: Annotated[Literal["raw", "gray", "recording", "none"], typer.Option("--images", help="kind of pictures")] = "raw",
+    images: Annotated[Literal["raw", "gray", "processed", "none"], typer.Option("--images", help="kind of pictures")] = "raw",
     states: Annotated[Literal["all", "end"], typer.Option("--states", help="states of a contact that become frames")] = "end",
     randomise: Annotated[
         str | None, typer.Option("--randomise", metavar="R", help="domain randomisation: a name or a file; none by default")
@@ -90,7 +90,7 @@ def make_dataset(
     \b
     --images raw        the camera's frames
              gray       their luminance
-             recording  processed (cropped, thresholded) like recordings
+             processed  cropped and thresholded, like recordings
              none       pins alone, without rendering (vgnn and the other graph
                         networks train on them; 'twin train' reads them like
                         frames)
@@ -250,12 +250,13 @@ def evaluate(
 
     \b
     Writes:
-      predictions.csv  image_name; <label>_true, _pred, _lo90, _hi90 of every
-                       label; executed_probability, valid
+      predictions.csv  image_name; COLUMN_true, _pred, _lo90, _hi90 of every
+                       label, by its column in the recording's table (pose_2
+                       is the depth of an MG400); executed_probability, valid
       metrics.json     mean absolute errors against raw and corrected labels,
                        overall and by depth, angle and shear; coverage of the 90 %
-                       intervals; slope of the angle's error on move_6 over frames
-                       whose move was not executed; ms per frame
+                       intervals; slope of the angle's error on the twist (move_6)
+                       where it was not executed; ms per frame
       errors.png
 
     With --robustness it also writes robustness.csv: errors on changed frames (1 % scale, 2 px shift, 1 deg turn, 5 pins erased, each in a

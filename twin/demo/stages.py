@@ -57,15 +57,15 @@ def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form:
     """Press, render, capture, detect, and build the graph, for one contact."""
     form, seconds = form_named(form), {}
 
-    def timed(stage: str, work: Callable[[], Result]) -> Result:
+    def clock(stage: str, work: Callable[[], Result]) -> Result:
         start = perf_counter()
         result = work()
         seconds[stage] = perf_counter() - start
         return result
 
-    state = timed("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
-    raw = timed("render", lambda: simulator.render(state))
-    rendered = raw if form == Form.RAW else timed("capture", lambda: simulator.as_processed(raw, state))
+    state = clock("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
+    raw = clock("render", lambda: simulator.render(state))
+    rendered = raw if form == Form.RAW else clock("capture", lambda: simulator.as_processed(raw, state))
     look = look_at(simulator, rendered)
     seconds["pins and graph"] = look.observation.ms["total"] / 1e3
     return ContactResult(simulator.spec.name, object_name, pose, state, raw, look, seconds)

@@ -102,9 +102,9 @@ def blob_spec(pipeline: PipelineSpec, form: Form) -> BlobSpec:
     FrameError
         The sensor has no processed form, or there is no such form.
     """
-    found = pipeline.raw if form_named(form) == Form.RAW else pipeline.recording
+    found = pipeline.raw if form_named(form) == Form.RAW else pipeline.processed
     if found is None:
-        raise FrameError("the sensor has no processed form ([pipeline.recording]): its recordings are raw frames; use the raw form")
+        raise FrameError("the sensor has no processed form ([pipeline.processed]): its recordings are raw frames; use the raw form")
     return found
 
 
@@ -130,7 +130,7 @@ def levels_at(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
 
 def polarity_of(pipeline: PipelineSpec, form: Form) -> Polarity:
     """Whether pins are bright or dark in frames of a form; if the sensor has no such form, as in raw frames."""
-    blob = pipeline.recording if form == Form.PROCESSED else None
+    blob = pipeline.processed if form == Form.PROCESSED else None
     return (blob or pipeline.raw).polarity
 
 

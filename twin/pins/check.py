@@ -295,7 +295,7 @@ def _twin(spec: SensorSpec, form: Form, nominal: Reference) -> list[Finding]:
     Pins are found from where they were measured; the twin draws them where lengths and camera put them. Therefore both can be wrong
     apart from each other.
     """
-    blob = spec.pipeline.raw if form == Form.RAW else spec.pipeline.recording
+    blob = spec.pipeline.raw if form == Form.RAW else spec.pipeline.processed
     if blob is None or not blob.rest_px:
         return []
     off_px = nominal.pins_px - project_rest(spec, form)

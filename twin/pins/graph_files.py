@@ -90,7 +90,7 @@ def write_graphs_of(
         names = list(found)
         form = form or form_of_pins(sensor, nodes_px)
         reference, image, left_out, notes = nominal_reference(sensor, form), None, [], []
-        graphs = [make_graph(kind, nodes, outmost=reference.outmost) for nodes in nodes_px]
+        graphs = [make_graph(kind, nodes, outmost=reference.outmost, net=reference.net) for nodes in nodes_px]
     else:
         seen = _graphs_of_recording(path, sensor, kind, form, legacy=legacy)
         names, graphs, left_out, notes = seen.names, seen.graphs, seen.left_out, seen.notes
@@ -247,7 +247,7 @@ def draw_graph_pictures(
     draw_nodes(ax, graph)
     written = [save_figure(out / "graph.png", figure, dpi=PICTURE_DPI)]
     if graph.kind == "voronoi":
-        rest = make_graph("voronoi", reference.pins_px, outmost=reference.outmost)
+        rest = make_graph("voronoi", reference.pins_px, outmost=reference.outmost, net=reference.net)
         written.append(save_figure(out / "surface.png", area_surface_figure(rest, graph), dpi=PICTURE_DPI))
     return written
 

@@ -7,18 +7,18 @@ way that no displacement of the camera explains (`measure_reference`, `twin.pins
 from dataclasses import replace
 from time import perf_counter
 
-import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
 from scenes.sensor import BlobSpec, SensorSpec
+from twin.compiled import compiled
 from twin.errors import FrameError
-from twin.frames.forms import blob_spec, form_named, frame_size, levels_at, pin_levels
+from twin.frames.forms import blob_spec, form_named, frame_size, pin_levels
 from twin.pins.finding.blobs import Blobs, Mask, circular_mask, despeckle, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.labelling.identify import SHOWN, score_layout
 from twin.pins.labelling.matching import Match, complete, confirm, look_again, match, proven, rematch
-from twin.pins.labelling.reference import Reference, folded_fraction, make_reference, nominal_reference
+from twin.pins.labelling.reference import Reference, folded_fraction, make_reference, mean_radius, median_px, nominal_reference
 from twin.pins.labelling.rest import require_even
 from twin.pins.labelling.split import split_chains, split_merged
 from twin.pins.labelling.view import NO_CONTACT_REMEDY, camera_modes, view_of
@@ -158,7 +158,7 @@ class Pipeline:
             reason = f"wrong pins: {between:.0%} of them stand between caps; stray light, a wrong threshold, or another sensor's frame"
         graph = None
         if not reason:
-            graph = make_graph(self.graph, nodes_px, outmost=self.reference.outmost)
+            graph = make_graph(self.graph, nodes_px, outmost=self.reference.outmost, net=self.reference.net)
         ms["graph"], now = _since(now)
         ms["total"], _ = _since(started)
         return Observation(pins_px, predicted_px, int(paired.sum()), expected, not reason, reason, graph, extra_px, ms)
@@ -240,7 +240,7 @@ class Pipeline:
         away = np.linalg.norm(found.predicted_px - self.blob_spec.mask_center_px, axis=1)
         if not len(rim) or not (away > self.blob_spec.mask_radius_px - MASK_MARGIN * self.reference.spacing_px).any():
             return blobs, found
-        shift = np.median(blobs.px[found.blob[rim]] - self.reference.pins_px[rim], axis=0)
+        shift = median_px(blobs.px[found.blob[rim]] - self.reference.pins_px[rim])
         if np.linalg.norm(shift) < REMASK_PX:
             return blobs, found
         center = np.asarray(self.blob_spec.mask_center_px) + shift
@@ -268,6 +268,8 @@ class Pipeline:
 
     def _cut_off(self, nodes_px: np.ndarray) -> np.ndarray:
         """Pins (N,) bool that the frame's border cuts off: they are near it at rest, and not whole in this frame."""
+        if not self._at_border.any():
+            return self._at_border
         return self._at_border & (self._inside_px(nodes_px) < CUT * self.reference.spacing_px)
 
     def out_of_view(self, seen: Observation) -> np.ndarray:
@@ -293,9 +295,9 @@ class Pipeline:
         ``nodes_px`` (N, 2) are the pins. A row goes on as far from a pin as one of its neighbours is, on the other side.
         """
         paired = found.blob >= 0
-        extra = np.setdiff1d(np.arange(len(blobs.px)), found.blob)
-        if paired.all() or not len(extra):
+        if paired.all() or paired.sum() == len(blobs.px):
             return 0
+        extra = np.setdiff1d(np.arange(len(blobs.px)), found.blob)
         ratio = blobs.area_px2[extra] / np.median(blobs.area_px2[found.blob[paired]])
         px = blobs.px[extra[(ratio > 1 / UNNAMED_AREA_RATIO) & (ratio < UNNAMED_AREA_RATIO)]]
         pins_px = nodes_px[paired]
@@ -306,16 +308,10 @@ class Pipeline:
 
     def _between_caps(self, frame: Frame, pins_px: np.ndarray) -> float:
         """Share of the found pins (N, 2), NaN where lost, that do not stand out from the midpoints between them and their neighbours."""
-        found = np.flatnonzero(np.isfinite(pins_px[:, 0]))
-        if len(found) < LEAST_COMPARED:
+        if np.isfinite(pins_px[:, 0]).sum() < LEAST_COMPARED:
             return 0.0
-        gray = cv2.blur(self._levels(frame.image), (3, 3))
-        near = self.reference.neighbours[found, :NEAREST]
-        middle = (pins_px[found, None] + pins_px[near]) / 2
-        known = np.isfinite(middle[..., 0])
-        between = np.where(known, levels_at(gray, np.where(known[..., None], middle, 0.0)), np.nan)[known.any(axis=1)]
-        above = levels_at(gray, pins_px[found])[known.any(axis=1)] - lower_levels(between, DARKER)
-        return float(np.mean(above <= LEAST_ABOVE * np.percentile(above, BRIGHT))) if len(above) else 0.0
+        near = self.reference.neighbours[:, :NEAREST]
+        return share_between(self._levels(frame.image), pins_px, near, DARKER, BRIGHT)
 
     def _reason(self, blobs: Blobs, found: int, n: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
         """Reason why a frame with ``n`` pins in view is not a valid observation; "" if it is valid."""
@@ -326,13 +322,15 @@ class Pipeline:
         folded = folded_fraction(self.reference, nodes_px)
         if folded > MAX_FOLDED:
             return f"inconsistent pins: the labelling inverts {folded:.1%} of the layout"
-        shift = np.linalg.norm(np.median(nodes_px, axis=0) - self._center_px)
+        shift = np.linalg.norm(median_px(nodes_px) - self._center_px)
         if shift > MAX_SHIFT * self._radius_px:
             return f"inconsistent pins: the layout is displaced by {shift:.0f} px"
         rim = self.reference.outmost
-        scale = _mean_radius(nodes_px[rim]) / _mean_radius(self.reference.pins_px[rim])
+        scale = mean_radius(nodes_px[rim]) / self.reference.rim_radius_px
         if not 1 / MAX_RIM_SCALE < scale < MAX_RIM_SCALE:
             return f"inconsistent pins: the rim is {scale:.2f} times its size at rest; another sensor's frame, or a contact too deep"
+        if not len(extra_px):
+            return ""
         center = nodes_px.mean(axis=0)
         radius = np.linalg.norm(nodes_px - center, axis=1).max()
         extra = int((np.linalg.norm(extra_px - center, axis=1) < radius).sum())
@@ -341,24 +339,56 @@ class Pipeline:
         return ""
 
 
-def lower_levels(levels: np.ndarray, percent: float) -> np.ndarray:
-    """Percentile (n,) of each row of levels (n, k), without NaN: the same as ``np.nanpercentile``, for all rows at once."""
-    rank = (np.isfinite(levels).sum(axis=1) - 1) * (percent / 100)
-    low = np.floor(rank).astype(int)
-    ordered, row = np.sort(levels, axis=1), np.arange(len(levels))  # NaN come last
-    below, above = ordered[row, low], ordered[row, np.ceil(rank).astype(int)]
-    lower: np.ndarray = below + (rank - low) * (above - below)
-    return lower
+@compiled()
+def _level(gray: np.ndarray, x: float, y: float) -> float:
+    """Mean level of the 3 x 3 pixels around the one nearest to a place, rounded. The picture is mirrored beyond its border."""
+    height, width = gray.shape
+    column, row, total = min(max(round(x), 0), width - 1), min(max(round(y), 0), height - 1), 0
+    inside = 0 < column < width - 1 and 0 < row < height - 1
+    for j in range(row - 1, row + 2):
+        for i in range(column - 1, column + 2):
+            if inside:
+                total += gray[j, i]
+            else:
+                total += gray[abs(j) if j < height else 2 * height - 2 - j, abs(i) if i < width else 2 * width - 2 - i]
+    return round(total / 9)
+
+
+@compiled()
+def _percentile(values: np.ndarray, percent: float) -> float:
+    """As ``np.percentile``, of values (n,) that are sorted in place."""
+    values.sort()
+    rank = (len(values) - 1) * (percent / 100)
+    low = int(rank)
+    return values[low] + (rank - low) * (values[min(low + 1, len(values) - 1)] - values[low])
+
+
+@compiled()
+def share_between(gray: np.ndarray, pins_px: np.ndarray, near: np.ndarray, darker: float, bright: float) -> float:
+    """Share of the pins (N, 2), NaN where lost, that stand between caps; ``near`` (N, k) are the pins with which each is compared.
+
+    See ``NEAREST`` for the test and the percentiles.
+    """
+    above, between, count = np.empty(len(pins_px)), np.empty(near.shape[1]), 0
+    for i in range(len(pins_px)):
+        x, y = pins_px[i]
+        compared = 0
+        for k in near[i]:
+            if np.isfinite(x + pins_px[k, 0]):
+                between[compared] = _level(gray, (x + pins_px[k, 0]) / 2, (y + pins_px[k, 1]) / 2)
+                compared += 1
+        if compared:
+            above[count] = _level(gray, x, y) - _percentile(between[:compared], darker)
+            count += 1
+    if not count:
+        return 0.0
+    least = LEAST_ABOVE * _percentile(above[:count], bright)
+    return (above[:count] <= least).sum() / count
 
 
 def _extra(blobs: Blobs, found: Match) -> int:
     """Number of blobs that are not pins."""
     return len(blobs.px) - int((found.blob >= 0).sum())
-
-
-def _mean_radius(px: np.ndarray) -> float:
-    """Mean distance of points (n, 2) from their mean."""
-    return float(np.linalg.norm(px - px.mean(axis=0), axis=1).mean())
 
 
 def _since(start: float) -> tuple[float, float]:

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from twin.compiled import compiled
+from twin.pins.flips import Net, flipped
 
 # Factor by which the outline is enlarged about its centroid: half way to the release's additional sites, which lie at 1.1.
 BOUNDARY_SCALE = 1.05
@@ -42,10 +43,15 @@ class Tessellation:
     region_px: np.ndarray
 
 
-def triangulate(nodes_px: np.ndarray) -> np.ndarray | None:
-    """Delaunay triangles (t, 3) of the nodes (N, 2); None if there are none (nodes are collinear, coincide, or are fewer than 3)."""
+def triangulate(nodes_px: np.ndarray, net: Net | None = None) -> np.ndarray | None:
+    """Delaunay triangles (t, 3) of the nodes (N, 2); None if there are none (nodes are collinear, coincide, or are fewer than 3).
+
+    They are found from a ``net`` of the nodes at rest, if it is given and the nodes turn none of its triangles over.
+    """
     if len(nodes_px) < 3:
         return None
+    if net is not None and len(triangles := flipped(nodes_px, *net)):
+        return triangles
     try:
         mesh = Delaunay(nodes_px)
     except QhullError:
@@ -180,12 +186,18 @@ def _cells(nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, region:
     return area, store, first
 
 
+@compiled()
 def _star_shaped(polygon: np.ndarray) -> bool:
     """Whether a closed polygon about the origin winds around it once, always in the same direction."""
-    ahead = np.roll(polygon, -1, axis=0)
-    cross = polygon[:, 0] * ahead[:, 1] - polygon[:, 1] * ahead[:, 0]
-    turn = np.arctan2(cross, (polygon * ahead).sum(axis=1))
-    return bool((np.all(cross > 0) or np.all(cross < 0)) and abs(abs(turn.sum()) - 2 * np.pi) < 1e-6)
+    total, sign = 0.0, 0.0
+    for k in range(len(polygon)):
+        (ax, ay), (bx, by) = polygon[k - 1], polygon[k]
+        cross = ax * by - ay * bx
+        if cross == 0 or cross * sign < 0:
+            return False
+        sign = cross
+        total += np.arctan2(cross, ax * bx + ay * by)
+    return abs(abs(total) - 2 * np.pi) < 1e-6
 
 
 def _outline_region(nodes: np.ndarray, outmost: np.ndarray | None) -> np.ndarray | None:

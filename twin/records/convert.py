@@ -58,10 +58,10 @@ def open_records(path: str | Path) -> Records:
     if path.is_dir():
         if is_session(path):
             return session_records(path)
-        if told := format_of(path):
-            if told not in READERS:
-                raise RecordError(f"{path}: of the unknown format {quote(told)}; read it with the program that wrote it")
-            return READERS[told](path)
+        if name := format_of(path):
+            if name not in READERS:
+                raise RecordError(f"{path}: of the unknown format {quote(name)}; read it with the program that wrote it")
+            return READERS[name](path)
         if (path / INFO).is_file():
             return lerobot_records(path)
     return recording_records(path)
@@ -90,7 +90,7 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
         except SpecError:
             spec = None
     if spec is None:
-        note = "no pins: the record does not name a sensor that is known here; give `sensor` to have them found"
+        note = "no pins: the record does not name a known sensor; give `sensor`, so that its pins are detected"
         return replace(records, notes=[*records.notes, note])
     if (expected := frame_size(spec, records.about.form)) != records.about.size_px:
         got = f"{records.episodes[0].key if records.episodes else 'the record'}: frames of {times(records.about.size_px)}"
@@ -108,8 +108,8 @@ def _require_pins_of(spec: SensorSpec, about: About) -> None:
     if name in ("", spec.name) and count == spec.pins.count:
         return
     owner = f"of the sensor '{name}' ({count} pins)" if name else f"of a sensor with {count} pins"
-    told = f"the record holds pins {owner}, the given sensor is '{spec.name}' ({spec.pins.count} pins)"
-    raise FrameError(f"{told}; leave `sensor` out, or give the matching one")
+    problem = f"the record holds pins {owner}, the given sensor is '{spec.name}' ({spec.pins.count} pins)"
+    raise FrameError(f"{problem}; leave `sensor` out, or give the matching one")
 
 
 def _translated_steps(episode: Episode, about: About, spec: SensorSpec) -> Iterator[RecordStep]:
@@ -142,7 +142,7 @@ def open_writer(folder: Path, to: str, about: About, rate_hz: int, *, video: boo
     if to not in FORMATS:
         raise RecordError(f"no format {quote(to)}; there are {', '.join(FORMATS)}")
     if video and to != LeRobotWriter.FORMAT:
-        raise RecordError(f"`video` goes with the format {LeRobotWriter.FORMAT}; {to} keeps every picture as it is")
+        raise RecordError(f"`video` is an option of the format {LeRobotWriter.FORMAT}; {to} stores pictures without loss; leave it out")
     if to == LeRobotWriter.FORMAT:
         return LeRobotWriter(folder, about, rate_hz, video=video, held_mb=0.0 if at_once else DATA_MB)
     if to == Ros2Writer.FORMAT:
@@ -231,7 +231,7 @@ def convert(
     first = opened[0]
     for source, records in zip(sources, opened, strict=True):
         if wrong := first.about.differs(records.about):
-            raise RecordError(f"{source}: does not fit to {sources[0]} ({'; '.join(wrong)}); translate it into another `out`")
+            raise RecordError(f"{source}: does not fit {sources[0]} ({'; '.join(wrong)}); translate it into another `out`")
     with open_writer(out, to, first.about, first.rate_hz(), video=video) as writer, stage(progress, "episodes") as step:
         before, total = len(writer.facts), sum(len(records.episodes) for records in opened)
         writer.write(_missing(opened, writer, lambda done: step(done, total)))
@@ -276,7 +276,7 @@ class KeptAlso:
         self.folder, self.formats, self.sensor, self.at_once = folder, tuple(dict.fromkeys(formats)), sensor, at_once
         for name in self.formats:
             if name not in ALSO:
-                raise RecordError(f"no format {quote(name)} to keep the record in, too; there are {', '.join(ALSO)}")
+                raise RecordError(f"no further format {quote(name)} for a record; there are {', '.join(ALSO)}")
             for needed in WRITERS[name].LIBRARIES:
                 library(needed)
         self._writers: list[FolderWriter] = []
@@ -289,7 +289,7 @@ class KeptAlso:
         self._open.close()
 
     def catch_up(self) -> None:
-        """Write the episodes that the record has and the other formats lack.
+        """Write the episodes of the record that the other formats do not have.
 
         Raises
         ------

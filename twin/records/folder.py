@@ -114,10 +114,10 @@ class FolderWriter(ABC):
         return {"format": self.FORMAT, "version": VERSION, "rate_hz": self.rate_hz, "about": self.about.plain()}
 
     def _go_on(self) -> None:
-        about, said = read_sidecar(self.folder, self.FORMAT)
+        about, stored = read_sidecar(self.folder, self.FORMAT)
         if wrong := about.differs(self.about):
-            raise RecordError(f"{self.folder}: the new episodes do not fit to those in it ({'; '.join(wrong)}); give another `out`")
-        self.about, self.rate_hz = about, int(said["rate_hz"])
+            raise RecordError(f"{self.folder}: the new episodes do not fit those in it ({'; '.join(wrong)}); give another `out`")
+        self.about, self.rate_hz = about, int(stored["rate_hz"])
         self.facts = self._find()
         self.keys = {facts["key"] for facts in self.facts}
 
@@ -136,13 +136,13 @@ class FolderWriter(ABC):
     def _require_fitting(self, episode: Episode, step: RecordStep) -> None:
         """Raise ``RecordError`` if a step does not agree with ``about``, or its time is not a valid number."""
         if not 0.0 <= step.time_s < float("inf"):
-            raise RecordError(f"{episode.key}: a picture {step.time_s} s after its first; look at its times, or record it again")
+            raise RecordError(f"{episode.key}: a picture has the time {step.time_s} s after the first; correct the times, or record again")
         height, width = step.image.shape[:2]
         if (width, height) != self.about.size_px or (step.image.ndim == 2) != self.about.gray:
-            raise RecordError(f"{episode.key}: a picture of {step.image.shape}, the others have {self.about.size_px}; record it apart")
+            raise RecordError(f"{episode.key}: a picture of {step.image.shape}, the others have {self.about.size_px}; record it separately")
         for name in self.about.numbers:
             if (got := np.shape(step.values.get(name, ()))) != self.about.shape(name):
-                raise RecordError(f"{episode.key}: {name} of shape {got}, expected {self.about.shape(name)}; record it apart")
+                raise RecordError(f"{episode.key}: {name} of shape {got}, expected {self.about.shape(name)}; record it separately")
 
 
 class PicturesWriter(FolderWriter):
@@ -195,17 +195,17 @@ def read_sidecar(folder: Path, form: str = "") -> tuple[About, dict[str, Any]]:
     RecordError
         The folder has no description, or a damaged one, or one of another format than ``form`` or of another version.
     """
-    said = read_json(folder / SIDECAR)
+    stored = read_json(folder / SIDECAR)
     try:
-        about = About.of(said["about"])
-        found, version = str(said["format"]), said["version"]
+        about = About.of(stored["about"])
+        found, version = str(stored["format"]), stored["version"]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RecordError(f"{folder / SIDECAR}: damaged; {AGAIN}") from error
     if version != VERSION:
         raise RecordError(f"{folder / SIDECAR}: of version {version!r}, expected {VERSION}; read it with the program that wrote it")
     if form and found != form:
         raise RecordError(f"{folder}: holds a record of the format {found}, not {form}; give another `out`")
-    return about, said
+    return about, stored
 
 
 def format_of(folder: Path) -> str:
@@ -259,7 +259,7 @@ def episode_of(folder: Path, facts: dict[str, Any], steps: Any) -> Episode:
         rest = None if facts["rest"] is None else read_image(folder / RESTS / str(facts["rest"]))[0]
         return Episode.from_facts(facts, steps, rest)
     except (KeyError, TypeError, ValueError, FrameError) as error:
-        raise RecordError(f"{folder}: what is kept of an episode is damaged ({error}); {AGAIN}") from error
+        raise RecordError(f"{folder}: the stored facts of an episode are damaged ({error}); {AGAIN}") from error
 
 
 def records_in(folder: Path, form: str, facts: Sequence[dict[str, Any]], steps_of: Any) -> Records:
@@ -282,7 +282,7 @@ def whole_steps(path: Path, facts: dict[str, Any], steps: Callable[[], Iterator[
         count += 1
         yield step
     if count != facts["length"]:
-        raise RecordError(f"{path}: damaged, {count} of {facts['length']} steps of {quote(facts['key'])} are there; {AGAIN}")
+        raise RecordError(f"{path}: damaged, {count} of {facts['length']} steps of {quote(facts['key'])} can be read; {AGAIN}")
 
 
 def png(image: ImageArray) -> bytes:

@@ -167,7 +167,7 @@ class LeRobotWriter(FolderWriter):
             return []
         most_s, key, pauses = max(self._off)
         where = f"{len(self._off)} episodes, by up to {most_s:.3g} s in {key}{f' ({pauses})' if pauses else ''}"
-        stamp = f"timestamp, as LeRobot wants it (frame number / {self.rate_hz} fps), is more than half a frame off the true times in"
+        stamp = f"timestamp, as LeRobot defines it (frame number / {self.rate_hz} fps), is more than half a frame off the true times in"
         return [f"{stamp} {where}; the true times are in {TIME}"]
 
     def _compare_times(self, times_s: np.ndarray, key: str) -> None:
@@ -387,8 +387,8 @@ def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Recor
         file = parquet.ParquetFile(path, page_checksum_verification=True)
         leaf = next(k for k in range(len(file.schema)) if file.schema.column(k).path == "episode_index")
         for group in range(file.num_row_groups):
-            told = file.metadata.row_group(group).column(leaf).statistics
-            if told is not None and told.has_min_max and not told.min <= number <= told.max:
+            statistics = file.metadata.row_group(group).column(leaf).statistics
+            if statistics is not None and statistics.has_min_max and not statistics.min <= number <= statistics.max:
                 continue
             for line in file.read_row_group(group).to_pylist():
                 if line["episode_index"] != number:
@@ -428,7 +428,7 @@ def _episode_rows(folder: Path) -> list[dict[str, Any]]:
     except (OSError, ValueError, KeyError, library("pyarrow").ArrowException) as error:
         raise RecordError(f"{folder / 'meta/episodes'}: damaged ({error}); {AGAIN}") from error
     if not isinstance(total, int) or len(rows) < total:
-        raise RecordError(f"{folder}: {INFO} states {total!r} episodes, {len(rows)} are there; {AGAIN}")
+        raise RecordError(f"{folder}: {INFO} states {total!r} episodes, the table has {len(rows)}; {AGAIN}")
     return rows[:total]
 
 

@@ -32,7 +32,7 @@ DIGEST = 16
 
 
 class RecordError(TwinError):
-    """A record can't be read, written or translated. The message says what was found and what to do."""
+    """A record can't be read, written or translated. The message states what was found and what to do."""
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
         The folder holds only pins, or is damaged.
     """
     if path.is_dir() and (path / TRUTH).is_dir() and not any((path / name).is_dir() for name in ("images", "frames_bw")):
-        raise RecordError(f"{path}: holds pins without pictures; make the data set with `images` raw, gray or recording")
+        raise RecordError(f"{path}: holds pins without pictures; make the data set with `images` raw, gray or processed")
     own = format_of(path) == RecordingWriter.FORMAT if path.is_dir() else False
     if own and not (path / EPISODES).is_file():
         return Records(read_sidecar(path)[0], [])
@@ -70,15 +70,15 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
     found = next(iter(recording), None)
     if found is None:
         raise RecordError(f"{path}: no frame can be read; {AGAIN}")
-    said = _read_description(path)
+    described = _read_description(path)
     about = About(
-        sensor=str(said.get("sensor", "")),
+        sensor=str(described.get("sensor", "")),
         form=recording.form,
         size_px=recording.size_px,
         gray=found.image.ndim == 2,
         numbers={name: int(np.prod(values[name].shape[1:])) for name in CHANNELS if name in values},
         estimates=estimates,
-        robot=str(said.get("arm", "")),
+        robot=str(described.get("arm", "")),
     )
     if own:
         about = read_sidecar(path)[0]
@@ -86,7 +86,7 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
             raise RecordError(f"{path}: {PINS if missing == {'pins'} else TABLE} is missing, or lacks columns; {AGAIN}")
     carried = {column for name in values for column in columns_of(CHANNELS[name], about.axes(name))} | NOT_CARRIED
     left = [name for name, cells in recording.labels.items() if name not in carried and cells.dtype.kind == "f"]
-    notes += [f"columns {', '.join(left)} are not taken over"] if left else []
+    notes += [f"columns {', '.join(left)} are not copied into the record"] if left else []
     records = Records(about, [], notes)
     rest = None if recording.reference is None else recording.reference.image
     facts = read_facts(path / EPISODES) if own else []
@@ -100,7 +100,7 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
             continue
         labels = {name: array[rows[0]].tolist() for name, array in values.items() if name in ("pose", "move")}
         key = f"{path.name}/{recording.names[rows[0]]}#{digest(labels, len(rows))}"
-        records.episodes.append(Episode(key, str(said["task"]), steps, len(rows), rest, T_tool_sensor=said.get("T_tool_sensor")))
+        records.episodes.append(Episode(key, str(described["task"]), steps, len(rows), rest, T_tool_sensor=described.get("T_tool_sensor")))
     return records
 
 
@@ -134,7 +134,8 @@ def _times(recording: Recording, rows: np.ndarray, notes: list[str]) -> np.ndarr
         if np.isfinite(times_s).all() and (np.diff(times_s) >= 0).all():
             return times_s
         note = (
-            f"column {TIME_S} is not taken over where it does not rise or is no number of s; such frames count as {NOMINAL_HZ:g} a second"
+            f"column {TIME_S} does not increase everywhere, or has cells without a number; such episodes get {NOMINAL_HZ:g} frames per "
+            "second"
         )
         if len(rows) > 1 and note not in notes:
             notes.append(note)
@@ -167,7 +168,7 @@ def _take_out_moves(path: Path, recording: Recording, values: dict[str, np.ndarr
     known = read_executed(path, recording.names, notes)
     executed = np.array([known.get(name, 1.0) for name in recording.names], np.float32)
     if count := np.count_nonzero(executed != 1):
-        notes.append(f"the moves of {count} frames were not, or not surely, executed: they are taken out of poses and moves")
+        notes.append(f"the moves of {count} frames were not, or not certainly, executed: they are removed from poses and moves")
         values["pose"], values["move"] = as_executed(values["pose"], values["move"], executed)
 
 
@@ -194,7 +195,7 @@ def _read_truth(path: Path, recording: Recording) -> dict[str, np.ndarray]:
     truth, _, _ = open_truth(path)
     by_name = row_of(truth)
     if strange := [name for name in recording.names if name not in by_name]:
-        raise FrameError(f"{path}: {TRUTH} knows nothing of {strange[0]}: the data set is damaged; {AGAIN}")
+        raise FrameError(f"{path}: {TRUTH} has no row for {strange[0]}: the data set is damaged; {AGAIN}")
     rows = [by_name[name] for name in recording.names]
     arrays = arrays_of(truth, ("pins_px", "force_n", "torque_nmm", "pose"))
     wrench = np.concatenate([arrays["force_n"], arrays["torque_nmm"]], axis=1)
@@ -218,25 +219,25 @@ def _read_requested_poses(path: Path, recording: Recording) -> dict[str, np.ndar
 
 def _read_description(path: Path) -> dict[str, Any]:
     """Sensor, arm, task and ``T_tool_sensor`` of a recording, if its files state them."""
-    told: dict[str, Any] = {"task": "touch"}
+    described: dict[str, Any] = {"task": "touch"}
     for name in (META, MADE):
         if path.is_dir() and (path / name).is_file():
             try:
                 content = read_json(path / name)
             except RecordError:  # a recording of another program. Its metadata are noted when it is opened
                 continue
-            told |= {key: content[key] for key in ("arm", "sensor", "experiment") if key in content}
+            described |= {key: content[key] for key in ("arm", "sensor", "experiment") if key in content}
             if isinstance(content.get("comments"), str) and content["comments"]:
-                told["task"] = content["comments"]
-    sensor, experiment = told.get("sensor", ""), told.get("experiment")
+                described["task"] = content["comments"]
+    sensor, experiment = described.get("sensor", ""), described.get("experiment")
     try:
         spec = SensorSpec.model_validate(sensor) if isinstance(sensor, dict) else load_sensor(str(sensor)) if sensor else None
-        told["sensor"] = "" if spec is None else spec.name
+        described["sensor"] = "" if spec is None else spec.name
         if spec is not None and isinstance(experiment, dict):
-            told["T_tool_sensor"] = Mounting.of(spec, ExperimentSpec.model_validate(experiment)).T_tool_sensor
+            described["T_tool_sensor"] = Mounting.of(spec, ExperimentSpec.model_validate(experiment)).T_tool_sensor
     except (SpecError, ValidationError):
-        told["sensor"] = sensor if isinstance(sensor, str) else ""
-    return told
+        described["sensor"] = sensor if isinstance(sensor, str) else ""
+    return described
 
 
 class RecordingWriter(PicturesWriter):

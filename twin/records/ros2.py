@@ -126,8 +126,8 @@ class _Bag:
 
     def finish(self, facts: dict[str, Any]) -> None:
         """Write the file's description, and its end."""
-        said = {"version": str(VERSION), "facts": json.dumps(facts), "about": json.dumps(self._about.plain())}
-        self._writer.add_metadata(METADATA, said)
+        metadata = {"version": str(VERSION), "facts": json.dumps(facts), "about": json.dumps(self._about.plain())}
+        self._writer.add_metadata(METADATA, metadata)
         if self._episode.rest is not None:
             self._writer.add_attachment(self._start_ns, self._start_ns, REST, "image/png", png(self._episode.rest))
         self._writer.finish()
@@ -152,13 +152,13 @@ def ros2_records(path: Path) -> Records:
     episodes = []
     for file, (its, facts, rest) in zip(files, found, strict=True):
         if wrong := about.differs(its):
-            raise RecordError(f"{file}: does not fit to the files before it ({'; '.join(wrong)}); give it alone")
+            raise RecordError(f"{file}: does not fit the files before it ({'; '.join(wrong)}); translate it alone")
         try:
             image = None if rest is None else image_of(rest, about.gray, str(file))
             steps = partial(whole_steps, file, facts, partial(_steps_of, file, about))
             episodes.append(Episode.from_facts(facts, steps, image))
         except (KeyError, TypeError, ValueError) as error:
-            raise RecordError(f"{file}: what it says of itself is damaged ({error}); {AGAIN}") from error
+            raise RecordError(f"{file}: its description is damaged ({error}); {AGAIN}") from error
     return Records(about, episodes)
 
 
@@ -168,12 +168,12 @@ def _read_description(path: Path) -> tuple[About, dict[str, Any], bytes | None]:
     try:
         with path.open("rb") as file:
             bag = reader.make_reader(file)
-            said = next(each.metadata for each in bag.iter_metadata() if each.name == METADATA)
+            metadata = next(each.metadata for each in bag.iter_metadata() if each.name == METADATA)
             rest = next((bytes(each.data) for each in bag.iter_attachments() if each.name == REST), None)
-        facts = json.loads(said["facts"])
-        if said["version"] != str(VERSION) or not isinstance(facts, dict):
-            raise ValueError(f"version {said['version']}")
-        return About.of(json.loads(said["about"])), facts, rest
+        facts = json.loads(metadata["facts"])
+        if metadata["version"] != str(VERSION) or not isinstance(facts, dict):
+            raise ValueError(f"version {metadata['version']}")
+        return About.of(json.loads(metadata["about"])), facts, rest
     except OSError as error:
         raise RecordError(f"{path}: can't be read ({error.strerror}); {AGAIN}") from error
     except StopIteration as error:

@@ -189,7 +189,7 @@ class Session:
             raise FrameError(f"{folder}: {note or 'the session ended before its first step'}; nothing to replay, record it again")
         self._lines = [self._check_step(number, step).frame for number, step in enumerate(self.steps, 1)]
         loose = {path.name for path in (self.folder / FRAMES).glob("*.png")} - {line.file for line in self._lines}
-        loose_note = f"{len(loose)} pictures in {FRAMES}/ have no step in {STEPS}: the session was cut" if loose else ""
+        loose_note = f"{len(loose)} pictures in {FRAMES}/ have no step in {STEPS}: the session was interrupted" if loose else ""
         self.notes = [each for each in (note, loose_note) if each]
         self.form = self._lines[0].form
 
@@ -237,7 +237,7 @@ class Session:
         unread, again = numbers[-1] - numbers[0] + 1 - len(numbers), len(self._lines) - len(numbers)
         found = [describe_pauses(times_s)]
         found += [f"{unread} frames of the camera between the recorded ones are not in the session"] if unread > 0 else []
-        found += [f"{again} of {len(self._lines)} steps use the frame of the step before them"] if again else []
+        found += [f"{again} of {len(self._lines)} steps use the same frame as the step before them"] if again else []
         return [f"{self.folder.name}: {each}" for each in found if each]
 
     @property

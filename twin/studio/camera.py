@@ -73,7 +73,7 @@ def in_window(planes: tuple[FloatArray, FloatArray], window_px: tuple[int, int, 
 
 
 class StudioCamera:
-    """Draws the dome, and makes frames from drawn or traced light.
+    """Draws the dome, and makes frames from rasterised or path-traced light.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class StudioCamera:
         self._around = expose(around, spec.capture)
 
     def draw(self, state: PinState) -> FloatArray:
-        """Linear light of the window for a state, drawn."""
+        """Linear light of the window for a state, rasterised."""
         return self.preview.render(state)
 
     def raw(self, light: FloatArray, *, seed: int) -> Frame:

@@ -148,7 +148,7 @@ class ContactSetup:
 
     @property
     def law(self) -> ContactLaw:
-        """The contact law of the pair. No arm holds the object, so nothing else gives way."""
+        """The contact law of the pair. No arm holds the object, so nothing else is compliant."""
         return ContactLaw.of_object(self.obj).override(friction=self.friction)
 
 
@@ -293,7 +293,7 @@ class MovingContact:
     # answers
 
     def step(self, wished: ObjectPose) -> ContactAnswer:
-        """Move one load step towards a wish, draw, and observe. If the solver finds nothing, the object stays and the answer says why."""
+        """Move one load step towards a wish, draw, and observe. Without a solution the object does not move, and the answer states why."""
         started = time.perf_counter()
         goal, reason = self.admissible(wished)
         T, now = self._next(goal), time.monotonic()

@@ -79,7 +79,7 @@ def put(control: viser.GuiInputHandle[Any], value: object, *, send: bool = False
     ----------
     send : bool
         Send the value although the control has it. A browser may show another one: its own change and a change by this program can
-        cross on their way.
+        cross on their path.
     """
     if send and control.value == value:
         control._impl.gui_api._websock_interface.queue_message(GuiUpdateMessage(control._impl.uuid, {"value": value}))
@@ -145,7 +145,7 @@ def guarded_server(hosts: Sequence[str], report: Callable[[str], None]) -> Itera
 
 
 def free_port(host: str, port: int) -> int:
-    """The port, or the next larger one on which this machine can listen; 0 stays 0.
+    """The port, or the next larger one on which this machine can listen; 0 is returned as 0.
 
     viser itself would try a thousand ports, and then wait forever.
 

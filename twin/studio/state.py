@@ -175,9 +175,7 @@ def read_trajectory(content: bytes, name: str) -> Way:
             raise TwinError(f"{name}: expected the columns {', '.join(COLUMNS)}, found {', '.join(table.fieldnames or ['none'])}")
         rows = [{key: float(cell) for key, cell in row.items()} for row in table]
     except (UnicodeDecodeError, ValueError, TypeError, csv.Error) as error:
-        raise TwinError(
-            f"{name}: not readable as a trajectory ({error}); expected a CSV table of numbers with {', '.join(COLUMNS)}"
-        ) from error
+        raise TwinError(f"{name}: no readable trajectory ({error}); expected a CSV table of numbers with {', '.join(COLUMNS)}") from error
     if not 0 < len(rows) <= MOST_ROWS:
         raise TwinError(f"{name}: {len(rows)} rows; a trajectory has 1 to {MOST_ROWS}")
     times = [row.pop("time_s") for row in rows]
@@ -190,7 +188,7 @@ def read_trajectory(content: bytes, name: str) -> Way:
 
 
 def tap_and_shear(pose: ObjectPose, *, depth_mm: float = 3.0, shear_mm: float = 3.0) -> Way:
-    """A tap from 2 mm above the tip down to a depth, a shear along x and back, and the way up. Tilts and twist are not changed."""
+    """A tap from 2 mm above the tip down to a depth, a shear along x and back, and the lift. Tilts and twist are not changed."""
     knots = [
         (0.0, -2.0, 0.0),
         (1.5, depth_mm, 0.0),

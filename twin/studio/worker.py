@@ -230,7 +230,7 @@ T = TypeVar("T")
 
 
 class Newest(_OwnThread, Generic[T]):
-    """Calls a function in its own thread with the newest thing that was given. Calls do not overlap.
+    """Calls a function in its own thread with the newest item that was given. Calls do not overlap.
 
     Parameters
     ----------
@@ -247,14 +247,14 @@ class Newest(_OwnThread, Generic[T]):
         self._waiting: list[T] = []
 
     def give(self, thing: T) -> None:
-        """Use this thing next. A thing that still waits is dropped."""
+        """Use this item next. An item that still waits is dropped."""
         with self._news:
             self._waiting = [thing]
             self._news.notify()
 
     @property
     def overtaken(self) -> bool:
-        """Whether a newer thing waits. For a ``take`` that can stop early."""
+        """Whether a newer item waits. For a ``take`` that can stop early."""
         return bool(self._waiting) or self._ended
 
     def _run(self) -> None:

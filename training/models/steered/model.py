@@ -70,6 +70,6 @@ class SteeredModel(PinModel):
 
 STEERED = SteeredModel(
     name="steered",
-    description="ours for an edge's direction: the field of displacements, turned to the direction and looked at again",
+    description="ours for an edge's direction: the displacements, turned to the estimated direction and evaluated again",
     recipe=Recipe(epochs=80, batch=128, members=2),
 )

@@ -24,7 +24,7 @@ MOST_LOST = 0.1
 
 @dataclass(frozen=True)
 class Bases:
-    """Means and directions of the three kinds of modes, learnt from training frames.
+    """Means and directions of the three kinds of modes, fitted to training frames.
 
     Attributes
     ----------

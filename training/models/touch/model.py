@@ -58,7 +58,7 @@ class TouchModel(PinModel):
     unmeasured_widens = 2.0  # in the twin, a camera moved by 3 px, 1 deg and 1 % has errors 1.0 to 2.2 times those of an unmoved one
 
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> TouchNetwork:
-        """See ``Model``; width and depth can be chosen. The modes are learnt before; their numbers are those of ``SIZES``."""
+        """See ``Model``; width and depth can be chosen. The modes are fitted before; their numbers are those of ``SIZES``."""
         refuse_sizes(self, size, ("width", "depth"))
         sizes = SIZES | dict(size)
         features = 2 * sizes["modes"] + sizes["light_modes"]
@@ -87,7 +87,7 @@ class TouchModel(PinModel):
         pins = pins.relative_to(reference) if pins.measured else pins
         registration, bases = Registration(**learnt["registration"]), Bases(**learnt["bases"])
         if bases.light_mean.any() and not pins.light.any():
-            raise TrainingError("the model was trained on the light on the caps as well, and these pins come without it; give it frames")
+            raise TrainingError("the model also needs the light on the caps, which these pins do not contain; give it frames")
         moved = _remove_camera_motion(registration, pins, reference, _find_untrusted(registration, pins, reference), together=together)
         return _scale(bases(moved, _as_bright(pins.light, bases)))
 

@@ -44,7 +44,7 @@ def fill_lost(
     nodes_px, area_px2 = nodes_px.copy(), area_px2.copy()
     for k in np.flatnonzero(lost.any(axis=1)):
         nodes_px[k] = registration.fill(nodes_px[k], lost[k])
-        area_px2[k] = make_graph("voronoi", nodes_px[k], outmost=reference.outmost).area_px2
+        area_px2[k] = make_graph("voronoi", nodes_px[k], outmost=reference.outmost, net=reference.net).area_px2
     return nodes_px, area_px2
 
 

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from scenes.object import ObjectSpec
 from training.data.targets import unit_of
 from training.studies.objects.plan import MIXED, TIMES, ObjectsPlan
+from twin.estimate import readable_labels
 from twin.report.charts import muted_colour, sized_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, PagePicture, sentence, strong
@@ -22,26 +23,27 @@ def write_page(folder: Path, plan: ObjectsPlan, rows: Sequence[Mapping], verdict
     Parameters
     ----------
     folder : Path
-    plan : Plan
+    plan : ObjectsPlan
     rows, verdicts : sequences
         As ``table`` and ``verdicts`` give them.
     """
     alone, names, ranges = plan.alone.name, plan.experiment.targets, plan.experiment.ranges()
-    judged = ", ".join(f"{name} {number(ranges[name][0])} to {number(ranges[name][1])} {unit_of(name)}".rstrip() for name in names)
-    page = Page(f"Objects never seen: {plan.sensor.name}", "twin study objects", topic="TacTip twin: study")
+    labels = zip(names, readable_labels(names), strict=True)
+    limits = ", ".join(f"{label} {number(ranges[name][0])} to {number(ranges[name][1])} {unit_of(name)}".rstrip() for name, label in labels)
+    page = Page(f"Unseen objects: {plan.sensor.name}", "twin study objects", topic="TacTip twin: study")
     page.lead = (
         f"Two models from {number(plan.count * len(plan.train))} simulated contacts each, evaluated on "
         f"{number(plan.tests)} other contacts of "
         "every object, seen or not."
     )
-    page.notice("Objects never seen", verdicts)
+    page.notice("Unseen objects", verdicts)
     chart = write_chart(folder / "errors.png", lambda: errors_figure(rows, names, alone))
     page.figures(
         PagePicture(
             chart,
             f"Errors of both models on every object, as multiples of their error on {alone}",
             f"Mean absolute error of each label, as a multiple of the same model's error on {alone} (dashed). Filled: the object was "
-            f"trained on; open: never seen. Dotted: the aim, {TIMES:g} times.",
+            f"trained on; open: unseen. Dotted: the target, {TIMES:g} times.",
         )
     )
     page.section("Errors")
@@ -55,14 +57,14 @@ def write_page(folder: Path, plan: ObjectsPlan, rows: Sequence[Mapping], verdict
         sentence(
             f"Contacts: {plan.wider.name}, {plan.randomisation.name}, {plan.across} elements across, seed {plan.seed}. Model",
             strong(MIXED),
-            f"learnt from {number(plan.count)} contacts of each of {_describe_objects(plan.train)}; model",
+            f"was trained on {number(plan.count)} contacts of each of {_describe_objects(plan.train)}; model",
             strong(alone),
-            f"from that alone. Never seen: {_describe_objects(plan.unseen)}.",
+            f"on those of this object alone. Unseen: {_describe_objects(plan.unseen)}.",
         ),
         f"Evaluated on {number(plan.tests)} other contacts of each object ({plan.experiment.name}), on all their states whose labels lie "
-        f"within {judged}.",
-        "A label means the same on every object: that of the flat plate which would be touched at the same distance from the dome's centre "
-        "and with the same normal.",
+        f"within {limits}.",
+        "A label means the same on every object: it is the label of a flat plate at the same distance from the dome's centre and with the "
+        "same normal.",
     )
     page.download(folder / "objects.csv", "the table, with all digits")
     return page.write(folder / "index.html")
@@ -83,19 +85,19 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str], alone: str) -> 
         ax.axvline(1.0, color=muted_colour(), ls="--", lw=1.0)
         ax.axvline(TIMES, color=muted_colour(), ls=":", lw=1.2)
         ax.set_yticks(np.arange(len(objects))[::-1], objects if panel == 0 else [])
-        ax.set(xlabel=f"{name}: times the error on {alone}", xlim=(0, None))
+        ax.set(xlabel=f"{readable_labels(names)[panel]}: times the error on {alone}", xlim=(0, None))
     axes[0].legend()
     return figure
 
 
 def _column(key: str, names: Sequence[str]) -> Column:
-    for name in names:
+    for name, label in zip(names, readable_labels(names), strict=True):
         if key in (f"{name}_error", f"{name}_bias"):
-            return Column(key, f"{name} {key.removeprefix(name)[1:]}", unit_of(name), digits=2, signed=key.endswith("bias"))
+            return Column(key, f"{label} {key.removeprefix(name)[1:]}", unit_of(name), digits=2, signed=key.endswith("bias"))
         if key == f"{name}_times":
-            return Column(key, f"{name} times", decimals=2)
+            return Column(key, f"{label} times", decimals=2)
     return Column.of(key)
 
 
-def _describe_objects(things: Sequence[ObjectSpec]) -> str:
-    return "; ".join(f"{thing.name} ({thing.description})" for thing in things)
+def _describe_objects(objects: Sequence[ObjectSpec]) -> str:
+    return "; ".join(f"{obj.name} ({obj.description})" for obj in objects)

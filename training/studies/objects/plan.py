@@ -55,9 +55,9 @@ class ObjectsPlan:
     def __post_init__(self) -> None:
         names = [each.name for each in (*self.train, *self.unseen)]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise TrainingError(f"{', '.join(twice)}: given twice; an object is either trained on or never seen")
+            raise TrainingError(f"{', '.join(twice)}: given twice; an object is either trained on or unseen")
         if len(self.train) < 2 or not self.unseen:
-            raise TrainingError("give at least two objects to train on and one never seen")
+            raise TrainingError("give at least two objects to train on and an unseen one")
         require_count(self.count)
         require_count(self.tests, "`tests`")
 
@@ -76,8 +76,8 @@ class ObjectsPlan:
         learnt = [
             (f"sim/{o.name}", self._config(o, self.wider, 0), self.count * (len(self.train) if o is self.alone else 1)) for o in self.train
         ]
-        judged = [(f"tests/{o.name}", self._config(o, self.experiment, TESTS_APART), self.tests) for o in (*self.train, *self.unseen)]
-        return learnt + judged
+        tests = [(f"tests/{o.name}", self._config(o, self.experiment, TESTS_APART), self.tests) for o in (*self.train, *self.unseen)]
+        return learnt + tests
 
     def _config(self, obj: ObjectSpec, experiment: ExperimentSpec, apart: int) -> GenerationConfig:
         return GenerationConfig(
@@ -94,6 +94,6 @@ class ObjectsPlan:
 
     def trained_on(self, sets: dict[str, Dataset]) -> dict[str, Dataset]:
         """The data set that each model is trained on, by the model's name. Both have the same number of contacts."""
-        parts = [sets[f"sim/{thing.name}"] for thing in self.train]
+        parts = [sets[f"sim/{obj.name}"] for obj in self.train]
         first = parts[0].rows(np.flatnonzero(contact_of(parts[0]) < self.count))
         return {MIXED: join_datasets([first, *parts[1:]]), self.alone.name: parts[0]}

@@ -20,6 +20,7 @@ from training.studies.objects.page import write_page
 from training.studies.objects.plan import MIXED, TIMES, ObjectsPlan
 from training.studies.sim_to_real.steps import train_in_twin
 from training.studies.sim_to_real.variants import contact_of
+from twin.estimate import readable_labels
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
@@ -48,10 +49,10 @@ class ObjectsResult(ReadableResult):
 
     def lines(self) -> list[str]:
         """The result as lines of text: one for each model and object, then the verdicts."""
-        lines = []
+        lines, labels = [], dict(zip(self.names, readable_labels(self.names), strict=True))
         for row in self.rows:
-            errors = ", ".join(f"{name} {row[f'{name}_error']:.3g} ({row[f'{name}_times']:.2f} times)" for name in self.names)
-            lines.append(f"{row['model']}, {row['object']} ({'seen' if row['seen'] else 'never seen'}): {errors}")
+            errors = ", ".join(f"{label} {row[f'{name}_error']:.3g} ({row[f'{name}_times']:.2f} times)" for name, label in labels.items())
+            lines.append(f"{row['model']}, {row['object']} ({'seen' if row['seen'] else 'unseen'}): {errors}")
         return lines + self.verdicts
 
 
@@ -101,19 +102,17 @@ def table(plan: ObjectsPlan, runs: dict[str, Path], sets: dict[str, Dataset]) ->
     rows = []
     for model, run in runs.items():
         estimator = PoseEstimator.load(run)
-        learnt = {thing.name for thing in (plan.train if model == MIXED else (plan.alone,))}
+        learnt = {obj.name for obj in (plan.train if model == MIXED else (plan.alone,))}
         flat: np.ndarray | None = None
-        for thing in (*plan.train, *plan.unseen):
-            data = sets[f"tests/{thing.name}"]
+        for obj in (*plan.train, *plan.unseen):
+            data = sets[f"tests/{obj.name}"]
             chosen = rows_in_range(data, plan.experiment)
             if not len(chosen):
-                raise TrainingError(
-                    f"{thing.name}: none of its contacts has labels within the ranges of {plan.experiment.name}; give more `tests`"
-                )
+                raise TrainingError(f"{obj.name}: no contact has labels within the ranges of {plan.experiment.name}; give more `tests`")
             off = label_error(estimator.predict_rows(data, chosen).mean, data.targets.corrected[chosen], data.targets.units)
             error, bias = np.abs(off).mean(axis=0), off.mean(axis=0)
             flat = error if flat is None else flat
-            row: dict[str, Any] = {"model": model, "object": thing.name, "seen": thing.name in learnt}
+            row: dict[str, Any] = {"model": model, "object": obj.name, "seen": obj.name in learnt}
             row |= {"contacts": len(np.unique(contact_of(data)[chosen])), "states": len(chosen)}
             for k, name in enumerate(data.targets.names):
                 row |= {f"{name}_error": float(error[k]), f"{name}_bias": float(bias[k]), f"{name}_times": float(error[k] / flat[k])}
@@ -125,11 +124,11 @@ def verdicts(plan: ObjectsPlan, rows: list[dict[str, Any]], names: tuple[str, ..
     """A sentence for each unseen object: are the mixed model's errors at most ``TIMES`` its errors on the first object?"""
     lines = []
     for row in rows:
-        if row["model"] != MIXED or row["object"] not in {thing.name for thing in plan.unseen}:
+        if row["model"] != MIXED or row["object"] not in {obj.name for obj in plan.unseen}:
             continue
         held = all(row[f"{name}_times"] <= TIMES for name in names)
-        said = ", ".join(f"{name} {row[f'{name}_times']:.2f}" for name in names)
+        said = ", ".join(f"{label} {row[f'{name}_times']:.2f}" for name, label in zip(names, readable_labels(names), strict=True))
         lines.append(
-            f"{row['object']}, never seen: {said} times the error on {plan.alone.name} ({'within' if held else 'not within'} {TIMES:g})"
+            f"{row['object']}, unseen: {said} times the error on {plan.alone.name} ({'within' if held else 'not within'} {TIMES:g})"
         )
     return lines

@@ -1,4 +1,4 @@
-"""The discrepancy between a calibrated twin's pins and real ones, learnt from a few labelled frames (Kennedy & O'Hagan 2001).
+"""The discrepancy between a calibrated twin's pins and real ones, fitted to a few labelled frames (Kennedy & O'Hagan 2001).
 
 A frame's residual is the real displacement minus the simulated one. It is divided by the rms of the simulated displacement, because
 without displacement there is no residual. The scaled residuals are decomposed into their principal modes. Each mode's amplitude a is a

@@ -44,12 +44,12 @@ class TwinField:
     rest_px : (N, 2) float
         The pins at rest.
     seed : int
-        Chooses the states that are learnt from.
+        Chooses the states for the training.
 
     Attributes
     ----------
     known : (s, 12) float
-        Of the states that are learnt from.
+        Of the states for the training.
     direction : int or None
         The column of ``known`` that goes round the whole circle.
     varied : (V,) int

@@ -1,4 +1,4 @@
-"""A twin that learns from labelled frames without any training of a network: its estimates are those of two readings, averaged.
+"""Estimates of a twin with labelled frames and without a network: the mean of two model inversions.
 
 Backwards (``inverted``): the labels whose simulated pins are most like a frame's. Forwards (``TwinForwards``): the labels as a function of
 the simulated pins. Both learn what the twin misses, the first in the pins and the second in the labels, and their errors differ. The
@@ -59,7 +59,7 @@ class TwinForwards:
     told : (S, K) float
         Labels of these states. None is a direction that goes round the whole circle.
     seed : int
-        Chooses the simulated states that are learnt from.
+        Chooses the simulated states for the training.
     """
 
     def __init__(self, moved_px: np.ndarray, known_labels: np.ndarray, *, seed: int = 0) -> None:
@@ -177,7 +177,7 @@ def _share(errors: np.ndarray) -> float:
 def read_twin(sets: list[Dataset], obj: ObjectSpec, experiment: ExperimentSpec, *, seed: int) -> TwinRead:
     """The twin of simulated data sets, to be read for frames of an experiment that touches an object.
 
-    It learns from the states of this object whose labels lie within the experiment's ranges, extended by ``RANGE_MARGIN``.
+    It is trained on the states of this object whose labels lie within the experiment's ranges, extended by ``RANGE_MARGIN``.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The discrepancy between a twin's waves and real ones, learnt from labelled frames, and the covariance of what is left.
+"""The discrepancy between a twin's waves and real ones, fitted to labelled frames, and the covariance of what is left.
 
 The discrepancy has two parts, and each is a Gaussian process of the labels. The first part stands in the object's frame: it is the error of
 the mechanics and of the object's shape, and the same all around an edge. The second part stands in the sensor's frame: it is the error of

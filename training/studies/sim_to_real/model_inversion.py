@@ -85,9 +85,9 @@ class ModelInversion:
     rest_px : (N, 2) float
         The pins at rest.
     ranges : (12, 2) float
-        Least and largest pose and move of the frames that are asked for; labels that do not vary are known.
+        Least and largest pose and move of the requested frames; labels that do not vary are known.
     seed : int
-        Chooses the simulated states that are learnt from.
+        Chooses the simulated states for the training.
 
     Attributes
     ----------

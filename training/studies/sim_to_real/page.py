@@ -12,6 +12,7 @@ from scenes.randomisation import FrictionSpread
 from training.data.targets import unit_of
 from training.studies.sim_to_real.inverse_estimates import READ
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
+from twin.estimate import readable_labels
 from twin.report.charts import muted_colour, plain_log, sized_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, PagePicture
@@ -55,7 +56,7 @@ def write_page(
     tested, frames, labelled : int
         Number of frames that are evaluated, of all frames of the recording, and of frames that are labelled for the twin.
     seed : int
-        Seed with which the frames were drawn.
+        Seed with which the frames were sampled.
     calibrated : bool
         Whether the specification was fitted to the labelled frames.
     error_px : float
@@ -78,17 +79,17 @@ def write_page(
     """
     page = Page(f"From the twin to real frames: {sensor}", "twin study sim-to-real", topic="TacTip twin: study")
     page.lead = (
-        f"Mean absolute errors on the same {number(tested)} real frames, a random fifth of {number(frames)} that no model has seen and no "
-        f"choice was made by. The {number(labelled)} labelled frames were sampled at random from the others (seed {seed})."
+        f"Mean absolute errors on the same {number(tested)} real frames, a random fifth of {number(frames)}, which were used for no "
+        f"training and for no choice. The {number(labelled)} labelled frames were sampled at random from the others (seed {seed})."
     )
-    page.notice("The reader says", problems)
+    page.notice("Notes on the recording", problems)
     page.figures(*_charts(folder, rows, names, labelled))
     page.section("Errors")
     page.table(rows, [_column(key, names) for key in columns], caption="The least error of each column is marked.")
     page.text(
-        "Corrected labels have the shear moves that were never executed taken out; all models learnt these. The leak slope is that of the "
-        "angle's error on such moves: a model that reads the contact has 0. Inside 90 %: share of the frames whose label lies within the "
-        "model's 90 % interval."
+        "Corrected labels have the shear moves that were never executed taken out; all models were trained on these. The leak slope is "
+        "that of the angle's error on such moves: a model that reads the contact has 0. Inside 90 %: share of the frames whose label lies "
+        "within the model's 90 % interval."
     )
     page.section("How it was made")
     page.items(
@@ -97,8 +98,8 @@ def write_page(
             _describe_pins(error_px, friction),
             _describe_missing(modes, bare=bool(_of(rows, BARE))),
             _describe_combination(names, left_out),
-            "Model inversion: the labels whose simulated pins are most like the frame's. What the twin misses is a quadratic of the label, "
-            "fitted to the labelled frames. Even: these are not sampled at random, but nearest to an even sequence.",
+            "Model inversion: the labels whose simulated pins are most like the frame's. The twin's error is a quadratic function of the "
+            "label, fitted to the labelled frames. Even: these frames are not sampled at random; they are nearest to an even sequence.",
             "Pins are counted from the no-contact frame of the recording, or of each simulated sensor.",
         ]
     )
@@ -113,7 +114,7 @@ def _charts(folder: Path, rows: Sequence[Mapping], names: Sequence[str], labelle
             write_chart(folder / "errors.png", lambda: errors_figure(rows, names)),
             "Errors of each label against the number of labelled real frames, for training in the twin and on real frames",
             "Errors against corrected labels by the number of labelled real frames. The dashed line is training in the twin alone: it "
-            f"learns no real label, but the {number(labelled)} labelled frames say what its pins miss.",
+            f"is trained on no real label, but the {number(labelled)} labelled frames show the error of its pins.",
         )
     ]
     others = [row for row in rows if row["trained_on"].startswith(f"{SIMULATED},")]
@@ -132,39 +133,40 @@ def _describe_twin(simulated: int, contacts: int, *, calibrated: bool) -> str:
     fitted = "fitted to the labelled frames first" if calibrated else "as shipped, not fitted to the labelled frames"
     return (
         f"The twin: {number(simulated)} states of {number(contacts)} simulated contacts. Its specification is {fitted}"
-        f"{'' if calibrated else ' (what its own calibration used is said in it)'}."
+        f"{'' if calibrated else ' (the file states from which frames)'}."
     )
 
 
 def _describe_pins(error_px: float, friction: FrictionSpread | None) -> str:
-    drawn = "that of the rig" if friction is None else f"drawn between {friction.low:.2f} and {friction.high:.2f}"
+    friction_words = "that of the rig" if friction is None else f"sampled between {friction.low:.2f} and {friction.high:.2f}"
     return (
-        f"On the labelled frames its pins miss the real ones by {number(error_px, decimals=2)} px, friction found frame by frame; for "
-        f"simulated contacts it is {drawn}."
+        f"The twin's pins are {number(error_px, decimals=2)} px off those of the labelled frames, with the best friction of each frame; "
+        f"for simulated contacts it is {friction_words}."
     )
 
 
 def _describe_missing(modes: Sequence[Mapping[str, float]], *, bare: bool) -> str:
     return (
-        "What the pins miss was learnt as a Gaussian process of the label and sampled for every simulated contact"
-        f"{', but for the rows called bare and uncalibrated' if bare else ''}. Its first modes hold "
-        f"{_percents(mode['share'] for mode in modes)} of it, of which the label contains {_percents(mode['told'] for mode in modes)}."
+        "The error of the pins is a Gaussian process of the label, fitted to the labelled frames and sampled for every simulated "
+        f"contact{', except in the rows called bare and uncalibrated' if bare else ''}. Its first modes have "
+        f"{_percents(mode['share'] for mode in modes)} of it; the label explains {_percents(mode['told'] for mode in modes)} of these."
     )
 
 
 def _describe_combination(names: Sequence[str], left_out: np.ndarray) -> str:
-    missed = ", ".join(f"{number(float(error))} {unit_of(name)} ({name})" for name, error in zip(names, left_out, strict=True))
+    known = zip(names, readable_labels(names), left_out, strict=True)
+    missed = ", ".join(f"{label} {number(float(error))} {unit_of(name)}" for name, label, error in known)
     return (
-        "Simulated and real: the model from the twin, averaged with a Gaussian process that takes the labelled frames for the simulated "
-        "contacts' labels plus a smooth difference. Left out of it one after another, the labelled frames are missed by that process alone "
-        f"by {missed}. These errors also widen the 90 % intervals of the model from the twin, but not those of the other rows."
+        "Simulated and real: the model from the twin, averaged with a Gaussian process, in which the label of a real frame is that of a "
+        "simulated contact plus a smooth difference. The errors of that process alone, with one labelled frame left out after another, are "
+        f"{missed}. These errors also widen the 90 % intervals of the model from the twin, but not those of the other rows."
     )
 
 
 def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
     """A chart of errors against corrected labels by the number of labelled real frames; a panel for each label, both axes logarithmic."""
     figure, axes = sized_figure((5.2 * len(names), 4.2), len(names))
-    for ax, name in zip(axes, names, strict=True):
+    for ax, name, label in zip(axes, names, readable_labels(names), strict=True):
         key = f"{name}_corrected"
         models = dict.fromkeys(row["model"] for row in _of(rows, REAL))
         for model, (color, line) in zip(models, STYLES[-len(models) :], strict=False):
@@ -177,11 +179,10 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
                 ax.plot(row["labelled_frames"], row[key], "*", color=PURPLE, ms=13, label="twin and labelled frames")
             elif not row["labelled_frames"]:
                 ax.axhline(row[key], color=PURPLE, ls=(0, (1, 2)), label="model inversion, no label")
-        _curve(ax, _model(rows, BOTH, READ), key, "^-", PURPLE, "twin read")
+        _curve(ax, _model(rows, BOTH, READ), key, "^-", PURPLE, "model inversion")
         _curve(ax, _model(rows, f"{BOTH}{EVENLY}", READ), key, "^:", PURPLE, "model inversion, evenly chosen frames")
-        ax.set(
-            title=f"{name} error", xlabel="labelled real frames", ylabel=f"mean absolute error, {unit_of(name)}", xscale="log", yscale="log"
-        )
+        ax.set(title=f"{label} error", xlabel="labelled real frames", ylabel=f"mean absolute error, {unit_of(name)}")
+        ax.set(xscale="log", yscale="log")
         counts = sorted({row["labelled_frames"] for row in rows if row["labelled_frames"]})
         ax.set_xticks(counts, [number(count) for count in counts])
         ax.xaxis.set_minor_locator(NullLocator())
@@ -211,7 +212,7 @@ def ingredients_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
         ax.axvline(errors[0], color=muted_colour(), ls="--", lw=1.0)
         ax.plot(errors, places, "o", color=BLUE)
         ax.set_yticks(places, [row["trained_on"] for row in rows] if panel == 0 else [])
-        ax.set(xlabel=f"{name}: mean absolute error, {unit_of(name)}", xlim=(0, 1.08 * max(errors)))
+        ax.set(xlabel=f"{readable_labels(names)[panel]}: mean absolute error, {unit_of(name)}", xlim=(0, 1.08 * max(errors)))
     return figure
 
 
@@ -220,11 +221,11 @@ def _of(rows: Sequence[Mapping], trained_on: str) -> list[Mapping]:
 
 
 def _column(key: str, names: Sequence[str]) -> Column:
-    for name in names:
+    for name, label in zip(names, readable_labels(names), strict=True):
         if key in (f"{name}_corrected", f"{name}_raw"):
-            return Column(key, f"{name}, {key.removeprefix(name)[1:]}", unit_of(name), digits=2, best="least")
+            return Column(key, f"{label}, {key.removeprefix(name)[1:]}", unit_of(name), digits=2, best="least")
         if key == f"{name}_inside_90":
-            return Column(key, f"{name} inside 90 %", "%", decimals=0, scale=100)
+            return Column(key, f"{label} inside 90 %", "%", decimals=0, scale=100)
     return Column(key, "leak slope", digits=2, signed=True) if key == "leak_slope" else Column.of(key)
 
 

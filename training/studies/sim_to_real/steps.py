@@ -80,7 +80,7 @@ def choose_frames(count: int, labels: int, seed: int) -> StudyFrames:
     Raises
     ------
     TrainingError
-        The recording has fewer frames than are asked for.
+        The recording has fewer frames than requested.
     """
     rest, test = split_rows(count, seed)
     if labels > len(rest):
@@ -190,7 +190,7 @@ def states_like(simulated: Dataset, labelled: Dataset) -> np.ndarray:
 def states_within(simulated: Dataset, low: np.ndarray, high: np.ndarray, least: int, meant: str) -> np.ndarray:
     """Rows of simulated states whose labels lie between ``low`` (K,) and ``high`` (K,), extended by ``RANGE_MARGIN``.
 
-    ``meant`` says in the error what the labels are and how many there must be.
+    ``meant`` states in the error what the labels are and how many there must be.
 
     Raises
     ------
@@ -251,7 +251,7 @@ def combine_co_kriging(run: Path, out: Path, simulated: Dataset, labelled: Datas
     labelled : Dataset
         The n labelled frames.
     seed : int
-        Seed with which simulated states are drawn.
+        Seed with which simulated states are sampled.
 
     Raises
     ------

@@ -33,6 +33,7 @@ from training.studies.sim_to_real.taught import teach
 from training.studies.sim_to_real.variants import Twin, as_mounted, contact_of, full_twin, without_one_ingredient
 from twin.calibration.contact import fit_contact
 from twin.calibration.contact.simulate import CalibrationSetup
+from twin.estimate import readable_labels
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
@@ -66,10 +67,12 @@ class SimToRealResult(ReadableResult):
 
     def lines(self) -> list[str]:
         """The result as lines of text, one for each model."""
-        shown = [key for key in self.rows[0] if key.endswith(("_corrected", "_raw"))]
+        names = [key.removesuffix("_raw") for key in self.rows[0] if key.endswith("_raw")]
+        labels = dict(zip(names, readable_labels(names), strict=True))
+        shown = [(f"{name}_{kind}", f"{label} {kind}") for name, label in labels.items() for kind in ("corrected", "raw")]
         return [
             f"{row['trained_on']}, {row['labelled_frames']} labelled, {row['model']}: "
-            + ", ".join(f"{key} {row[key]:.3g}" for key in shown)
+            + ", ".join(f"{label} {row[key]:.3g}" for key, label in shown)
             for row in self.rows
         ]
 

@@ -1,4 +1,4 @@
-"""A network that a twin taught: it learns from real frames without labels, whose labels that model inversion estimates.
+"""A network that is trained on real frames without labels: model inversion estimates their labels (pseudo-labels).
 
 The twin is read in seconds for hundreds of frames, but not by a live loop. The network has nearly its errors, and is a run as any other. It
 needs no label of these frames, only more of them.

@@ -47,7 +47,7 @@ class Twin:
     across : int
         Elements along each side of the skin's grid.
     learns : bool
-        Whether a discrepancy is learnt from the labelled frames and added to the pins.
+        Whether a discrepancy is fitted to the labelled frames and added to the pins.
     share : float
         Share of the set's contacts, the first ones, that are used for training.
     """

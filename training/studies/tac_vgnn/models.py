@@ -102,7 +102,7 @@ def train_all(
 
 
 def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None) -> dict[str, Any]:
-    """One run's row of the table, with its errors on the rows kept out of training. If it was not begun, the row says only that."""
+    """One run's row of the table, with its errors on the rows kept out of training. If it was not begun, the row states only that."""
     folder = out / plan.folder
     row: dict[str, Any] = {
         "model": plan.name,

@@ -9,6 +9,7 @@ from matplotlib.ticker import NullLocator
 from training.data.dataset import Dataset
 from training.data.targets import unit_of
 from training.studies.tac_vgnn.models import PlannedRun, error_columns, ordering, read_curves
+from twin.estimate import readable_labels
 from twin.report.charts import new_figure, plain_log, sized_figure
 from twin.report.numbers import number
 from twin.report.page import Page, PagePicture
@@ -58,21 +59,21 @@ def write_page(
     models, graphs, efficiency, contacts : list of dict
         Rows of the tables of the same names.
     notes : dict
-        ``columns`` of the table of models, kind of ``labels`` that were learnt, ``max_minutes``, ``device`` and ``threads``.
+        ``columns`` of the table of models, kind of ``labels`` that were used, ``max_minutes``, ``device`` and ``threads``.
     """
     ranges = ", ".join(
         f"{name} [{number(float(data.targets.raw[:, k].min()))}, {number(float(data.targets.raw[:, k].max()))}] {unit}"
-        for k, (name, unit) in enumerate(zip(data.targets.names, data.targets.units, strict=True))
+        for k, (name, unit) in enumerate(zip(readable_labels(data.targets.names), data.targets.units, strict=True))
     )
     page = Page(
         f"The Tac-VGNN paper's comparison on {data.pins.sensor.name}",
         "twin study tac-vgnn",
         topic="TacTip twin: study",
-        lead=f"{len(data)} labelled frames. The paper's own data were others: depth [-2, 2] mm and angle [-30, 30] deg; here {ranges}. Its "
-        "figures stand beside ours for orientation; equal figures would not mean equal models. Times are of this machine "
+        lead=f"{len(data)} labelled frames. The paper used other data: depth [-2, 2] mm and angle [-30, 30] deg; here {ranges}. Its "
+        "figures are shown for orientation; equal figures would not mean equal models. Times are of this machine "
         f"({notes['device']}, {notes['threads']} threads), the paper's of a Titan Xp.",
     )
-    page.notice("The reader says", data.problems)
+    page.notice("Notes on the recording", data.problems)
     _errors_section(page, out, data, models, notes)
     page.section("Graphs")
     page.table(graphs, [_column(key) for key in graphs[0]])
@@ -106,12 +107,11 @@ def _errors_section(page: Page, out: Path, data: Dataset, models: list[dict], no
         given = f" This time {number(notes['max_minutes'], 4)} minutes were given to all training together."
     page.section(
         "Errors",
-        "Mean absolute errors on the random fifth of the frames that no training saw (every frame counted; those without a prediction are "
-        f"listed), of models that learnt {notes['labels']} labels. Corrected labels have the shear moves that were never executed taken "
-        "out. The leak slope is that of the angle's error on such moves: a model that reads the contact has 0, one that reads the time of "
-        "the frame has not."
-        f"{given} A run that ended early says what it reached in its time and nothing of what it might have reached. The least error of "
-        "each column is marked.",
+        "Mean absolute errors on the random fifth of the frames that are kept out of all training (every frame counts; those without a "
+        f"prediction are listed), of models that were trained on {notes['labels']} labels. Corrected labels have the shear moves that were "
+        "never executed taken out. The leak slope is that of the angle's error on such moves: a model that reads the contact has 0, one "
+        f"that reads the time of the frame has not.{given} The error of a run that ended early is what it reached in its time, not what it "
+        "would reach. The least error of each column is marked.",
     )
     errors = error_columns(data)
     shown = [key for key in notes["columns"] if key not in TRAINING]

@@ -15,6 +15,7 @@ from training.studies.tac_vgnn.contacts import AreaChange, compare_graphs, conta
 from training.studies.tac_vgnn.models import SHOWN, PlannedRun, error_columns, measure_training, plan_run, table_row, train_all
 from training.studies.tac_vgnn.page import curves_figure, efficiency_figure, write_page
 from twin.errors import OptionError
+from twin.estimate import readable_labels
 from twin.progress import Progress, silent, stage
 from twin.report.charts import write_chart
 from twin.report.table import write_table
@@ -106,7 +107,7 @@ class TacVgnnResult(ReadableResult):
     rows : list of dict
         A row for each run, see ``table_row``.
     graphs, efficiency, contacts : list of dict
-        Rows of the other tables; the last two are empty if they were not asked for.
+        Rows of the other tables; the last two are empty if they were not requested.
     names : tuple of str
         Names of the labels.
     frames : int
@@ -130,7 +131,8 @@ class TacVgnnResult(ReadableResult):
     def _errors(self, row: dict[str, Any]) -> str:
         if "epochs" not in row:
             return ""
-        return ", " + "; ".join(f"{name} {row[f'{name}_raw']:.4g} raw, {row[f'{name}_corrected']:.4g} corrected" for name in self.names)
+        known = zip(self.names, readable_labels(self.names), strict=True)
+        return ", " + "; ".join(f"{label} {row[f'{k}_raw']:.4g} raw, {row[f'{k}_corrected']:.4g} corrected" for k, label in known)
 
 
 @writes(*FILES)

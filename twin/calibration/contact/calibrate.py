@@ -80,13 +80,13 @@ class ContactCalibration(ReadableResult):
         for p in self.summary["parameters"]:
             doubt = "" if p["known"] else "  (these frames do not determine it)"
             lines.append(f"{p['name']:26s} {p['start']:9.4g} -> {p['value']:9.4g} +- {p['sd']:.2g}{doubt}")
-        for title, key in (("fitted frames", "fitted_px"), ("frames kept out", "held_out_px")):
+        for title, key in (("fitted frames", "fitted_px"), ("held-out frames", "held_out_px")):
             if part := self.summary[key]:
                 lines.append(f"{title}: {part['before']:.2f} -> {part['after']:.2f} px over {part['frames']}")
         lines.append(self.summary["newtons"]["said"])
         lines += self.summary["warnings"]
         if self.summary["distrusted"]:
-            lines.append(f"not trusted: {', '.join(self.summary['distrusted'])}")
+            lines.append(f"labels not trusted: {', '.join(self.summary['distrusted'])}")
         return lines
 
 
@@ -151,6 +151,6 @@ def calibrate_to_file(
         moved = np.stack([simulate(setup, fitted, [values], sign)[0] for values, sign in pairs]).swapaxes(1, 2)
         page = write_calibration(folder, replace(fitted, no_contact_px=fit.rest_px), moved, fit, summary)
     found = newtons.of(fit.sensor)
-    said = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."
-    write_sensor(out, found, "\n".join([said, summary["newtons"]["said"], *summary["warnings"]]))
+    text = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."
+    write_sensor(out, found, "\n".join([text, summary["newtons"]["said"], *summary["warnings"]]))
     return ContactCalibration(found, summary, [out, page])

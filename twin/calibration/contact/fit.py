@@ -59,7 +59,7 @@ class ContactFit:
     ----------
     sensor : SensorSpec
     start, value, sd : (P,) float
-        Fitted quantities of the setup's parameters (see ``Parameter.scale``) at the start and at the end, and their standard deviations.
+        Fitted quantities of the parameters (see ``FittedParameter.scale``) at the start and at the end, and their standard deviations.
     determined : (P,) float
         Share of the prior's variance that the frames removed: 1 if the frames determine the parameter, 0 if it stayed at its start.
     correlation : (P, P) float

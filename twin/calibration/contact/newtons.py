@@ -83,8 +83,9 @@ def assume_stiffness(sensor: SensorSpec, why: str) -> Newtons:
         0,
         1.0,
         factor,
-        f"forces: {why}, so the stiffness is assumed (skin {skin:.3g} MPa, gel {gel:.3g} MPa), and every force may be {factor:.2g} "
-        f"times larger or smaller; to fix it, weigh {FEWEST_PRESSES} presses or more and give their newtons in a column {ALONG[0]}",
+        f"forces: {why}, so the stiffness is assumed (skin {skin:.3g} MPa, gel {gel:.3g} MPa), and every force may be {factor:.2g} times "
+        f"larger or smaller; to determine it, measure the force of {FEWEST_PRESSES} presses or more with scales and give it in newtons in "
+        f"a column {ALONG[0]}",
     )
 
 
@@ -102,8 +103,8 @@ def compare_forces(measured_n: ArrayLike, simulated_n: ArrayLike, sensor: Sensor
         count,
         scale,
         factor,
-        f"forces: {count} presses fix the stiffness: {scale:.3g} times that of before, and every force may be {factor:.3g} times larger or "
-        f"smaller; single presses scatter by {100 * (np.exp(ratio.std(ddof=1)) - 1):.0f} %",
+        f"forces: {count} presses determine the stiffness: {scale:.3g} times the previous one, and every force may be {factor:.3g} times "
+        f"larger or smaller; single presses scatter by {100 * (np.exp(ratio.std(ddof=1)) - 1):.0f} %",
     )
 
 

@@ -32,8 +32,10 @@ def summary_of(setup: CalibrationSetup, measured: MeasuredFrames, fit: ContactFi
     for k, parameter in enumerate(setup.parameters):
         start, value = (parameter.number(v[k]) for v in (fit.start, fit.value))
         sd = float(fit.sd[k] * parameter.slope(fit.value[k]))
-        told = float(fit.determined[k])
-        parameters.append({"name": parameter.name, "start": start, "value": value, "sd": sd, "told": told, "known": told >= TOLD})
+        determined = float(fit.determined[k])
+        parameters.append(
+            {"name": parameter.name, "start": start, "value": value, "sd": sd, "told": determined, "known": determined >= TOLD}
+        )
     pairs = [
         [setup.parameters[i].name, setup.parameters[k].name, float(fit.correlation[i, k])]
         for i in range(len(setup.parameters))
@@ -65,13 +67,10 @@ def warnings_of(fit: ContactFit, held_out: tuple | None, held_frames: int) -> li
     """Warnings about everything that is worse than before the fit, or unknown; empty if there are none."""
     found = []
     if not held_out:
-        found.append(
-            "no frame was left to keep out of the fit: how well it does on other frames is not known; give more frames, "
-            "or a smaller `num_labelled`"
-        )
+        found.append("no held-out frame is left, so the error on other frames is not known; give more frames, or a smaller `num_labelled`")
     pairs = {"the fitted frames": (float(np.nanmean(fit.before_px)), float(np.nanmean(fit.after_px)))}
     if held_out:
-        pairs[f"the {held_frames} frames kept out"] = held_out
+        pairs[f"the {held_frames} held-out frames"] = held_out
     for frames, (before, after) in pairs.items():
         if not after <= before:
             found.append(
@@ -93,10 +92,12 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
     chosen = solved[np.argsort(fit.before_px[solved])[[len(solved) // 2, -1]]] if len(solved) else solved
     page = Page(f"Contact of {summary['sensor']}", "twin calibrate contact", topic="TacTip twin: contact calibration", lead=_lead(summary))
     page.notice(
-        "Not trusted, as neither hypothesis fits them", [", ".join(summary["distrusted"])] if summary["distrusted"] else [], tone="bad"
+        "Labels that are not trusted, because neither hypothesis fits",
+        [", ".join(summary["distrusted"])] if summary["distrusted"] else [],
+        tone="bad",
     )
     page.notice("Warnings", summary["warnings"], tone="bad")
-    page.notice("Noted", [summary["newtons"]["said"], *summary["problems"]])
+    page.notice("Notes", [summary["newtons"]["said"], *summary["problems"]])
     _parameters_section(page, summary)
     page.section("Frames")
     page.table(
@@ -160,7 +161,7 @@ def _parameters_section(page: Page, summary: dict) -> None:
     )
     independent = f"{summary['independent_numbers_a_frame']:.0f}"
     page.text(
-        "Told: the share of the prior uncertainty that the frames took away. A parameter that they do not determine "
+        "Determined by the frames: the share by which they reduce the prior uncertainty. A parameter that they do not determine "
         "(red) stays near its start. "
         f"The sd counts a frame's pins as {independent} independent numbers, because all pins share the model's own errors."
     )

@@ -40,7 +40,7 @@ class CalibrationSetup:
         Folder for the simulated contacts.
     workers : int
         Number of processes.
-    parameters : tuple of Parameter
+    parameters : tuple of FittedParameter
         The fitted parameters.
     """
 

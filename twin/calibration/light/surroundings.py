@@ -66,8 +66,8 @@ def _require_raw_frames(images: np.ndarray, camera: CameraSpec, name: str) -> No
         raise FrameError(f"frames are {width} x {height} px, the camera of {name} has {camera.width_px} x {camera.height_px}")
     if np.mean((images == 0) | (images == 255)) > MOST_BINARY:
         raise FrameError(
-            f"the frames of {name} are thresholded: they hold no gray levels to find the surroundings' light in; "
-            "give raw camera frames, or leave housing and leds as the specification has them"
+            f"the frames of {name} are thresholded: they have no gray levels, from which the light of the surroundings could be fitted; "
+            "give raw camera frames, or keep the specification's housing and leds"
         )
 
 
@@ -80,5 +80,5 @@ def _require_pins_inside(pins_px: np.ndarray, camera: CameraSpec) -> None:
         x, y = pins_px[frame, pin]
         raise FrameError(
             f"frame {frame}, pin {pin}: lies at ({x:.1f}, {y:.1f}) px, outside the {camera.width_px} x {camera.height_px} px picture; "
-            "give the pins that the pipeline finds in these very frames (raw form), NaN where one is not seen"
+            "give the pins that the pipeline finds in these frames (raw form), and NaN where it finds none"
         )

@@ -130,7 +130,7 @@ class TwinDetector:
         return Found(seen.pins_px[np.isfinite(seen.pins_px[:, 0])], seen.pins_px, seen.graph, seen.expected, seen.valid, seen.reason)
 
     def graph_of(self, nodes_px: np.ndarray) -> PinGraph:
-        return make_graph("voronoi", nodes_px, outmost=self._pipeline.reference.outmost)
+        return make_graph("voronoi", nodes_px, outmost=self._pipeline.reference.outmost, net=self._pipeline.reference.net)
 
 
 class MatchedDetector:
@@ -166,7 +166,7 @@ class MatchedDetector:
         return Found(pins_px[paired], pins_px, self.graph_of(nodes_px) if valid else None, count, valid, reason)
 
     def graph_of(self, nodes_px: np.ndarray) -> PinGraph:
-        return make_graph("voronoi", nodes_px, outmost=self._reference.outmost)
+        return make_graph("voronoi", nodes_px, outmost=self._reference.outmost, net=self._reference.net)
 
 
 class LegacyDetector:

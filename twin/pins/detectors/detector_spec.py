@@ -73,7 +73,7 @@ class DetectorSpec(Section):
         The file's stem; not a key of the file.
     method : str
         A key of ``METHODS``, which describes each method; or ``OWN``.
-    form : {"raw", "recording"}
+    form : {"raw", "processed"}
         Form of the frames.
     size_px : (width, height), optional
         Width and height of the frames; by default those of the sensor's specification.

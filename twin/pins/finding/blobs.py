@@ -51,8 +51,7 @@ def circular_mask(size_px: tuple[int, int], center_px: tuple[float, float], radi
     x, y = center_px
     columns = slice(int(np.clip(np.ceil(x - radius_px), 0, width - 1)), int(np.clip(np.floor(x + radius_px) + 1, 1, width)))
     rows = slice(int(np.clip(np.ceil(y - radius_px), 0, height - 1)), int(np.clip(np.floor(y + radius_px) + 1, 1, height)))
-    grid_y, grid_x = np.mgrid[rows, columns]
-    inside = (grid_x - x) ** 2 + (grid_y - y) ** 2 <= radius_px**2
+    inside = (np.arange(columns.start, columns.stop) - x) ** 2 + ((np.arange(rows.start, rows.stop) - y) ** 2)[:, None] <= radius_px**2
     return Mask((rows, columns), np.array([columns.start, rows.start], float), (255 * inside).astype(np.uint8))
 
 
@@ -142,36 +141,57 @@ def _smooth_window(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
 
 
 @compiled()
-def _centroids(gray: np.ndarray, labels: np.ndarray, grown: np.ndarray, ringed: np.ndarray, bright: np.ndarray, count: int) -> np.ndarray:
-    """Sums (count, 7) over the pixels of each label: weight, weight x, weight y, bright pixels, weight xx, weight xy, weight yy.
-
-    A pixel's weight is its level above the mean of the ring around its label; negative weights are left out. ``grown`` is
-    overwritten: afterwards it also holds the labels themselves.
-    """
-    height, width = gray.shape
-    ring_sum, ring_n = np.zeros(count), np.zeros(count)
-    for y in range(height):
-        for x in range(width):
-            if grown[y, x] == 0 and ringed[y, x] > 0:
-                ring_sum[ringed[y, x]] += gray[y, x]
-                ring_n[ringed[y, x]] += 1
-    sums = np.zeros((count, 7))
+def _boxes(labels: np.ndarray, grown: np.ndarray, count: int) -> np.ndarray:
+    """Left, top, width, height and area (count, 5) of each label. Its pixels are also written to ``grown``."""
+    height, width = labels.shape
+    boxes = np.zeros((count, 5), np.int64)
     for y in range(height):
         for x in range(width):
             k = labels[y, x]
             if k == 0:
-                k = grown[y, x]
-            if k > 0:
-                grown[y, x] = k
-                sums[k, 3] += bright[y, x] > 0
-                weight = gray[y, x] - ring_sum[k] / max(ring_n[k], 1.0)
-                if weight > 0:
-                    sums[k, 0] += weight
-                    sums[k, 1] += weight * x
-                    sums[k, 2] += weight * y
-                    sums[k, 4] += weight * x * x
-                    sums[k, 5] += weight * x * y
-                    sums[k, 6] += weight * y * y
+                continue
+            grown[y, x] = k
+            box = boxes[k]
+            if box[4] == 0:
+                box[0], box[1] = x, y
+            left = min(box[0], x)
+            box[2] = max(box[0] + box[2], x + 1) - left
+            box[0], box[3] = left, y + 1 - box[1]
+            box[4] += 1
+    return boxes
+
+
+@compiled()
+def _centroids(gray: np.ndarray, grown: np.ndarray, ringed: np.ndarray, bright: np.ndarray, boxes: np.ndarray, reach: int) -> np.ndarray:
+    """Sums (count, 7) over the pixels of each label: weight, weight x, weight y, bright pixels, weight xx, weight xy, weight yy.
+
+    A pixel's weight is its level above the mean of the ring around its label; negative weights are left out. A label's pixels and its
+    ring lie within ``reach`` of its box.
+    """
+    height, width = gray.shape
+    sums = np.zeros((len(boxes), 7))
+    for k in range(1, len(boxes)):
+        left, right = max(boxes[k, 0] - reach, 0), min(boxes[k, 0] + boxes[k, 2] + reach, width)
+        top, bottom = max(boxes[k, 1] - reach, 0), min(boxes[k, 1] + boxes[k, 3] + reach, height)
+        total, count = 0.0, 0.0
+        for y in range(top, bottom):
+            for x in range(left, right):
+                if ringed[y, x] == k and grown[y, x] == 0:
+                    total += gray[y, x]
+                    count += 1
+        level = total / max(count, 1.0)
+        for y in range(top, bottom):
+            for x in range(left, right):
+                if grown[y, x] == k:
+                    sums[k, 3] += bright[y, x] > 0
+                    weight = gray[y, x] - level
+                    if weight > 0:
+                        sums[k, 0] += weight
+                        sums[k, 1] += weight * x
+                        sums[k, 2] += weight * y
+                        sums[k, 4] += weight * x * x
+                        sums[k, 5] += weight * x * y
+                        sums[k, 6] += weight * y * y
     return sums
 
 
@@ -185,20 +205,20 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
     eroded = bright
     if blob.erosion_px > 1:
         eroded = cv2.erode(bright, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(eroded, connectivity=8, ltype=cv2.CV_16U)
+    count, labels = cv2.connectedComponents(eroded, connectivity=8, ltype=cv2.CV_16U)
     grow = 2 * blob.erosion_px + 1
     grown = cv2.dilate(labels, np.ones((grow, grow), np.uint8))
     ringed = cv2.dilate(labels, np.ones((grow + 4, grow + 4), np.uint8))
-    sums = _centroids(gray, labels, grown, ringed, bright, count)
+    boxes = _boxes(labels, grown, count)
+    sums = _centroids(gray, grown, ringed, bright, boxes, blob.erosion_px + 2)
     area = sums[:, 3]
     keep = np.flatnonzero((area >= blob.min_area_px2) & (area <= max_area_px2) & (sums[:, 0] > 0) & (np.arange(count) > 0))
-    box = stats[keep, cv2.CC_STAT_WIDTH] * stats[keep, cv2.CC_STAT_HEIGHT].astype(float)
-    keep = keep[stats[keep, cv2.CC_STAT_AREA] >= LEAST_FILL * box]
+    keep = keep[boxes[keep, 4] >= LEAST_FILL * boxes[keep, 2] * boxes[keep, 3]]
     mean = sums[keep, 1:3] / sums[keep, :1]
     xx, xy, yy = (sums[keep, 4:] / sums[keep, :1] - np.stack([mean[:, 0] ** 2, mean[:, 0] * mean[:, 1], mean[:, 1] ** 2], axis=1)).T
     root = np.hypot(xx - yy, 2 * xy)
     elongation = (xx + yy + root) / np.maximum(xx + yy - root, 1e-3)
-    return Blobs(mean + mask.corner_px, area[keep], elongation, keep, area, stats[:, :4], grown, gray, mask.corner_px)
+    return Blobs(mean + mask.corner_px, area[keep], elongation, keep, area, boxes[:, :4], grown, gray, mask.corner_px)
 
 
 def find_spots(gray: np.ndarray, mask: Mask, blob: BlobSpec) -> Blobs:

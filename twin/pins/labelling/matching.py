@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 from twin.compiled import compiled
 from twin.geometry.drift import drift
 from twin.pins.labelling.buckets import Buckets, fill_buckets, nearest_free
-from twin.pins.labelling.reference import Reference, turned_over
+from twin.pins.labelling.reference import Reference, median_px, turned_over
 
 RIDGE = 0.25
 """Penalty of the local gradient, which draws it towards zero. It is equivalent to this many neighbours at a distance of one spacing."""
@@ -67,10 +67,6 @@ BROKEN_RINGS = 2
 """Number of innermost rings that are left out when the shift is found, because they are inconsistent in a shifted labelling."""
 EXTENT_MARGIN = 0.02
 """Share of the points that is left out on each side of their extent. The middle of the extent is used as the place of the whole view."""
-RIM_SEEDS = 12
-"""Number of pins at the rim from which labellings start."""
-INSIDE_SEEDS = 6
-"""Approximate number of pins inside the rim from which labellings start."""
 SEED_RANKS = 3
 """Number of nearest blobs that are tried for each of these pins."""
 REFINED = 8
@@ -216,7 +212,7 @@ def _drift_labelling(
     n, caps = len(reference.pins_px), np.flatnonzero(area_px2 >= DRIFT_SPECK * np.median(area_px2))
     if not (1 - MOST_LOST) * n <= len(caps) <= MOST_BLOBS * n:
         return None
-    spacing = float(np.median(reference.spacing_px))
+    spacing = reference.pitch_px
     rest, blobs = reference.pins_px / spacing, px[caps] / spacing
     best, most = None, (1 - MOST_LOST) * n
     for beta, stiffness in stiffnesses:
@@ -253,11 +249,14 @@ def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) 
         return nothing
     px = np.ascontiguousarray(px)
     layout = _layout(reference)
-    cell = float(np.median(reference.spacing_px))
+    cell = reference.pitch_px
     buckets = fill_buckets(px, cell)
     grown: dict[bytes, np.ndarray] = {}
+    large: list[np.ndarray] = []  # a start that one of them holds would grow to the same one
     best = None
     for pin, blob in _seeds(reference, px):
+        if any(labels[pin] == blob for labels in large):
+            continue
         start = np.full(n, -1)
         start[pin] = blob
         labels = _grow(*layout[:3], px, start, buckets, cell)
@@ -273,6 +272,8 @@ def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) 
                 best = found
                 break
         grown[labels.tobytes()] = labels
+        if count >= NEARLY_ALL * n:
+            large.append(labels)
     if best is None:
         likely = sorted(grown.values(), key=lambda labels: -int((labels >= 0).sum()))[:REFINED]
         best = _leading(reference, px, [_refine(layout, px, area_px2, labels, buckets, cell) for labels in likely])
@@ -300,8 +301,8 @@ def _rim_displacement(reference: Reference, px: np.ndarray, blob: np.ndarray) ->
     rim = reference.outmost[blob[reference.outmost] >= 0]
     if not len(rim):
         return 0.0
-    away = np.median(px[blob[rim]] - reference.pins_px[rim], axis=0)
-    return float(np.hypot(*away) / np.median(reference.spacing_px))
+    away = median_px(px[blob[rim]] - reference.pins_px[rim])
+    return float(np.hypot(*away) / reference.pitch_px)
 
 
 def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray, found: Match | None = None) -> Match:
@@ -309,7 +310,7 @@ def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np
     if found is not None and found.drifted:
         return look_again(reference, px, area_px2, replace(found, blob=np.full(len(blob), -1)))
     px = np.ascontiguousarray(px)
-    cell = float(np.median(reference.spacing_px))
+    cell = reference.pitch_px
     layout = _layout(reference)
     return _refine(layout, px, area_px2, blob, fill_buckets(px, cell), cell)
 
@@ -328,7 +329,7 @@ def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: M
     if main[blob >= 0].all():
         return found
     px = np.ascontiguousarray(px)
-    cell = float(np.median(reference.spacing_px))
+    cell = reference.pitch_px
     layout, buckets = _layout(reference), fill_buckets(px, cell)
     again = _refine(layout, px, area_px2, _grow(*layout[:3], px, np.where(main, blob, -1), buckets, cell), buckets, cell)
     across = (blob >= 0) & (again.blob < 0) & ~np.isin(blob, again.blob)
@@ -591,8 +592,8 @@ def _candidates(
     blob: np.ndarray,
     buckets: Buckets,
     cell: float,
-) -> tuple[list[int], list[int], list[float], bool]:
-    """Possible pairs within the gate (pins, blobs, costs), and whether a pin or blob is in more than one of them."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+    """Possible pairs within the gate: pins, blobs and costs (p,), and whether a pin or blob is in more than one of them."""
     n = len(predicted)
     # numba needs lists of a known type, also empty ones
     pins: list[int] = [0 for _ in range(0)]
@@ -627,13 +628,12 @@ def _candidates(
                         uses[k] += 1
                         contested = contested or mine > 1 or uses[k] > 1
                     k = following[k]
-    return pins, blobs, costs, contested
+    return np.array(pins), np.array(blobs), np.array(costs), contested
 
 
-def _assign(n: int, blob_count: int, pins_list: list[int], blobs_list: list[int], costs_list: list[float], contested: bool) -> np.ndarray:
-    """One-to-one assignment (N,) of possible pairs: as many pairs as possible, with the least cost."""
+def _assign(n: int, blob_count: int, pins: np.ndarray, blobs: np.ndarray, costs: np.ndarray, contested: bool) -> np.ndarray:
+    """One-to-one assignment (N,) of possible pairs (p,): as many pairs as possible, with the least cost."""
     blob = np.full(n, -1)
-    pins, blobs, costs = np.array(pins_list, int), np.array(blobs_list, int), np.array(costs_list, float)
     if not contested:
         blob[pins] = blobs
         return blob
@@ -671,8 +671,10 @@ def _adopt(layout: LayoutArrays, px: np.ndarray, area: np.ndarray, blob: np.ndar
     """Give lost pins free blobs of a cap's size slightly outside the gate. Predictions at the rim are extrapolated and less precise."""
     neighbours, spacing = layout.neighbours, layout.spacing
     lost = np.flatnonzero((blob < 0) & np.isfinite(predicted[:, 0]))
+    if not 0 < len(lost) <= MOST_ADOPTED * len(blob):
+        return blob
     free = np.setdiff1d(np.arange(len(px)), blob)
-    if not len(lost) or not len(free) or len(lost) > MOST_ADOPTED * len(blob):
+    if not len(free):
         return blob
     distance = np.linalg.norm(px[free] - predicted[lost][:, None], axis=2) / spacing[lost][:, None]
     around = np.where(blob[neighbours[lost]] >= 0, area[blob[neighbours[lost]]], np.nan)
@@ -696,19 +698,15 @@ def _middle(px: np.ndarray) -> np.ndarray:
 
 
 def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Pairs to start from: pins around the rim, where motion is least, then inside, with their 1st, 2nd, 3rd nearest blobs."""
-    rim = reference.outmost
-    inner = np.setdiff1d(np.arange(len(reference.pins_px)), rim)
-    pins = np.concatenate(
-        [rim[np.linspace(0, len(rim), RIM_SEEDS, endpoint=False).astype(int)], inner[:: max(len(inner) // INSIDE_SEEDS, 1)]]
-    )
-    extent = _middle(px) - _middle(reference.pins_px)
-    median = np.median(px, axis=0) - np.median(reference.pins_px, axis=0)
+    """Pairs to start from: some pins of the reference, with their 1st, 2nd, 3rd nearest blobs."""
+    offsets = [_middle(px) - _middle(reference.pins_px)]
     seen: set[tuple[int, int]] = set()
     for rank in range(SEED_RANKS):
-        for offset in (extent, np.zeros(2), median):
-            for pin in pins.tolist():
-                distance2 = ((px - (reference.pins_px[pin] + offset)) ** 2).sum(axis=1)
+        for place in range(3):
+            if place == len(offsets):
+                offsets += [np.zeros(2), median_px(px) - median_px(reference.pins_px)]
+            for pin in reference.starts:
+                distance2 = ((px - (reference.pins_px[pin] + offsets[place])) ** 2).sum(axis=1)
                 pair = pin, int(np.argpartition(distance2, rank)[rank])
                 if pair not in seen:
                     seen.add(pair)

@@ -1,6 +1,7 @@
 """The reference: places of the pins of a sensor in a frame without contact, and their neighbours."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
@@ -8,10 +9,12 @@ from scipy.spatial import Delaunay, cKDTree
 from scenes.pins import PinsSpec
 from scenes.sensor import SensorSpec
 from twin.camera.projection import project
+from twin.compiled import compiled
 from twin.errors import FrameError
 from twin.frames.forms import form_named, from_raw
 from twin.geometry.drift import coherent_motions
 from twin.geometry.pins import pin_lattice, rest_pins
+from twin.pins.flips import Net, net_of
 from twin.pins.voronoi import voronoi
 from twin.types import Form
 
@@ -21,6 +24,8 @@ NEIGHBOURS = 18
 LEAST_SPREAD_PX = 1.0
 # Least distance between two pins at rest, in median spacings. If two pins are nearer to each other, no frame shows them apart.
 FOLDED = 0.02
+# Number of pins at the rim from which labellings start, and approximate number of those inside.
+RIM_STARTS, INSIDE_STARTS = 12, 6
 # Largest distance of a pin from the frame's origin, px. It is larger than any camera's frame.
 FARTHEST_PX = 1e6
 
@@ -56,10 +61,36 @@ class Reference:
     ring_ends: np.ndarray
     _motions: dict[float, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
 
+    @cached_property
+    def pitch_px(self) -> float:
+        """Median of the spacings."""
+        return float(np.median(self.spacing_px))
+
+    @cached_property
+    def starts(self) -> list[int]:
+        """Pins from which labellings start: around the rim, where motion is least, then inside."""
+        rim = self.outmost
+        inner = np.setdiff1d(np.arange(len(self.pins_px)), rim)
+        around = rim[np.linspace(0, len(rim), RIM_STARTS, endpoint=False).astype(int)]
+        starts: list[int] = np.concatenate([around, inner[:: max(len(inner) // INSIDE_STARTS, 1)]]).tolist()
+        return starts
+
+    @cached_property
+    def net(self) -> Net | None:
+        """The triangles as a net for ``flipped``; None if they make none. An outmost pin in none of them makes one with those beside it."""
+        ears = np.column_stack([np.roll(self.outmost, 1), self.outmost, np.roll(self.outmost, -1)])
+        ears = ears[~np.isin(self.outmost, self.triangles)]
+        return net_of(_turned_alike(self.pins_px, np.concatenate([self.triangles, ears])), len(self.pins_px))
+
+    @cached_property
+    def rim_radius_px(self) -> float:
+        """Mean distance of the outmost pins from their mean."""
+        return mean_radius(self.pins_px[self.outmost])
+
     def motions(self, width: float) -> np.ndarray:
         """Coherent motions (N, m) of the pins (`twin.geometry.drift`), for a kernel of this width in spacings."""
         if width not in self._motions:
-            self._motions[width] = coherent_motions(self.pins_px / np.median(self.spacing_px), width)
+            self._motions[width] = coherent_motions(self.pins_px / self.pitch_px, width)
         return self._motions[width]
 
     def map_to(self, other: "Reference") -> np.ndarray:
@@ -67,6 +98,18 @@ class Reference:
         here, there = (each.pins_px - each.pins_px.mean(axis=0) for each in (self, other))
         linear: np.ndarray = np.linalg.lstsq(here, there, rcond=None)[0]
         return linear
+
+
+def mean_radius(px: np.ndarray) -> float:
+    """Mean distance of points (n, 2) from their mean."""
+    return float(np.linalg.norm(px - px.mean(axis=0), axis=1).mean())
+
+
+def median_px(px: np.ndarray) -> np.ndarray:
+    """Medians (2,) of points (n, 2): ``np.median``, in a tenth of its time for a few points."""
+    ordered, n = np.sort(px, axis=0), len(px)
+    median: np.ndarray = (ordered[(n - 1) // 2] + ordered[n // 2]) / 2
+    return median
 
 
 def spread_out(pins_px: np.ndarray) -> bool:
@@ -105,9 +148,7 @@ def make_reference(pins_px: np.ndarray, pins: PinsSpec) -> Reference:
         raise FrameError(
             f"pins {one} and {other} are at the same place at rest; repair rest_px of the specification, or pins_px of the tuned file"
         )
-    triangles = Delaunay(pins_px).simplices.astype(np.int64)
-    area = _double_areas(pins_px, triangles)
-    triangles[area < 0] = triangles[area < 0][:, ::-1]
+    triangles = _turned_alike(pins_px, Delaunay(pins_px).simplices.astype(np.int64))
     inner = ~np.isin(triangles, lattice.outmost).all(axis=1)  # thin triangles of three outmost pins turn over without a wrong labelling
     triangles = triangles[inner]
     area_px2 = voronoi(pins_px, outmost=lattice.outmost).area_px2
@@ -123,7 +164,7 @@ def nominal_reference(spec: SensorSpec, form: Form) -> Reference:
     FrameError
         The sensor has no processed form, or there is no such form.
     """
-    blob = spec.pipeline.raw if form_named(form) == Form.RAW else spec.pipeline.recording
+    blob = spec.pipeline.raw if form_named(form) == Form.RAW else spec.pipeline.processed
     if blob is not None and blob.rest_px:
         return make_reference(np.array(blob.rest_px), spec.pins)
     return make_reference(project_rest(spec, form), spec.pins)
@@ -134,10 +175,19 @@ def project_rest(spec: SensorSpec, form: Form) -> np.ndarray:
     return from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm))
 
 
+def _turned_alike(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Triangles (t, 3) over points (N, 2), turned over where their area is negative."""
+    return np.where(_double_areas(px, triangles)[:, None] < 0, triangles[:, ::-1], triangles)
+
+
+@compiled()
 def _double_areas(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Twice the signed area (t,) of triangles (t, 3) over points (N, 2)."""
-    a, b, c = px[triangles[:, 0]], px[triangles[:, 1]], px[triangles[:, 2]]
-    return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    areas = np.empty(len(triangles))
+    for t in range(len(triangles)):
+        (ax, ay), (bx, by), (cx, cy) = px[triangles[t, 0]], px[triangles[t, 1]], px[triangles[t, 2]]
+        areas[t] = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    return areas
 
 
 def turned_over(reference: Reference, nodes_px: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:

@@ -131,6 +131,7 @@ def split_chains(blobs: Blobs) -> Blobs:
     px: list[np.ndarray] = []
     part_area: list[float] = []
     part_label: list[int] = []
+    odd &= (caps_in > MIN_CAPS_NECKED) & (caps_in < MAX_CAPS)
     for k, caps in zip(long[odd], caps_in[odd], strict=True):
         pixels, level = blobs.pixels(int(blobs.label[k]))
         weight = _weight(level)
@@ -138,7 +139,7 @@ def split_chains(blobs: Blobs) -> Blobs:
         axis = np.linalg.eigh(np.cov(pixels.T, aweights=weight))[1][:, 1]
         along = (pixels - middle) @ axis
         neck = _neck(along, weight)
-        if not (MIN_CAPS_NECKED if neck is not None else MIN_CAPS) < caps < MAX_CAPS:
+        if neck is None and caps <= MIN_CAPS:
             continue
         count = 2 if neck is not None else max(int(np.round(caps)), 2)
         if neck is not None:

@@ -123,7 +123,7 @@ class DegradeMode(PageMode):
                     control.on_update(lambda event: self._restart())
                 self._choices.append(choice)
                 self._severities.append(slider)
-            page.button("Find breaking point", self._find, hint="raise the severity of condition 1 until something fails; the others stay")
+            page.button("Find breaking point", self._find, hint="raise the severity of condition 1 until something fails; others are kept")
             page.button("Reset", self._reset)
 
     def show(self) -> None:
@@ -174,7 +174,7 @@ class DegradeMode(PageMode):
         pictures = frame_pictures(judge.spec, judge.reference, frame, judged.seen)
         words = "; ".join(f"{case.title} {case.label(severity)}" for case, severity in cases if severity) or "no degradation"
         numbers = [
-            badge("degraded" if any(severity for _, severity in cases) else "as it is") + badge("rasterised"),
+            badge("degraded" if any(severity for _, severity in cases) else "not degraded") + badge("rasterised"),
             paragraph(words, "note"),
             _measures(judged, judge.limits),
             paragraph("" if judged.seen.valid else f"The pipeline refuses the frame: {judged.seen.reason}", "stop"),

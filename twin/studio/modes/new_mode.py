@@ -81,9 +81,9 @@ class NewMode(PageMode):
         with self.folder:
             self._frames = gui.add_text("frames", "", hint="folder, video or recording on the studio's machine")
             self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
-            self._layout = gui.add_text("layout", "", hint="empty: found; or rings:10, hexagon:6, grid:9x7, positions:FILE.csv")
+            self._layout = gui.add_text("layout", "", hint="empty: identified; or rings:10, hexagon:6, grid:9x7, positions:FILE.csv")
             page.button("Propose a specification", self.propose)
-            correct = gui.add_button_group("make the layout", (SMALLER, LARGER))
+            correct = gui.add_button_group("correct the layout", (SMALLER, LARGER))
             self._number = gui.add_slider("frame shown", 0, 1, 1, 0, disabled=True)
             page.button("Use this sensor", self.use)
         correct.on_click(page.guard(lambda: self.correct(+1 if correct.value == LARGER else -1)))

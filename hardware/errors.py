@@ -43,6 +43,13 @@ def cannot_listen(who: str, host: str, port: int, error: OSError, *, option: str
 class Connection(ABC):
     """Base class of all devices with ``connect()`` and ``disconnect()``."""
 
+    name: str
+
+    @property
+    @abstractmethod
+    def is_connected(self) -> bool:
+        """Whether the connection is open."""
+
     @abstractmethod
     def connect(self) -> None: ...
 
@@ -55,6 +62,14 @@ class Connection(ABC):
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
         leave(self.disconnect, error)
+
+    def _require_connected(self) -> None:
+        if not self.is_connected:
+            raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
+
+    def _require_disconnected(self) -> None:
+        if self.is_connected:
+            raise DeviceAlreadyConnectedError(f"{self.name}: connected already; disconnect() first")
 
 
 def leave(disconnect: Callable[[], None], error: BaseException | None) -> None:

@@ -4,7 +4,7 @@ A policy's file contains no code. A policy takes frames through the real pipelin
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -232,8 +232,3 @@ class PolicyModel:
         self._stack = [*(self._stack or [moved] * count), moved][-count:]
         action = self.policy.act(np.array(self._stack)[None], self._goal[None])[0]
         return PolicyAction(self.policy.axes, action, True, "", seen)
-
-
-def with_goal(policy: Policy, goal: FloatArray) -> Policy:
-    """The same policy with another goal."""
-    return replace(policy, about={**policy.about, "goal": np.asarray(goal, float).tolist()})

@@ -15,7 +15,7 @@ import numpy as np
 
 from hardware.arms.kinematics import FARTHEST, LinkageKinematics, joint_target, linear_target
 from hardware.arms.motion import turn_between_deg
-from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError, also
+from hardware.errors import Connection, DeviceError, StaleDataError, also
 
 # Interval in s at which feedback is read. It is shorter than the 8 ms period of the fastest feedback.
 POLL_S = 0.005
@@ -147,14 +147,8 @@ def stop_after(arm: "Arm | BaseArm", error: BaseException) -> None:
 class BaseArm(Connection):
     """Base class of the arms; see ``hardware.arms.arm.Arm`` for the methods."""
 
-    name: str
     axes: int
     _unstopped = False  # whether the newest stop failed and this was reported
-
-    @property
-    @abstractmethod
-    def is_connected(self) -> bool:
-        """Whether the connection is open."""
 
     @abstractmethod
     def stop(self) -> None: ...
@@ -244,14 +238,6 @@ class BaseArm(Connection):
         self._require_connected()
         if not (0 < linear_mm_s < np.inf and 0 < angular_deg_s < np.inf):
             raise DeviceError(f"{self.name}: speeds of {linear_mm_s} mm/s and {angular_deg_s} deg/s; both must be positive")
-
-    def _require_connected(self) -> None:
-        if not self.is_connected:
-            raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
-
-    def _require_disconnected(self) -> None:
-        if self.is_connected:
-            raise DeviceAlreadyConnectedError(f"{self.name}: connected already; disconnect() first")
 
 
 class LinkageArm(BaseArm):

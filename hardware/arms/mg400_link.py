@@ -193,7 +193,6 @@ class Feedback:
         self._heard_s = 0.0  # when the newest packet arrived, on the clock of ``awake_s``
         self._arrived, self._ended = Condition(), Event()
         self._thread: Thread | None = None
-        self.skipped_bytes = self.reconnects = 0
 
     def open(self) -> None:
         """Connect to the first port that accepts and wait for a packet.
@@ -265,7 +264,6 @@ class Feedback:
                 return
             with contextlib.suppress(DeviceNotConnectedError):
                 connection = self._connect()
-                self.reconnects += 1
         connection.close()
 
     def _read_until_silent(self, connection: socket.socket, ended: Event) -> None:
@@ -281,8 +279,7 @@ class Feedback:
                 return
             if self._newest is None:
                 self._came = (self._came + data)[-2 * PACKET_BYTES :]
-            packet, buffer, skipped = newest_packet(buffer + data, lenient=self._lenient)
-            self.skipped_bytes += skipped
+            packet, buffer = newest_packet(buffer + data, lenient=self._lenient)
             if packet is not None and len(data) < BACKLOG_BYTES:  # otherwise newer packets are still waiting to be read
                 valid_s, heard_s = time.monotonic(), awake_s()
                 if self._joints is not None and np.abs(packet["q_actual"] - self._joints).max() > MOTION_DEG:

@@ -137,7 +137,6 @@ ROBOT_TYPE_MG400 = 1
 _SIX = ("<f8", (6,))
 _FIELDS = {  # name: (format, offset)
     "length": ("<u2", 0),
-    "digital_in": ("<u8", 8),
     "digital_out": ("<u8", 16),
     "mode": ("<u8", 24),
     "unix_ms": ("<u8", 32),
@@ -147,28 +146,23 @@ _FIELDS = {  # name: (format, offset)
     "qd_target": (_SIX, 240),
     "q_actual": (_SIX, 432),
     "qd_actual": (_SIX, 480),
-    "i_actual": (_SIX, 528),
     "tool_actual": (_SIX, 624),  # X, Y, Z, R, -, -: R is the fourth
     "tcp_speed_actual": (_SIX, 672),
-    "tcp_force": (_SIX, 720),
     "tool_target": (_SIX, 768),
     "tcp_speed_target": (_SIX, 816),
     "user_index": ("u1", 1012),
     "tool_index": ("u1", 1013),
     "queue_runs": ("u1", 1014),
     "paused": ("u1", 1015),
-    "brake": ("u1", 1025),
     "enabled": ("u1", 1026),
     "drag": ("u1", 1027),
     "running": ("u1", 1028),
     "error": ("u1", 1029),
     "jog": ("u1", 1030),
     "robot_type": ("u1", 1031),
-    "m_actual": (_SIX, 1120),
     "load": (("<f8", (4,)), 1168),  # kg, and its centre x, y, z in mm
     "user": (_SIX, 1200),
     "tool": (_SIX, 1248),
-    "trace_index": ("<u8", 1296),
     "target_quaternion": (("<f8", (4,)), 1352),
     "actual_quaternion": (("<f8", (4,)), 1384),
 }
@@ -188,7 +182,7 @@ def pose_in(packet: np.void) -> np.ndarray:
     return np.array([x, y, z, 0.0, 0.0, turn])
 
 
-def newest_packet(buffer: bytes, *, lenient: bool = False) -> tuple[np.void | None, bytes, int]:
+def newest_packet(buffer: bytes, *, lenient: bool = False) -> tuple[np.void | None, bytes]:
     """The newest whole packet in the received bytes.
 
     A packet counts if its length is 1440, its test value is at its place, no other packet begins inside it, and it is
@@ -199,10 +193,8 @@ def newest_packet(buffer: bytes, *, lenient: bool = False) -> tuple[np.void | No
     packet : record of ``PACKET`` or None
     rest : bytes
         The bytes after it.
-    skipped : int
-        Number of bytes before it that are not part of a packet.
     """
-    newest, begin, used = None, 0, 0
+    newest, begin = None, 0
     mark, offset = (_LENGTH, 0) if lenient else (TEST_BYTES, TEST_OFFSET)
     at = buffer.find(mark)
     while at >= 0:
@@ -211,12 +203,11 @@ def newest_packet(buffer: bytes, *, lenient: bool = False) -> tuple[np.void | No
         whole = alone and start >= 0 and start + PACKET_BYTES <= len(buffer)
         if whole and buffer.startswith(_LENGTH, start) and _LENGTH.startswith(buffer[start + PACKET_BYTES :][:2]):
             newest, begin = np.frombuffer(buffer[start : start + PACKET_BYTES], PACKET)[0], start
-            used += PACKET_BYTES
             following = buffer.find(mark, at + PACKET_BYTES)
         at = following
     if newest is None:
-        return None, buffer[-2 * PACKET_BYTES :], max(0, len(buffer) - 2 * PACKET_BYTES)
-    return newest, buffer[begin + PACKET_BYTES :], begin + PACKET_BYTES - used
+        return None, buffer[-2 * PACKET_BYTES :]
+    return newest, buffer[begin + PACKET_BYTES :]
 
 
 def describe_bytes(came: bytes) -> str:
@@ -238,7 +229,7 @@ def why_no_packet(came: bytes, *, closed: bool) -> str:
             "connected, but nothing came: the controller hangs, another program holds the feedback, or this is no MG400 "
             "(a server that waits for a request). Check the address, close other programs, else restart the arm"
         )
-    packet, _, _ = newest_packet(came, lenient=True)
+    packet, _ = newest_packet(came, lenient=True)
     if packet is not None:
         return (
             f"packets came whose test value is {int(packet['test_value']):#x} instead of {TEST_VALUE:#x}: an emulator, or a controller of "

@@ -6,7 +6,7 @@ from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.recorded import RecordedSource
 from hardware.cameras.session import SessionSource
 from hardware.cameras.source import FrameSource
-from hardware.cameras.uvc import UvcCamera, UvcSettings
+from hardware.cameras.uvc import UvcCamera
 from hardware.errors import DeviceError
 from scenes.files import LONGEST_PATH, quote
 from scenes.plugins import others
@@ -16,14 +16,7 @@ from twin.records.session import is_session
 from twin.types import Form
 
 
-def open_camera(
-    text: str,
-    spec: SensorSpec | None = None,
-    form: Form | None = None,
-    *,
-    settings: UvcSettings | None = None,
-    twin: FrameSource | None = None,
-) -> FrameSource:
+def open_camera(text: str, spec: SensorSpec | None = None, form: Form | None = None, *, twin: FrameSource | None = None) -> FrameSource:
     """Make a frame source. It is not connected yet.
 
     Parameters
@@ -35,7 +28,6 @@ def open_camera(
     form : Form, optional
         Form of the frames. By default a live source has the form of the sensor's recordings if the sensor has one, otherwise raw. The form
         of recorded frames is determined from the frames.
-    settings : UvcSettings, optional
     twin : FrameSource, optional
         The source that the text ``twin`` selects.
 
@@ -52,7 +44,7 @@ def open_camera(
             raise DeviceError("the twin as a camera needs an arm and an object; use 'twin servo', 'twin collect' or 'twin emulate camera'")
         return twin
     if text.isdecimal() or text.startswith("/dev/"):
-        return UvcCamera(int(text) if text.isdecimal() else text, spec, live_form, settings)
+        return UvcCamera(int(text) if text.isdecimal() else text, spec, live_form)
     kind, _, rest = text.partition(":")
     if (there := others("cameras", ("twin", "http", "https"))) and kind in there:
         source: FrameSource = there[kind](rest, spec, live_form)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hardware.arms.awake import awake_s
-from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.errors import Connection, DeviceError, StaleDataError
 from scenes.sensor import SensorSpec
 from twin.camera.capture import record
 from twin.frames.forms import form_named, frame_size, gray_levels
@@ -177,8 +177,7 @@ class LiveSource(Connection):
             return "" if quiet_s <= max(BLIND_S, BLIND_PERIODS * self._usual_s()) else f"no new picture for {quiet_s:.1f} s"
 
     def connect(self) -> None:
-        if self.is_connected:
-            raise DeviceAlreadyConnectedError(f"{self.name}: connected already; disconnect() first")
+        self._require_disconnected()
         self._open()
         self._reset()
         self._end.clear()
@@ -213,8 +212,7 @@ class LiveSource(Connection):
             while True:
                 if self._error is not None:
                     raise DeviceError(f"{self.name}: {self._error}") from self._error
-                if self._thread is None:
-                    raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
+                self._require_connected()
                 if self.fault:
                     raise DeviceError(f"{self.name}: {self.fault}")
                 if self._frame is not None and wanted(self._frame):

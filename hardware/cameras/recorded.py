@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 
-from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceNotConnectedError
+from hardware.errors import Connection
 from scenes.sensor import SensorSpec
 from twin.frames import Recording, open_recording
 from twin.types import Form, Frame
@@ -47,17 +47,15 @@ class SequentialSource(Connection):
         return self._left is not None
 
     def connect(self) -> None:
-        if self.is_connected:
-            raise DeviceAlreadyConnectedError(f"{self.name}: connected already; disconnect() first")
+        self._require_disconnected()
         self._left, self._newest = self._frames(), None
 
     def disconnect(self) -> None:
         self._left = None
 
     def read(self, *, timeout_s: float = 1.0) -> Frame:
-        if self._left is None:
-            raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
-        frame = next(self._left, None)
+        self._require_connected()
+        frame = next(self._left or iter(()), None)
         if frame is None:
             raise EOFError(f"{self.name}: the recording is at its end")
         self._newest = frame

@@ -14,11 +14,6 @@ SLOWEST, FASTEST = 1e-3, 1e3  # limits of the time scale: beyond them a move tak
 CHECK_S = 0.5  # interval, s, at which a failure of the emulator is checked
 
 
-def say(line: str) -> None:
-    """Print a line at once, so that a program that waits for it on a pipe can continue."""
-    print(line, flush=True)
-
-
 def run_until_signal(
     device: AbstractContextManager[Any],
     ready: Callable[[], str],
@@ -41,7 +36,7 @@ def run_until_signal(
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # signals are waited for, so that nothing is interrupted halfway
     try:
         with device:
-            say(f"ready {ready()}")
+            print(f"ready {ready()}", flush=True)  # at once, because a program may wait for it on a pipe
             while not told and not _comes(ends):
                 if (error := failure()) is not None:
                     raise error

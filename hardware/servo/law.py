@@ -44,14 +44,10 @@ class LawStep:
     pose : (6,) float
         The arm's next pose.
     memory : Memory
-    error_mm, error_deg : float
-        Reference minus reading.
     """
 
     pose: np.ndarray
     memory: Memory
-    error_mm: float
-    error_deg: float
 
 
 def tangent_of(mounting: Mounting, pose: np.ndarray, reading: Reading) -> np.ndarray:
@@ -112,4 +108,4 @@ def servo_step(
     T = matrix_of(pose)
     T[:3, :3] = T_base_surface[:3, :3] @ Rotation.from_rotvec(np.radians(now.angle_deg + turn_deg) * out_of_plane).as_matrix()
     T[:3, 3] += T_base_surface[:3, :3] @ step_mm
-    return LawStep(pose_of(T, pose), memory, error_mm, error_deg)
+    return LawStep(pose_of(T, pose), memory)

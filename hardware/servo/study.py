@@ -1,6 +1,5 @@
 """Compares models by following the surfaces of several objects."""
 
-import csv
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -14,7 +13,8 @@ from twin.errors import StoreError, TwinError
 from twin.estimate import SensorModel
 from twin.progress import Progress, silent
 from twin.report.charts import save_figure
-from twin.store import text_file, writes
+from twin.report.table import write_rows
+from twin.store import writes
 from twin.types import ReadableResult
 
 # Measures that are printed, with their headings.
@@ -119,7 +119,7 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
     if reasons and len(reasons) == len(found):
         raise TwinError(f"none of {len(found)} runs made a step; the first: {reasons[0]}")
     made = ServoStudy(found, [])
-    made.written.append(_write_rows(out / "study.csv", made.rows))
+    made.written.append(write_rows(out / "study.csv", made.rows))
     pictures = [(*key, run.path, run.outline_mm) for key, run in found.items() if isinstance(run, Followed)]
     if pictures:
         made.written.append(save_figure(out / "study.png", comparison_figure(pictures)))
@@ -129,15 +129,6 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
 def folder_name(label: str) -> str:
     """A model's name as a valid name of a folder: one part of a path, and never the parent folder."""
     return re.sub(r"^\.+|[^\w.-]+", "_", label) or "_"
-
-
-def _write_rows(path: Path, rows: list[dict[str, Any]]) -> Path:
-    names = list(rows[0]) if rows else ["model", "object", "failure"]
-    with text_file(path) as file:
-        writer = csv.writer(file)
-        writer.writerow(names)
-        writer.writerows(row.values() for row in rows)
-    return path
 
 
 def _cells(run: Followed) -> str:

@@ -14,7 +14,7 @@ from training.data.targets import PRESETS
 from training.studies.label_audit import summary_of, write_audit
 from training.studies.objects import ObjectsPlan, verdicts
 from training.studies.tac_vgnn import page as study_report
-from training.studies.tac_vgnn.contacts import AreaChange
+from training.studies.tac_vgnn.contacts import AreaChange, contacts_figure
 from training.studies.tac_vgnn.models import plan_run
 from twin.calibration.contact.report import write_calibration
 from twin.calibration.optics import Calibration
@@ -119,9 +119,9 @@ def study(out: Path) -> Path:
     efficiency = [{"model": "gnn", "batch": n, "ms_per_frame": 3 / n, "s_per_epoch": None, "memory_mib": 27.0} for n in (16, 64)]
     graph = make_graph("voronoi", reference.pins_px + rng.normal(0, 1, reference.pins_px.shape), outmost=reference.outmost)
     contacts = [AreaChange("centre", depth, graph, reference.area_px2) for depth in (2.0, 4.0)]
-    study_report.draw_curves(out / "curves.png", plans, out / "runs")
-    study_report.draw_efficiency(out / "efficiency.png", efficiency)
-    study_report.draw_contacts(out / "contacts.png", contacts)
+    write_chart(out / "curves.png", lambda: study_report.curves_figure(plans, out / "runs"))
+    write_chart(out / "efficiency.png", lambda: study_report.efficiency_figure(efficiency))
+    write_chart(out / "contacts.png", lambda: contacts_figure(contacts))
     figures = [contact.figures() for contact in contacts]
     for name, rows in (("models", models), ("graphs", graphs), ("efficiency", efficiency), ("contacts", figures)):
         write_table(out / f"{name}.csv", rows)

@@ -21,6 +21,7 @@ from scenes import load_experiment, load_object, load_randomisation, load_sensor
 from scenes.base import SpecError
 from scenes.load import load_servo
 from twin.cli import command_line, main
+from twin.cli.options import INSIDE
 
 ROOT = Path(__file__).parents[2]
 CLI = ROOT / "twin" / "cli"
@@ -102,6 +103,28 @@ def test_a_function_of_the_packages_is_behind_every_command(command):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_reaches_the_function_behind_the_command(command):
+    """``call`` leaves out what a function does not take: an option is either used by its name, or an argument of what is called."""
+    used = {part.id for statement in command.body for part in ast.walk(statement) if isinstance(part, ast.Name)}
+    found = dict(_everything(command))
+    calls = [part for part in ast.walk(command) if isinstance(part, ast.Call) and ast.unparse(part.func) == "call"]
+    for each in calls:
+        name, *attribute = ast.unparse(each.args[0]).split(".")
+        takes = inspect.signature(getattr(found[name], attribute[0]) if attribute else found[name]).parameters
+        used |= {*takes, *(option for option, inside in INSIDE.items() if inside in takes)}
+        assert {keyword.arg for keyword in each.keywords if keyword.arg} <= set(takes)
+    options = [*command.args.args, *command.args.kwonlyargs] if calls else []
+    assert {option.arg for option in options if "is_eager" not in ast.unparse(option.annotation or option)} <= used
+
+
+def _everything(command):
+    """What a command imports, by name."""
+    for source, name in imported(command):
+        module = import_module(source)
+        yield name, getattr(module, name, None) or import_module(f"{source}.{name}")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_that_writes_overwrites_nothing_foreign_unless_it_is_forced(command):
     """What a command with ``--out`` calls opens its output by the store before it works. ``App.command`` adds ``--force``.
 
@@ -169,7 +192,7 @@ def test_the_command_line_computes_nothing(path):
 def test_nothing_takes_the_command_line_for_a_library():
     own = {
         CLI,
-        *(ROOT / "tests" / "unit" / f"test_{name}.py" for name in ("progress", "door", "former_names")),
+        *(ROOT / "tests" / "unit" / f"test_{name}.py" for name in ("progress", "door", "former_names", "command_line")),
     }  # what is no command is tested apart
     for package in (*OURS, "tests"):
         for path in sorted((ROOT / package).rglob("*.py")):

@@ -61,9 +61,8 @@ def test_contacts_without_labels_tell_where_another_units_pins_are_at_rest(known
     """A mean of the frames would be wrong by the mean displacement."""
     moved = contacts(FEWEST_CONTACTS, 2, depth=depth)
     found = rest_from_contacts(known, START, other_unit + moved)
-    off, before, mean = (np.sqrt(np.mean((px - other_unit) ** 2)) for px in (found.pins_px, START.pins_px, other_unit + moved.mean(axis=0)))
+    off, before, mean = (np.sqrt(np.mean((px - other_unit) ** 2)) for px in (found, START.pins_px, other_unit + moved.mean(axis=0)))
     assert off < 0.25 * before and off < 0.5 * mean, (off, before, mean)
-    assert found.left_px < 0.03 * PITCH
 
 
 def test_the_same_unit_keeps_its_places_and_few_contacts_tell_nothing(known, other_unit):

@@ -20,7 +20,7 @@ from training.environments.world import Surfaces, standing_on
 from twin.cli import command_line
 from twin.errors import FrameError, OptionError
 from twin.geometry.pins import rest_pins
-from twin.policy import Policy, PolicyError, PolicyModel, flatten, load_policy, with_goal
+from twin.policy import Policy, PolicyError, PolicyModel, flatten, load_policy
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
 
@@ -78,7 +78,7 @@ def test_a_frame_gives_the_action_that_its_observation_gives(policy):
     seen, _ = env.reset(seed=4)
     eye = env.batch.eye
     rest = eye.frame(0, rest_pins(eye.sensor.geometry), np.random.default_rng(0))
-    model = PolicyModel(with_goal(policy, seen["goal"])).at_rest(rest)
+    model = PolicyModel(replace(policy, about={**policy.about, "goal": seen["goal"].tolist()})).at_rest(rest)
     frame = eye.frame(0, env.batch.backend.attitude(0), np.random.default_rng(1))
     told = model(frame)
     assert told.valid and told.names == policy.axes

@@ -182,7 +182,7 @@ def test_a_way_is_gone_pose_by_pose_and_a_wish_ends_it():
         worker.play([(0.02 * k, ObjectPose(depth_mm=float(k % 2))) for k in range(500)])
         worker.ask(ObjectPose(depth_mm=5.0))
         wait(lambda a: a.arrived and a.pose.depth_mm == 5.0)
-        assert not worker.playing
+        assert not worker._way
 
 
 def test_a_state_opens_again(tmp_path):

@@ -11,7 +11,7 @@ from training.data.pins import PIN_COLUMNS, PinTable, pin_table, voronoi_areas
 from training.data.simulated import contact_labels, is_pins_only, is_simulated, labels_of_surface, open_simulated
 from training.data.targets import CONTACT, CONTACT_UNITS, Targets, choose_targets, joined_targets
 from twin.errors import FrameError
-from twin.frames import Recording, natural_key, open_recording
+from twin.frames import natural_key, open_recording
 from twin.pins import nominal_reference
 from twin.progress import Step
 from twin.rig.labels import label_slope, plate_slope
@@ -127,7 +127,12 @@ def load_dataset(
     depth_per_move = plate_slope(spec.rig) if simulated else label_slope(spec.rig)
     if is_pins_only(Path(folder)):
         recording, truth = open_simulated(Path(folder), spec, form)
-        pins = simulated_table(recording, spec, truth, progress=progress)
+        reference = nominal_reference(spec, recording.form)
+        # The displacements of each contact are relative to its own sensor's pins at rest, because its pins may be longer, its skin thinner.
+        nodes_px = reference.pins_px + (truth["pins_px"].astype(float) - truth["rest_px"])
+        known = {"image_name": np.array(recording.names, str), "valid": np.ones(len(nodes_px), bool), "lost": ~truth["visible"]}
+        known |= {"nodes_px": nodes_px, "area_px2": voronoi_areas(nodes_px, reference, progress=progress)}
+        pins = PinTable(spec, recording.form, reference, **known, measured=True)
     else:
         recording = open_recording(folder, spec, form)
         pins = pin_table(recording, spec, problems=problems, progress=progress)
@@ -179,10 +184,8 @@ def join_datasets(parts: list[Dataset]) -> Dataset:
                 raise FrameError(f"{part.folder}: its {what} ({mine}) differs from that of {first.folder} ({others}); train on one kind")
     tables = [part.pins.relative_to(first.pins.reference) for part in parts]
     columns = {key: np.concatenate([getattr(table, key) for table in tables]) for key in PIN_COLUMNS}
-    called = shortest_distinct_ends([part.folder.resolve() for part in parts])
-    columns["image_name"] = np.concatenate(
-        [np.char.add(f"{name}/", part.pins.image_name) for name, part in zip(called, parts, strict=True)]
-    )
+    named = zip(name_prefixes([part.folder for part in parts]), parts, strict=True)
+    columns["image_name"] = np.concatenate([np.char.add(prefix, part.pins.image_name) for prefix, part in named])
     pins = replace(first.pins.with_columns(columns), measured=all(table.measured for table in tables))
     targets = joined_targets([part.targets for part in parts])
     groups: list[np.ndarray] = []
@@ -210,10 +213,12 @@ def with_common_labels(parts: Sequence[Dataset]) -> list[Dataset]:
     return [replace(part, targets=part.targets.only(common)) for part in parts]
 
 
-def shortest_distinct_ends(folders: list[Path]) -> list[str]:
-    """The shortest ends of the paths that are all different: mostly the folders' names."""
-    longest = max(len(folder.parts) for folder in folders)
-    ends = (["/".join(folder.parts[-count:]) for folder in folders] for count in range(1, longest + 1))
+def name_prefixes(folders: Sequence[Path]) -> list[str]:
+    """Text before the names of each folder's frames in a joined data set: the shortest distinct end of its path; of one folder none."""
+    if len(folders) == 1:
+        return [""]
+    parts = [folder.resolve().parts for folder in folders]
+    ends = (["/".join((*each[-count:], "")) for each in parts] for count in range(1, max(map(len, parts)) + 1))
     return next(names for names in ends if len(set(names)) == len(names))
 
 
@@ -231,27 +236,6 @@ def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[
     shuffled = np.random.default_rng(seed).permutation(count)
     out_count = -(-count // HELD_OUT)
     return np.sort(shuffled[out_count:]), shuffled[:out_count]
-
-
-def simulated_table(
-    recording: Recording,
-    spec: SensorSpec,
-    truth: dict[str, np.ndarray],
-    *,
-    progress: Step | None = None,
-) -> PinTable:
-    """The pin table that a perfect pipeline would make of simulated frames. The pins are known; hidden caps count as lost.
-
-    Each contact may have another sensor (longer pins, a thinner skin). Its displacements are counted from that sensor's pins at rest, as
-    those of a real sensor are counted from its own frame without contact.
-    """
-    reference = nominal_reference(spec, recording.form)
-    nodes = reference.pins_px + (truth["pins_px"].astype(float) - truth["rest_px"])
-    area_px2 = voronoi_areas(nodes, reference, progress=progress)
-    seen = np.ones(len(nodes), bool)
-    return PinTable(
-        spec, recording.form, reference, np.array(recording.names, str), nodes, area_px2, ~truth["visible"], seen, measured=True
-    )
 
 
 def _list_names(names: np.ndarray) -> str:

@@ -96,21 +96,6 @@ class DisplacementModel:
         return (whole + whole.T) / 2
 
 
-@dataclass(frozen=True)
-class RestFound:
-    """Pins at rest, estimated from contacts.
-
-    Attributes
-    ----------
-    pins_px : (N, 2) float
-    left_px : float
-        Rms residual of a coordinate in the frames.
-    """
-
-    pins_px: np.ndarray
-    left_px: float
-
-
 def learn_displacements(moved_px: np.ndarray) -> DisplacementModel | None:
     """Learn the model from displacements (M, N, 2) of contacts; None for fewer than ``FEWEST_FRAMES``."""
     if len(moved_px) < FEWEST_FRAMES:
@@ -135,7 +120,7 @@ def _terms(a: np.ndarray) -> np.ndarray:
     return np.column_stack([np.ones(len(a)), *(np.prod(a[:, term], axis=1) for term in chosen)])
 
 
-def rest_from_contacts(known: DisplacementModel, start: Reference, pins_px: np.ndarray) -> RestFound:
+def rest_from_contacts(known: DisplacementModel, start: Reference, pins_px: np.ndarray) -> np.ndarray:
     """Rest places of a unit, estimated from its pins (M, N, 2) in contacts of any kind that the model describes.
 
     Parameters
@@ -163,8 +148,7 @@ def rest_from_contacts(known: DisplacementModel, start: Reference, pins_px: np.n
         a = a + np.clip(follows, -LONGEST_STEP, LONGEST_STEP)
         if np.abs(change).max() < SETTLED * spacing:
             break
-    left = seen - off - known.at(a)
-    return RestFound(start.pins_px + off.reshape(-1, 2), float(np.sqrt(np.mean(left**2))))
+    return start.pins_px + off.reshape(-1, 2)
 
 
 def other_rest(known: DisplacementModel | None, start: Reference, pins_px: np.ndarray) -> np.ndarray | None:
@@ -179,7 +163,7 @@ def other_rest(known: DisplacementModel | None, start: Reference, pins_px: np.nd
     if known is None or len(whole) < FEWEST_CONTACTS:
         return None
     chosen = spread_indices(len(whole), MOST_CONTACTS)
-    found = rest_from_contacts(known, start, whole[chosen]).pins_px
+    found = rest_from_contacts(known, start, whole[chosen])
     away = float(np.sqrt(np.mean(np.sum((found - start.pins_px) ** 2, axis=1))))
     return found if away > SAME_UNIT * float(np.median(start.spacing_px)) else None
 

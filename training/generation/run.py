@@ -19,12 +19,13 @@ from twin.types import FINE, Quality, ReadableResult
 from twin.workers import outcomes, require_scheduler
 
 
-@dataclass(frozen=True)
-class Summary:
-    """Numbers of a run of ``generate``.
+@dataclass(frozen=True, repr=False)
+class Simulated(ReadableResult):
+    """A data set that was made.
 
     Attributes
     ----------
+    folder : Path
     contacts, frames : int
         Number in the whole data set.
     before : int
@@ -33,15 +34,28 @@ class Summary:
         Draws that failed in this run.
     """
 
+    folder: Path
     contacts: int
     frames: int
     before: int
     failed: int
 
+    @property
+    def written(self) -> list[Path]:
+        """The data set's folder."""
+        return [self.folder]
+
+    def lines(self) -> list[str]:
+        """The result as lines of text."""
+        lines = [f"{self.before} contacts were there before"] if self.before else []
+        if self.failed:
+            lines.append(f"{self.failed} contacts failed and were sampled again: see {self.folder / 'failures.csv'}")
+        return [*lines, f"{self.frames} frames of {self.contacts} contacts"]
+
 
 def generate(
     folder: Path, config: GenerationConfig, count: int, *, workers: int = 1, scheduler: str = "", progress: Step | None = None
-) -> Summary:
+) -> Simulated:
     """Make a data set of ``count`` contacts, or continue the one in the folder.
 
     The result does not depend on ``workers``, on ``scheduler``, or on how often the work was interrupted.
@@ -84,27 +98,7 @@ def generate(
             made += outcome.index != REST
             if progress:
                 progress(made, count)
-        return Summary(count, store.finish(count), before, failed)
-
-
-@dataclass(frozen=True, repr=False)
-class Simulated(ReadableResult):
-    """A data set that was made, and its folder."""
-
-    folder: Path
-    made: Summary
-
-    @property
-    def written(self) -> list[Path]:
-        """The data set's folder."""
-        return [self.folder]
-
-    def lines(self) -> list[str]:
-        """The result as lines of text."""
-        lines = [f"{self.made.before} contacts were there before"] if self.made.before else []
-        if self.made.failed:
-            lines.append(f"{self.made.failed} contacts failed and were sampled again: see {self.folder / 'failures.csv'}")
-        return [*lines, f"{self.made.frames} frames of {self.made.contacts} contacts"]
+        return Simulated(folder, count, store.finish(count), before, failed)
 
 
 def config_for(
@@ -182,4 +176,4 @@ def simulate_dataset(
         with stage(progress, f"{config.experiment.name}, {config.sensor.name}") as step:
             made = generate(out, config, count, workers=workers, scheduler=scheduler, progress=step)
         kept.catch_up()
-    return Simulated(out, made)
+    return made

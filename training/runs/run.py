@@ -9,8 +9,6 @@
 Every file is written as a whole or not at all.
 """
 
-import csv
-import io
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -32,6 +30,7 @@ from training.runs.loop import Loop, TrainingRows
 from training.runs.networks import parameter_count
 from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damage_error, read_config, read_tensors, write_tensors
 from twin.frames.forms import blob_spec
+from twin.report.table import write_rows
 from twin.store import fingerprint, write_text, writes
 
 RUN_FILES = (CONFIG, "curves.csv", TENSORS)
@@ -280,13 +279,8 @@ def _require_same(out: Path, wanted: dict, found: Mapping, state: str) -> None:
 
 
 def write_curves(out: Path, curves: list[list[dict]]) -> None:
-    """Write ``curves.csv``: the curves of all networks, one network after the other."""
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(["network", "epoch", "loss", "held_out_error", "rate", "seconds"])
-    for k, points in enumerate(curves):
-        writer.writerows([k, *point.values()] for point in points)
-    write_text(out / "curves.csv", text.getvalue())
+    """Write the points of each network's training: ``network``, and the keys of ``Loop.epoch``."""
+    write_rows(out / "curves.csv", [{"network": k, **point} for k, points in enumerate(curves) for point in points])
 
 
 def _identity(resolved: dict) -> str:

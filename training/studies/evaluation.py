@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from training.data.dataset import Dataset, join_datasets, load_dataset, shortest_distinct_ends
+from training.data.dataset import Dataset, join_datasets, load_dataset
 from training.data.simulated import is_simulated
 from training.errors import TrainingError
 from training.estimate.contact_estimator import ContactEstimator, contacts_folder
@@ -17,7 +17,7 @@ from training.runs.identity import changed_since, trained_before
 from training.runs.packed import folder_of
 from training.studies.judging import measure_changes, measure_errors, rows_to_evaluate, time_frames, write_evaluation
 from training.touch.contact_maps import compare_maps
-from training.touch.slip import CapView, compare_slip, drags_of, random_places, resample_path
+from training.touch.slip import CapView, compare_slip, name_drags, random_places, resample_path
 from twin.estimate import readable_labels
 from twin.frames import open_recording
 from twin.progress import Progress, silent, stage
@@ -53,13 +53,9 @@ def _slip_errors(estimator: PoseEstimator, parts: Sequence[Dataset], chosen: set
     """Errors of slip on the drags whose frames are all ``chosen``, each traversed once at a random speed; None if there is none."""
     assert estimator.slip is not None
     rng, ways = np.random.default_rng(0), []
-    called = shortest_distinct_ends([part.folder.resolve() for part in parts]) if len(parts) > 1 else [""]
-    for part, prefix in zip(parts, called, strict=True):
-        eyes = CapView(estimator.modes_of, part.pins)
-        for rows, drag in drags_of(part):
-            names = {f"{prefix}/{name}" if prefix else name for name in part.pins.image_name[rows].tolist()}
-            if names <= chosen:
-                ways.append(resample_path(drag, random_places(len(rows), rng), eyes, rng))
+    for part, names, drag in name_drags(parts):
+        if chosen.issuperset(names):
+            ways.append(resample_path(drag, random_places(len(names), rng), CapView(estimator.modes_of, part.pins), rng))
     return asdict(compare_slip(estimator.slip, ways)) if ways else None
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from scenes import SensorSpec
-from training.data.dataset import Dataset, join_datasets, load_dataset, shortest_distinct_ends, with_common_labels
+from training.data.dataset import Dataset, join_datasets, load_dataset, with_common_labels
 from training.data.simulated import is_simulated
 from training.data.targets import CONTACT, PRESETS, SHEAR, TURN
 from training.estimate.displacements import learn_displacements, write_displacements
@@ -24,7 +24,7 @@ from training.runs.run import RUN_FILES, train_run
 from training.runs.run_files import BESIDE_FILES, CHECKPOINT, DISPLACEMENTS, DOMAIN, MAPS, SLIP
 from training.touch.contact_maps import FEWEST_STATES, learn_maps, write_maps
 from training.touch.contact_probability import TouchAnswer
-from training.touch.slip import FEWEST_DRAGS, CapView, drags_of, learn_slip, write_slip
+from training.touch.slip import FEWEST_DRAGS, CapView, learn_slip, name_drags, write_slip
 from twin.errors import OptionError
 from twin.estimate import readable_labels
 from twin.progress import Progress, silent, stage
@@ -220,14 +220,9 @@ def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str
     list of str
         The reason why slip was not trained, at most one line.
     """
-    estimator, drags = PoseEstimator.load(run), []
+    estimator = PoseEstimator.load(run)
     kept_out = set(estimator.config["rows"]["kept_out"])
-    called = shortest_distinct_ends([part.folder.resolve() for part in parts]) if len(parts) > 1 else [""]
-    for part, prefix in zip(parts, called, strict=True):
-        for rows, drag in drags_of(part):
-            names = [f"{prefix}/{name}" if prefix else name for name in part.pins.image_name[rows].tolist()]
-            if kept_out.isdisjoint(names):
-                drags.append(drag)
+    drags = [drag for _, names, drag in name_drags(parts) if kept_out.isdisjoint(names)]
     slide = sum(np.isfinite(drag.whole_mm) for drag in drags)
     if slide < FEWEST_DRAGS:
         return [

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from scenes.sensor import GeometrySpec
-from training.data.dataset import Dataset, shortest_distinct_ends
+from training.data.dataset import Dataset, name_prefixes
 from training.errors import TrainingError
 from training.runs.run_files import AGAIN
 from twin.frames.truth import arrays_of, open_truth, row_of
@@ -126,12 +126,11 @@ class _Truth:
 def _truth(data: Dataset, rows: np.ndarray, geometry: GeometrySpec) -> _Truth:
     """Known forces and places of rows (m,) of a data set. In joined data sets the folder stands before a frame's name."""
     grid = skin_grid(geometry)
-    called = shortest_distinct_ends([folder.resolve() for folder in data.folders]) if len(data.folders) > 1 else [""]
     names = data.pins.image_name[rows]
     force = np.zeros((len(rows), 3, SIDE * SIDE), np.float32)
     skin: np.ndarray | None = None
-    for folder, prefix in zip(data.folders, called, strict=True):
-        mine = np.flatnonzero([name.rpartition("/")[0] == prefix for name in names.tolist()])
+    for folder, prefix in zip(data.folders, name_prefixes(data.folders), strict=True):
+        mine = np.flatnonzero([name[: name.rfind("/") + 1] == prefix for name in names.tolist()])
         if not len(mine):
             continue
         truth, _, _ = open_truth(folder)

@@ -14,7 +14,7 @@ A press alone does not count as slip, although skin that spreads over a smooth o
 traversed at random speeds with random stops, and every frame has its own noise of the pins, so that the network depends on no frame rate.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from torch import nn
 
 from scenes.layouts.rings import Rings
 from scenes.sensor import SensorSpec
-from training.data.dataset import Dataset
+from training.data.dataset import Dataset, name_prefixes
 from training.data.pins import PinTable
 from training.errors import TrainingError
 from training.runs.assemble import COVERAGE, conformal_quantile
@@ -290,6 +290,13 @@ def drags_of(data: Dataset) -> list[tuple[np.ndarray, Drag]]:
             continue
         found.append((rows, _drag({key: array[mine] for key, array in arrays.items()}, nodes_mm)))
     return found
+
+
+def name_drags(parts: Sequence[Dataset]) -> Iterator[tuple[Dataset, list[str], Drag]]:
+    """The drags of several data sets, each with its data set and the names of its frames in the joined one."""
+    for part, prefix in zip(parts, name_prefixes([part.folder for part in parts]), strict=True):
+        for rows, drag in drags_of(part):
+            yield part, [prefix + name for name in part.pins.image_name[rows].tolist()], drag
 
 
 def _drag(arrays: dict[str, np.ndarray], nodes_mm: np.ndarray) -> Drag:

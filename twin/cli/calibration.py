@@ -30,6 +30,7 @@ from twin.cli.options import (
     Table,
     Tuning,
     Workers,
+    call,
     load_if_named,
     print_lines,
     sensor_with,
@@ -122,23 +123,8 @@ def new_sensor(
         raise OptionError("give either a folder of frames or `camera`")
     if frames is None:
         frames = gather_frames(open_camera(camera), out.with_name(f"{out.stem}-frames"))
-    return whole_sensor(
-        frames,
-        out,
-        labels=label_table,
-        optics=optics,
-        experiment=load_if_named(load_experiment, experiment),
-        contacts=contacts,
-        workers=workers,
-        across=elements,
-        layout=load_if_named(layout_from, layout),
-        radius_mm=radius_mm,
-        no_contact=no_contact,
-        table=table,
-        form=form,
-        limit=max_frames,
-        progress=progress,
-    )
+    made_of = {"experiment": load_if_named(load_experiment, experiment), "layout": load_if_named(layout_from, layout)}
+    return call(whole_sensor, locals(), **made_of)
 
 
 calibrate_app = App(
@@ -186,7 +172,7 @@ def calibrate_optics(
     """
     from twin.calibration.optics import calibrate_optics
 
-    return calibrate_optics(frames, sensor_with(sensor, pipeline), out, limit=max_frames, no_contact=no_contact, progress=progress)
+    return call(calibrate_optics, locals(), sensor=sensor_with(sensor, pipeline))
 
 
 @calibrate_app.command("contact", goes_on=True)
@@ -248,20 +234,15 @@ def calibrate_contact(
     from twin.calibration.contact.calibrate import calibrate_to_file
     from twin.frames import frames_at
 
-    return calibrate_to_file(
-        frames_at(frames, table, no_contact),
-        sensor_with(sensor, pipeline),
-        load_experiment(experiment),
-        out,
-        obj=load_if_named(load_object, obj),
-        labels=num_labelled,
-        seed=seed,
-        hold=hold or (),
-        workers=workers,
-        across=elements,
-        form=form,
+    frames, spec = frames_at(frames, table, no_contact), sensor_with(sensor, pipeline)
+    of, touched = load_experiment(experiment), load_if_named(load_object, obj)
+    return call(
+        calibrate_to_file,
+        locals(),
+        sensor=spec,
+        experiment=of,
+        obj=touched,
         columns=dict(pair.partition("=")[::2] for pair in column or ()),
-        progress=progress,
     )
 
 
@@ -311,19 +292,15 @@ def validate(
     from training.studies.validation import validate_contacts
     from twin.frames import frames_at
 
-    return validate_contacts(
-        sensor_with(sensor, pipeline),
-        frames_at(frames, table, no_contact),
-        load_experiment(experiment),
-        out,
-        obj=load_if_named(load_object, obj),
-        limit=max_frames,
-        friction_frames=friction_frames,
-        seed=seed,
-        across=elements,
-        form=form,
+    frames, spec = frames_at(frames, table, no_contact), sensor_with(sensor, pipeline)
+    of, touched = load_experiment(experiment), load_if_named(load_object, obj)
+    return call(
+        validate_contacts,
+        locals(),
+        sensor=spec,
+        experiment=of,
+        obj=touched,
         columns=dict(pair.partition("=")[::2] for pair in column or ()),
-        progress=progress,
     )
 
 
@@ -396,19 +373,8 @@ def realism(
     from training.studies.realism import compare_with_renders
     from twin.frames import frames_at
 
-    return compare_with_renders(
-        frames_at(path, table),
-        with_residual_if(residual, sensor_with(sensor, pipeline)),
-        out,
-        pose_aligned=pose_aligned,
-        limit=max_frames,
-        fitted=fitted,
-        without=without or (),
-        quality=quality,
-        test=two_sample,
-        thorough=thorough,
-        progress=progress,
-    )
+    spec = with_residual_if(residual, sensor_with(sensor, pipeline))
+    return call(compare_with_renders, locals(), frames=frames_at(path, table), sensor=spec, test=two_sample)
 
 
 def _list_conditions(asked: bool) -> None:
@@ -497,16 +463,8 @@ def robustness(
     from training.studies import degradation
     from twin.evaluation.degradation.plan import SweepPlan, load_plan
 
-    plan = degradation.DegradationPlan(
-        load_sensor(sensor),
-        pipelines=tuple(pipeline or degradation.PIPELINES),
-        models=tuple(model or ()),
-        sweep=load_if_named(load_plan, conditions) or SweepPlan(),
-        frames=frames,
-        limit=max_frames,
-        rendered=rendered,
-        jobs=jobs,
-    )
+    sweep = load_if_named(load_plan, conditions) or SweepPlan()
+    plan = call(degradation.DegradationPlan, locals(), sensor=load_sensor(sensor))
     return degradation.run(plan, out, progress=progress)
 
 
@@ -543,5 +501,4 @@ def audit(
     from training.studies.label_audit import audit_recording
     from twin.frames import frames_at
 
-    spec = sensor_with(sensor, pipeline)
-    return audit_recording(frames_at(data, table, no_contact), spec, out, form=form, progress=progress)
+    return call(audit_recording, locals(), data=frames_at(data, table, no_contact), sensor=sensor_with(sensor, pipeline))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from twin.cli import app
-from twin.cli.options import FormOrAuto, MaxFrames, NoContact, Out, Sensor, Table, Tuning, load_if_named, sensor_with
+from twin.cli.options import FormOrAuto, MaxFrames, NoContact, Out, Sensor, Table, Tuning, call, load_if_named, sensor_with
 from twin.progress import Progress
 
 if TYPE_CHECKING:
@@ -110,8 +110,7 @@ def graph(
     from twin.frames import frames_at
     from twin.pins.graph_files import write_graphs_of
 
-    spec, at = sensor_with(sensor, pipeline), frames_at(path, table, no_contact)
-    return write_graphs_of(at, spec, out, kind=kind, form=form, legacy=legacy)
+    return call(write_graphs_of, locals(), path=frames_at(path, table, no_contact), sensor=sensor_with(sensor, pipeline))
 
 
 @app.command("tune")
@@ -148,8 +147,7 @@ def tune(
     from twin.frames import frames_at
     from twin.pins.detectors.tune_files import tune_on_frames
 
-    at = frames_at(frames, table, no_contact)
-    return tune_on_frames(at, load_sensor(sensor), out=out, method=method, form=form, limit=max_frames, progress=progress)
+    return call(tune_on_frames, locals(), path=frames_at(frames, table, no_contact), sensor=load_sensor(sensor))
 
 
 # Exit code of 'twin check' if the sensor has failed. It differs from those of a failure (1) and of a wrong command line (2).
@@ -208,16 +206,5 @@ def check(
     from training.studies.contact_check import contact_finding
     from twin.pins import load_detector
 
-    return examine_sensor(
-        source,
-        load_sensor(sensor),
-        form=form,
-        detector=load_if_named(load_detector, pipeline),
-        limit=max_frames,
-        no_contact=no_contact,
-        pushes=push or (),
-        twist=twist,
-        out=out,
-        contacts=partial(contact_finding, run=model),
-        progress=progress,
-    )
+    detector, contacts = load_if_named(load_detector, pipeline), partial(contact_finding, run=model)
+    return call(examine_sensor, locals(), sensor=load_sensor(sensor))

@@ -29,21 +29,21 @@ from twin.cli.options import (
     Out,
     Residual,
     Sensor,
-    Split,
     Table,
     Target,
     Threads,
     Tuning,
     Workers,
+    call,
     each_once,
     finite,
     load_if_named,
     names_in,
     print_lines,
-    require_one_recording,
     sensor_with,
     with_residual_if,
 )
+from twin.errors import OptionError
 from twin.progress import Progress
 from twin.types import FINE, Quality
 
@@ -128,18 +128,19 @@ def make_dataset(
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.generation.run import config_for, simulate_dataset
 
-    config = config_for(
-        with_residual_if(residual, load_sensor(sensor)),
-        load_experiment(experiment, wide=wide),
-        obj=load_if_named(load_object, obj),
-        images=images,
-        states=states,
-        randomisation=load_if_named(load_randomisation, randomise),
-        seed=seed,
-        quality=quality,
-        across=elements,
-    )
-    return simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, also=tuple(also or ()), progress=progress)
+    spec, of = with_residual_if(residual, load_sensor(sensor)), load_experiment(experiment, wide=wide)
+    touched, randomisation = load_if_named(load_object, obj), load_if_named(load_randomisation, randomise)
+    config = call(config_for, locals(), sensor=spec, experiment=of, obj=touched)
+    return call(simulate_dataset, locals())
+
+
+def require_one_recording(folders: list[Path], table: Path | None, no_contact: Path | None) -> list[Path]:
+    """The recordings. A table or a no-contact frame from elsewhere is allowed for a single recording only, and is attached to it."""
+    from twin.frames import frames_at
+
+    if len(folders) > 1 and (table or no_contact):
+        raise OptionError("`table` and `no_contact` belong to one recording; with several `data` put each table beside its frames")
+    return [frames_at(folder, table, no_contact) for folder in folders]
 
 
 @app.command("train", goes_on=True)
@@ -151,7 +152,7 @@ def train(
     target: Target = "surface-2d",
     label_kind: Annotated[str, typer.Option("--label-kind", help="corrected or raw"), Formerly("labels")] = "corrected",
     seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and order")] = 0,
-    split: Split = 0,
+    split: Annotated[int, typer.Option("--split", min=-1, max=MOST_SEED, help="seed of the held-out fifth; -1: nothing is held out")] = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", help="epochs of training, instead of the model's own number")] = None,
     batch: Annotated[int | None, typer.Option("--batch", help="batch size, instead of the model's own")] = None,
     members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,
@@ -218,25 +219,8 @@ def train(
     """
     from training.studies.train import train_model
 
-    return train_model(
-        model,
-        sensor_with(sensor, pipeline),
-        require_one_recording(data, table, no_contact),
-        out,
-        target=target,
-        labels=label_kind,
-        seed=seed,
-        split=None if split < 0 else split,
-        epochs=epochs,
-        batch=batch,
-        members=members,
-        kernel=kernel,
-        max_minutes=max_minutes,
-        threads=threads,
-        device=device,
-        form=form,
-        progress=progress,
-    )
+    recordings, kept_out = require_one_recording(data, table, no_contact), None if split < 0 else split
+    return call(train_model, locals(), sensor=sensor_with(sensor, pipeline), split=kept_out)
 
 
 @app.command("evaluate")
@@ -285,7 +269,7 @@ def evaluate(
     from training.studies.evaluation import evaluate_run
 
     recordings = require_one_recording(data, table, no_contact)
-    return evaluate_run(run, recordings, out, rows=rows, labels=label_kind, robustness=robustness, progress=progress)
+    return call(evaluate_run, locals())
 
 
 @app.command("predict")
@@ -370,7 +354,7 @@ def make_surrogate(
     from scenes import load_sensor
     from training.surrogate.fit import distil
 
-    return distil(load_sensor(sensor), out, paths=paths, processes=workers, seed=seed, progress=progress)
+    return call(distil, locals(), sensor=load_sensor(sensor))
 
 
 @app.command("learn")
@@ -421,15 +405,6 @@ def learn(
     from training.environments.batch import Options
     from training.environments.learn import LearnPlan, learn_policy
 
-    asked = {
-        "sensor": sensor,
-        "observation": observation,
-        "randomise": randomise,
-        "friction_history": friction_history,
-        "surrogate": surrogate,
-        "objects": names_in(objects) if objects else None,
-    }
-    plan = LearnPlan(
-        task, Options.from_keywords(asked), minutes=minutes, environments=environments, fem_episodes=fem, seed=seed, sight=state_estimator
-    )
+    options = call(Options, locals(), objects=names_in(objects) if objects else None)
+    plan = call(LearnPlan, locals(), fem_episodes=fem, sight=state_estimator)
     return learn_policy(plan, out, progress=progress)

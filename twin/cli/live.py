@@ -7,38 +7,14 @@
 - ``twin emulate``: arms, and the sensor's camera, emulated on this machine for any client.
 """
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from twin.cli import FewCommands, app
 from twin.cli.command import App
-from twin.cli.options import (
-    SHIPPED_MODEL,
-    Also,
-    AlsoFormat,
-    ArmOption,
-    AtRest,
-    Camera,
-    DryRun,
-    Experiment,
-    FormOrAuto,
-    KnownPlace,
-    Limits,
-    Model,
-    NoiseSeed,
-    Object,
-    Out,
-    PlainLight,
-    Record,
-    Sensor,
-    ServoName,
-    Steps,
-    print_lines,
-)
+from twin.cli.options import Also, Experiment, Formerly, FormOrAuto, Object, Out, PlainLight, Sensor, ServoName, call, print_lines
 from twin.progress import Progress
 from twin.signals import signals_as_ctrl_c
 from twin.types import FIRST, NONE
@@ -47,7 +23,27 @@ if TYPE_CHECKING:
     from hardware.collect.collect import Collected
     from hardware.live.live import WatchResult
     from hardware.servo.following import Followed
-    from twin.estimate import SensorModel
+
+# Sensor whose trained weights are shipped with the package.
+SHIPPED_MODEL = Path("mg400-331")
+Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights are shipped")]
+Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
+Steps = Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")]
+Record = Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")]
+NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")]
+KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stands exactly at --servo: measure errors against it")]
+ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS, magician:PORT")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, without motion")]
+Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, or a TOML file"), Formerly("limits")]
+AtRest = Annotated[
+    str,
+    typer.Option(
+        "--at-rest",
+        metavar="FRAME|first|none",
+        help="frame without contact, the zero of displacements: a file, the first frame (an error if it shows a contact), "
+        "or none (positions at rest of the model, or estimated from some forty contacts)",
+    ),
+]
 
 
 @app.command("live")
@@ -90,18 +86,7 @@ def live(
     from hardware.live.live import WatchPlan, watch
     from training.estimate.loading import load_with_history
 
-    plan = WatchPlan(
-        camera=camera,
-        replay=replay,
-        record=record,
-        shown=not headless,
-        rerun=rerun,
-        seconds=seconds,
-        count=count,
-        at_rest=at_rest,
-        port=port,
-        also=tuple(also or ()),
-    )
+    plan = call(WatchPlan, locals(), shown=not headless)
     with signals_as_ctrl_c():
         return watch(plan, load_with_history(model), name=str(model), on_shown=print_view)
 
@@ -158,22 +143,8 @@ def collect(
     from scenes import load_experiment, load_object, load_sensor, load_servo
 
     asked = load_experiment(experiment)
-    plan = CollectPlan(
-        sensor=load_sensor(sensor),
-        obj=load_object(obj or asked.object),
-        experiment=asked,
-        servo=load_servo(servo),
-        camera=camera,
-        arm=arm,
-        count=count,
-        seed=seed,
-        design=design,
-        form=form,
-        limits=safety,
-        plain_light=plain_light,
-        also=tuple(also or ()),
-        dry_run=dry_run,
-    )
+    things = {"sensor": load_sensor(sensor), "obj": load_object(obj or asked.object), "servo": load_servo(servo)}
+    plan = call(CollectPlan, locals(), experiment=asked, **things)
     with signals_as_ctrl_c():
         return collect_frames(plan, out, progress=progress)
 
@@ -239,65 +210,15 @@ def servo(
 
     The exit code is 1 if it ended early.
     """
-    from hardware.servo.following import follow
+    from hardware.servo.following import FollowPlan, follow
+    from scenes import load_object, load_servo
     from training.estimate.loading import load_with_history
 
-    return run_along(
-        follow,
-        load_with_history,
-        model,
-        out,
-        kept_as="model",
-        obj=obj,
-        servo=servo,
-        also=also,
-        camera=camera,
-        arm=arm,
-        steps=steps,
-        stream_hz=rate if stream else None,
-        limits=safety,
-        record=record,
-        seed=seed,
-        plain_light=plain_light,
-        known_place=known_place,
-        at_rest=at_rest,
-        dry_run=dry_run,
-        progress=progress,
-    )
-
-
-def run_along(
-    follow: "Callable[..., Any]",
-    load: "Callable[[Path], SensorModel]",
-    run: Path,
-    out: Path,
-    *,
-    kept_as: str,
-    obj: str,
-    servo: str,
-    also: list[AlsoFormat] | None,
-    progress: Progress,
-    **options: Any,
-) -> "Followed":
-    """Follow an object's outline with a model or policy, from a command's options to the result.
-
-    Parameters
-    ----------
-    follow : callable
-        ``hardware.servo.following.follow``.
-    load, run : callable, Path
-        Function that loads the model, and its path.
-    kept_as : str
-        Name of ``run`` in the results.
-    **options
-        The other fields of ``FollowPlan``.
-    """
-    from hardware.servo.following import FollowPlan
-    from scenes import load_object, load_servo
-
-    plan = FollowPlan(obj=load_object(obj), servo=load_servo(servo), also=tuple(also or ()), **options)
+    stream_hz = rate if stream else None
+    plan = call(FollowPlan, locals(), obj=load_object(obj), servo=load_servo(servo))
     with signals_as_ctrl_c():
-        return follow(plan, load(run), out, about={kept_as: str(run)}, progress=progress)
+        followed = follow(plan, load_with_history(model), out, about={"model": str(model)}, progress=progress)
+    return followed  # type: ignore[return-value]  # a dry run has nothing but its lines
 
 
 @app.command("policy", exit_code=ended_early)
@@ -333,30 +254,15 @@ def run_policy(
       twin policy out/learnt/policy.safetensors --object can --out out/live \\
           --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1
     """
-    from hardware.servo.following import follow
+    from hardware.servo.following import FollowPlan, follow
     from hardware.servo.policy_law import load_for_outlines
+    from scenes import load_object, load_servo
     from training.environments.policy_domain import contacts_of
 
-    return run_along(
-        follow,
-        partial(load_for_outlines, contacts_of=contacts_of),
-        policy,
-        out,
-        kept_as="policy",
-        obj=obj,
-        servo=servo,
-        also=also,
-        camera=camera,
-        arm=arm,
-        steps=steps,
-        limits=safety,
-        record=record,
-        seed=seed,
-        plain_light=plain_light,
-        known_place=known_place,
-        dry_run=dry_run,
-        progress=progress,
-    )
+    plan = call(FollowPlan, locals(), obj=load_object(obj), servo=load_servo(servo))
+    with signals_as_ctrl_c():
+        followed = follow(plan, load_for_outlines(policy, contacts_of), out, about={"policy": str(policy)}, progress=progress)
+    return followed  # type: ignore[return-value]  # a dry run has nothing but its lines
 
 
 emulate = App(
@@ -404,8 +310,7 @@ def mg400(
     from hardware.emulators.mg400 import FAULTS
     from hardware.emulators.running import emulate_mg400
 
-    faults = faults_of(fault, FAULTS)
-    emulate_mg400(host=host, port_offset=port_offset, faults=faults, firmware=firmware, lenient=lenient, time_scale=time_scale)
+    call(emulate_mg400, locals(), faults=faults_of(fault, FAULTS))
 
 
 @emulate.command("magician")
@@ -427,8 +332,7 @@ def magician(
     from hardware.emulators.magician import FAULTS
     from hardware.emulators.running import emulate_magician
 
-    faults = faults_of(fault, FAULTS)
-    emulate_magician(link=link, faults=faults, time_scale=time_scale)
+    call(emulate_magician, locals(), faults=faults_of(fault, FAULTS))
 
 
 @emulate.command("camera")
@@ -458,6 +362,5 @@ def camera(
     from hardware.emulators.twin_camera import emulate_camera
     from scenes import load_object, load_sensor, load_servo
 
-    faults = faults_of(fault, FAULTS)
-    things = load_sensor(sensor), load_object(obj), load_servo(servo)
-    emulate_camera(arm, *things, host=host, port=port, fps=fps, faults=faults, plain_light=plain_light)
+    faults, spec = faults_of(fault, FAULTS), load_sensor(sensor)
+    call(emulate_camera, locals(), sensor=spec, obj=load_object(obj), servo=load_servo(servo))

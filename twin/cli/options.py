@@ -1,9 +1,10 @@
 """Options that several commands share, and the printing of results."""
 
+import inspect
 import math
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 Given = TypeVar("Given", str, Path)
 Spec = TypeVar("Spec")
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -70,11 +72,9 @@ def finite(value: float | None) -> float | None:
 
 
 Target = Annotated[str, typer.Option("--target", callback=each_once, help="preset, or label columns separated by commas")]
-Split = Annotated[int, typer.Option("--split", min=-1, max=MOST_SEED, help="seed of the held-out fifth; -1: nothing is held out")]
 Threads = Annotated[int | None, typer.Option("--threads", min=1, max=MOST_THREADS, help="CPU threads")]
 Workers = Annotated[int, typer.Option("--workers", min=1, metavar="N", show_default="one for each core", help="processes on this machine")]
 Pair = tuple[float, float]
-Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights are shipped")]
 Table = Annotated[Path | None, typer.Option("--table", metavar="CSV", help="table of labels, if it is not targets.csv beside the frames")]
 NoContact = Annotated[
     Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, if it is not init_0.png beside the frames")
@@ -82,16 +82,6 @@ NoContact = Annotated[
 Tuning = Annotated[
     Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="pin detection of 'twin tune', instead of the sensor's own")
 ]
-# Sensor whose trained weights are shipped with the package.
-SHIPPED_MODEL = Path("mg400-331")
-Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
-Steps = Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")]
-Record = Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")]
-NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")]
-KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stands exactly at --servo: measure errors against it")]
-ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS, magician:PORT")]
-
-
 # Further formats in which a record can be kept, as in ``twin.records.ALSO``, whose import would load the pin detection.
 AlsoFormat = StrEnum("AlsoFormat", {"LEROBOT": "lerobot", "HUGGINGFACE": "huggingface", "MCAP": "mcap"})
 Also = Annotated[
@@ -99,18 +89,7 @@ Also = Annotated[
     typer.Option("--also", help="also write this format, in a subfolder of that name; may be repeated ('twin convert --help')"),
 ]
 PlainLight = Annotated[bool, typer.Option("--plain-light", help="render the twin's frames with direct light alone, without path tracing")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, without motion")]
 ServoName = Annotated[str, typer.Option("--servo", help="gains, speeds and the object's place: a name, or a TOML file")]
-Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, or a TOML file"), Formerly("limits")]
-AtRest = Annotated[
-    str,
-    typer.Option(
-        "--at-rest",
-        metavar="FRAME|first|none",
-        help="frame without contact, the zero of displacements: a file, the first frame (an error if it shows a contact), "
-        "or none (positions at rest of the model, or estimated from some forty contacts)",
-    ),
-]
 
 
 def _even(value: int) -> int:
@@ -132,15 +111,34 @@ def names_in(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
-    """The comma-separated whole numbers, each at least ``least`` and at most the largest seed."""
-    try:
-        numbers = tuple(int(part) for part in names_in(text))
-    except ValueError as error:
-        raise typer.BadParameter(f"takes whole numbers with commas between, got {text!r}", param_hint=option) from error
-    if any(not least <= number <= MOST_SEED for number in numbers):
-        raise typer.BadParameter(f"takes whole numbers from {least} to {MOST_SEED}, got {text!r}", param_hint=option)
-    return numbers
+# Names that functions have for an option, if they have no argument of the option's own name.
+INSIDE = {
+    "data": "recordings",
+    "elements": "across",
+    "label_kind": "labels",
+    "label_table": "labels",
+    "max_frames": "limit",
+    "model": "models",
+    "num_labelled": "labels",
+    "pipeline": "pipelines",
+    "push": "pushes",
+    "safety": "limits",
+    "sim": "simulated",
+    "workers": "processes",
+}
+
+
+def call(function: Callable[..., Made], given: Mapping[str, Any], **others: Any) -> Made:
+    """Call a function, or make a plan, with those of a command's options (its ``locals()``) that are arguments of it.
+
+    An option that was not given leaves the function's default. ``others`` are arguments that differ from the option.
+    """
+    takes, arguments = inspect.signature(function).parameters, {}
+    for name, value in given.items():
+        name = name if name in takes else INSIDE.get(name, name)
+        if name in takes and value is not None:
+            arguments[name] = tuple(value) if isinstance(value, list) else value
+    return function(**arguments | others)
 
 
 def load_if_named(load: Callable[[Given], Spec], name: Given | None) -> Spec | None:
@@ -162,15 +160,6 @@ def with_residual_if(wanted: bool, sensor: "SensorSpec") -> "SensorSpec":
     from twin.camera.residual import with_residual
 
     return with_residual(sensor) if wanted else sensor
-
-
-def require_one_recording(folders: list[Path], table: Path | None, no_contact: Path | None) -> list[Path]:
-    """The recordings. A table or a no-contact frame from elsewhere is allowed for a single recording only, and is attached to it."""
-    from twin.frames import frames_at
-
-    if len(folders) > 1 and (table or no_contact):
-        raise OptionError("`table` and `no_contact` belong to one recording; with several `data` put each table beside its frames")
-    return [frames_at(folder, table, no_contact) for folder in folders]
 
 
 NAMED_OTHERWISE = {"obj": "object"}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import QUALITY, Object, Out, Pair, Sensor, print_lines
+from twin.cli.options import QUALITY, Object, Out, Pair, Sensor, call, print_lines
 from twin.progress import Progress
 from twin.types import Form, Quality
 
@@ -175,6 +175,5 @@ def render_contact_command(
     from twin.mechanics.path import ContactPose
     from twin.one_contact import render_contact
 
-    spec, stimulus = load_sensor(sensor), load_object(obj)
-    pose = ContactPose(indent_mm=indent_mm, tilt_deg=tilt_deg, shear_mm=shear_mm, twist_deg=twist_deg, offset_mm=offset_mm)
-    return render_contact(spec, stimulus, pose, out, form=form, quality=quality, seed=seed, progress=progress)
+    pose = call(ContactPose, locals())
+    return call(render_contact, locals(), sensor=load_sensor(sensor), obj=load_object(obj))

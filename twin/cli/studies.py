@@ -27,11 +27,11 @@ from twin.cli.options import (
     Target,
     Threads,
     Workers,
+    call,
     each_once,
     finite,
     load_if_named,
     names_in,
-    numbers_in,
 )
 from twin.progress import Progress
 from twin.types import FINE
@@ -73,14 +73,8 @@ def study_servo_command(
     from scenes import load_object, load_servo
     from training.estimate.loading import load_by_name
 
-    plan = ServoStudyPlan(
-        models=load_by_name(models),
-        objects=tuple(map(load_object, names_in(objects))),
-        servo=load_servo(servo),
-        steps=steps,
-        seed=seed,
-        plain_light=plain_light,
-    )
+    of_name, things = load_by_name(models), tuple(map(load_object, names_in(objects)))
+    plan = call(ServoStudyPlan, locals(), models=of_name, objects=things, servo=load_servo(servo))
     return study_servo(plan, out, progress=progress)
 
 
@@ -136,19 +130,9 @@ def study_objects(
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.studies import objects
 
-    plan = objects.ObjectsPlan(
-        sensor=load_sensor(sensor),
-        experiment=load_experiment(experiment),
-        randomisation=load_randomisation(randomise),
-        train=tuple(map(load_object, names_in(train))),
-        unseen=tuple(map(load_object, names_in(unseen))),
-        count=count,
-        tests=tests,
-        seed=seed,
-        across=elements,
-        epochs=epochs,
-        workers=workers,
-    )
+    of, randomisation = load_experiment(experiment), load_randomisation(randomise)
+    things = {"train": tuple(map(load_object, names_in(train))), "unseen": tuple(map(load_object, names_in(unseen)))}
+    plan = call(objects.ObjectsPlan, locals(), sensor=load_sensor(sensor), experiment=of, **things)
     return objects.run(plan, out, progress=progress)
 
 
@@ -225,23 +209,20 @@ def study_sim_to_real(
     from scenes import load_experiment, load_sensor
     from training.studies import sim_to_real
 
-    plan = sim_to_real.SimToRealPlan(
-        sensor=load_sensor(sensor),
-        frames=frames,
-        experiment=load_experiment(experiment),
-        contacts=load_if_named(load_experiment, contacts),
-        labels=num_labelled,
-        seed=seed,
-        draws=draws,
-        count=count,
-        simulated=tuple(sim or ()),
-        calibrate=calibrate,
-        ablate=ablate,
-        epochs=epochs,
-        workers=workers,
-        across=elements,
-    )
+    of, wider = load_experiment(experiment), load_if_named(load_experiment, contacts)
+    plan = call(sim_to_real.SimToRealPlan, locals(), sensor=load_sensor(sensor), experiment=of, contacts=wider)
     return sim_to_real.run(plan, out, progress=progress)
+
+
+def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
+    """The comma-separated whole numbers, each at least ``least`` and at most the largest seed."""
+    try:
+        numbers = tuple(int(part) for part in names_in(text))
+    except ValueError as error:
+        raise typer.BadParameter(f"takes whole numbers with commas between, got {text!r}", param_hint=option) from error
+    if any(not least <= number <= MOST_SEED for number in numbers):
+        raise typer.BadParameter(f"takes whole numbers from {least} to {MOST_SEED}, got {text!r}", param_hint=option)
+    return numbers
 
 
 MODELS = "gnn,tac-vgnn,vgnn,cnn-v2,cnn-v1"
@@ -297,20 +278,6 @@ def study_tac_vgnn(
     from training.studies import tac_vgnn
     from training.studies.train import columns_of
 
-    plan = tac_vgnn.TacVgnnPlan(
-        data=data,
-        sensor=load_sensor(sensor),
-        models=tuple(names_in(models)),
-        seeds=numbers_in(seeds, "--seeds", 0),
-        labels=label_kind,
-        target=columns_of(target),
-        split=split,
-        epochs=epochs,
-        max_minutes=max_minutes,
-        batches=numbers_in(batches, "--batches", 1),
-        contacts=contacts,
-        device=device,
-        threads=threads,
-        form=form,
-    )
+    lists = {"models": tuple(names_in(models)), "seeds": numbers_in(seeds, "--seeds", 0), "batches": numbers_in(batches, "--batches", 1)}
+    plan = call(tac_vgnn.TacVgnnPlan, locals(), sensor=load_sensor(sensor), target=columns_of(target), **lists)
     return tac_vgnn.run(plan, out, progress=progress)

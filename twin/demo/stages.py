@@ -1,7 +1,7 @@
 """Computations of the demo: contacts through the whole chain, three motions, and the depth table."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import perf_counter
 from typing import TypeVar
 
@@ -41,20 +41,6 @@ TABLE_INDENTS_MM = (1.5, 2.5, 3.5, 4.5)
 
 
 @dataclass(frozen=True)
-class Timed:
-    """Seconds spent, by stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    def run(self, stage: str, work: Callable[[], Result]) -> Result:
-        """Call ``work()`` and add its time to the stage."""
-        start = perf_counter()
-        result = work()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + perf_counter() - start
-        return result
-
-
-@dataclass(frozen=True)
 class ContactResult:
     """One contact through the whole chain."""
 
@@ -69,12 +55,19 @@ class ContactResult:
 
 def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form: Form, *, progress: Step = unheard) -> ContactResult:
     """Press, render, capture, detect, and build the graph, for one contact."""
-    form, timed = form_named(form), Timed()
-    state = timed.run("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
-    raw = timed.run("render", lambda: simulator.render(state))
-    rendered = raw if form == Form.RAW else timed.run("capture", lambda: simulator.as_processed(raw, state))
+    form, seconds = form_named(form), {}
+
+    def clock(stage: str, work: Callable[[], Result]) -> Result:
+        start = perf_counter()
+        result = work()
+        seconds[stage] = perf_counter() - start
+        return result
+
+    state = clock("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
+    raw = clock("render", lambda: simulator.render(state))
+    rendered = raw if form == Form.RAW else clock("capture", lambda: simulator.as_processed(raw, state))
     look = look_at(simulator, rendered)
-    seconds = timed.seconds | {"pins and graph": look.observation.ms["total"] / 1e3}
+    seconds["pins and graph"] = look.observation.ms["total"] / 1e3
     return ContactResult(simulator.spec.name, object_name, pose, state, raw, look, seconds)
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager, redirect_stdout
 from http import HTTPStatus
 from io import StringIO
 from itertools import count
-from typing import Any, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -26,6 +26,9 @@ from scenes.files import quote
 from twin.errors import TwinError
 from twin.studio.pictures import numbers_html, paragraph
 from twin.types import ImageArray
+
+if TYPE_CHECKING:
+    from twin.studio.modes.mode import PageMode
 
 Value = TypeVar("Value")
 
@@ -51,22 +54,6 @@ CHANGE_S = 10.0
 """Longest wait, s, for changes of the page."""
 SAID_S = 12.0
 """Time, s, for which a message is shown."""
-
-
-class StudioMode(Protocol):
-    """Interface of a mode for the page."""
-
-    @property
-    def title(self) -> str:
-        """Name by which the user chooses the mode."""
-
-    folder: viser.GuiFolderHandle
-
-    def enter(self) -> None:
-        """The user has chosen the mode: show its state."""
-
-    def leave(self) -> None:
-        """The user has chosen another mode."""
 
 
 def value_of(control: viser.GuiInputHandle[str], kind: Callable[[str], Value], now: str) -> Value:
@@ -277,7 +264,7 @@ class StudioPage:
         self._numbers = gui.add_html(numbers_html())
         self._said = gui.add_html("", visible=False)
         self._forget_s = 0.0
-        self._modes: dict[str, StudioMode] = {}
+        self._modes: dict[str, PageMode] = {}
         self._mode: str = ""
         self._choice: viser.GuiDropdownHandle[str] | None = None
 
@@ -288,11 +275,11 @@ class StudioPage:
         return f"http://{shown}:{self.server.get_port()}/"
 
     @property
-    def mode(self) -> StudioMode:
+    def mode(self) -> "PageMode":
         """The mode that the user has chosen."""
         return self._modes[self._mode]
 
-    def set_modes(self, modes: Sequence[StudioMode]) -> None:
+    def set_modes(self, modes: Sequence["PageMode"]) -> None:
         """Offer these modes, and enter the first one."""
         self._modes = {mode.title: mode for mode in modes}
         if self._choice is not None:

@@ -13,7 +13,7 @@ from scenes import load_object, load_sensor
 from scenes.base import NonNegative, Section
 from scenes.files import read_regular
 from twin.errors import TwinError
-from twin.store import unwritten, write_json, write_text
+from twin.store import text_file, unwritten, write_json
 from twin.studio.pictures import OverlayChoices
 from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.scene import PinColour
@@ -149,18 +149,13 @@ Way = list[tuple[float, ObjectPose]]
 """Poses with their times in s, increasing from 0."""
 
 
-def trajectory_text(way: Way) -> str:
-    """A path as a CSV table (``COLUMNS``)."""
-    out = io.StringIO()
-    writer = csv.DictWriter(out, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({"time_s": f"{at:.3f}", **{name: f"{value:.4f}" for name, value in asdict(pose).items()}} for at, pose in way)
-    return out.getvalue()
-
-
 def save_trajectory(path: Path, way: Way) -> Path:
-    """Write a path to a file."""
-    return write_text(path, trajectory_text(way))
+    """Write a path as a CSV table (``COLUMNS``)."""
+    with text_file(path) as text:
+        writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({"time_s": f"{at:.3f}", **{name: f"{value:.4f}" for name, value in asdict(pose).items()}} for at, pose in way)
+    return path
 
 
 def read_trajectory(content: bytes, name: str) -> Way:

@@ -105,11 +105,6 @@ class Worker(_OwnThread):
         with self._news:
             self._news.notify()
 
-    @property
-    def playing(self) -> bool:
-        """Whether a path is being played."""
-        return bool(self._way)
-
     def ask(self, wished: ObjectPose) -> None:
         """Move to a pose from now on. Earlier wishes, and a path that is being played, are dropped."""
         with self._news:

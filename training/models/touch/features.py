@@ -9,7 +9,7 @@
 Mode k is scaled to the standard deviation sqrt(s_k / s_0), with s_k the singular values: small modes carry finer detail.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -62,10 +62,6 @@ class Bases:
     def relative_of(self, moved: np.ndarray) -> np.ndarray:
         """Displacements (M, 2 N) divided by their norm plus ``small``."""
         return moved / (np.linalg.norm(moved, axis=1, keepdims=True) + self.small)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays from which the same bases can be made again."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @classmethod
     def learn_bases(cls, moved: np.ndarray, light: np.ndarray, lost: np.ndarray, *, modes: int, light_modes: int) -> "Bases":

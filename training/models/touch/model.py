@@ -75,7 +75,7 @@ class TouchModel(PinModel):
             )
         moved = _remove_camera_motion(registration, pins, pins.reference, lost, together=False)
         bases = Bases.learn_bases(moved[train], pins.light[train], lost[train], modes=SIZES["modes"], light_modes=SIZES["light_modes"])
-        learnt = {"registration": registration.arrays(), "bases": bases.arrays()}
+        learnt = {"registration": vars(registration), "bases": vars(bases)}
         return Prepared(_scale(bases(moved, pins.light)), learnt)
 
     def inputs_seen(self, data: Dataset) -> object:

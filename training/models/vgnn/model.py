@@ -54,7 +54,7 @@ class VgnnModel(PinModel):
         displaced = pin_features(*registration.take_out(nodes_px, area_px2, taken), pins.reference)
         both = np.concatenate([seated.x.numpy(), displaced])
         inputs = PinInputs(both, np.concatenate([pins.lost, pins.lost]), np.repeat([0.0, 1.0], len(pins)))
-        return Prepared(inputs, {"registration": registration.arrays()}, views=2)
+        return Prepared(inputs, {"registration": vars(registration)}, views=2)
 
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> PinInputs:
         """See ``PinModel``. If a frame without contact shows the camera's place, no displacement of the camera is estimated."""

@@ -116,10 +116,6 @@ class Registration:
     def _modes(self, aligned: np.ndarray) -> np.ndarray:
         return (aligned.reshape(len(aligned), -1) - self.mean) @ self.components
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays from which the same registration can be made again."""
-        return {key: getattr(self, key) for key in ("rest_px", "mean", "components", "weight", "usual")}
-
 
 def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[Registration, np.ndarray]:
     """Learn which similarity a contact causes, from frames (M, N, 2) of one camera position.

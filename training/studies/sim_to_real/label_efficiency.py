@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from scenes import load_randomisation
 from training.data.dataset import load_dataset
 from training.data.label_code import goes_round
-from training.generation import generate
 from training.studies.sim_to_real.inverse_estimates import read_row, read_twin
-from training.studies.sim_to_real.plan import BOTH, EVENLY, FULL, REAL, WITHOUT, SimToRealPlan
+from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
 from training.studies.sim_to_real.steps import arm_labels, choose_frames, designed_frames, quadratic_row
-from training.studies.sim_to_real.variants import Twin
+from training.studies.sim_to_real.variants import full_twin
 from twin.progress import Progress, silent, stage
 
 UNLABELLED = (300, 3000)
@@ -44,15 +42,7 @@ def label_efficiency(plan: SimToRealPlan, out: Path, seeds: Sequence[int], *, pr
     with stage(progress, "frames") as step:
         real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
     labels = arm_labels(real)
-    folders = list(plan.simulated)
-    if not folders:
-        executed = 1.0 if all(label.executed for label in labels) else load_randomisation("moves").executed_share
-        drawn = load_randomisation("moves").model_copy(update={"friction": None, "executed_share": executed})
-        full = Twin(FULL, "simulated", "sim", plan.sensor, plan.wider, drawn, plan.across)
-        folders = [out / full.contacts]
-        with stage(progress, plan.wider.name) as step:
-            generate(folders[0], full.config(plan.target_object, plan.seed), plan.count, workers=plan.workers, progress=step)
-    sets = [load_dataset(folder, plan.sensor, plan.experiment.targets, form=real.pins.form) for folder in folders]
+    sets = full_twin(plan, plan.sensor, labels, None).simulated_sets(plan, out, plan.sensor, real.pins.form, plan.simulated, progress)
     twin = read_twin(sets, plan.target_object, plan.experiment, seed=plan.seed)
     unlabelled = UNLABELLED if any(goes_round(real.targets.units, real.targets.corrected)) else ()
     found: dict[tuple[str, str, int], list[dict[str, Any]]] = {}

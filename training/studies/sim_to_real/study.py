@@ -1,18 +1,17 @@
 """The sim-to-real study, from its plan to its tables and runs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scenes import SensorSpec, load_randomisation
+from scenes import load_randomisation
 from training.data.dataset import Dataset, join_datasets, load_dataset
-from training.generation import generate
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
 from training.studies.sim_to_real.inverse_estimates import TwinRead, read_row, read_twin
 from training.studies.sim_to_real.page import write_page
-from training.studies.sim_to_real.plan import BOTH, EVENLY, FULL, REAL, WITHOUT, SimToRealPlan
+from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
 from training.studies.sim_to_real.steps import (
     CoKriging,
     StudyFrames,
@@ -31,7 +30,7 @@ from training.studies.sim_to_real.steps import (
     with_missing,
 )
 from training.studies.sim_to_real.taught import teach
-from training.studies.sim_to_real.variants import Twin, as_mounted, contact_of, without_one_ingredient
+from training.studies.sim_to_real.variants import Twin, as_mounted, contact_of, full_twin, without_one_ingredient
 from twin.calibration.contact import fit_contact
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.estimate import readable_labels
@@ -84,8 +83,8 @@ class _Ground:
 
     Attributes
     ----------
-    sensor : SensorSpec
-        The sensor as shipped, or fitted to the labelled frames.
+    setup : CalibrationSetup
+        Setup in which the labelled frames are simulated, with the sensor as shipped, or fitted to these frames.
     real, few : Dataset
         The recording, and its labelled frames.
     chosen : Frames
@@ -100,7 +99,7 @@ class _Ground:
     plan: SimToRealPlan
     out: Path
     progress: Progress
-    sensor: SensorSpec
+    setup: CalibrationSetup
     real: Dataset
     few: Dataset
     chosen: StudyFrames
@@ -128,11 +127,18 @@ def run(plan: SimToRealPlan, out: Path, *, progress: Progress = silent) -> SimTo
     for twin in ground.twins:
         missing = _missing(ground, twin, known)
         if twin.contacts not in sets:
-            sets[twin.contacts] = _simulate_contacts(ground, twin)
-        learnt = _training_sets(ground, twin, sets[twin.contacts], missing)
-        folder = _train_simulated(ground, twin, learnt, missing is not None)
+            given = plan.simulated if twin is ground.full else ()
+            sets[twin.contacts] = twin.simulated_sets(plan, out, ground.setup.sensor, ground.real.pins.form, given, progress)
+        learnt, folder = _training_sets(ground, twin, sets[twin.contacts], missing), out / twin.name
+        labelled, copies = None if missing is None else ground.few, [each.pins for each in learnt[1:]]
+        with stage(progress, twin.name) as step:
+            every, seed = learnt[0].with_copies(copies), plan.seed
+            train_in_twin(every, folder, seed=seed, split=seed, epochs=plan.epochs, labelled=labelled, progress=step)
         if twin is ground.full:
-            beside = _combine_co_kriging(ground, folder, sets[twin.contacts])
+            bare = states_touching(sets[twin.contacts], plan.target_object)
+            like = bare.rows(states_like(bare, ground.few))
+            beside = combine_co_kriging(folder, out / BESIDE, like, ground.few, seed=plan.seed)
+            widen_intervals(folder, beside.intervals)
             full_learnt = learnt[0]
         rows.append(evaluate_run_row(twin.says, 0, folder, ground.real, ground.chosen.test))
         if twin is ground.full:
@@ -151,26 +157,21 @@ def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> _Ground:
         real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
     chosen = choose_frames(len(real), plan.labels, plan.seed)
     few = real.rows(chosen.few)
-    measured, sensor = measured_of(few), plan.sensor
+    measured = measured_of(few)
+    setup = CalibrationSetup(
+        plan.sensor, plan.experiment, plan.target_object, measured.form, plan.across, out / "calibration", plan.workers
+    )
     if plan.calibrate:
-        setup = CalibrationSetup(sensor, plan.experiment, plan.target_object, measured.form, plan.across, out / "calibration", plan.workers)
         with stage(progress, "calibration") as step:
-            sensor = fit_contact(setup, measured, progress=step).sensor
+            setup = replace(setup, sensor=fit_contact(setup, measured, progress=step).sensor)
+    setup = replace(setup, folder=out / "labelled", parameters=())
     with stage(progress, "labelled frames") as step:
-        residuals = measure_residuals(_labelled_setup(plan, sensor, measured, out, plan.across), measured, step)
+        residuals = measure_residuals(setup, measured, step)
     moves = load_randomisation("moves")
     sheared = any(label.move.any() for label in measured.labels)
-    seen = moves.model_copy(update={"friction": (residuals.friction_spread() or moves.friction) if sheared else None})
-    if all(label.executed for label in measured.labels):
-        seen = seen.model_copy(update={"executed_share": 1.0})
-    full = Twin(FULL, "simulated", "sim", sensor, plan.wider, seen, plan.across)
+    full = full_twin(plan, setup.sensor, measured.labels, (residuals.friction_spread() or moves.friction) if sheared else None)
     others = without_one_ingredient(full, as_mounted(plan.sensor), moves, load_randomisation("contact")) if plan.ablate else []
-    return _Ground(plan, out, progress, sensor, real, few, chosen, measured, residuals, full, [full, *others])
-
-
-def _labelled_setup(plan: SimToRealPlan, sensor: SensorSpec, measured: MeasuredFrames, out: Path, across: int) -> CalibrationSetup:
-    """The setup with which the labelled frames are simulated."""
-    return CalibrationSetup(sensor, plan.experiment, plan.target_object, measured.form, across, out / "labelled", plan.workers, ())
+    return _Ground(plan, out, progress, setup, real, few, chosen, measured, residuals, full, [full, *others])
 
 
 def _residual_key(twin: Twin) -> tuple[int, tuple[float, ...]]:
@@ -183,24 +184,10 @@ def _missing(ground: _Ground, twin: Twin, known: dict[tuple[int, tuple[float, ..
     if not twin.learns:
         return None
     if _residual_key(twin) not in known:
-        setup = _labelled_setup(ground.plan, ground.sensor, ground.measured, ground.out, twin.across)
+        setup = replace(ground.setup, across=twin.across)
         with stage(ground.progress, f"{twin.name}: labelled frames") as step:
             known[_residual_key(twin)] = Discrepancy(measure_residuals(setup, ground.measured, step, frictions=twin.frictions))
     return known[_residual_key(twin)]
-
-
-def _simulate_contacts(ground: _Ground, twin: Twin) -> list[Dataset]:
-    """The twin's contacts: simulated, or read from finished data sets."""
-    plan, folders = ground.plan, list(ground.plan.simulated) if twin is ground.full else []
-    if not folders:
-        folders = [ground.out / twin.contacts]
-        with stage(ground.progress, f"{twin.name}: {twin.experiment.name}") as step:
-            generate(folders[0], twin.config(plan.target_object, plan.seed), plan.count, workers=plan.workers, progress=step)
-    found = []
-    for folder in folders:
-        with stage(ground.progress, f"states of {folder.name}") as step:
-            found.append(load_dataset(folder, ground.sensor, plan.experiment.targets, form=ground.real.pins.form, progress=step))
-    return found
 
 
 def _training_sets(ground: _Ground, twin: Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
@@ -214,30 +201,6 @@ def _training_sets(ground: _Ground, twin: Twin, sets: list[Dataset], missing: Di
             pairs = zip(sets, labels, strict=True)
             drawn.append(join_datasets([with_missing(each, told, missing, seed, progress=step) for each, told in pairs]))
     return [twin.part(each) for each in drawn]
-
-
-def _train_simulated(ground: _Ground, twin: Twin, learnt: list[Dataset], told: bool) -> Path:
-    """Train the twin's run, and return its folder; ``told``: whether a discrepancy was learnt from labelled frames."""
-    folder, plan = ground.out / twin.name, ground.plan
-    with stage(ground.progress, twin.name) as step:
-        train_in_twin(
-            learnt[0].with_copies([each.pins for each in learnt[1:]]),
-            folder,
-            seed=plan.seed,
-            split=plan.seed,
-            epochs=plan.epochs,
-            labelled=ground.few if told else None,
-            progress=step,
-        )
-    return folder
-
-
-def _combine_co_kriging(ground: _Ground, folder: Path, sets: list[Dataset]) -> CoKriging:
-    """Average the twin's run with a Gaussian process of the labelled frames, and widen its intervals to its errors on these frames."""
-    bare = states_touching(sets, ground.plan.target_object)
-    made = combine_co_kriging(folder, ground.out / BESIDE, bare.rows(states_like(bare, ground.few)), ground.few, seed=ground.plan.seed)
-    widen_intervals(folder, made.intervals)
-    return made
 
 
 def _invert_model_rows(ground: _Ground, twin: TwinRead) -> list[dict[str, Any]]:
@@ -277,7 +240,7 @@ def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
 def _write_page(ground: _Ground, rows: list[dict[str, Any]], beside: CoKriging, missing: Discrepancy, learnt: Dataset) -> Path:
     return write_page(
         ground.out,
-        sensor=ground.sensor.name,
+        sensor=ground.setup.sensor.name,
         tested=len(ground.chosen.test),
         frames=len(ground.real),
         labelled=ground.plan.labels,

@@ -1,20 +1,27 @@
 """The twins of a study: the one with all ingredients, and twins without one ingredient each."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from scenes import load_randomisation
 from scenes.experiment import ExperimentSpec, MoveRanges
 from scenes.object import ObjectSpec
-from scenes.randomisation import RandomisationSpec
+from scenes.randomisation import FrictionSpread, RandomisationSpec
 from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
-from training.data.dataset import Dataset
+from training.data.dataset import Dataset, load_dataset
 from training.errors import TrainingError
-from training.generation import GenerationConfig
+from training.generation import GenerationConfig, generate
 from training.studies.sim_to_real.discrepancy import FRICTIONS
+from training.studies.sim_to_real.plan import FULL, SimToRealPlan
+from twin.progress import Progress, stage
 from twin.rig.kinematics import rig_of
+from twin.rig.labels import ArmLabel
+from twin.types import Form
 
 # Elements across the skin of the twin with a coarse mesh.
 COARSE = 12
@@ -74,6 +81,20 @@ class Twin:
             across=self.across,
         )
 
+    def simulated_sets(
+        self, plan: SimToRealPlan, out: Path, sensor: SensorSpec, form: Form, given: Sequence[Path], progress: Progress
+    ) -> list[Dataset]:
+        """Contacts as a sensor's data sets: the finished ones ``given``, or one simulated to the folder ``out`` if there are none."""
+        if not given:
+            given = [out / self.contacts]
+            with stage(progress, f"{self.name}: {self.experiment.name}") as step:
+                generate(given[0], self.config(plan.target_object, plan.seed), plan.count, workers=plan.workers, progress=step)
+        found = []
+        for folder in given:
+            with stage(progress, f"states of {folder.name}") as step:
+                found.append(load_dataset(folder, sensor, plan.experiment.targets, form=form, progress=step))
+        return found
+
     def part(self, contacts: Dataset) -> Dataset:
         """The states of the contacts that are used for training."""
         if self.share == 1:
@@ -94,6 +115,12 @@ def contact_of(simulated: Dataset) -> np.ndarray:
     if simulated.group is None:
         raise TrainingError(f"{', '.join(map(str, simulated.folders))}: no simulated contacts; give a data set of 'twin dataset'")
     return simulated.group.astype(int)
+
+
+def full_twin(plan: SimToRealPlan, sensor: SensorSpec, labels: Sequence[ArmLabel], friction: FrictionSpread | None) -> Twin:
+    """The twin with all ingredients; if all moves of the labels were executed, it executes all moves, too."""
+    changes = {"friction": friction} | ({"executed_share": 1.0} if all(label.executed for label in labels) else {})
+    return Twin(FULL, "simulated", "sim", sensor, plan.wider, load_randomisation("moves").model_copy(update=changes), plan.across)
 
 
 def without_one_ingredient(

@@ -8,10 +8,9 @@ from matplotlib.ticker import NullLocator
 
 from training.data.dataset import Dataset
 from training.data.targets import unit_of
-from training.studies.tac_vgnn.contacts import AreaChange, contacts_figure
 from training.studies.tac_vgnn.models import PlannedRun, error_columns, ordering, read_curves
 from twin.estimate import readable_labels
-from twin.report.charts import new_figure, plain_log, sized_figure, write_chart
+from twin.report.charts import new_figure, plain_log, sized_figure
 from twin.report.numbers import number
 from twin.report.page import Page, PagePicture
 from twin.report.table import Column
@@ -46,22 +45,6 @@ HEADINGS = {  # titles and units of the tables' columns; the title of any other 
     "largest_growth_percent": ("largest growth", "%"),
     "mean_size_of_change_percent": ("mean size of change", "%"),
 }
-
-
-def draw_efficiency(path: Path, rows: list[dict]) -> Path:
-    """Draw the time of training against batch size. The area of a marker is proportional to the memory."""
-    return write_chart(path, lambda: _efficiency_figure(rows))
-
-
-def draw_curves(path: Path, plans: list[PlannedRun], folder: Path) -> Path:
-    """Draw the error on the held-out tenth of the training rows against epochs and against time, for every run that was begun."""
-    begun = [plan for plan in plans if (folder / plan.folder / "curves.csv").is_file()]
-    return write_chart(path, lambda: _curves_figure(begun, folder))
-
-
-def draw_contacts(path: Path, contacts: list[AreaChange]) -> Path:
-    """Draw the change of the Voronoi areas of each contact (the paper's interpretability figure)."""
-    return write_chart(path, lambda: contacts_figure(contacts))
 
 
 def write_page(
@@ -158,7 +141,8 @@ def _column(key: str, errors: Sequence[str] = ()) -> Column:
     return Column(key, title, unit, digits=2 if key.startswith("paper") else 3) if title else Column.of(key)
 
 
-def _efficiency_figure(rows: Sequence[Mapping]) -> Figure:
+def efficiency_figure(rows: Sequence[Mapping]) -> Figure:
+    """Times of training against batch size, a line for each model; the area of a marker is the memory."""
     figure, (ax,) = sized_figure((7.0, 4.6))
     for model in dict.fromkeys(row["model"] for row in rows):
         mine = [row for row in rows if row["model"] == model]
@@ -174,7 +158,9 @@ def _efficiency_figure(rows: Sequence[Mapping]) -> Figure:
     return figure
 
 
-def _curves_figure(plans: Sequence[PlannedRun], folder: Path) -> Figure:
+def curves_figure(plans: Sequence[PlannedRun], folder: Path) -> Figure:
+    """Learning curves of the runs in a folder that were begun, against epochs and against time."""
+    plans = [plan for plan in plans if (folder / plan.folder / "curves.csv").is_file()]
     figure, axes = new_figure(2, panel_inch=5)
     names = list(dict.fromkeys(plan.name for plan in plans))
     labelled: set[str] = set()

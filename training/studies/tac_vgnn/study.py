@@ -11,12 +11,13 @@ from scenes import SensorSpec
 from training.data.dataset import Dataset, load_dataset
 from training.models import model_named
 from training.runs.networks import choose_device
-from training.studies.tac_vgnn.contacts import AreaChange, compare_graphs, recorded_contacts, twin_contacts
+from training.studies.tac_vgnn.contacts import AreaChange, compare_graphs, contacts_figure, recorded_contacts, twin_contacts
 from training.studies.tac_vgnn.models import SHOWN, PlannedRun, error_columns, measure_training, plan_run, table_row, train_all
-from training.studies.tac_vgnn.page import draw_contacts, draw_curves, draw_efficiency, write_page
+from training.studies.tac_vgnn.page import curves_figure, efficiency_figure, write_page
 from twin.errors import OptionError
 from twin.estimate import readable_labels
 from twin.progress import Progress, silent, stage
+from twin.report.charts import write_chart
 from twin.report.table import write_table
 from twin.store import writes
 from twin.types import Form, ReadableResult
@@ -158,15 +159,16 @@ def run(plan: TacVgnnPlan, out: Path, *, progress: Progress = silent) -> TacVgnn
     written = [
         write_table(out / "models.csv", rows),
         write_table(out / "graphs.csv", graphs),
-        draw_curves(out / "curves.png", runs, folder),
+        write_chart(out / "curves.png", lambda: curves_figure(runs, folder)),
     ]
     efficiency = _efficiency(plan, runs, data, device, progress)
     if efficiency:
-        written += [write_table(out / "efficiency.csv", efficiency), draw_efficiency(out / "efficiency.png", efficiency)]
+        chart = write_chart(out / "efficiency.png", lambda: efficiency_figure(efficiency))
+        written += [write_table(out / "efficiency.csv", efficiency), chart]
     changes = _contacts(plan, data, progress)
     contacts = [change.figures() for change in changes]
     if contacts:
-        written += [write_table(out / "contacts.csv", contacts), draw_contacts(out / "contacts.png", changes)]
+        written += [write_table(out / "contacts.csv", contacts), write_chart(out / "contacts.png", lambda: contacts_figure(changes))]
     notes = {"device": device, "threads": torch.get_num_threads(), "labels": plan.labels, "max_minutes": plan.max_minutes}
     notes["columns"] = [*SHOWN, *error_columns(data)]
     written.append(write_page(out, data=data, models=rows, graphs=graphs, efficiency=efficiency, contacts=contacts, notes=notes))

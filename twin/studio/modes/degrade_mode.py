@@ -16,10 +16,11 @@ from twin.optics.preview import Shading
 from twin.pins import make_detector, nominal_reference, shipped_detector
 from twin.pins.pipeline import Pipeline
 from twin.studio.contact import ContactAnswer
+from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import StudioPage, put
-from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, paragraph
+from twin.studio.pictures import badge, estimate_table, paragraph
 from twin.studio.pose import ObjectPose
 from twin.types import Form, Frame, Observation
 
@@ -170,9 +171,7 @@ class DegradeMode(PageMode):
         judged = judge(answer, cases, shading)
         ms = 1e3 * (time.perf_counter() - started)
         frame = judged.degraded.frame
-        crop = self._twin.contact.camera.crop
-        camera = crop(camera_picture(frame, judged.seen, judge.reference.pins_px, OverlayChoices.GRAPH), Form.RAW)
-        cells = crop(cell_picture(frame, judged.seen, judge.reference.area_px2), Form.RAW)
+        pictures = frame_pictures(judge.spec, judge.reference, frame, judged.seen)
         words = "; ".join(f"{case.title} {case.label(severity)}" for case, severity in cases if severity) or "no degradation"
         numbers = [
             badge("degraded" if any(severity for _, severity in cases) else "not degraded") + badge("rasterised"),
@@ -183,7 +182,7 @@ class DegradeMode(PageMode):
             paragraph(self._edge, "said"),
             paragraph(f"{ms:.0f} ms latency", "note"),
         ]
-        self.put_up((camera, cells), "camera, raw frame, degraded", numbers)
+        self.put_up(pictures, "camera, raw frame, degraded", numbers)
 
     def _edge_of(self, judge: FrameEvaluator, answer: ContactAnswer, shading: Shading) -> str:
         """The severity of the first chosen condition at which this contact leaves the envelope, in words."""

@@ -30,7 +30,7 @@ DEPTHS, TILTS_DEG = (0.05, 0.1, 0.15), (-10.0, 0.0, 10.0)
 """Depths, in radii of the tip, and tilts about x of the nine contacts."""
 SIZES = np.array([DEPTHS[1], TILTS_DEG[2]])
 """A usual depth and tilt, by which they are divided."""
-PROBES = tuple(product((0.075, 0.125), (-5.0, 5.0)))
+PROBES = ((0.08, -5.0), (0.12, 5.0))
 """Depth and tilt of the contacts of the other twins."""
 MORE, TURN_DEG, STIFFER = 1.1, 5.0, 1.5
 """Changes: of a length, of the angle of the outermost pins, and of a modulus."""
@@ -87,7 +87,7 @@ def _changes(spec: SensorSpec) -> dict[tuple[str, str], tuple[SensorSpec, str]]:
 
 
 def cost_of_assumptions(spec: SensorSpec, *, progress: Step | None = None) -> list[AssumptionCost]:
-    """The costs of a specification's assumed numbers, the largest first. One that makes no sensor, or whose contacts fail, is left out.
+    """The costs of a specification's assumed numbers, the largest first. One with which a contact fails is left out.
 
     Parameters
     ----------

@@ -9,6 +9,7 @@ from scipy.spatial import Delaunay
 from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
 from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Polarity, SensorSpec
+from twin.calibration.assumptions import AssumptionCost, cost_of_assumptions
 from twin.calibration.camera_pose import LEAST_PINS, MODEL_PX, CameraReport, fit_camera
 from twin.calibration.sensor_file import sibling_folder, write_sensor
 from twin.calibration.size import of_radius, require_radius
@@ -131,6 +132,8 @@ class NewSensor:
         Where the size of the tip comes from, which frames do not determine.
     known, assumed, next_steps : tuple of str
         What the frames determine, what is assumed instead, and how to find out more.
+    costs : tuple of AssumptionCost
+        How far estimates move if an assumed number is wrong; the largest first.
     odd : tuple of str
         Irregularities of the recording.
     written : list of Path
@@ -146,6 +149,7 @@ class NewSensor:
     known: tuple[str, ...]
     assumed: tuple[str, ...]
     next_steps: tuple[str, ...]
+    costs: tuple[AssumptionCost, ...]
     odd: tuple[str, ...]
     written: list[Path]
 
@@ -156,6 +160,7 @@ class NewSensor:
         if not self.identified.sure:
             lines += [f"or: {other.line()}" for other in self.identified.candidates[1:2]]
         lines += [self.rest.line(), *self.known[2:], *self.health.lines(), self.size]
+        lines += [f"measure first: {cost.line()}" for cost in self.costs[:1]]
         return lines + [f"next: {step}" for step in self.next_steps] + [f"note: {note}" for note in self.odd]
 
 
@@ -246,8 +251,10 @@ def new_sensor(
         known, assumed, steps = _describe_result(sensor, found, rest, camera, others, tuned, health, recording, out)
         known, assumed = ((*known, size), assumed) if radius_mm is not None else (known, (size, *assumed))
         write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
+        with stage(progress, "assumptions") as step:
+            costs = tuple(cost_of_assumptions(sensor, progress=step))
         files = [out, folder / "index.html"]
-        made = NewSensor(sensor, found, rest, camera, tuned, health, size, known, assumed, steps, tuple(odd), files)
+        made = NewSensor(sensor, found, rest, camera, tuned, health, size, known, assumed, steps, costs, tuple(odd), files)
         _write_page(files[1], made, pictures)
         return made
 
@@ -611,6 +618,18 @@ def _write_page(path: Path, made: NewSensor, pictures: list[Path]) -> None:
     page.items(made.known)
     page.section("What is assumed")
     page.items(made.assumed)
+    page.section(
+        "What an assumption costs",
+        "By simulation: how far an estimated depth, and an estimated tilt of 5 deg, move if one of the assumed numbers is wrong. The first "
+        "number is the first to measure.",
+    )
+    page.table(
+        [
+            {"assumed": c.assumed, "change": c.change, "depth": f"{100 * c.depth_share:+.0f} %", "tilt": f"{c.tilt_deg:+.1f} deg"}
+            for c in made.costs
+        ],
+        ["assumed", "change", "depth", "tilt"],
+    )
     page.section("How to find out more")
     page.items(made.next_steps)
     page.section("Layouts that were considered")

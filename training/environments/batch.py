@@ -337,6 +337,18 @@ class Batch:
         """Values of the newest states that no real sensor measures, (B, K), by the task's ``oracle_names``."""
         return np.clip(self.task.oracle(self._observe_world()), -MOST_ORACLE, MOST_ORACLE)
 
+    def expert(self) -> FloatArray:
+        """Actions (B, A) of the task's scripted expert in the newest states.
+
+        Raises
+        ------
+        OptionError
+            The task has no expert, or other axes than the task's were chosen.
+        """
+        if self.axes != self.task.axes:
+            raise OptionError(f"axes={self.axes!r}: the expert of {self.task.name} moves {', '.join(self.task.axes)}; leave `axes` out")
+        return np.clip(self.task.expert(self._observe_world()) / self.action_scale, -1.0, 1.0)
+
     def picture(self, row: int) -> ImageArray:
         """(H, W, 3) uint8: the sensor's frame of one environment."""
         image = self.frame(row).image

@@ -61,6 +61,11 @@ class SensorView:
         return _painter(self.sensor, self.form, self.pictures)
 
     @cached_property
+    def at_rest(self) -> Frame:
+        """The frame without contact."""
+        return self.paint(rest_pins(self.sensor.geometry), np.random.default_rng(0))
+
+    @cached_property
     def pipeline(self) -> Pipeline:
         """The pipeline for the sensor's frames, with the pins at rest from a frame without contact.
 
@@ -69,9 +74,8 @@ class SensorView:
         OptionError
             The pins can't be found in the frame at rest.
         """
-        rest = self.paint(rest_pins(self.sensor.geometry), np.random.default_rng(0))
         try:
-            return Pipeline(self.sensor, self.form, measure_reference(self.sensor, self.form, rest))
+            return Pipeline(self.sensor, self.form, measure_reference(self.sensor, self.form, self.at_rest))
         except FrameError as error:
             raise OptionError(
                 f"the pins of the sampled {self.sensor.name} can't be found at rest ({error}); narrow the randomisation"
@@ -133,6 +137,10 @@ class Eye:
     def begin(self, row: int, sensor: SensorSpec) -> None:
         """Use the camera and light that were sampled for an environment's episode."""
         self._views[row] = self._nominal if sensor is self.sensor else SensorView(sensor, self.form, self.pictures)
+
+    def view(self, row: int) -> SensorView:
+        """The view of one environment's sensor as sampled for the episode."""
+        return self._views[row]
 
     def frame(self, row: int, pins: PinState, rng: np.random.Generator) -> Frame:
         """The frame of one environment's sensor as sampled for the episode; a preview if no kind of pictures was chosen."""

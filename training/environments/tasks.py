@@ -144,6 +144,16 @@ class Task(ABC):
     def evaluate(self, seen: WorldState) -> StepOutcome:
         """Evaluate the state after a step."""
 
+    def expert(self, seen: WorldState) -> FloatArray:
+        """Motions (B, A) along the task's ``axes``, mm and deg, of a scripted expert that knows the true state.
+
+        Raises
+        ------
+        OptionError
+            The task has no expert.
+        """
+        raise OptionError(f"{self.name} has no scripted expert; give its class a method `expert`")
+
     def push_object(self, reading: ContactReading, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
         """The object's poses (B, 4, 4) after it gave way to the skin's forces, or None if no object moves."""
         return None
@@ -205,6 +215,10 @@ class SurfaceFollow(Task):
         good = (off_mm <= self.good_mm) & (off_deg <= self.good_deg)
         reward = closeness(off_mm + off_deg / TURN_DEG)
         return StepOutcome(reward, failed, np.zeros(len(failed), bool), good, {"off_mm": off_mm, "off_deg": off_deg})
+
+    def expert(self, seen: WorldState) -> FloatArray:
+        off_mm, off_deg = seen.goal[:, 0] - seen.touch.indent_mm, seen.touch.angle_deg - TURN_DEG * seen.goal[:, 1]
+        return np.column_stack([off_mm, off_deg])
 
 
 class ContourFollow(SurfaceFollow):
@@ -288,6 +302,10 @@ class EdgeFollow(Task):
         across, turn = self.place(seen)
         return np.column_stack([across, turn / TURN_DEG, super().oracle(seen)[:, 2:]])
 
+    def expert(self, seen: WorldState) -> FloatArray:
+        across, turn = self.place(seen)
+        return np.column_stack([seen.goal[:, 0] - across, TURN_DEG * seen.goal[:, 1] - turn])
+
 
 class GentlePress(Task):
     """Approach an object, reach a force and hold it without slip."""
@@ -301,6 +319,8 @@ class GentlePress(Task):
     off_deg = 10.0
     drift_mm = 0.25
     good_share, slip_share = 0.1, 0.5
+    soft_mm_per_n = 1.2
+    """Motion of the expert, mm, per N that the force lacks."""
     columns = 1  # sideways drift per step
     success_share = 0.8
 
@@ -322,6 +342,11 @@ class GentlePress(Task):
         good = (off_n <= self.good_share * goal) & ~slips
         reward = closeness(off_n / goal + gap_mm + seen.reading.slip)
         return StepOutcome(reward, failed, np.zeros(len(failed), bool), good, {"off_n": off_n, "gap_mm": gap_mm})
+
+    def expert(self, seen: WorldState) -> FloatArray:
+        force, gap_mm = np.linalg.norm(seen.reading.force_n, axis=1), -seen.touch.indent_mm
+        pressed = self.soft_mm_per_n * (seen.goal[:, 0] - force)
+        return np.column_stack([self.kept[:, 0], np.where(gap_mm > 0, gap_mm + self.soft_mm_per_n * FORCE_N / 5, pressed)])
 
 
 class ObjectRoll(Task):
@@ -388,6 +413,10 @@ class ObjectRoll(Task):
 
     def oracle(self, seen: WorldState) -> FloatArray:
         return np.column_stack([self.place(seen), super().oracle(seen)[:, 2:]])
+
+    def expert(self, seen: WorldState) -> FloatArray:
+        off_mm: FloatArray = seen.goal - self.place(seen)
+        return -2.0 * off_mm  # a ball rolls half as far as the tool moves
 
 
 class ObjectPush(Task):
@@ -480,6 +509,13 @@ class ObjectPush(Task):
 
     def oracle(self, seen: WorldState) -> FloatArray:
         return np.column_stack([_shift_in_plane(self.place(seen), seen.T_work), super().oracle(seen)])
+
+    def expert(self, seen: WorldState) -> FloatArray:
+        """It pushes beside the block's middle and obliquely, so that the block turns towards the goal."""
+        beside, ahead = 10.0 * _shift_in_plane(self.place(seen), seen.T_work).T
+        bearing_deg = np.degrees(np.arctan2(beside, np.maximum(ahead, 1.0)))
+        aside_mm = -0.3 * np.clip(bearing_deg, -12.0, 12.0)
+        return np.column_stack([aside_mm - seen.touch.place_mm[:, 0], seen.touch.angle_deg + 0.5 * bearing_deg])
 
 
 def _shift_in_plane(away_mm: FloatArray, T_work: FloatArray) -> FloatArray:

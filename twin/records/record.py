@@ -76,13 +76,16 @@ CHANNELS = {
         Channel("estimate", "observation.tactile.estimate", "/tactip/estimate", (), "the model's estimate, mm and deg; NaN: not valid"),
         Channel("low", "observation.tactile.estimate_low", "/tactip/estimate_low", (), "lower end of its 90 % interval"),
         Channel("high", "observation.tactile.estimate_high", "/tactip/estimate_high", (), "upper end of its 90 % interval"),
-        Channel("action", "action", "/tactip/command", POSE_AXES, "the pose that the arm was sent to, mm and deg"),
+        Channel("goal", "observation.environment_state", "/tactip/goal", (), "the goal of the task"),
+        Channel(
+            "action", "action", "/tactip/command", POSE_AXES, "the pose that the arm was sent to, mm and deg; or as the record names it"
+        ),
     )
 }
 """All channels, in the order in which formats have them."""
 IMAGE, TIME = "observation.images.tactip", "observation.time_s"
 """Columns of the picture and of the time of its exposure (s, from the episode's first exposure)."""
-_NAMED_HERE = {name for name, channel in CHANNELS.items() if not channel.axes and name != "pins"}
+_ESTIMATED = ("estimate", "low", "high")
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,8 @@ class About:
         Frame of poses and actions: ``base`` (of the arm) or ``work`` (of the experiment).
     robot : str
         Description of the arm; "" if unknown.
+    names : dict of str to tuple of str
+        Names of the numbers of channels that are not the usual ones: of goals, and of actions that are no poses.
     """
 
     sensor: str
@@ -116,12 +121,17 @@ class About:
     estimates: tuple[str, ...] = ()
     frame: str = "work"
     robot: str = ""
+    names: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def axes(self, channel: str) -> tuple[str, ...]:
         """Names of the numbers of a channel. Pins have ``pin_0_x, pin_0_y, pin_1_x, ...``."""
         if channel == "pins":
             return tuple(f"pin_{k}_{axis}" for k in range(self.numbers["pins"] // 2) for axis in "xy")
-        return self.estimates if channel in _NAMED_HERE else CHANNELS[channel].axes
+        return self.names.get(channel, self.estimates if channel in _ESTIMATED else CHANNELS[channel].axes)
+
+    def is_plain(self, channel: str) -> bool:
+        """Whether a channel's numbers are no pose and no wrench."""
+        return channel in self.names or not CHANNELS[channel].axes
 
     def shape(self, channel: str) -> tuple[int, ...]:
         """Shape of a channel's array in one step."""

@@ -105,8 +105,8 @@ class _Bag:
         for name, values in step.values.items():
             numbers = values.astype(float)
             topic = CHANNELS[name].topic
-            if not CHANNELS[name].axes:
-                send(topic, "std_msgs/msg/Float32MultiArray", _array(values, "pin" if name == "pins" else ",".join(self._about.estimates)))
+            if self._about.is_plain(name):
+                send(topic, "std_msgs/msg/Float32MultiArray", _array(values, "pin" if name == "pins" else ",".join(self._about.axes(name))))
             elif name == "wrench":
                 parts = {"force": _vector(numbers[:3]), "torque": _vector(numbers[3:] / MM_PER_M)}
                 send(topic, "geometry_msgs/msg/WrenchStamped", {"header": header, "wrench": parts})
@@ -212,7 +212,7 @@ def _steps_of(path: Path, about: About) -> Iterator[RecordStep]:
 
 def _numbers(name: str, ros: Any, about: About) -> np.ndarray:
     """A channel's numbers from its message."""
-    if not CHANNELS[name].axes:
+    if about.is_plain(name):
         return float32(list(ros.data)).reshape(about.shape(name))
     if name == "wrench":
         force, torque = ros.wrench.force, ros.wrench.torque

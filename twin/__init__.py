@@ -15,7 +15,7 @@ frames, pins    Frame Form Pipeline Observation node_features preprocess tune
 your sensor     new_sensor check calibrate_optics calibrate_contact
 how true it is  validate realism robustness audit
 models          make_dataset train evaluate predict load_model
-policies        register_environments BaselinesVecEnv learn
+policies        register_environments BaselinesVecEnv demonstrate learn
 devices         open_camera open_arm SafeArm load_limits collect servo run_policy
 other           errors extend __version__
 
@@ -45,6 +45,7 @@ _PLACES = {
     "calibrate_optics": "twin.cli.calibration",
     "check": "twin.cli.frames",
     "collect": "twin.cli.live",
+    "demonstrate": "twin.cli.learning",
     "evaluate": "twin.cli.learning",
     "learn": "twin.cli.learning",
     "load_experiment": "scenes",

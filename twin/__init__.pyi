@@ -20,6 +20,7 @@ from scenes import load_object as load_object
 from scenes import load_sensor as load_sensor
 from training.environments import register_all as register_all
 from training.environments.baselines import BaselinesVecEnv as BaselinesVecEnv
+from training.environments.demonstrations import Demonstrations as Demonstrations
 from training.environments.learn import Learnt as Learnt
 from training.estimate.loading import load_with_history as load_with_history
 from training.generation.run import Simulated as Simulated
@@ -136,6 +137,21 @@ def collect(
     force: bool = ...,
     progress: Progress | bool | None = ...,
 ) -> Collected: ...
+
+def demonstrate(
+    *,
+    task: str,
+    sensor: str | Path | SensorSpec,
+    out: Path | str,
+    episodes: int = ...,
+    randomise: str | None = ...,
+    surrogate: Path | str | None = ...,
+    objects: str | Sequence[str] | None = ...,
+    video: bool = ...,
+    seed: int = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Demonstrations: ...
 
 def evaluate(
     run: Path | str,

@@ -118,7 +118,7 @@ def _solve(
                 if len(failed) > found + MOST_FAILED:
                     raise TwinError(
                         f"the expert of {plan.task} solved {found} of {found + len(failed)} episodes; give other objects or another "
-                        "randomisation, or improve the task's `expert`"
+                        "randomisation, or improve the task's expert"
                     )
                 continue
             assert batch.eye is not None  # it makes pictures

@@ -152,7 +152,7 @@ class Task(ABC):
         OptionError
             The task has no expert.
         """
-        raise OptionError(f"{self.name} has no scripted expert; give its class a method `expert`")
+        raise OptionError(f"{self.name} has no scripted expert; give its class a method of this name: expert")
 
     def push_object(self, reading: ContactReading, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
         """The object's poses (B, 4, 4) after it gave way to the skin's forces, or None if no object moves."""

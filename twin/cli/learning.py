@@ -6,6 +6,7 @@
 - ``twin predict``: the pose in each frame.
 - ``twin pack``: a small copy of a trained model.
 - ``twin surrogate``: a fast surrogate model of a sensor's finite elements.
+- ``twin demonstrate``: episodes of a task by a scripted expert.
 - ``twin learn``: a policy of a task.
 """
 
@@ -48,12 +49,23 @@ from twin.progress import Progress
 from twin.types import FINE, Quality
 
 if TYPE_CHECKING:
+    from training.environments.demonstrations import Demonstrations
     from training.environments.learn import Learnt
     from training.generation.run import Simulated
     from training.studies.evaluation import Evaluation
     from training.studies.prediction import Predictions
     from training.studies.train import TrainedRun
     from training.surrogate.fit import Distilled
+
+
+TaskName = Annotated[str, typer.Option("--task", metavar="T", help="EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ...")]
+RandomiseEpisodes = Annotated[
+    str | None, typer.Option("--randomise", metavar="R", help="domain randomisation between episodes, e.g. moves")
+]
+OwnSurrogate = Annotated[Path | None, typer.Option("--surrogate", metavar="FILE", help="surrogate model of your own sensor")]
+TaskObjects = Annotated[
+    str | None, typer.Option("--objects", callback=each_once, help="objects instead of the task's, separated by commas")
+]
 
 
 @app.command("dataset", goes_on=True)
@@ -357,19 +369,55 @@ def make_surrogate(
     return call(distil, locals(), sensor=load_sensor(sensor))
 
 
+@app.command("demonstrate", goes_on=True)
+def demonstrate(
+    task: TaskName,
+    sensor: Sensor,
+    out: Out,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, metavar="N", help="solved episodes")] = 50,
+    randomise: RandomiseEpisodes = None,
+    surrogate: OwnSurrogate = None,
+    objects: TaskObjects = None,
+    video: Annotated[bool, typer.Option("--video", help="pictures as video, which loses detail")] = False,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the episodes")] = 0,
+    *,
+    progress: Progress,
+) -> "Demonstrations":
+    """Record demonstrations of a task by a scripted expert, for imitation learning.
+
+    The expert knows the true state. Its solved episodes become a LeRobot data set (pip install 'tactip-twin[gym,records]'); the others are
+    left out. The same command adds missing episodes, also with a larger --episodes.
+
+    \b
+    Each step has:
+      observation.images.tactip       the sensor's frame
+      observation.tactile.pins        the pins that the pipeline finds in it, px
+      observation.tactile.wrench      force, N, and torque, N mm, on the object
+      observation.state               the tool's pose, mm and deg
+      observation.environment_state   the goal of the task
+      action                          the environment's action, -1 to 1
+
+    \b
+    Example:
+      twin demonstrate --task EdgeFollow --sensor mg400-331 --out out/demos
+    """
+    from training.environments.batch import Options
+    from training.environments.demonstrations import DemonstrationPlan
+    from training.environments.demonstrations import demonstrate as record
+
+    options = call(Options, locals(), objects=names_in(objects) if objects else None)
+    return record(call(DemonstrationPlan, locals()), out, video=video, progress=progress)
+
+
 @app.command("learn")
 def learn(
-    task: Annotated[str, typer.Option("--task", metavar="T", help="EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ...")],
+    task: TaskName,
     sensor: Sensor,
     out: Out,
     observation: Annotated[str, typer.Option("--observation", help="pins, image, graph, pose or oracle")] = "pins",
-    randomise: Annotated[
-        str | None, typer.Option("--randomise", metavar="R", help="domain randomisation between episodes, e.g. moves")
-    ] = None,
-    surrogate: Annotated[Path | None, typer.Option("--surrogate", metavar="FILE", help="surrogate model of your own sensor")] = None,
-    objects: Annotated[
-        str | None, typer.Option("--objects", callback=each_once, help="objects instead of the task's, separated by commas")
-    ] = None,
+    randomise: RandomiseEpisodes = None,
+    surrogate: OwnSurrogate = None,
+    objects: TaskObjects = None,
     friction_history: Annotated[
         bool,
         typer.Option("--friction-history/--no-friction-history", help="history-dependent friction; switch it off to measure its effect"),

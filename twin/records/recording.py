@@ -62,7 +62,7 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
     if own and not (path / EPISODES).is_file():
         return Records(read_sidecar(path)[0], [])
     recording = open_recording(path, None, form)
-    values, estimates = _table_values(recording)
+    values, estimates = _table_values(recording, read_sidecar(path)[0].names if own else {})
     notes = list(recording.problems)
     _take_out_moves(path, recording, values, notes)
     values |= _read_pins(path, recording) | _read_truth(path, recording) | _read_requested_poses(path, recording)
@@ -142,13 +142,13 @@ def _times(recording: Recording, rows: np.ndarray, notes: list[str]) -> np.ndarr
     return np.arange(len(rows)) / NOMINAL_HZ
 
 
-def _table_values(recording: Recording) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """The table's numbers of each channel, and the names of estimated labels."""
+def _table_values(recording: Recording, names: dict[str, tuple[str, ...]]) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """The table's numbers of each channel, and the names of estimated labels. ``names`` are those of ``About``."""
     labels = recording.labels
     estimates = tuple(name.removeprefix("estimate_") for name in labels if name.startswith("estimate_"))
     found = {}
     for channel in CHANNELS.values():
-        axes = channel.axes or (estimates if channel.name != "pins" else ())
+        axes = names.get(channel.name) or channel.axes or (estimates if channel.name not in ("pins", "goal") else ())
         columns = columns_of(channel, axes)
         if not any(column in labels for column in columns):
             continue

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from training.environments import OWN
+from training.environments import OWN, demonstrations
 from training.environments.batch import Batch, Options
 from training.environments.demonstrations import DemonstrationPlan, demonstrate
 from training.environments.environment import TactileVectorEnv
@@ -55,6 +55,26 @@ def test_a_larger_number_adds_what_is_missing_and_the_same_adds_nothing(made):
     keys = [episode.key for episode in open_records(out).episodes]
     more = demonstrate(DemonstrationPlan("GentlePress", Options(steps=12, randomise="moves"), episodes=3, seed=1), out)
     assert more.episodes == 3 and [episode.key for episode in open_records(out).episodes][:2] == keys
+
+
+def test_an_interruption_keeps_the_episodes_that_were_finished(monkeypatch, tmp_path):
+    play, played = demonstrations._play, []
+
+    def once(batch):
+        if any(played):
+            raise KeyboardInterrupt
+        steps, solved = play(batch)
+        played.append(solved)
+        return steps, solved
+
+    plan = DemonstrationPlan("GentlePress", Options(steps=12), episodes=2)
+    with monkeypatch.context() as patch:
+        patch.setattr(demonstrations, "_play", once)
+        with pytest.raises(KeyboardInterrupt):
+            demonstrate(plan, tmp_path / "cut")
+    (first,) = open_records(tmp_path / "cut").episodes
+    demonstrate(plan, tmp_path / "cut")
+    assert [episode.key for episode in open_records(tmp_path / "cut").episodes][0] == first.key
 
 
 def test_other_formats_keep_goals_and_actions(made, tmp_path):

@@ -346,7 +346,7 @@ class Batch:
             The task has no expert, or other axes than the task's were chosen.
         """
         if self.axes != self.task.axes:
-            raise OptionError(f"axes={self.axes!r}: the expert of {self.task.name} moves {', '.join(self.task.axes)}; leave this option out")
+            raise OptionError(f"axes={self.axes!r}: the expert moves {', '.join(self.task.axes)}; leave this option out")
         return np.clip(self.task.expert(self._observe_world()) / self.action_scale, -1.0, 1.0)
 
     def picture(self, row: int) -> ImageArray:

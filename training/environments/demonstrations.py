@@ -89,7 +89,8 @@ def demonstrate(plan: DemonstrationPlan, out: Path, *, video: bool = False, prog
     height, width = frame.image.shape[:2]
     about = About(batch.sensor.name, frame.form, (width, height), frame.image.ndim == 2, numbers, names=names)
     failed: list[int] = []
-    with open_writer(out, LeRobotWriter.FORMAT, about, round(1 / PERIOD_S), video=video) as writer, stage(progress, plan.task) as step:
+    writer = open_writer(out, LeRobotWriter.FORMAT, about, round(1 / PERIOD_S), video=video, at_once=True)
+    with writer, stage(progress, plan.task) as step:
         writer.write(_solve(batch, plan, writer, failed, lambda done: step(done, plan.episodes)))
         facts = writer.facts
     return Demonstrations(out, len(facts), sum(int(each["length"]) for each in facts), len(failed))

@@ -155,7 +155,7 @@ def test_no_good_frame_is_a_failure_that_still_leaves_its_summary(tmp_path):
 
 def test_a_sensor_without_recording_form_says_so_before_it_presses(tmp_path):
     text = (SHIPPED / "sensors" / "mg400-127.toml").read_text()
-    own = re.sub(r"\n\[(pipeline\.)?recording\].*?(?=\n\[)", "", text, flags=re.DOTALL)
+    own = re.sub(r"\n\[(recording|pipeline\.processed)\].*?(?=\n\[)", "", text, flags=re.DOTALL)
     (tmp_path / "own.toml").write_text(own)
     asked = ("--sensor", tmp_path / "own.toml", "--object", "plane", "--indent-mm", 2, "--form", "processed", "--out", tmp_path)
     one_line_error(twin("render", *asked), "own", "raw form")

@@ -66,7 +66,7 @@ def run(recording, tmp_path_factory):
 
 def test_a_trained_run_is_judged_and_used(recording, run, tmp_path):
     said = twin("evaluate", run, "--data", recording, "--out", tmp_path, "--robustness")
-    assert "2 px shift: pose_2" in said and len(list(csv.DictReader((tmp_path / "robustness.csv").open()))) == 5
+    assert "2 px shift: depth" in said and len(list(csv.DictReader((tmp_path / "robustness.csv").open()))) == 5
     assert "depth: mean error" in said and "ms per frame" in said
     rows = list(csv.DictReader((tmp_path / "predictions.csv").open()))
     assert len(rows) == FRAMES / 5 and all(float(row["pose_2_lo90"]) < float(row["pose_2_hi90"]) and row["valid"] == "1" for row in rows)

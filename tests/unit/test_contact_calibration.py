@@ -152,7 +152,7 @@ def test_without_enough_weighed_presses_it_says_which_stiffness_is_assumed(tmp_p
     sensor = small_config(tmp_path).sensor
     for found in (assume_stiffness(sensor, "none was measured"), compare_forces([1.0, 2.0, 0.01], [1.0, 2.0, 0.01], sensor)):
         assert (found.presses, found.scale, found.factor) == (0, 1.0, ASSUMED_FACTOR)
-        assert f"skin {sensor.skin.young_modulus_mpa:.3g} MPa" in found.explanation and "weigh 3 presses" in found.explanation
+        assert f"skin {sensor.skin.young_modulus_mpa:.3g} MPa" in found.explanation and "the force of 3 presses" in found.explanation
     wide, narrow = (compare_forces(np.exp(spread * np.linspace(-1, 1, 5)), np.ones(5), sensor).factor for spread in (0.3, 0.03))
     assert wide > 1.2 > narrow > 1.0
 

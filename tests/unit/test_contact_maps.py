@@ -145,7 +145,7 @@ def test_lost_pins_an_unknown_place_of_the_camera_and_an_assumed_stiffness_widen
     assert not whole.notes and "30% of the pins were not found" in holed.notes[0]
     z = estimator.names.index("force_z")
     assert whole.high[z] > 1.6 * whole.value[z] and whole.low[z] < whole.value[z] / 1.6
-    assert len(estimator.caveats) == 2 and "no frame without contact" in estimator.caveats[0] and "1.6 times larger" in estimator.caveats[1]
+    assert len(estimator.caveats) == 2 and "without a frame" in estimator.caveats[0] and "1.6 times larger" in estimator.caveats[1]
     estimator.sensor = sensor.model_copy(update={"skin": sensor.skin.model_copy(update={"stiffness_factor": 1.0})})
     known = estimator.estimate_one(OneFrame(pins), 0.0, "")
     np.testing.assert_allclose((known.high - known.value)[force], TOUCH.unmeasured_widens * made.half_width[0][force], rtol=1e-6)

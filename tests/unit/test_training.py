@@ -261,12 +261,12 @@ def test_another_sensors_frames_are_refused(data, trained):
     estimator = PoseEstimator.load(trained)
     other = load_sensor("mg400-331")
     pins = replace(data.pins, sensor=other)
-    with pytest.raises(FrameError, match="trained on recording frames of 'mg400-127'.*'mg400-331'"):
+    with pytest.raises(FrameError, match="trained on processed frames of 'mg400-127'.*'mg400-331'"):
         estimator.predict_table(pins)
     rest = nominal_reference(other, Form.PROCESSED).pins_px
     with pytest.raises(FrameError, match="expected 256x256"):
         estimator(drawn_frame(other, Form.PROCESSED, rest))
-    with pytest.raises(FrameError, match="expected a recording frame"):
+    with pytest.raises(FrameError, match="expected a processed frame"):
         estimator(Frame(np.zeros((256, 256), np.uint8), Form.RAW))
 
 

@@ -59,13 +59,9 @@ if TYPE_CHECKING:
 
 
 TaskName = Annotated[str, typer.Option("--task", metavar="T", help="EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ...")]
-RandomiseEpisodes = Annotated[
-    str | None, typer.Option("--randomise", metavar="R", help="domain randomisation between episodes, e.g. moves")
-]
+RandomiseEpisodes = Annotated[str | None, typer.Option("--randomise", metavar="R", help="domain randomisation of episodes, e.g. moves")]
 OwnSurrogate = Annotated[Path | None, typer.Option("--surrogate", metavar="FILE", help="surrogate model of your own sensor")]
-TaskObjects = Annotated[
-    str | None, typer.Option("--objects", callback=each_once, help="objects instead of the task's, separated by commas")
-]
+TaskObjects = Annotated[str | None, typer.Option("--objects", callback=each_once, help="objects instead of the task's, with commas")]
 
 
 @app.command("dataset", goes_on=True)

@@ -21,7 +21,7 @@ from twin.store import writes
 from twin.types import ReadableResult
 
 MOST_FAILED = 20
-"""Largest number of failed episodes in succession."""
+"""Largest number by which failed episodes may exceed the solved ones."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ in each. A twin with another number, whose camera is fitted to the same pins at 
 displacements are most like those of the other twin, less the true ones, are the cost of the assumption.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -21,8 +21,9 @@ from twin.errors import ContactError, FrameError
 from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
+from twin.pins.labelling.reference import project_rest
 from twin.progress import Step
-from twin.types import FloatArray
+from twin.types import FloatArray, Form
 
 SPARSE = Resolution(across=8)
 """Elements of these simulations, in which only differences count."""
@@ -96,17 +97,16 @@ def cost_of_assumptions(spec: SensorSpec, *, progress: Step | None = None) -> li
     progress : callable, optional
         Called with (contacts done, contacts wanted).
     """
-    radius_mm = spec.skin.outer_radius_mm
+    radius_mm, plate = spec.skin.outer_radius_mm, load_object("plane")
     grid, changes, found, done = list(product(DEPTHS, TILTS_DEG)), _changes(spec), [], 0
-    rest_px = project(spec.view, SkinSolver(spec, resolution=SPARSE).rest().caps_mm)
 
-    def displacements(sensor: SensorSpec, contacts: list[tuple[float, float]]) -> FloatArray:
+    def displacements(sensor: SensorSpec, contacts: Sequence[tuple[float, float]]) -> FloatArray:
         """Displacements (contacts, 2 N) of the pins of a sensor, px."""
         nonlocal done
         solver, rows = SkinSolver(sensor, resolution=SPARSE), []
         rest = project(sensor.view, solver.rest().caps_mm)
         for depth, tilt_deg in contacts:
-            state = solver.press(load_object("plane"), ContactPose(depth * radius_mm, (tilt_deg, 0.0)))
+            state = solver.press(plate, ContactPose(depth * radius_mm, (tilt_deg, 0.0)))
             rows.append((project(sensor.view, state.caps_mm) - rest).ravel())
             done += 1
             if progress is not None:
@@ -117,20 +117,21 @@ def cost_of_assumptions(spec: SensorSpec, *, progress: Step | None = None) -> li
         a, b = np.array([depth, tilt_deg]) / SIZES
         return np.outer([1, a, a * a], [1, b, b * b]).ravel()
 
-    table = np.linalg.solve(np.array([powers(*each) for each in grid]), displacements(spec, grid))
+    moved, truth = displacements(spec, [*grid, *PROBES]), np.array(PROBES)
+    table = np.linalg.solve(np.array([powers(*each) for each in grid]), moved[: len(grid)])
 
-    def estimate(sensor: SensorSpec) -> FloatArray:
-        """Depths and tilts (contacts, 2) that the assumed numbers give to the contacts of a sensor."""
-        seen = zip(displacements(sensor, list(PROBES)), np.array(PROBES) / SIZES, strict=True)
-        fits = [least_squares(lambda x, row=row: powers(*x * SIZES) @ table - row, start).x for row, start in seen]
+    def estimate(seen: FloatArray) -> FloatArray:
+        """Depths and tilts (probes, 2) that the assumed numbers give to displacements (probes, 2 N)."""
+        pairs = zip(seen, truth / SIZES, strict=True)
+        fits = [least_squares(lambda x, row=row: powers(*x * SIZES) @ table - row, start).x for row, start in pairs]
         return np.array(fits) * SIZES
 
-    own, truth = estimate(spec), np.array(PROBES)  # what is off already with the right numbers is the table's error
+    own, rest_px = estimate(moved[len(grid) :]), project_rest(spec, Form.RAW)  # the table's error, with the right numbers
     for (assumed, change), (other, held) in changes.items():
         try:
             if held:  # the others leave the pins at rest where they are seen
                 other, _ = fit_camera(other, rest_px, free=tuple(key for key in FREE if key != held), named=True)
-            depth, tilt = ((estimate(other) - own) * np.sign(truth)).T
+            depth, tilt = ((estimate(displacements(other, PROBES)) - own) * np.sign(truth)).T
         except (ContactError, FrameError):
             continue
         found.append(AssumptionCost(assumed, change, float(np.mean(depth / truth[:, 0])), float(np.mean(tilt))))

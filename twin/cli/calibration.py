@@ -56,6 +56,11 @@ Columns = Annotated[
 ]
 
 
+def columns_in(pairs: list[str] | None) -> dict[str, str]:
+    """A table's columns by their keys."""
+    return dict(pair.partition("=")[::2] for pair in pairs or ())
+
+
 @app.command("new")
 def new_sensor(
     out: Annotated[Path, typer.Option("--out", metavar="MY.toml", help="the specification to write")],
@@ -236,14 +241,7 @@ def calibrate_contact(
 
     frames, spec = frames_at(frames, table, no_contact), sensor_with(sensor, pipeline)
     of, touched = load_experiment(experiment), load_if_named(load_object, obj)
-    return call(
-        calibrate_to_file,
-        locals(),
-        sensor=spec,
-        experiment=of,
-        obj=touched,
-        columns=dict(pair.partition("=")[::2] for pair in column or ()),
-    )
+    return call(calibrate_to_file, locals(), sensor=spec, experiment=of, obj=touched, columns=columns_in(column))
 
 
 @app.command("validate")
@@ -294,14 +292,7 @@ def validate(
 
     frames, spec = frames_at(frames, table, no_contact), sensor_with(sensor, pipeline)
     of, touched = load_experiment(experiment), load_if_named(load_object, obj)
-    return call(
-        validate_contacts,
-        locals(),
-        sensor=spec,
-        experiment=of,
-        obj=touched,
-        columns=dict(pair.partition("=")[::2] for pair in column or ()),
-    )
+    return call(validate_contacts, locals(), sensor=spec, experiment=of, obj=touched, columns=columns_in(column))
 
 
 @app.command("realism")

@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from twin.mechanics.follow import Follower
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview
 from twin.rig.contact import contact_law
-from twin.types import ContactState, Form, Frame
+from twin.types import Form, Frame, PinState
 
 LOG = logging.getLogger(__name__)
 PoseSource = Callable[[], ArmState]
@@ -31,6 +32,31 @@ ASKED_S = 0.1
 FIRST_FRAME_S = 120.0
 # Standard deviation of the noise in gray levels, for a sensor whose specification has no noise. It was measured over time on a real sensor.
 STEADY_SD = 1.0
+
+
+class World(Protocol):
+    """What a sensor touches while an arm moves it."""
+
+    def warm_up(self) -> None:
+        """Compile what ``move`` needs."""
+
+    def move(self, pose: np.ndarray, time_s: float) -> PinState:
+        """The pins with the arm at a pose (6,), where it is at ``time_s``; ``ContactError`` if the contact can't be computed."""
+        ...
+
+
+class _AtPlacedObject:
+    """A placed object, which stands still, with finite elements."""
+
+    def __init__(self, spec: SensorSpec, placed: PlacedObject) -> None:
+        self._placed = placed
+        self._follower = Follower(SkinSolver(spec), placed.spec, contact_law(spec.rig, placed.mounting, placed.spec))
+
+    def warm_up(self) -> None:
+        self._follower.warm_up()
+
+    def move(self, pose: np.ndarray, time_s: float) -> PinState:
+        return self._follower.move(self._placed.object_from(pose), time_s)
 
 
 class TwinCamera(LiveSource):
@@ -56,6 +82,8 @@ class TwinCamera(LiveSource):
         Draw only while a reader waits for a frame. This is for loops that stop for each frame: they do not use the frames in between.
     waits_for_arm : bool
         Deliver nothing while the arm's pose is not known, for any time. Otherwise the camera ends after some failed reads.
+    world : World, optional
+        What the sensor touches; by default the placed object, which stands still, with finite elements.
     """
 
     notices_still = False  # the twin's pictures may repeat without a fault
@@ -75,6 +103,7 @@ class TwinCamera(LiveSource):
         preview: Preview | None = None,
         on_demand: bool = False,
         waits_for_arm: bool = False,
+        world: World | None = None,
     ) -> None:
         super().__init__(f"twin of {spec.name}", form)
         frame_size(spec, self.form)
@@ -84,17 +113,18 @@ class TwinCamera(LiveSource):
         self.streams = not on_demand
         self._on_demand, self._asked = on_demand, threading.Event()
         self._waits_for_arm = waits_for_arm
-        self._follower: Follower | None = None
+        self._given = world
+        self._world: World | None = None
         self._drawn, self._due_s = 0, 0.0
-        self.state: ContactState | None = None  # of the newest frame
+        self.state: PinState | None = None  # of the newest frame
 
     def _open(self) -> None:
         if self._preview is None:
             self._preview = preview_of(self._spec, self.form)
-        if self._follower is None:
-            law = contact_law(self._spec.rig, self._placed.mounting, self._placed.spec)
-            self._follower = Follower(SkinSolver(self._spec), self._placed.spec, law)
-            self._follower.warm_up()
+        if self._world is None:
+            world = self._given or _AtPlacedObject(self._spec, self._placed)
+            world.warm_up()
+            self._world = world
 
     def _close(self) -> None:
         pass
@@ -104,14 +134,14 @@ class TwinCamera(LiveSource):
         return super()._take(wanted, timeout_s, missing)
 
     def _grab(self) -> DevicePicture:
-        follower, preview = self._require_open()
+        world, preview = self._require_open()
         if self._on_demand:
             self._await_reader()
         self._end.wait(max(0.0, self._due_s - time.monotonic()))
         self._due_s = time.monotonic() + self._period_s
         try:
             state = self._pose()
-            self.state = follower.move(self._placed.object_from(state.pose), state.time_s)
+            self.state = world.move(state.pose, state.time_s)
         except (ContactError, DeviceError) as error:
             self._end.wait(RETRY_S)
             self._asked.set()
@@ -140,11 +170,11 @@ class TwinCamera(LiveSource):
                     LOG.warning("%s: its arm is back", self.name)
                 return state
 
-    def _require_open(self) -> tuple[Follower, Preview]:
+    def _require_open(self) -> tuple[World, Preview]:
         """The objects that ``_open`` made; raises ``DeviceNotConnectedError`` before it."""
-        if self._follower is None or self._preview is None:
+        if self._world is None or self._preview is None:
             raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
-        return self._follower, self._preview
+        return self._world, self._preview
 
     def _await_reader(self) -> None:
         """Wait until a reader asks for a frame. A later reader gets a frame that is drawn later."""

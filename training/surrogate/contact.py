@@ -17,9 +17,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from training.surrogate.bending import bend, unbent
+from training.surrogate.solids import distances_to
 from twin.compiled import compiled
 from twin.objects.analytic import CompiledSolid
-from twin.objects.kernels import solid
 from twin.rig.contact import ArmTurning
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -192,10 +192,10 @@ def _distances(
     for r in range(len(rows)):
         row, turn, place = rows[r], T[r, :3, :3], T[r, :3, 3]
         _to_object_frame(node, still, turn, place, points)
-        found, _, _ = solid(points, kind[row], sizes[row])
+        found, _ = distances_to(points, kind[row], sizes[row])
         gap[r] = found
         _to_object_frame(origin, origin, turn, place, middle)
-        distance, outward, _ = solid(middle, kind[row], sizes[row])
+        distance, outward = distances_to(middle, kind[row], sizes[row])
         centre[r, 0] = distance[0]
         centre[r, 1] = -(turn[2, 0] * outward[0, 0] + turn[2, 1] * outward[0, 1] + turn[2, 2] * outward[0, 2])
 
@@ -251,7 +251,7 @@ def _follow(
                 if part > 1 and change < BENT_MM:
                     break
                 _to_object_frame(node, moved[row], turn, place, here)
-                gap, normal, _ = solid(here, kind[row], sizes[row])
+                gap, normal = distances_to(here, kind[row], sizes[row])
                 if part == 0:
                     for i in range(len(node)):
                         if gap[i] < REACH_MM or held[row, i]:

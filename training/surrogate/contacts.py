@@ -81,8 +81,18 @@ class SurrogateContacts:
         law, thing = contact.law, _field(contact.obj)
         assert isinstance(thing, CompiledSolid)  # required
         assert law.given_way is None or isinstance(law.given_way, ArmTurning)
-        friction, soft = law.friction.static, law.compliance_mm_per_n
-        self._linear.begin(row, thing, friction, compliance_mm_per_n=soft, turning=law.given_way)
+        self.begin_solid(row, thing, law.friction.static, compliance_mm_per_n=law.compliance_mm_per_n, turning=law.given_way)
+
+    def begin_solid(
+        self, row: int, thing: CompiledSolid, friction: float, *, compliance_mm_per_n: float = 0.0, turning: ArmTurning | None = None
+    ) -> None:
+        """As ``begin``, for a solid that is not checked against the domain."""
+        self._linear.begin(row, thing, friction, compliance_mm_per_n=compliance_mm_per_n, turning=turning)
+        self.rest(row)
+
+    def rest(self, row: int) -> None:
+        """End a sensor's contact."""
+        self._linear.free(row)
         self._known[row] = False
         self._gap[row] = np.inf
         self._parts[row] = 0.0
@@ -114,6 +124,16 @@ class SurrogateContacts:
     def caps_at_rest_mm(self) -> FloatArray:
         """Centres (N, 3) of the pins' caps at rest."""
         return self._caps_rest
+
+    @property
+    def domain(self) -> dict[str, float]:
+        """As of ``Surrogate``."""
+        return self._domain
+
+    @property
+    def radius_mm(self) -> float:
+        """Radius of the dome."""
+        return self._linear.radius_mm
 
     @property
     def depth_mm(self) -> FloatArray:

@@ -1,0 +1,212 @@
+"""Sensors in a MuJoCo scene: laws of statics and dynamics, agreement with the finite elements, and what is refused."""
+
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+import pytest
+
+from scenes import load_object, load_sensor
+from training.mujoco import TactileScene
+from training.mujoco.geoms import FILLET_MM, solid_of
+from training.mujoco.model import attach_sensor, load_scene, sensor_part, write_urdf
+from training.surrogate.solids import Drum, Ellipsoid, SweptBox, distances_to
+from twin.errors import OptionError
+from twin.mechanics.path import ContactPose
+from twin.simulator import Simulator
+from twin.types import Form
+
+SENSOR = "mg400-331"
+WEIGHT = 9.81
+
+
+def scene_of(bodies, *, geom="", dt=0.002, **options):
+    """A scene of the tip at the origin, its apex up, and a body above it."""
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><option timestep='{dt}'/><worldbody><body name='tip'>{geom}<site name='tip'/></body>{bodies}</worldbody></mujoco>"
+    )
+    return TactileScene(model, {"tip": SENSOR}, **options)
+
+
+def above(shape, height_mm, *, mass=0.1, joint="<joint type='slide' axis='0 0 1'/>"):
+    """A body with one geom at a height, that moves up and down."""
+    return f"<body name='thing' pos='0 0 {height_mm / 1e3}'>{joint}<geom name='thing' {shape} mass='{mass}' friction='.5'/></body>"
+
+
+BOX, BALL = "type='box' size='.03 .03 .01'", "type='sphere' size='.02'"
+
+
+@pytest.mark.parametrize("shape", [BOX, BALL])
+@pytest.mark.parametrize("mass", [0.02, 0.1])
+def test_a_body_at_rest_on_the_sensor_weighs_its_weight(shape, mass):
+    scene = scene_of(above(shape, 29.0 if shape == BOX else 39.0, mass=mass))
+    scene.step(4000)
+    force = scene.read("tip").force_n
+    assert np.allclose(force, [0, 0, mass * WEIGHT], atol=0.01 * mass * WEIGHT + 0.01)
+    assert abs(force[2] / (mass * WEIGHT) - 1) < 0.01
+
+
+def test_action_equals_reaction_in_force_and_moment_wherever_the_centres_of_mass_are():
+    held = (
+        "<joint type='slide' axis='0 0 1'/><geom type='box' size='.01 .01 .01' pos='.03 .02 -.05' mass='.3' contype='0' conaffinity='0'/>"
+    )
+    scene = scene_of(above(BOX, 26.0, joint="<freejoint/>"), geom=held)
+    scene.step(5)
+    applied, at = scene.data.xfrc_applied, scene.data.xipos
+    assert np.abs(applied[:, :3]).sum() > 0.1
+    assert np.allclose(applied[:, :3].sum(axis=0), 0, atol=1e-12)
+    assert np.allclose((applied[:, 3:] + np.cross(at, applied[:, :3])).sum(axis=0), 0, atol=1e-12)
+
+
+def test_a_light_ball_never_bounces_higher_than_it_fell_with_and_without_loss():
+    for loss in (0.0, 1.0):
+        scene, heights = scene_of(above(BALL, 44.0, mass=0.02), loss_s_per_m=loss), []
+        for _ in range(1500):
+            scene.step()
+            heights.append(scene.data.qpos[0])
+        tops = [h for before, h, after in zip(heights, heights[1:], heights[2:], strict=False) if before <= h > after]
+        assert len(tops) >= 5 and tops[0] <= 0 and np.all(np.diff(tops) < 1e-5)
+
+
+def test_forces_of_others_on_the_bodies_stay():
+    scene = scene_of(above(BOX, 29.0))
+    scene.data.xfrc_applied[2, 0] = 0.125
+    scene.step(50)
+    scene.reset()
+    scene.data.xfrc_applied[:] = 0.0
+    scene.data.xfrc_applied[2, 0] = 0.125
+    scene.data.qpos[:] = 0.1  # far away: no skin pushes
+    scene.step(3)
+    assert np.allclose(scene.data.xfrc_applied[2], [0.125, 0, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize("name, shape, height_mm", [("plane", BOX, 10.0), ("sphere", "type='sphere' size='.01'", 10.0)])
+def test_a_press_is_that_of_the_simulator_within_the_surrogates_error(name, shape, height_mm):
+    sensor, depth = load_sensor(SENSOR), 2.5
+    state = Simulator(sensor).press(load_object(name), ContactPose(indent_mm=depth), friction=0.5)
+    scene = scene_of(above(shape, 20.0 + height_mm, joint=""))
+    scene.model.body_pos[2, 2] += 1e-3
+    for _ in range(int(1000 * (1 + depth) / 100)):
+        scene.model.body_pos[2, 2] -= 1e-4
+        scene.step()
+    seen = scene.read("tip")
+    assert abs(seen.depth_mm - depth) < 0.05 and seen.geom == "thing"
+    assert np.linalg.norm(seen.force_n - state.force_n) < 0.06 * np.linalg.norm(state.force_n) + 0.02
+    moved = np.linalg.norm(state.caps_mm - seen.caps_mm, axis=1)
+    assert moved.mean() < 0.08
+
+
+@pytest.mark.parametrize("share, slips", [(0.95, False), (1.05, True)])
+def test_a_held_block_slips_when_and_only_when_friction_says_so(share, slips):
+    """``share`` is the grip that friction needs, relative to the grip there is."""
+    spec, sensors = load_scene("gripper", load_sensor(SENSOR))
+    spec.geom("table").pos[2] = -1.0
+    model = spec.compile()
+    block, geom, grip_n = model.body("block").id, model.geom("block").id, 1.0
+    model.geom_friction[geom, 0] = model.body_mass[block] * WEIGHT / (2 * grip_n * share)
+    scene = TactileScene(model, sensors, touchable=["block"])
+    scene.data.ctrl[:] = 0.0, 0.0215
+    model.opt.gravity[2] = 0.0
+    scene.step(500)
+    forces = [scene.read(site).force_n[2] for site in sensors]
+    assert np.mean(forces) == pytest.approx(grip_n, rel=0.02)
+    low = scene.data.xpos[block, 2]
+    for part in range(50):  # the weight grows slowly, so that it is not felt twice
+        model.opt.gravity[2] = -WEIGHT * (part + 1) / 50
+        scene.step(20)
+    scene.step(400)
+    assert bool(low - scene.data.xpos[block, 2] > 20e-3) is slips  # the skin gives way by 5 mm
+
+
+def test_a_contact_that_ends_a_jump_and_a_deep_object_are_defined():
+    scene = scene_of(above(BOX, 28.0, joint=""))
+    scene.step(5)
+    assert scene.read("tip").depth_mm == pytest.approx(2.0) and scene.read("tip").geom == "thing"
+    first = scene.read("tip").force_n.copy()
+    scene.model.body_pos[2] = [0, 0, 0.2]
+    scene.step()
+    seen = scene.read("tip")
+    assert seen.geom == "" and not seen.force_n.any() and not seen.slip and not scene.data.xfrc_applied.any()
+    scene.model.body_pos[2] = [0, 0, 0.028]  # a jump: the contact begins anew, pressed straight
+    scene.step()
+    assert np.allclose(scene.read("tip").force_n, first, atol=0.05)
+    scene.model.body_pos[2] = [0, 0, 0.0225]
+    scene.step(2)
+    seen = scene.read("tip")
+    assert "at most 5.5" in seen.lost and seen.force_n[2] > 2 * first[2] and np.isfinite(scene.data.qpos).all()
+
+
+def test_one_object_at_a_time_is_felt_and_a_second_one_is_named():
+    two = above(BOX, 28.0, joint="") + "<body pos='.02 0 .017'><geom name='other' type='sphere' size='.01'/></body>"
+    scene = scene_of(two)
+    scene.step()
+    assert {scene.read("tip").geom, *scene.read("tip").beside} == {"thing", "other"}
+
+
+def test_distances_of_closed_solids_are_true_distances():
+    rng = np.random.default_rng(0)
+    for thing in (SweptBox(5.0, 3.0, 8.0, 0.5), SweptBox(0, 0, 10.0, 6.0), Drum(7.0, 4.0, 0.5), Ellipsoid(12.0, 8.0, 6.0)):
+        points = rng.uniform(-20, 20, (400, 3))
+        gap, normal = distances_to(points, thing.kind, np.array(thing.sizes))
+        assert np.allclose(np.linalg.norm(normal, axis=1), 1)
+        foot = points - gap[:, None] * normal
+        assert np.abs(distances_to(foot, thing.kind, np.array(thing.sizes))[0]).max() < 1e-6
+        ahead, _ = distances_to(points + 1e-5 * normal, thing.kind, np.array(thing.sizes))
+        assert np.allclose((ahead - gap) / 1e-5, 1, atol=1e-3)
+
+
+def test_geoms_that_no_skin_can_touch_are_refused_by_name():
+    small = above("type='sphere' size='.003'", 40.0)
+    with pytest.raises(OptionError, match=r"geom thing: a radius of curvature of 3 mm"):
+        scene_of(small)
+    star = "<asset><mesh name='m' vertex='0 0 0 .05 0 0 0 .05 0 0 0 .05'/></asset>"
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco>{star}<worldbody><site name='tip'/><geom name='pyramid' type='mesh' mesh='m'/></worldbody></mujoco>"
+    )
+    with pytest.raises(OptionError, match=r"geom pyramid: its mesh is .* mm off the nearest box"):
+        TactileScene(model, {"tip": SENSOR})
+    with pytest.raises(OptionError, match="no site 'nose'"):
+        TactileScene(model, {"nose": SENSOR}, touchable=[])
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    with pytest.raises(OptionError, match="RK4"):
+        TactileScene(model, {"tip": SENSOR}, touchable=[])
+
+
+def test_a_mesh_of_a_box_is_that_box():
+    corners = " ".join(f"{x} {y} {z}" for x in (-0.02, 0.02) for y in (-0.03, 0.03) for z in (-0.01, 0.01))
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><asset><mesh name='m' vertex='{corners}'/></asset><worldbody><geom name='b' type='mesh' mesh='m'/></worldbody></mujoco>"
+    )
+    thing, _ = solid_of(model, 0)
+    assert isinstance(thing, SweptBox) and sorted(np.array(thing.sizes[:3]) + FILLET_MM) == pytest.approx([10, 20, 30])
+
+
+def test_a_sensor_is_a_part_of_any_model(tmp_path):
+    sensor = load_sensor(SENSOR)
+    part = sensor_part(sensor).compile()
+    soft = part.geom("skin")
+    assert not soft.contype and not soft.conaffinity and part.body("tactip").mass == pytest.approx(0.12)
+    robot = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody><body name='hand'><site name='flange' euler='0 90 0'/></body></worldbody></mujoco>"
+    )
+    with pytest.raises(OptionError, match="no site 'wrist'; its sites are flange"):
+        attach_sensor(robot, "wrist", sensor, prefix="a_")
+    site = attach_sensor(robot, "flange", sensor, prefix="a_")
+    model = robot.compile()
+    scene = TactileScene(model, {site: sensor})
+    mujoco.mj_forward(model, scene.data)
+    assert np.allclose(scene.data.site_xmat[model.site(site).id].reshape(3, 3)[:, 2], [1, 0, 0])
+    file = write_urdf(sensor, tmp_path)
+    assert mujoco.MjModel.from_xml_path(str(file)).ngeom == 1  # it collides with its housing alone
+    mass, mesh = (ElementTree.parse(file).find(f".//{tag}") for tag in ("mass", "mesh"))
+    assert float(mass.get("value")) == 0.12 and (tmp_path / mesh.get("filename")).is_file()
+
+
+def test_frames_of_the_scene_go_through_the_pipeline():
+    scene = scene_of(above(BOX, 28.0, joint=""))
+    scene.step(3)
+    seen = scene.observe("tip")
+    assert scene.form("tip") is Form.PROCESSED and seen.valid
+    moved = seen.pins_px - scene.pipeline("tip").reference.pins_px
+    assert np.nanmax(np.linalg.norm(moved, axis=1)) > 2
+    assert np.nanmean(np.linalg.norm(seen.pins_px - scene.read("tip").pins_px, axis=1)) < 1.0

@@ -1,0 +1,407 @@
+"""TacTips in a MuJoCo model: in each step the surrogate computes the contact of each sensor, and its forces act on sensor and object.
+
+A sensor is a site of the model: its frame is the sensor's, with the origin at the centre of the dome and z out of its apex. Each sensor
+touches one geom at a time: the one that is deepest in its dome; it stays at this geom until the contact ends. MuJoCo must not compute the
+same contact itself: the soft part of a sensor has no geom that collides (``training.mujoco.model`` makes sensors so).
+
+MuJoCo integrates velocities before positions (symplectic Euler). With forces at the present pose, this adds no energy to an elastic
+contact. Therefore ``step`` uses ``mj_step1`` and ``mj_step2``: after ``mj_step`` the poses in ``data`` are those of the step before.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from scenes import SensorSpec, load_sensor
+from training.environments.observe import Pictures, SensorView, caps_px
+from training.mujoco.geoms import MM, solid_of
+from training.surrogate.contacts import SurrogateContacts
+from training.surrogate.model import surrogate_of
+from training.surrogate.solids import distances_to
+from twin.compiled import compiled
+from twin.errors import OptionError
+from twin.pins import Pipeline
+from twin.types import FloatArray, Form, Frame, IntArray, Observation, PinState
+
+NEAR_MM = 2.0
+"""Distance between dome and geom from which the motion towards it is followed."""
+STOP_N_PER_MM = 20.0
+"""Stiffness with which a geom is pushed out that is deeper in the dome than the surrogate was trained for."""
+STOP_RETURNS = 0.5
+"""Share of this force while the geom moves out again, so that the stop takes energy away."""
+SHEAR, LEAST_DEPTH_MM = 0.7, 0.3
+"""Stiffness of a contact across its normal relative to that along it, and the least depth by which a stiffness is computed, between two
+evaluations of the surrogate."""
+LOSS_S_PER_M = 1.0
+"""Loss of skin and gel: forces grow by this factor times the speed of indentation (Hunt and Crossley 1975). It is assumed, not measured. A
+light ball at 0.2 m/s keeps some 0.85 of its speed."""
+MOST_GROWTH = 2.0
+"""Largest factor of this loss."""
+
+
+@dataclass(frozen=True)
+class TactileReading:
+    """The contact of one sensor.
+
+    Attributes
+    ----------
+    geom : str
+        The touched geom's name; "" without contact.
+    force_n, torque_nmm : (3,) float
+        Wrench on the geom, sensor frame, about the sensor's origin.
+    caps_mm, pins_px : (N, 3), (N, 2) float
+        Centres of the pins' caps, sensor frame, and in the sensor's frame without noise.
+    depth_mm, area_mm2, slip : float
+        Depth of the geom in the undeformed dome, contact area, and share of this area that slides.
+    lost : str
+        Why the contact can't be computed, or "". Caps, area and slip are then those of the last computed contact.
+    beside : tuple of str
+        Further geoms in the dome. They are not felt.
+    """
+
+    geom: str
+    force_n: FloatArray
+    torque_nmm: FloatArray
+    caps_mm: FloatArray
+    pins_px: FloatArray
+    depth_mm: float
+    area_mm2: float
+    slip: float
+    lost: str
+    beside: tuple[str, ...]
+
+
+class TactileScene:
+    """A MuJoCo model with TacTips.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+    sensors : mapping of str to str or SensorSpec
+        For each sensor's site: a sensor's name, file or specification. It needs a surrogate.
+    touchable : sequence of str, optional
+        Names of the geoms that the sensors can touch. By default all that collide with others and are not of the sensor's own body.
+    data : mujoco.MjData, optional
+    loss_s_per_m : float
+        Loss of skin and gel, see ``LOSS_S_PER_M``; with 0 a contact without friction is elastic.
+    every : int
+        The surrogate is evaluated in every ``every``-th step; the steps between follow the stiffness of the contact (``_extrapolate``).
+
+    Attributes
+    ----------
+    model, data : MjModel, MjData
+    sensors : dict of str to SensorSpec
+
+    Raises
+    ------
+    OptionError
+        There is no such site or geom, a geom can't be touched, or the integrator is RK4.
+    SurrogateError
+        A sensor has no surrogate.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        sensors: Mapping[str, str | SensorSpec],
+        *,
+        touchable: Sequence[str] | None = None,
+        data: mujoco.MjData | None = None,
+        loss_s_per_m: float = LOSS_S_PER_M,
+        every: int = 1,
+    ) -> None:
+        if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            raise OptionError("integrator RK4 computes forces between two steps; choose Euler, implicit or implicitfast")
+        if every < 1:
+            raise OptionError(f"`every={every}`: expected at least 1")
+        self.model, self.data = model, mujoco.MjData(model) if data is None else data
+        self._loss, self._every = loss_s_per_m, every
+        self.sensors = {site: load_sensor(each) if isinstance(each, str) else each for site, each in sensors.items()}
+        self._site = np.array([_named(model, mujoco.mjtObj.mjOBJ_SITE, site) for site in self.sensors], int)
+        self._body = model.site_bodyid[self._site]
+        geoms = _touchable(model) if touchable is None else [_named(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in touchable]
+        of = [solid_of(model, geom) for geom in geoms]
+        self._geom = np.array(geoms, int)
+        self._solid, self._pose = [each for each, _ in of], np.array([pose for _, pose in of]).reshape(-1, 4, 4)
+        self._kind = np.array([each.kind for each in self._solid], np.int64)
+        self._sizes = np.zeros((len(of), 4))
+        for row, each in enumerate(self._solid):
+            self._sizes[row, : len(each.sizes)] = each.sizes
+        fixed = np.where(model.body_weldid > 0, model.body_weldid, -np.arange(model.nbody))  # bodies of the world are no parts of a sensor
+        self._own = fixed[model.geom_bodyid[self._geom]][None] == fixed[self._body][:, None]
+        specs = list(dict.fromkeys(self.sensors.values()))
+        self._set = np.array([specs.index(each) for each in self.sensors.values()], int)  # of each sensor: number of its contacts
+        self._row = np.array([int((self._set[:place] == number).sum()) for place, number in enumerate(self._set)], int)  # row in them
+        self._contacts = [SurrogateContacts(surrogate_of(each), each, int((self._set == k).sum())) for k, each in enumerate(specs)]
+        self._radius = np.array([self._contacts[number].radius_mm for number in self._set])
+        self._views: dict[tuple[str, Form, Pictures], SensorView] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all contacts, and the forces that acted in the last step. The state in ``data`` stays."""
+        count = len(self._site)
+        self._steps = 0
+        self._at = np.full(count, -1)  # the solid that each sensor touches
+        self._gap = np.full((count, len(self._geom)), np.inf)
+        self._friction, self._lost = np.zeros(count), np.zeros(count, bool)
+        self._wrench = np.zeros((count, 6))  # N, N mm, sensor frame, on the geom
+        self._solved, self._solved_T = np.zeros((count, 7)), np.zeros((count, 4, 4))  # wrench, depth, and pose of the newest evaluation
+        self._applied = np.zeros_like(self.data.xfrc_applied)
+        for contacts in self._contacts:
+            for row in range(len(contacts.felt.lost)):
+                contacts.rest(row)
+
+    def step(self, count: int = 1) -> None:
+        """Step the model; the skins' forces are those at the beginning of each step."""
+        for _ in range(count):
+            mujoco.mj_step1(self.model, self.data)
+            self.apply()
+            mujoco.mj_step2(self.model, self.data)
+
+    def apply(self) -> None:
+        """Compute the contacts at the poses in ``data``, and set their forces in ``data.xfrc_applied``, beside those of others there.
+
+        For an own loop: ``mj_step1``, ``apply``, ``mj_step2``.
+        """
+        data = self.data
+        turn, place = data.site_xmat[self._site].reshape(-1, 3, 3), MM * data.site_xpos[self._site]
+        held = data.geom_xmat[self._geom].reshape(-1, 3, 3)
+        solid_turn, solid_place = held @ self._pose[:, :3, :3], MM * data.geom_xpos[self._geom] + (held @ self._pose[:, :3, 3:])[..., 0]
+        normal, before = np.zeros((*self._gap.shape, 3)), self._gap.copy()
+        _gaps(place, turn, solid_place, solid_turn, self._kind, self._sizes, self._own, self._radius, self._gap, normal)
+        begun = [sensor for sensor in range(len(self._site)) if self._choose(sensor)]
+        T = _relative(place, turn, solid_place, solid_turn, self._at)
+        due = self._at >= 0
+        if self._steps % self._every:
+            due &= np.isin(np.arange(len(due)), begun)
+        for number, contacts in enumerate(self._contacts):
+            mine = np.flatnonzero(due & (self._set == number))
+            if len(mine):
+                rows, felt = self._row[mine], contacts.felt
+                contacts.move(rows, T[mine], np.full(len(mine), data.time))
+                self._lost[mine] = [bool(felt.lost[row]) for row in rows]
+                seen = mine[~self._lost[mine]]
+                depth = -self._gap[seen, self._at[seen]]
+                self._solved[seen] = np.column_stack([felt.force_n[self._row[seen]], felt.torque_nmm[self._row[seen]], depth])
+                self._solved_T[seen] = T[seen]
+        self._steps += 1
+        loss = self._loss / MM / self.model.opt.timestep
+        _wrenches(
+            turn, T, self._at, self._gap, before, normal, self._radius, self._friction, self._lost, self._solved, self._solved_T, loss,
+            self._wrench,
+        )  # fmt: skip
+        bodies = np.stack([self.model.geom_bodyid[self._geom[self._at]], self._body], axis=1)
+        applied = np.zeros_like(self._applied)
+        _push(place, turn, self._wrench, bodies, data.xipos, applied)
+        data.xfrc_applied += applied - self._applied
+        self._applied = applied
+
+    def _choose(self, sensor: int) -> bool:
+        """Choose the solid that a sensor touches, and return whether a contact with it begins."""
+        gap, at = self._gap[sensor], self._at[sensor]
+        if at >= 0 and gap[at] <= 0 or not len(gap):
+            return False
+        nearest, contacts, row = int(gap.argmin()), self._contacts[self._set[sensor]], int(self._row[sensor])
+        if gap[nearest] > NEAR_MM:
+            if at >= 0:
+                contacts.rest(row)
+                self._at[sensor] = -1
+            return False
+        if nearest == at:
+            return False
+        friction = float(self.model.geom_friction[self._geom[nearest], 0])
+        self._friction[sensor] = min(friction, contacts.domain["friction"])
+        contacts.begin_solid(row, self._solid[nearest], self._friction[sensor])
+        self._at[sensor], self._solved[sensor] = nearest, 0.0
+        return True
+
+    def read(self, site: str) -> TactileReading:
+        """The contact of a sensor at the beginning of the last step."""
+        sensor = self._number(site)
+        contacts, row, at, gap = self._contacts[self._set[sensor]], int(self._row[sensor]), int(self._at[sensor]), self._gap[sensor]
+        felt, spec = contacts.felt, self.sensors[site]
+        inside = np.flatnonzero(gap < 0)
+        return TactileReading(
+            self._name(at) if at >= 0 and gap[at] < 0 else "",
+            self._wrench[sensor, :3].copy(),
+            self._wrench[sensor, 3:].copy(),
+            felt.caps_mm[row].copy(),
+            caps_px(spec, self.form(site), felt.caps_mm[row]),
+            max(float(-gap[at]), 0.0) if at >= 0 else 0.0,
+            float(felt.area_mm2[row]),
+            float(felt.slip[row]),
+            felt.lost[row],
+            tuple(self._name(each) for each in inside.tolist() if each != at),
+        )
+
+    def form(self, site: str) -> Form:
+        """Form of a sensor's frames: that of its recordings, or raw frames of the camera."""
+        return Form.PROCESSED if self.sensors[site].recording else Form.RAW
+
+    def frame(self, site: str, *, pictures: Pictures = "preview", seed: int = 0) -> Frame:
+        """The sensor's frame: rasterised (``preview``) or path-traced (``traced``)."""
+        return self._view(site, pictures).paint(self.pins(site), np.random.default_rng(seed))
+
+    def pins(self, site: str) -> PinState:
+        """Feet, axes and caps of the sensor's pins."""
+        sensor = self._number(site)
+        return self._contacts[self._set[sensor]].attitude(int(self._row[sensor]))
+
+    def pipeline(self, site: str, *, pictures: Pictures = "preview") -> Pipeline:
+        """The pipeline for a sensor's frames, with the pins at rest from a frame without contact."""
+        return self._view(site, pictures).pipeline
+
+    def observe(self, site: str, *, pictures: Pictures = "preview", seed: int = 0) -> Observation:
+        """The pins that the real pipeline finds in the sensor's frame."""
+        return self.pipeline(site, pictures=pictures)(self.frame(site, pictures=pictures, seed=seed))
+
+    def _view(self, site: str, pictures: Pictures) -> SensorView:
+        key = site, self.form(site), pictures
+        if key not in self._views:
+            self._views[key] = SensorView(self.sensors[site], key[1], pictures)
+        return self._views[key]
+
+    def _number(self, site: str) -> int:
+        if site not in self.sensors:
+            raise OptionError(f"there is no sensor {site!r}; sensors are {', '.join(self.sensors)}")
+        return list(self.sensors).index(site)
+
+    def _name(self, geom: int) -> str:
+        return self.model.geom(int(self._geom[geom])).name or str(self._geom[geom])
+
+
+def _named(model: mujoco.MjModel, kind: Any, name: str) -> int:
+    number = mujoco.mj_name2id(model, kind, name)
+    if number < 0:
+        what = mujoco.mju_type2Str(kind)
+        raise OptionError(f"the model has no {what} {name!r}")
+    return int(number)
+
+
+def _touchable(model: mujoco.MjModel) -> list[int]:
+    """The geoms that collide with others."""
+    return np.flatnonzero(model.geom_contype | model.geom_conaffinity).tolist()
+
+
+@compiled()
+def _gaps(
+    place: FloatArray,
+    turn: FloatArray,
+    solid_place: FloatArray,
+    solid_turn: FloatArray,
+    kind: IntArray,
+    sizes: FloatArray,
+    own: FloatArray,
+    radius: FloatArray,
+    gap: FloatArray,
+    normal: FloatArray,
+) -> None:
+    """Write the distances (S, G) of solids from domes, and the solids' outward normals (S, G, 3) there, world frame.
+
+    Sensors (S, 3), (S, 3, 3) and solids (G, 3), (G, 3, 3) are given by place and axes. A solid behind the dome is infinitely far.
+    """
+    point = np.empty((1, 3))
+    for g in range(len(kind)):
+        for s in range(len(place)):
+            if own[s, g]:
+                continue
+            for axis in range(3):
+                point[0, axis] = (solid_turn[g, :, axis] * (place[s] - solid_place[g])).sum()
+            away, outward = distances_to(point, kind[g], sizes[g])
+            ahead = 0.0
+            for axis in range(3):
+                normal[s, g, axis] = (solid_turn[g, axis] * outward[0]).sum()
+                ahead -= normal[s, g, axis] * turn[s, axis, 2]
+            gap[s, g] = away[0] - radius[s] if ahead > 0 else np.inf
+
+
+@compiled()
+def _relative(place: FloatArray, turn: FloatArray, solid_place: FloatArray, solid_turn: FloatArray, at: IntArray) -> FloatArray:
+    """Poses (S, 4, 4) of each sensor's solid in its frame; zero where ``at`` is -1."""
+    T = np.zeros((len(at), 4, 4))
+    for s in range(len(at)):
+        if at[s] < 0:
+            continue
+        T[s, 3, 3] = 1.0
+        for i in range(3):
+            T[s, i, 3] = (turn[s, :, i] * (solid_place[at[s]] - place[s])).sum()
+            for j in range(3):
+                T[s, i, j] = (turn[s, :, i] * solid_turn[at[s], :, j]).sum()
+    return T
+
+
+@compiled()
+def _wrenches(
+    turn: FloatArray,
+    T: FloatArray,
+    at: IntArray,
+    gap: FloatArray,
+    before: FloatArray,
+    normal: FloatArray,
+    radius: FloatArray,
+    friction: FloatArray,
+    lost: FloatArray,
+    solved: FloatArray,
+    solved_T: FloatArray,
+    loss: float,
+    wrench: FloatArray,
+) -> None:
+    """Write the wrenches (S, 6) at poses ``T`` (S, 4, 4) from those at the poses ``solved_T`` of the newest evaluation.
+
+    Between them the contact is a spring at its point: along the normal with the stiffness 3 F / 2 d of a ball (Hertz) under the force F at
+    the depth d, and across it with ``SHEAR`` times this stiffness, up to Coulomb's bound.
+    """
+    u, point, moved, force = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for s in range(len(at)):
+        wrench[s] = 0.0
+        if at[s] < 0:
+            continue
+        depth, last = -gap[s, at[s]], solved[s, 6]
+        faster = depth + before[s, at[s]] if before[s, at[s]] <= NEAR_MM else 0.0  # mm in this step; none after a jump
+        for i in range(3):
+            u[i] = -(turn[s, :, i] * normal[s, at[s]]).sum()
+        pressed = (solved[s, :3] * u).sum()
+        if lost[s]:
+            wrench[s, :3] = u * (pressed + STOP_N_PER_MM * max(depth - last, 0.0)) * (STOP_RETURNS if faster < 0 else 1.0)
+            continue
+        for i in range(3):
+            point[i] = u[i] * (radius[s] - depth)
+        for i in range(3):
+            moved[i] = T[s, i, 3] - point[i]
+            for j in range(3):
+                moved[i] += T[s, i, j] * (solved_T[s, :3, j] * (point - solved_T[s, :3, 3])).sum()
+        stiff = 1.5 * max(pressed, 0.0) / max(last, LEAST_DEPTH_MM)
+        along = (moved * u).sum()
+        now = max(pressed - stiff * along, 0.0)
+        before_n = np.sqrt(((solved[s, :3] - pressed * u) ** 2).sum())
+        force[:] = solved[s, :3] - pressed * u - SHEAR * stiff * (moved - along * u)
+        size, most = np.sqrt((force**2).sum()), max(friction[s] * now, before_n * min(now / max(pressed, 1e-9), 1.0))
+        force *= most / size if size > most else 1.0
+        force += now * u
+        change = force - solved[s, :3]
+        growth = min(max(1.0 + loss * faster, 0.0), MOST_GROWTH)
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            wrench[s, i] = growth * force[i]
+            wrench[s, 3 + i] = growth * (solved[s, 3 + i] + point[j] * change[k] - point[k] * change[j])
+
+
+@compiled()
+def _push(place: FloatArray, turn: FloatArray, wrench: FloatArray, bodies: IntArray, middle: FloatArray, applied: FloatArray) -> None:
+    """Add the wrenches on solids and sensors to the forces (N) and torques (N m) on ``bodies`` (S, 2) at their centres of mass."""
+    force, torque, lever = np.empty(3), np.empty(3), np.empty(3)
+    for s in range(len(wrench)):
+        if not wrench[s].any():
+            continue
+        for i in range(3):
+            force[i], torque[i] = (turn[s, i] * wrench[s, :3]).sum(), (turn[s, i] * wrench[s, 3:]).sum()
+        for side in range(2):
+            body, sign = bodies[s, side], 1.0 - 2.0 * side
+            lever[:] = place[s] - MM * middle[body]
+            for i in range(3):
+                j, k = (i + 1) % 3, (i + 2) % 3
+                applied[body, i] += sign * force[i]
+                applied[body, 3 + i] += sign * (torque[i] + lever[j] * force[k] - lever[k] * force[j]) / MM

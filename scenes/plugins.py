@@ -1,7 +1,8 @@
 """Parts of other packages, which offer them by entry points ``tactip_twin.KIND``.
 
 A sensor, object, experiment, randomisation, servo or limits is the path of a TOML file. An arm is a function of the text after the colon in
-``NAME:REST``, and a camera a function of this text, the sensor and the form. A layout, material, condition, model or task is the object
+``NAME:REST``, and a camera a function of this text, the sensor and the form. A world, in which an arm carries a sensor, is a function of
+this text, the sensor and its pose on the tool (``hardware.cameras.twin.World``). A layout, material, condition, model or task is the object
 itself. A part that raises, that is of another kind or that has the name of another one is left out, and a warning names it.
 """
 
@@ -19,7 +20,7 @@ from typing import Any
 
 KINDS = (
     *("sensors", "objects", "experiments", "randomisations", "servos", "limits"),
-    *("layouts", "materials", "arms", "cameras", "conditions", "models", "tasks"),
+    *("layouts", "materials", "arms", "cameras", "worlds", "conditions", "models", "tasks"),
 )
 _found: dict[str, dict[str, Any]] = {}  # the parts of each kind, by name
 _judged: dict[EntryPoint, str] = {}  # of each entry point that was looked at: why its part is left out, "" if it is not
@@ -97,7 +98,7 @@ def plugin_lines() -> list[str]:
     """A line for each part that another package offers: its kind, name and package, and why it is left out if it is."""
     lines = []
     for kind in KINDS:
-        for entry in _entries(kind):
+        for entry in (each for each in _entries(kind) if not (each.dist and each.dist.name == "tactip-twin")):
             why = _judged[entry] if entry in _judged else _load_part(entry)[1]
             lines.append(f"{kind}: {entry.name} of {_package(entry)}{f'; LEFT OUT: {why}' if why else ''}")
     return lines

@@ -16,6 +16,7 @@ your sensor     new_sensor check calibrate_optics calibrate_contact
 how true it is  validate realism robustness audit
 models          make_dataset train evaluate predict load_model
 policies        register_environments BaselinesVecEnv demonstrate learn
+robot scenes    TactileScene attach_sensor load_scene write_urdf
 devices         open_camera open_arm SafeArm load_limits collect servo run_policy
 other           errors extend __version__
 
@@ -40,6 +41,8 @@ _PLACES = {
     "Pipeline": "twin.pins.pipeline",
     "SafeArm": "hardware.safety.safe_arm",
     "Simulator": "twin.simulator",
+    "TactileScene": "training.mujoco.scene",
+    "attach_sensor": "training.mujoco.model",
     "audit": "twin.cli.calibration",
     "calibrate_contact": "twin.cli.calibration",
     "calibrate_optics": "twin.cli.calibration",
@@ -53,6 +56,7 @@ _PLACES = {
     "load_model": "training.estimate.loading:load_with_history",
     "load_object": "scenes",
     "load_sensor": "scenes",
+    "load_scene": "training.mujoco.model",
     "make_dataset": "twin.cli.learning",
     "new_sensor": "twin.cli.calibration",
     "node_features": "twin.pins.graph",
@@ -68,6 +72,7 @@ _PLACES = {
     "train": "twin.cli.learning",
     "tune": "twin.cli.frames",
     "validate": "twin.cli.calibration",
+    "write_urdf": "training.mujoco.model",
 }
 """By public name: its module, and its name there if that is another."""
 _MODULES = ("errors", "extend")

@@ -24,6 +24,10 @@ from training.environments.demonstrations import Demonstrations as Demonstration
 from training.environments.learn import Learnt as Learnt
 from training.estimate.loading import load_with_history as load_with_history
 from training.generation.run import Simulated as Simulated
+from training.mujoco.model import attach_sensor as attach_sensor
+from training.mujoco.model import load_scene as load_scene
+from training.mujoco.model import write_urdf as write_urdf
+from training.mujoco.scene import TactileScene as TactileScene
 from training.studies.degradation import DegradationResult as DegradationResult
 from training.studies.evaluation import Evaluation as Evaluation
 from training.studies.label_audit import LabelAudit as LabelAudit

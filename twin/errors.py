@@ -61,6 +61,7 @@ EXTRAS = {
     "gymnasium": "gym",
     "mcap": "records",
     "mcap_ros2": "records",
+    "mujoco": "mujoco",
     "pyarrow": "records",
     "rerun": "rerun",
     "stable_baselines3": "rl",

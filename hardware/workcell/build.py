@@ -22,6 +22,7 @@ from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 from scenes import ObjectSpec, PlacementSpec, SensorSpec
 from scenes.experiment import ExperimentSpec
+from scenes.plugins import offered, others
 from twin.errors import FrameError, RenderError
 from twin.estimate import SensorModel
 from twin.frames import open_recording
@@ -32,8 +33,6 @@ from twin.types import FIRST, NONE, Form, Frame
 
 # Value of ``camera`` that selects the twin.
 TWIN = "twin"
-# Beginning of a value of ``camera`` that selects a MuJoCo scene, by its name or file.
-SCENE = "mujoco:"
 # Longest wait in s for a real camera's frame while the arm stands still.
 FRAME_S = 5.0
 # Longest wait in s for a frame of the twin while the arm stands still. The twin may take longer to draw a frame than a camera.
@@ -130,7 +129,7 @@ def build_rig(
     Parameters
     ----------
     camera : str
-        As for ``open_camera``, or ``mujoco:SCENE``: a MuJoCo scene in the arm's base frame.
+        As for ``open_camera``, or ``WORLD:REST``, such as ``mujoco:SCENE``: a scene in the arm's base frame (see ``scenes.plugins``).
     arm : str
         As for ``open_arm``.
     form : Form, optional
@@ -147,21 +146,17 @@ def build_rig(
     placed = PlacedObject(obj, placement, Mounting.of(sensor, experiment))
     device: Arm = open_arm(arm)
     simulated = kind_of(arm) == "simulated"  # by its name: an arm of another package is guarded, whatever class it has
-    in_scene = camera.startswith(SCENE)
+    kind, _, rest = camera.partition(":")
+    world = others("worlds")[kind](rest, sensor, placed.mounting.T_tool_sensor) if kind in offered("worlds") else None
     if isinstance(device, SimulatedArm) and camera == TWIN and at_once:
         device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
     if not simulated or limits is not None:
         device = SafeArm(device, load_limits(limits or kind_of(arm)))
     twin = None
-    if camera == TWIN or in_scene:
-        world = None
-        if in_scene:
-            from hardware.rig.scene import CarriedSensor
-
-            world = CarriedSensor.of(camera.removeprefix(SCENE), sensor, placed.mounting.T_tool_sensor)
+    if camera == TWIN or world is not None:
         preview = draw_window(sensor, form, plain_light)
         twin = TwinCamera(sensor, placed, device.state, form, seed=seed, preview=preview, on_demand=at_once, world=world)
-    return Rig(open_camera(TWIN if in_scene else camera, sensor, form, twin=twin), device, placed, camera == TWIN)
+    return Rig(open_camera(camera if twin is None else TWIN, sensor, form, twin=twin), device, placed, camera == TWIN)
 
 
 def twin_camera(sensor: SensorSpec, placed: PlacedObject, pose: PoseSource, form: Form, *, fps: float, plain_light: bool) -> TwinCamera:

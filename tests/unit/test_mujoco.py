@@ -2,9 +2,11 @@
 
 from xml.etree import ElementTree
 
+import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 from scenes import load_object, load_sensor
 from training.mujoco import TactileScene
@@ -210,3 +212,37 @@ def test_frames_of_the_scene_go_through_the_pipeline():
     moved = seen.pins_px - scene.pipeline("tip").reference.pins_px
     assert np.nanmax(np.linalg.norm(moved, axis=1)) > 2
     assert np.nanmean(np.linalg.norm(seen.pins_px - scene.read("tip").pins_px, axis=1)) < 1.0
+
+
+def hold(env, grip_n):
+    """Actions that grip with a force, lift, hold and set down."""
+    force, hand = env.grip_n(), env.goal_mm - env.hand_mm
+    if env.part == 2 and env.height_mm() < 0.5:
+        return np.array([-1.0, 0.0])
+    ready = force > 0.9 * grip_n
+    return np.clip([1.2 * (grip_n - force), ready * hand / 4], [-1, -0.5], [1, 0.5])
+
+
+def play(env, seed, grip_n):
+    """Whether an episode is solved with a grip that may depend on what the object needs."""
+    env.reset(seed=seed)
+    while True:
+        *_, failed, late, info = env.step(hold(env, grip_n(env)))
+        if failed or late:
+            return info["is_success"]
+
+
+def test_a_lift_needs_the_right_grip_for_each_object():
+    env = gymnasium.make("tactip/GraspLift-v0", observation="wrench").unwrapped
+    assert all(play(env, seed, lambda env: 1.35 * env.least_n) for seed in range(3))
+    assert sum(play(env, seed, lambda env: 1.2) for seed in range(3)) < 3
+
+
+def test_a_lift_is_repeated_exactly_by_its_seed_and_is_an_environment_for_gymnasium():
+    env = gymnasium.make("tactip/GraspLift-v0").unwrapped
+    seen = []
+    for _ in range(2):
+        env.reset(seed=5)
+        seen.append([env.step(np.array([1.0, 0.2]))[0]["tactile"] for _ in range(12)][-1])
+    assert np.array_equal(*seen) and seen[0].any() and seen[0].shape == (2, 331, 2)
+    check_env(env, skip_render_check=True)

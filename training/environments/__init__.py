@@ -21,6 +21,8 @@ NAMESPACE = "tactip"
 VERSION = 0
 OWN = ("EdgeFollow", "SurfaceFollow", "ContourFollow", "GentlePress", "ObjectRoll", "ObjectPush")
 """Names of this package's tasks."""
+IN_SCENES = {"GraspLift": "training.mujoco.grasp:GraspLift"}
+"""By name: the environments in MuJoCo scenes (extra ``mujoco``)."""
 _PLACES = {
     "Options": "training.environments.batch",
     "TactileEnv": "training.environments.environment",
@@ -30,13 +32,16 @@ _PLACES = {
 
 
 def ids() -> tuple[str, ...]:
-    """The ids of all environments."""
+    """The ids of the environments whose sensor touches one object, without a robot scene."""
     return tuple(f"{NAMESPACE}/{name}-v{VERSION}" for name in dict.fromkeys((*OWN, *offered("tasks"))))
 
 
 def register_all() -> None:
     """Register the environments; a second call has no effect. Some versions of gymnasium call it where the package is installed."""
     where = "training.environments.environment"
+    for name, place in IN_SCENES.items():
+        if (full := f"{NAMESPACE}/{name}-v{VERSION}") not in registry:
+            register(id=full, entry_point=place)
     for full in ids():
         if full not in registry:
             task = full.removeprefix(f"{NAMESPACE}/").removesuffix(f"-v{VERSION}")

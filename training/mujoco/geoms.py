@@ -28,7 +28,7 @@ def _refuse(name: str, reason: str) -> OptionError:
     return OptionError(f"geom {name}: {reason}; leave it out by `touchable`, or replace it by a plane, ball, capsule, cylinder or box")
 
 
-def _curved(name: str, radius_mm: float) -> float:
+def _require_curvature(name: str, radius_mm: float) -> float:
     if radius_mm < LEAST_MM:
         raise _refuse(name, f"a radius of curvature of {radius_mm:.2g} mm is too small for the surrogate (at least {LEAST_MM:g} mm)")
     return radius_mm
@@ -41,18 +41,18 @@ def _box(name: str, size: FloatArray) -> CompiledSolid:
 
 def _cylinder(name: str, size: FloatArray) -> CompiledSolid:
     fillet = min(FILLET_MM, size[1])
-    return Drum(_curved(name, size[0]) - fillet, size[1] - fillet, fillet)
+    return Drum(_require_curvature(name, size[0]) - fillet, size[1] - fillet, fillet)
 
 
 def _ellipsoid(name: str, size: FloatArray) -> CompiledSolid:
-    _curved(name, size.min() ** 2 / size.max())
+    _require_curvature(name, size.min() ** 2 / size.max())
     return Ellipsoid(*size.tolist())
 
 
 _KINDS: dict[int, Callable[[str, FloatArray], CompiledSolid]] = {
     mujoco.mjtGeom.mjGEOM_PLANE: lambda name, size: Plane(),
-    mujoco.mjtGeom.mjGEOM_SPHERE: lambda name, size: SweptBox(0.0, 0.0, 0.0, _curved(name, size[0])),
-    mujoco.mjtGeom.mjGEOM_CAPSULE: lambda name, size: SweptBox(0.0, 0.0, size[1], _curved(name, size[0])),
+    mujoco.mjtGeom.mjGEOM_SPHERE: lambda name, size: SweptBox(0.0, 0.0, 0.0, _require_curvature(name, size[0])),
+    mujoco.mjtGeom.mjGEOM_CAPSULE: lambda name, size: SweptBox(0.0, 0.0, size[1], _require_curvature(name, size[0])),
     mujoco.mjtGeom.mjGEOM_CYLINDER: _cylinder,
     mujoco.mjtGeom.mjGEOM_BOX: _box,
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: _ellipsoid,
@@ -90,7 +90,7 @@ def _of_mesh(model: mujoco.MjModel, geom: int, name: str) -> Solid:
     tried: list[tuple[Callable[[], CompiledSolid], FloatArray]] = [
         (lambda: _box(name, box.extents / 2), np.asarray(box.transform)),
         (lambda: _cylinder(name, np.array([drum.radius, drum.height / 2])), np.asarray(drum.transform)),
-        (lambda: SweptBox(0.0, 0.0, 0.0, _curved(name, ball.radius)), trimesh.transformations.translation_matrix(ball.center)),
+        (lambda: SweptBox(0.0, 0.0, 0.0, _require_curvature(name, ball.radius)), trimesh.transformations.translation_matrix(ball.center)),
     ]
     found = []
     for make, pose in tried:

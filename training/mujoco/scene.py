@@ -120,9 +120,9 @@ class TactileScene:
         self.model, self.data = model, mujoco.MjData(model) if data is None else data
         self._loss, self._every = loss_s_per_m, every
         self.sensors = {site: load_sensor(each) if isinstance(each, str) else each for site, each in sensors.items()}
-        self._site = np.array([_named(model, mujoco.mjtObj.mjOBJ_SITE, site) for site in self.sensors], int)
+        self._site = np.array([_number_of(model, mujoco.mjtObj.mjOBJ_SITE, site) for site in self.sensors], int)
         self._body = model.site_bodyid[self._site]
-        geoms = _touchable(model) if touchable is None else [_named(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in touchable]
+        geoms = _touchable(model) if touchable is None else [_number_of(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in touchable]
         of = [solid_of(model, geom) for geom in geoms]
         self._geom = np.array(geoms, int)
         self._solid, self._pose = [each for each, _ in of], np.array([pose for _, pose in of]).reshape(-1, 4, 4)
@@ -273,7 +273,7 @@ class TactileScene:
         return self.model.geom(int(self._geom[geom])).name or str(self._geom[geom])
 
 
-def _named(model: mujoco.MjModel, kind: Any, name: str) -> int:
+def _number_of(model: mujoco.MjModel, kind: Any, name: str) -> int:
     number = mujoco.mj_name2id(model, kind, name)
     if number < 0:
         what = mujoco.mju_type2Str(kind)

@@ -1,4 +1,4 @@
-"""Distance and outward normal of the solids that the contact at the nodes takes: those of ``twin.objects``, and closed ones of robot scenes.
+"""Distance and outward normal of the solids of a contact at the nodes: those of ``twin.objects``, and closed ones of robot scenes.
 
 A closed solid has its origin at its centre. A swept box (Minkowski sum of a box and a ball) is a box with rounded edges, a capsule or a
 ball. The distance of an ellipsoid follows from its nearest point x, with x_i = a_i^2 p_i / (t + a_i^2) and sum (x_i / a_i)^2 = 1; Newton's

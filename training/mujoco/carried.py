@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from hardware.rig.geometry import matrix_of
 from scenes.sensor import SensorSpec
 from training.mujoco.geoms import MM
 from training.mujoco.model import scene_file
@@ -19,7 +18,7 @@ from twin.errors import ContactError
 from twin.types import PinState
 
 CARRIED = "carried_tactip"
-LONGEST_S = 0.5
+LONGEST_S = 0.2
 """Most time that passes in the scene between two poses. If the arm needs more, the objects stand still for the rest of it."""
 
 
@@ -37,13 +36,6 @@ class CarriedSensor:
     T_tool_sensor: np.ndarray
     _last: tuple[np.ndarray, float] | None = None  # pose of the sensor (4, 4), and time
 
-    @classmethod
-    def of(cls, scene: str, sensor: SensorSpec, T_tool_sensor: np.ndarray) -> "CarriedSensor":
-        """In a scene's file, or in a scene of this package; see ``load_scene`` for the errors."""
-        spec = mujoco.MjSpec.from_file(str(scene_file(scene)))
-        spec.worldbody.add_body(name=CARRIED, mocap=True).add_site(name=CARRIED)
-        return cls(TactileScene(spec.compile(), {CARRIED: sensor}), T_tool_sensor)
-
     def warm_up(self) -> None:
         """Compile what a step needs."""
         self.scene.apply()
@@ -56,7 +48,9 @@ class CarriedSensor:
         ContactError
             The contact can't be computed.
         """
-        T, data, dt = matrix_of(pose) @ self.T_tool_sensor, self.scene.data, self.scene.model.opt.timestep
+        T, data, dt = np.eye(4), self.scene.data, self.scene.model.opt.timestep
+        T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", pose[3:], degrees=True).as_matrix(), pose[:3]
+        T = T @ self.T_tool_sensor
         before, before_s = self._last or (T, time_s)
         steps = max(round(min(time_s - before_s, LONGEST_S) / dt), 1)
         turns = Slerp([0.0, 1.0], Rotation.from_matrix([before[:3, :3], T[:3, :3]]))
@@ -68,3 +62,10 @@ class CarriedSensor:
         if lost := self.scene.read(CARRIED).lost:
             raise ContactError(lost)
         return self.scene.pins(CARRIED)
+
+
+def open_world(scene: str, sensor: SensorSpec, T_tool_sensor: np.ndarray) -> CarriedSensor:
+    """A sensor in a scene's file, or in a scene of this package; see ``scene_file`` for the error."""
+    spec = mujoco.MjSpec.from_file(str(scene_file(scene)))
+    spec.worldbody.add_body(name=CARRIED, mocap=True).add_site(name=CARRIED)
+    return CarriedSensor(TactileScene(spec.compile(), {CARRIED: sensor}), T_tool_sensor)

@@ -24,7 +24,7 @@ WORLD = """
 PUSH_FROM_S, PUSH_N = 1.0, 0.3  # sideways
 
 scene = twin.TactileScene(mujoco.MjModel.from_xml_string(WORLD), {"tip": "mg400-331"})
-for half in range(6):
+for _ in range(6):
     for _ in range(250):
         scene.data.qfrc_applied[1] = PUSH_N * (scene.data.time > PUSH_FROM_S)
         scene.step()

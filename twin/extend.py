@@ -1,7 +1,7 @@
 """What authors of new parts need: protocols and base classes of layouts, materials, arms, cameras, models, tasks, degradations, detectors.
 
 arms          Arm ArmState BaseArm FEEDBACK_AGE_S MG400 Mg400Ports Mg400Emulator
-cameras       FrameSource LiveSource DevicePicture ReadFailed capture
+cameras       FrameSource LiveSource DevicePicture ReadFailed capture World
 devices       DeviceError Connection
 models        Estimate SensorModel Model PinModel Recipe register_model refuse_sizes
 tasks         Task Start StepOutcome WorldState standing_on
@@ -58,6 +58,7 @@ _PLACES = {
     "StepOutcome": "training.environments.tasks",
     "Task": "training.environments.tasks",
     "TaskContract": "twin.contracts",
+    "World": "hardware.cameras.twin",
     "WorldState": "training.environments.tasks",
     "capture": "hardware.cameras.reader",
     "over_channels": "twin.evaluation.degradation.condition",

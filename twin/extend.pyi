@@ -11,6 +11,7 @@ from hardware.cameras.reader import LiveSource as LiveSource
 from hardware.cameras.reader import ReadFailed as ReadFailed
 from hardware.cameras.reader import capture as capture
 from hardware.cameras.source import FrameSource as FrameSource
+from hardware.cameras.twin import World as World
 from hardware.emulators.mg400 import Mg400Emulator as Mg400Emulator
 from hardware.errors import Connection as Connection
 from hardware.errors import DeviceError as DeviceError

@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from scenes import load_object, load_sensor
+from hardware.rig.geometry import PlacedObject
+from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from training.mujoco import TactileScene
+from training.mujoco.carried import CARRIED, open_world
 from training.mujoco.geoms import FILLET_MM, solid_of
 from training.mujoco.model import attach_sensor, load_scene, sensor_part, write_urdf
 from training.surrogate.solids import Drum, Ellipsoid, SweptBox, distances_to
-from twin.errors import OptionError
+from twin.errors import ContactError, OptionError
+from twin.geometry.pins import rest_pins
 from twin.mechanics.path import ContactPose
+from twin.rig.mounting import Mounting
 from twin.simulator import Simulator
 from twin.types import Form
 
@@ -246,3 +250,19 @@ def test_a_lift_is_repeated_exactly_by_its_seed_and_is_an_environment_for_gymnas
         seen.append([env.step(np.array([1.0, 0.2]))[0]["tactile"] for _ in range(12)][-1])
     assert np.array_equal(*seen) and seen[0].any() and seen[0].shape == (2, 331, 2)
     check_env(env, skip_render_check=True)
+
+
+def test_an_arm_carries_a_sensor_through_a_scene_as_through_the_twin():
+    """The scene 'following' is the can before which the servo places the sensor: the depths are those of the twin."""
+    sensor = load_sensor(SENSOR)
+    placed = PlacedObject(load_object("can"), PlacementSpec(), Mounting.of(sensor, load_experiment("surface-2d")))
+    world = open_world("following", sensor, placed.mounting.T_tool_sensor)
+    for k, indent_mm in enumerate(np.linspace(-1.0, 2.5, 8)):
+        pins = world.move(placed.start_pose(indent_mm), 0.1 * k)
+        assert world.scene.read(CARRIED).depth_mm == pytest.approx(max(indent_mm, 0), abs=0.02)
+    rest = rest_pins(sensor.geometry)
+    assert 0.5 < np.linalg.norm(pins.caps_mm - rest.caps_mm, axis=1).max() < 3
+    with pytest.raises(ContactError, match=r"at most 5\.5"):
+        world.move(placed.start_pose(6.5), 1.0)
+    with pytest.raises(OptionError, match="no such scene; give a file of MJCF, or following, gripper"):
+        open_world("elsewhere", sensor, np.eye(4))

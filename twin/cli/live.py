@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 # Sensor whose trained weights are shipped with the package.
 SHIPPED_MODEL = Path("mg400-331")
 Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights are shipped")]
-Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
+Camera = Annotated[
+    str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder, a video or mujoco:SCENE")
+]
 Steps = Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")]
 Record = Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")]
 NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")]

@@ -36,7 +36,8 @@ def _require_curvature(name: str, radius_mm: float) -> float:
 
 def _box(name: str, size: FloatArray) -> CompiledSolid:
     fillet = min(FILLET_MM, *size)
-    return SweptBox(*(size - fillet).tolist(), fillet)
+    x, y, z = (size - fillet).tolist()
+    return SweptBox(x, y, z, fillet)
 
 
 def _cylinder(name: str, size: FloatArray) -> CompiledSolid:

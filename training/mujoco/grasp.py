@@ -4,7 +4,7 @@ The object breaks above a force that is ``CRUSH`` times the least grip that hold
 load and the beginning slip. An episode has three parts: lift the object by ``LIFT_MM``, hold it for ``HOLD_S``, and set it down.
 """
 
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, cast, get_args
 
 import gymnasium
 import mujoco
@@ -44,8 +44,6 @@ class GraspLift(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         Name or file.
     observation : {"pins", "wrench", "none"}
         Touch: displacements of both sensors' pins in spacings (2, N, 2), the wrenches on the object (2, 6) in N and 10 N mm, or nothing.
-    every : int
-        As of ``TactileScene``.
     render_mode : {None, "rgb_array"}
         ``render`` then shows the scene.
 
@@ -57,7 +55,7 @@ class GraspLift(gymnasium.Env[dict[str, FloatArray], FloatArray]):
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": round(1 / PERIOD_S)}  # type: ignore[misc]
 
-    def __init__(self, sensor: str = "mg400-331", observation: Touch = "pins", every: int = 1, render_mode: str | None = None) -> None:
+    def __init__(self, sensor: str = "mg400-331", observation: Touch = "pins", render_mode: str | None = None) -> None:
         if observation not in TOUCHES:
             raise OptionError(f"observation={observation!r}: expected one of {', '.join(TOUCHES)}")
         if render_mode not in (None, "rgb_array"):
@@ -65,17 +63,17 @@ class GraspLift(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         self.observation, self.render_mode = observation, render_mode
         spec, sensors = load_scene("gripper", load_sensor(sensor))
         self._model = spec.compile()
-        self.scene = TactileScene(self._model, sensors, touchable=["block"], every=every)
+        self.scene = TactileScene(self._model, sensors, touchable=["block"])
         self._block, self._geom = self._model.body("block").id, self._model.geom("block").id
         self._rest_px = [self.scene.read(site).pins_px for site in sensors]
         self._spacing = float(np.median(np.linalg.norm(np.diff(self._rest_px[0], axis=0), axis=1)))
         self._inertia = self._model.body_inertia[self._block] / self._model.body_mass[self._block]
         self._renderer: mujoco.Renderer | None = None
         shapes = {"pins": (2, *self._rest_px[0].shape), "wrench": (2, 6)}
-        box = {"state": spaces.Box(-10.0, 10.0, (5,), np.float32)}
+        box: dict[str, spaces.Space[Any]] = {"state": spaces.Box(-10.0, 10.0, (5,), np.float32)}
         if observation in shapes:
             box["tactile"] = spaces.Box(-10.0, 10.0, shapes[observation], np.float32)
-        self.observation_space = spaces.Dict(box)
+        self.observation_space = cast(spaces.Space[dict[str, FloatArray]], spaces.Dict(box))
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, FloatArray], dict[str, Any]]:
@@ -155,7 +153,7 @@ class GraspLift(gymnasium.Env[dict[str, FloatArray], FloatArray]):
     def _look(self) -> dict[str, FloatArray]:
         of = [self.scene.read(site) for site in self.scene.sensors]
         state = [(self._fingers - OPEN_MM) / 5.0, self.hand_mm / LIFT_MM, self.goal_mm / LIFT_MM, float(self.part), self._held * PERIOD_S]
-        seen = {"state": np.array(state, np.float32)}
+        seen: dict[str, FloatArray] = {"state": np.array(state)}
         if self.observation == "pins":
             seen["tactile"] = np.stack([each.pins_px - rest for each, rest in zip(of, self._rest_px, strict=True)]) / self._spacing
         elif self.observation == "wrench":

@@ -24,7 +24,7 @@ from training.surrogate.solids import distances_to
 from twin.compiled import compiled
 from twin.errors import OptionError
 from twin.pins import Pipeline
-from twin.types import FloatArray, Form, Frame, IntArray, Observation, PinState
+from twin.types import BoolArray, FloatArray, Form, Frame, IntArray, Observation, PinState
 
 NEAR_MM = 2.0
 """Distance between dome and geom from which the motion towards it is followed."""
@@ -32,9 +32,6 @@ STOP_N_PER_MM = 20.0
 """Stiffness with which a geom is pushed out that is deeper in the dome than the surrogate was trained for."""
 STOP_RETURNS = 0.5
 """Share of this force while the geom moves out again, so that the stop takes energy away."""
-SHEAR, LEAST_DEPTH_MM = 0.7, 0.3
-"""Stiffness of a contact across its normal relative to that along it, and the least depth by which a stiffness is computed, between two
-evaluations of the surrogate."""
 LOSS_S_PER_M = 1.0
 """Loss of skin and gel: forces grow by this factor times the speed of indentation (Hunt and Crossley 1975). It is assumed, not measured. A
 light ball at 0.2 m/s keeps some 0.85 of its speed."""
@@ -87,8 +84,6 @@ class TactileScene:
     data : mujoco.MjData, optional
     loss_s_per_m : float
         Loss of skin and gel, see ``LOSS_S_PER_M``; with 0 a contact without friction is elastic.
-    every : int
-        The surrogate is evaluated in every ``every``-th step; the steps between follow the stiffness of the contact (``_extrapolate``).
 
     Attributes
     ----------
@@ -111,14 +106,11 @@ class TactileScene:
         touchable: Sequence[str] | None = None,
         data: mujoco.MjData | None = None,
         loss_s_per_m: float = LOSS_S_PER_M,
-        every: int = 1,
     ) -> None:
         if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             raise OptionError("integrator RK4 computes forces between two steps; choose Euler, implicit or implicitfast")
-        if every < 1:
-            raise OptionError(f"`every={every}`: expected at least 1")
         self.model, self.data = model, mujoco.MjData(model) if data is None else data
-        self._loss, self._every = loss_s_per_m, every
+        self._loss = loss_s_per_m
         self.sensors = {site: load_sensor(each) if isinstance(each, str) else each for site, each in sensors.items()}
         self._site = np.array([_number_of(model, mujoco.mjtObj.mjOBJ_SITE, site) for site in self.sensors], int)
         self._body = model.site_bodyid[self._site]
@@ -143,12 +135,11 @@ class TactileScene:
     def reset(self) -> None:
         """Forget all contacts, and the forces that acted in the last step. The state in ``data`` stays."""
         count = len(self._site)
-        self._steps = 0
         self._at = np.full(count, -1)  # the solid that each sensor touches
         self._gap = np.full((count, len(self._geom)), np.inf)
-        self._friction, self._lost = np.zeros(count), np.zeros(count, bool)
+        self._lost = np.zeros(count, bool)
         self._wrench = np.zeros((count, 6))  # N, N mm, sensor frame, on the geom
-        self._solved, self._solved_T = np.zeros((count, 7)), np.zeros((count, 4, 4))  # wrench, depth, and pose of the newest evaluation
+        self._solved = np.zeros((count, 7))  # the newest wrench that could be computed, and its depth
         self._applied = np.zeros_like(self.data.xfrc_applied)
         for contacts in self._contacts:
             for row in range(len(contacts.felt.lost)):
@@ -172,13 +163,11 @@ class TactileScene:
         solid_turn, solid_place = held @ self._pose[:, :3, :3], MM * data.geom_xpos[self._geom] + (held @ self._pose[:, :3, 3:])[..., 0]
         normal, before = np.zeros((*self._gap.shape, 3)), self._gap.copy()
         _gaps(place, turn, solid_place, solid_turn, self._kind, self._sizes, self._own, self._radius, self._gap, normal)
-        begun = [sensor for sensor in range(len(self._site)) if self._choose(sensor)]
+        for sensor in range(len(self._site)):
+            self._choose(sensor)
         T = _relative(place, turn, solid_place, solid_turn, self._at)
-        due = self._at >= 0
-        if self._steps % self._every:
-            due &= np.isin(np.arange(len(due)), begun)
         for number, contacts in enumerate(self._contacts):
-            mine = np.flatnonzero(due & (self._set == number))
+            mine = np.flatnonzero((self._at >= 0) & (self._set == number))
             if len(mine):
                 rows, felt = self._row[mine], contacts.felt
                 contacts.move(rows, T[mine], np.full(len(mine), data.time))
@@ -186,37 +175,28 @@ class TactileScene:
                 seen = mine[~self._lost[mine]]
                 depth = -self._gap[seen, self._at[seen]]
                 self._solved[seen] = np.column_stack([felt.force_n[self._row[seen]], felt.torque_nmm[self._row[seen]], depth])
-                self._solved_T[seen] = T[seen]
-        self._steps += 1
         loss = self._loss / MM / self.model.opt.timestep
-        _wrenches(
-            turn, T, self._at, self._gap, before, normal, self._radius, self._friction, self._lost, self._solved, self._solved_T, loss,
-            self._wrench,
-        )  # fmt: skip
+        self._wrench[:] = _wrenches(turn, self._at, self._gap, before, normal, self._lost, self._solved, loss)
         bodies = np.stack([self.model.geom_bodyid[self._geom[self._at]], self._body], axis=1)
         applied = np.zeros_like(self._applied)
         _push(place, turn, self._wrench, bodies, data.xipos, applied)
         data.xfrc_applied += applied - self._applied
         self._applied = applied
 
-    def _choose(self, sensor: int) -> bool:
-        """Choose the solid that a sensor touches, and return whether a contact with it begins."""
+    def _choose(self, sensor: int) -> None:
+        """Choose the solid that a sensor touches."""
         gap, at = self._gap[sensor], self._at[sensor]
         if at >= 0 and gap[at] <= 0 or not len(gap):
-            return False
+            return
         nearest, contacts, row = int(gap.argmin()), self._contacts[self._set[sensor]], int(self._row[sensor])
         if gap[nearest] > NEAR_MM:
             if at >= 0:
                 contacts.rest(row)
                 self._at[sensor] = -1
-            return False
-        if nearest == at:
-            return False
-        friction = float(self.model.geom_friction[self._geom[nearest], 0])
-        self._friction[sensor] = min(friction, contacts.domain["friction"])
-        contacts.begin_solid(row, self._solid[nearest], self._friction[sensor])
-        self._at[sensor], self._solved[sensor] = nearest, 0.0
-        return True
+        elif nearest != at:
+            friction = float(self.model.geom_friction[self._geom[nearest], 0])
+            contacts.begin_solid(row, self._solid[nearest], min(friction, contacts.domain["friction"]))
+            self._at[sensor], self._solved[sensor] = nearest, 0.0
 
     def read(self, site: str) -> TactileReading:
         """The contact of a sensor at the beginning of the last step."""
@@ -294,7 +274,7 @@ def _gaps(
     solid_turn: FloatArray,
     kind: IntArray,
     sizes: FloatArray,
-    own: FloatArray,
+    own: BoolArray,
     radius: FloatArray,
     gap: FloatArray,
     normal: FloatArray,
@@ -336,57 +316,28 @@ def _relative(place: FloatArray, turn: FloatArray, solid_place: FloatArray, soli
 @compiled()
 def _wrenches(
     turn: FloatArray,
-    T: FloatArray,
     at: IntArray,
     gap: FloatArray,
     before: FloatArray,
     normal: FloatArray,
-    radius: FloatArray,
-    friction: FloatArray,
-    lost: FloatArray,
+    lost: BoolArray,
     solved: FloatArray,
-    solved_T: FloatArray,
     loss: float,
-    wrench: FloatArray,
-) -> None:
-    """Write the wrenches (S, 6) at poses ``T`` (S, 4, 4) from those at the poses ``solved_T`` of the newest evaluation.
-
-    Between them the contact is a spring at its point: along the normal with the stiffness 3 F / 2 d of a ball (Hertz) under the force F at
-    the depth d, and across it with ``SHEAR`` times this stiffness, up to Coulomb's bound.
-    """
-    u, point, moved, force = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+) -> FloatArray:
+    """The wrenches (S, 6) of the contacts ``solved`` (S, 7), with the loss of skin and gel, and of contacts that can't be computed."""
+    wrench = np.zeros((len(at), 6))
     for s in range(len(at)):
-        wrench[s] = 0.0
         if at[s] < 0:
             continue
-        depth, last = -gap[s, at[s]], solved[s, 6]
+        depth = -gap[s, at[s]]
         faster = depth + before[s, at[s]] if before[s, at[s]] <= NEAR_MM else 0.0  # mm in this step; none after a jump
-        for i in range(3):
-            u[i] = -(turn[s, :, i] * normal[s, at[s]]).sum()
-        pressed = (solved[s, :3] * u).sum()
-        if lost[s]:
-            wrench[s, :3] = u * (pressed + STOP_N_PER_MM * max(depth - last, 0.0)) * (STOP_RETURNS if faster < 0 else 1.0)
+        if not lost[s]:
+            wrench[s] = solved[s, :6] * min(max(1.0 + loss * faster, 0.0), MOST_GROWTH)
             continue
+        size = np.sqrt((solved[s, :3] ** 2).sum()) + STOP_N_PER_MM * max(depth - solved[s, 6], 0.0)
         for i in range(3):
-            point[i] = u[i] * (radius[s] - depth)
-        for i in range(3):
-            moved[i] = T[s, i, 3] - point[i]
-            for j in range(3):
-                moved[i] += T[s, i, j] * (solved_T[s, :3, j] * (point - solved_T[s, :3, 3])).sum()
-        stiff = 1.5 * max(pressed, 0.0) / max(last, LEAST_DEPTH_MM)
-        along = (moved * u).sum()
-        now = max(pressed - stiff * along, 0.0)
-        before_n = np.sqrt(((solved[s, :3] - pressed * u) ** 2).sum())
-        force[:] = solved[s, :3] - pressed * u - SHEAR * stiff * (moved - along * u)
-        size, most = np.sqrt((force**2).sum()), max(friction[s] * now, before_n * min(now / max(pressed, 1e-9), 1.0))
-        force *= most / size if size > most else 1.0
-        force += now * u
-        change = force - solved[s, :3]
-        growth = min(max(1.0 + loss * faster, 0.0), MOST_GROWTH)
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            wrench[s, i] = growth * force[i]
-            wrench[s, 3 + i] = growth * (solved[s, 3 + i] + point[j] * change[k] - point[k] * change[j])
+            wrench[s, i] = -size * (STOP_RETURNS if faster < 0 else 1.0) * (turn[s, :, i] * normal[s, at[s]]).sum()
+    return wrench
 
 
 @compiled()

@@ -54,8 +54,8 @@ def test_a_picture_that_took_long_to_compute_is_shown(monkeypatch):
     late_s = 0.1
     with TwinCamera(spec, placed, arm.state, Form.PROCESSED, on_demand=True) as camera:
         camera.read(timeout_s=camera.first_frame_s)
-        move = camera._follower.move
-        monkeypatch.setattr(camera._follower, "move", lambda *told: time.sleep(2 * late_s) or move(*told))
+        move = camera._world.move
+        monkeypatch.setattr(camera._world, "move", lambda *told: time.sleep(2 * late_s) or move(*told))
         monkeypatch.setattr("hardware.cameras.reader.LATE_S", late_s)
         for _ in range(2):
             camera.read_after(time.monotonic(), timeout_s=camera.first_frame_s)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from scenes import SensorSpec
+from scenes.body import ASSUMED_FACTOR
 from scenes.object import ObjectSpec
 from twin.frames.images import write_image
 from twin.mechanics.path import ContactPose
@@ -14,6 +15,7 @@ from twin.pins.graph import make_graph
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.report.charts import save_figure
+from twin.report.numbers import force_interval
 from twin.report.plots import ObservedFrame, contact_panel
 from twin.report.skin3d import displaced_skin, draw_contact_skin, write_surface
 from twin.simulator import RenderedFrame, Simulator
@@ -42,17 +44,19 @@ class RenderedContact(ReadableResult):
     rendered: RenderedFrame
     look: ObservedFrame
     written: list[Path]
+    stiffness_factor: float = ASSUMED_FACTOR
 
     def lines(self) -> list[str]:
-        """The result as lines of text: force, contact area and number of visible caps, and what the pipeline finds of them."""
+        """The result as lines of text: force with the 90 % interval of its size, contact area, visible caps, and what is found."""
         force = self.state.force_n.round(2) + 0.0  # 0.0 turns negative zeros into positive ones
+        low, high = force_interval(self.state.force_n.tolist(), self.stiffness_factor)
         visible = self.rendered.truth.visible
         seen = self.look.observation
         found = f"the pipeline finds {seen.found} of {len(seen.pins_px)} pins in the picture"
         useless = f"note: the pipeline can't use the picture: {seen.reason}; 'twin check' shows where the specification is wrong"
         return [
-            f"force {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f} N, contact area {self.state.area_mm2:.1f} mm2, "
-            f"{int(visible.sum())} of {len(visible)} caps visible",
+            f"force {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f} N (size with 90 %: {low:.2f} to {high:.2f} N), "
+            f"contact area {self.state.area_mm2:.1f} mm2, {int(visible.sum())} of {len(visible)} caps visible",
             found if seen.valid else useless,
         ]
 
@@ -99,7 +103,7 @@ def render_contact(
         rendered = simulator.render(state, form=form, seed=seed)
     with stage(progress, "pictures"):
         written, look = write_contact(out, simulator, obj, pose, state, rendered)
-    return RenderedContact(state, rendered, look, written)
+    return RenderedContact(state, rendered, look, written, sensor.skin.stiffness_factor)
 
 
 def write_contact(
@@ -140,6 +144,7 @@ def contact_record(simulator: Simulator, obj: ObjectSpec, pose: Pose, state: Con
     """The content of ``truth.json``: forces on the object in the sensor frame, the pose, and all resolved specifications."""
     return {
         "force_n": state.force_n.tolist(),
+        "force_size_90_n": force_interval(state.force_n.tolist(), simulator.spec.skin.stiffness_factor),
         "torque_nmm": state.torque_nmm.tolist(),
         "area_mm2": state.area_mm2,
         "pose": asdict(pose),

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from force_curves import EVERY, FORCES, LABELS, LAST, make_tables
 
 from scenes import load_experiment, load_object, load_sensor
 from scenes.rig import ForceSensorSpec, RigSpec
@@ -257,3 +258,20 @@ def test_a_calibration_writes_a_specification_with_the_conventions_and_a_page(mo
 
 def test_the_error_of_a_force_grows_with_it():
     assert noise_of(np.zeros((1, 3)))[0, 0] == module.NOISE_N and noise_of(np.array([[0.0, 0, 4]]))[0, 0] > module.NOISE_N
+
+
+def test_tables_of_force_curves_have_the_mean_of_the_last_samples_and_whole_curves_of_some(tmp_path):
+    """A curve that oscillates about its end value with a period of LAST samples gives this value, and the reader takes the table."""
+    values, turn = np.array([[0.5, -0.25, -2.0], [0.0, 0.125, -1.0]]), np.sin(2 * np.pi * np.arange(3 * LAST) / LAST)
+    (tmp_path / "ft_data").mkdir()
+    lines = [",".join(("ft_data_csv", *LABELS, *FORCES))]
+    for k, value in enumerate(values):
+        lines.append(",".join((f"c{k}.csv", *(["3.0"] * len(LABELS)), *map(str, value + 9))))
+        curve = np.column_stack([np.arange(len(turn)) / 240, value + 0.3 * turn[:, None]])
+        np.savetxt(tmp_path / f"ft_data/c{k}.csv", curve, delimiter=",", header=",".join(("Time", *FORCES)), comments="")
+    (tmp_path / "targets.csv").write_text("\n".join(lines))
+    make_tables(tmp_path, tmp_path / "out", rows=2, whole=[2])
+    ends, curves = (np.genfromtxt(tmp_path / f"out/{name}.csv", delimiter=",", names=True) for name in ("targets", "curves"))
+    assert np.allclose(np.stack([ends[axis] for axis in FORCES], axis=1), values, atol=1e-4)
+    assert np.allclose(ends["label_Fz"] - ends["Fz"], 9, atol=1e-4) and (ends["pose_3"] == 3).all()
+    assert (curves["row"] == 2).all() and len(curves) == len(turn) // EVERY and curves["Time"][1] == pytest.approx(EVERY / 240)

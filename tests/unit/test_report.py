@@ -17,7 +17,7 @@ from made_up_pages import HOSTILE, PAGES
 from sound_page import PageReader, read_sound_page
 
 from twin.report.charts import muted_colour, new_figure, write_chart
-from twin.report.numbers import GROUP, LONGEST, MINUS, NOTHING, column, number
+from twin.report.numbers import GROUP, LONGEST, MINUS, NOTHING, column, force_interval, number
 from twin.report.page import Page, PagePicture, bad, code, good, link_to, sentence, strong
 from twin.report.table import Cell, Column, make_table, write_rows, write_table
 from twin.report.themes import DARK, LIGHT, SERIES, Theme, dark_of, stylesheet
@@ -280,3 +280,10 @@ def test_rows_are_written_for_machines(tmp_path):
     assert list(csv.DictReader(path.open(newline=""))) == [{"a": repr(1 / 3), "b": 'x,"y"'}]
     path = write_table(tmp_path / "table.csv", [{"a": 1 / 3}, {"a": None, "b": 3010}])
     assert path.read_bytes() == b"a,b\r\n0.333333,\r\n,3010\r\n"
+
+
+def test_the_interval_of_a_simulated_force_has_its_size_in_the_middle_of_both_factors():
+    force_n, factor = (1.0, -2.0, 2.0), 1.6
+    low, high = force_interval(force_n, factor)
+    assert low * high == pytest.approx(3.0**2) and high / low == pytest.approx(factor**2)
+    assert force_interval(force_n, 1.0) == (3.0, 3.0)

@@ -163,7 +163,8 @@ def render_contact_command(
                    specification's order; positions, normals and forces of the
                    contact
       truth.json   force_n of the skin on the object in the sensor's axes (z > 0
-                   when pressed), torque_nmm about the sensor's origin, area_mm2,
+                   when pressed), force_size_90_n (ends of the 90 % interval of
+                   its size), torque_nmm about the sensor's origin, area_mm2,
                    the pose and all resolved specifications
       skin.vtp, skin.png, panel.png   the deformed skin, and an overview
 

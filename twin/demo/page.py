@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from scenes import load_sensor
 from twin.demo.stages import ContactResult, DepthRow
 from twin.frames.images import write_image
 from twin.report.charts import new_figure, write_chart
-from twin.report.numbers import number
+from twin.report.numbers import force_interval, number
 from twin.report.page import Page, PagePicture, code, sentence
 from twin.report.plots import (
     ObservedFrame,
@@ -86,11 +87,13 @@ def contact_figures(result: ContactResult, contact_px: np.ndarray) -> list[tuple
     """Names and values of one contact's figures, as shown on the page."""
     look, force = result.look, result.state.force_n
     observation = look.observation
+    ends = force_interval(force.tolist(), load_sensor(result.sensor).skin.stiffness_factor)
     parts = ", ".join(number(float(part), decimals=2, signed=True) for part in force)
     return [
         ("pins found", f"{observation.found} of {len(observation.pins_px)}"),
         ("directed edges (Delaunay)", number(len(look.graphs()[0].edges))),
         ("force on the object, N", f"({parts})"),
+        ("90 % interval of its size, N", " to ".join(number(each, decimals=2) for each in ends)),
         ("contact area, mm²", number(float(result.state.area_mm2), decimals=1)),
         ("cell area at the contact against no contact", f"{number(area_change_at(look, contact_px, count=12), decimals=1, signed=True)} %"),
         *((f"{name}, s", number(value, decimals=3)) for name, value in result.seconds.items()),

@@ -92,3 +92,9 @@ def _power(size: float, digits: int) -> int:
 def _group_digits(text: str) -> str:
     whole, point, rest = text.partition(".")
     return (f"{int(whole):,}".replace(",", GROUP) if int(whole) >= GROUPED_FROM else whole) + point + rest
+
+
+def force_interval(force_n: Sequence[float], factor: float) -> tuple[float, float]:
+    """Ends of the 90 % interval of a simulated force's size, N, if the true one is larger or smaller by ``skin.stiffness_factor``."""
+    size = math.hypot(*force_n)
+    return size / factor, size * factor

@@ -16,6 +16,7 @@ from twin.errors import TwinError
 from twin.estimate import SensorModel, readable_labels
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
+from twin.report.numbers import force_interval
 from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
 from twin.studio.modes.mode import PageMode
 from twin.studio.page import LineChart, StudioPage, put, value_of
@@ -449,8 +450,10 @@ class TwinMode(PageMode):
         mesh = str(answer.mesh) if len(state.contact_mm) else "no contact"
         force, torque = np.round(state.force_n, 2) + 0.0, round(float(state.torque_nmm[2]), 1) + 0.0
         across, into = float(np.hypot(*state.force_n[:2])), float(state.force_n[2])
+        ends = force_interval(state.force_n.tolist(), self.contact.setup.sensor.skin.stiffness_factor)
         rows = {
             "force x, y, z": f"{force[0]:+.2f}  {force[1]:+.2f}  {force[2]:+.2f} N",
+            "its size, 90 % interval": f"{ends[0]:.2f} to {ends[1]:.2f} N",
             "lateral force, ratio to normal": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
             "torque about z": f"{torque:+.1f} N mm",
             "indentation": f"{answer.indent_mm:+.2f} mm",

@@ -13,7 +13,6 @@ from training.studies.sim_to_real.inverse_estimates import TwinRead, read_row, r
 from training.studies.sim_to_real.page import write_page
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
 from training.studies.sim_to_real.steps import (
-    CoKriging,
     StudyFrames,
     arm_labels,
     choose_frames,
@@ -30,7 +29,7 @@ from training.studies.sim_to_real.steps import (
     with_missing,
 )
 from training.studies.sim_to_real.taught import teach
-from training.studies.sim_to_real.variants import Twin, as_mounted, contact_of, full_twin, without_one_ingredient
+from training.studies.sim_to_real.variants import Twin, as_mounted, full_twin, without_one_ingredient
 from twin.calibration.contact import fit_contact
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.estimate import readable_labels
@@ -78,7 +77,7 @@ class SimToRealResult(ReadableResult):
 
 
 @dataclass(frozen=True)
-class _Ground:
+class Ground:
     """What all models of a study have in common.
 
     Attributes
@@ -147,11 +146,11 @@ def run(plan: SimToRealPlan, out: Path, *, progress: Progress = silent) -> SimTo
     read = read_twin(sets[ground.full.contacts], plan.target_object, plan.experiment, seed=plan.seed)
     rows += _invert_model_rows(ground, read)
     rows.append(_train_on_labelled(ground, read))
-    page = _write_page(ground, rows, beside, known[_residual_key(ground.full)], full_learnt)
+    page = write_page(ground, rows, beside, known[_residual_key(ground.full)].summary()[:SHOWN_MODES], full_learnt)
     return SimToRealResult(rows, beside.left_out, ground.residuals.error_px, [write_table(out / "study.csv", rows), page])
 
 
-def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> _Ground:
+def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> Ground:
     """Read and choose frames, fit the specification if the plan says so, and measure the residuals on the labelled frames."""
     with stage(progress, "frames") as step:
         real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
@@ -171,7 +170,7 @@ def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> _Ground:
     sheared = any(label.move.any() for label in measured.labels)
     full = full_twin(plan, setup.sensor, measured.labels, (residuals.friction_spread() or moves.friction) if sheared else None)
     others = without_one_ingredient(full, as_mounted(plan.sensor), moves, load_randomisation("contact")) if plan.ablate else []
-    return _Ground(plan, out, progress, setup, real, few, chosen, measured, residuals, full, [full, *others])
+    return Ground(plan, out, progress, setup, real, few, chosen, measured, residuals, full, [full, *others])
 
 
 def _residual_key(twin: Twin) -> tuple[int, tuple[float, ...]]:
@@ -179,7 +178,7 @@ def _residual_key(twin: Twin) -> tuple[int, tuple[float, ...]]:
     return twin.across, twin.frictions
 
 
-def _missing(ground: _Ground, twin: Twin, known: dict[tuple[int, tuple[float, ...]], Discrepancy]) -> Discrepancy | None:
+def _missing(ground: Ground, twin: Twin, known: dict[tuple[int, tuple[float, ...]], Discrepancy]) -> Discrepancy | None:
     """The discrepancy of a twin that uses one, else None. ``known`` stores it for other twins with the same residuals."""
     if not twin.learns:
         return None
@@ -190,7 +189,7 @@ def _missing(ground: _Ground, twin: Twin, known: dict[tuple[int, tuple[float, ..
     return known[_residual_key(twin)]
 
 
-def _training_sets(ground: _Ground, twin: Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
+def _training_sets(ground: Ground, twin: Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
     """The data sets to train on: the states once for each draw of the discrepancy, or once unchanged if there is none."""
     if missing is None:
         return [twin.part(join_datasets(sets))]
@@ -203,7 +202,7 @@ def _training_sets(ground: _Ground, twin: Twin, sets: list[Dataset], missing: Di
     return [twin.part(each) for each in drawn]
 
 
-def _invert_model_rows(ground: _Ground, twin: TwinRead) -> list[dict[str, Any]]:
+def _invert_model_rows(ground: Ground, twin: TwinRead) -> list[dict[str, Any]]:
     """Rows of the table for model inversion, with growing numbers of labelled frames."""
     labels, test = arm_labels(ground.real), ground.chosen.test
     rows = [read_row(BOTH, twin, ground.real, labels, rows, test) for rows in (np.zeros(0, int), *ground.chosen.nested)]
@@ -211,7 +210,7 @@ def _invert_model_rows(ground: _Ground, twin: TwinRead) -> list[dict[str, Any]]:
     return rows + [read_row(f"{BOTH}{EVENLY}", twin, ground.real, labels, rows, test) for rows in designed]
 
 
-def _train_on_labelled(ground: _Ground, twin: TwinRead) -> dict[str, Any]:
+def _train_on_labelled(ground: Ground, twin: TwinRead) -> dict[str, Any]:
     """Train a run on the labelled frames and on all others that are not evaluated, with the labels that model inversion estimates for
     them."""
     plan, real, few = ground.plan, ground.real, ground.chosen.few
@@ -221,7 +220,7 @@ def _train_on_labelled(ground: _Ground, twin: TwinRead) -> dict[str, Any]:
     return evaluate_run_row(BOTH + WITHOUT.format(count=len(others)), len(few), ground.out / TAUGHT, real, ground.chosen.test)
 
 
-def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
+def _without_the_twin(ground: Ground) -> list[dict[str, Any]]:
     """Rows of the table for the models that are trained on real frames alone."""
     rows = []
     for name, index in ground.chosen.trained.items():
@@ -235,25 +234,3 @@ def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
     rows += [quadratic_row(REAL, ground.real, index, ground.chosen.test) for index in others]
     designed = designed_frames(ground.real, ground.chosen, ground.plan.seed)
     return rows + [quadratic_row(f"{REAL}{EVENLY}", ground.real, index, ground.chosen.test) for index in designed]
-
-
-def _write_page(ground: _Ground, rows: list[dict[str, Any]], beside: CoKriging, missing: Discrepancy, learnt: Dataset) -> Path:
-    return write_page(
-        ground.out,
-        sensor=ground.setup.sensor.name,
-        tested=len(ground.chosen.test),
-        frames=len(ground.real),
-        labelled=ground.plan.labels,
-        seed=ground.plan.seed,
-        calibrated=ground.plan.calibrate,
-        error_px=ground.residuals.error_px,
-        modes=missing.summary()[:SHOWN_MODES],
-        friction=ground.full.randomisation.friction,
-        simulated=len(learnt),
-        contacts=len(np.unique(contact_of(learnt))),
-        names=ground.real.targets.names,
-        left_out=beside.left_out,
-        columns=list(rows[0]),
-        rows=rows,
-        problems=ground.real.problems,
-    )

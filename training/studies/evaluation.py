@@ -1,7 +1,7 @@
 """A trained model's errors on labelled frames."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,7 @@ def _slip_errors(estimator: PoseEstimator, parts: Sequence[Dataset], chosen: set
     for part, names, drag in name_drags(parts):
         if chosen.issuperset(names):
             ways.append(resample_path(drag, random_places(len(names), rng), CapView(estimator.modes_of, part.pins), rng))
-    return asdict(compare_slip(estimator.slip, ways)) if ways else None
+    return compare_slip(estimator.slip, ways) if ways else None
 
 
 def at_own_rest(estimator: PoseEstimator, data: Dataset) -> Dataset:
@@ -86,8 +86,8 @@ class Evaluation(ReadableResult):
     ----------
     metrics : dict
         Content of ``metrics.json``. With models of several kinds of contact it includes ``taken_for``, the share of frames classified as
-        each kind. For simulated contacts and a run with contact maps it includes ``maps`` (see ``MapErrors``), and for a run that estimates
-        slip ``slip`` (see ``SlipErrors``).
+        each kind. For simulated contacts and a run with contact maps it includes ``maps`` (see ``compare_maps``), and for a run that
+        estimates slip ``slip`` (see ``compare_slip``).
     changes : list of dict
         Errors on changed images; empty if they were not requested.
     units : dict of str to str
@@ -212,8 +212,7 @@ def evaluate_run(
     if several is not None:
         metrics["taken_for"] = several.taken_for(found.pins.rows(chosen))
     if estimator.maps is not None and several is None and all(is_simulated(folder) for folder in found.folders):
-        rated = compare_maps(estimator.maps_of(found.pins.rows(chosen), made.mean), found, chosen)
-        metrics["maps"] = None if rated is None else asdict(rated)
+        metrics["maps"] = compare_maps(estimator.maps_of(found.pins.rows(chosen), made.mean), found, chosen)
     if estimator.slip is not None and several is None and all(is_simulated(folder) for folder in found.folders):
         metrics["slip"] = _slip_errors(estimator, parts, set(found.pins.image_name[chosen].tolist()))
     written, changes = write_evaluation(out, made, found, chosen, metrics, labels), []

@@ -19,9 +19,9 @@ from training.studies.tac_vgnn.models import plan_run
 from twin.calibration.contact.report import write_calibration
 from twin.calibration.optics import Calibration
 from twin.calibration.optics import write_page as write_calibration_page
+from twin.demo.make_demo import DepthRow
 from twin.demo.page import ContactContent
 from twin.demo.page import write_page as write_demo_page
-from twin.demo.stages import DepthRow
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.evaluation.pictures import report as realism
 from twin.evaluation.pictures.compare import Pair

@@ -12,7 +12,7 @@ from training.models.part import OneFrame
 from training.models.touch.model import TOUCH
 from training.runs.packed import pack
 from training.runs.run_files import MAPS
-from training.studies.prediction import Predictions, write_frame_maps
+from training.studies.evaluation import Predictions, write_frame_maps
 from training.touch.contact_maps import compare_maps, read_maps, write_maps
 from twin.errors import StoreError
 from twin.geometry.mesh import build_mesh

@@ -12,7 +12,7 @@ from matplotlib.ticker import NullLocator
 from scenes.randomisation import FrictionSpread
 from training.data.dataset import Dataset
 from training.data.targets import unit_of
-from training.studies.sim_to_real.inverse_estimates import READ
+from training.studies.sim_to_real.model_inversion import READ
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
 from training.studies.sim_to_real.steps import CoKriging
 from training.studies.sim_to_real.variants import contact_of

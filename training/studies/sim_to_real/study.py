@@ -1,5 +1,11 @@
-"""The sim-to-real study, from its plan to its tables and runs."""
+"""The sim-to-real study, from its plan to its tables and runs.
 
+One of its networks is trained on real frames without labels: model inversion estimates their labels (pseudo-labels). The twin is read in
+seconds for hundreds of frames, but not by a live loop. The network has nearly its errors, and is a run as any other. It needs no label of
+these frames, only more of them.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,8 +14,11 @@ import numpy as np
 
 from scenes import load_randomisation
 from training.data.dataset import Dataset, join_datasets, load_dataset
+from training.data.targets import Targets
+from training.estimate.estimator import PoseEstimator
+from training.runs.assemble import intervals
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
-from training.studies.sim_to_real.inverse_estimates import TwinRead, read_row, read_twin
+from training.studies.sim_to_real.model_inversion import TwinRead, named_labels, read_row, read_twin
 from training.studies.sim_to_real.page import write_page
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
 from training.studies.sim_to_real.steps import (
@@ -28,20 +37,81 @@ from training.studies.sim_to_real.steps import (
     widen_intervals,
     with_missing,
 )
-from training.studies.sim_to_real.taught import teach
 from training.studies.sim_to_real.variants import Twin, as_mounted, full_twin, without_one_ingredient
 from twin.calibration.contact import fit_contact
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.estimate import readable_labels
 from twin.evaluation.labelled.model import MeasuredFrames
-from twin.progress import Progress, silent, stage
+from twin.progress import Progress, Step, silent, stage
 from twin.report.table import write_table
+from twin.rig.labels import ArmLabel
 from twin.store import writes
 from twin.types import ReadableResult
 
 SEEDS_APART = 1000  # between the draws of one study, so that those of seeds 0, 1, 2... differ
 BESIDE, TAUGHT = "sim_plus_real", "sim_taught"  # folders of the run with labelled frames beside it, and of the one that the twin taught
 SHOWN_MODES = 4  # of what the twin misses, that the page names
+
+
+def teach(
+    twin: TwinRead,
+    real: Dataset,
+    labels: Sequence[ArmLabel],
+    few: np.ndarray,
+    unlabelled: np.ndarray,
+    out: Path,
+    *,
+    seed: int,
+    epochs: int | None,
+    progress: Step | None = None,
+) -> None:
+    """Train a run on labelled frames and on frames whose labels that model inversion estimates, or continue it.
+
+    The intervals are at least as wide as the twin's errors on labelled frames that are estimated from other ones.
+
+    Parameters
+    ----------
+    real : Dataset
+        A recording.
+    labels : sequence of ArmLabel
+        Of all its frames. Those of the frames ``unlabelled`` are not used.
+    few, unlabelled : (n,) and (u,) int
+        Rows of the labelled frames, and of the others to learn from.
+    out : Path
+        Folder of the run.
+    epochs : int or None
+        None: the recipe's own.
+    """
+    moved, known = real.pins.nodes_px - real.pins.reference.pins_px, [labels[row] for row in few]
+    told = named_labels(twin.estimate(moved[few], known, moved[unlabelled], moved[unlabelled]), real.targets.names)
+    rows = np.sort(np.concatenate([few, unlabelled]))
+    train_on_real(
+        replace(real, targets=_with_estimated(real.targets, few, unlabelled, told)).rows(rows),
+        out,
+        seed=seed,
+        epochs=epochs,
+        progress=progress,
+    )
+    judged, found = twin.left_out(moved[few], known)
+    part = real.rows(few[judged])
+    if not len(part):
+        return
+    estimator = PoseEstimator.load(out)
+    inputs, index = estimator.inputs_of(part.pins, together=not part.pins.measured)
+    mean, scale, executed = estimator.ensemble.outputs(inputs, index)
+    _, scale = estimator.ensemble.destandardise(mean, scale)
+    made = named_labels(found, part.targets.names)
+    said = intervals(made, scale, part.targets.corrected, part.targets.raw, executed, part.targets.units)
+    widen_intervals(out, {key: np.maximum(getattr(estimator.ensemble, key), width) for key, width in said.items()})
+
+
+def _with_estimated(targets: Targets, few: np.ndarray, unlabelled: np.ndarray, told: np.ndarray) -> Targets:
+    """Targets with the labels (u, K) that are estimated for frames without; nothing is known of their moves."""
+    corrected, nothing = targets.corrected.copy(), np.full(len(targets.executed), np.nan)
+    corrected[unlabelled] = told
+    raw = corrected.copy()
+    raw[few] = targets.raw[few]
+    return replace(targets, raw=raw, corrected=corrected, executed=nothing, move=np.full_like(targets.move, np.nan))
 
 
 @dataclass(frozen=True, repr=False)

@@ -26,8 +26,8 @@ from training.estimate.loading import load_with_history as load_with_history
 from training.generation.run import Simulated as Simulated
 from training.studies.degradation import DegradationResult as DegradationResult
 from training.studies.evaluation import Evaluation as Evaluation
+from training.studies.evaluation import Predictions as Predictions
 from training.studies.label_audit import LabelAudit as LabelAudit
-from training.studies.prediction import Predictions as Predictions
 from training.studies.realism import Realism as Realism
 from training.studies.train import TrainedRun as TrainedRun
 from training.studies.validation import Validation as Validation

@@ -19,9 +19,9 @@ from training.studies.tac_vgnn.models import plan_run
 from twin.calibration.contact.report import write_calibration
 from twin.calibration.optics import Calibration
 from twin.calibration.optics import write_page as write_calibration_page
+from twin.demo.make_demo import DepthRow
 from twin.demo.page import ContactContent
 from twin.demo.page import write_page as write_demo_page
-from twin.demo.stages import DepthRow
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.evaluation.pictures import report as realism
 from twin.evaluation.pictures.compare import Pair
@@ -65,25 +65,19 @@ def sim_to_real(out: Path) -> Path:
         for name, n, model, e in told
     ]
     write_table(out / "study.csv", rows)
-    return write_page(
-        out,
-        sensor=SENSOR,
-        tested=752,
-        frames=3762,
-        labelled=40,
-        seed=0,
-        calibrated=False,
-        error_px=0.31,
-        modes=[{"share": 0.61, "told": 0.8}, {"share": 0.2, "told": 0.0}],
-        friction=FrictionSpread(low=0.14, high=1.3),
-        simulated=25344,
-        contacts=500,
-        names=LABELS,
-        left_out=np.array([0.071, 0.912]),
-        columns=list(rows[0]),
-        rows=rows,
-        problems=[f"no label: {HOSTILE}"],
+    recording = Rows(count=3762, targets=SimpleNamespace(names=LABELS), problems=[f"no label: {HOSTILE}"])
+    ground = SimpleNamespace(
+        setup=SimpleNamespace(sensor=load_sensor(SENSOR)),
+        plan=SimpleNamespace(labels=40, seed=0, calibrate=False),
+        out=out,
+        real=recording,
+        chosen=SimpleNamespace(test=range(752)),
+        residuals=SimpleNamespace(error_px=0.31),
+        full=SimpleNamespace(randomisation=SimpleNamespace(friction=FrictionSpread(low=0.14, high=1.3))),
     )
+    beside = SimpleNamespace(left_out=np.array([0.071, 0.912]))
+    modes = [{"share": 0.61, "told": 0.8}, {"share": 0.2, "told": 0.0}]
+    return write_page(ground, rows, beside, modes, Rows(count=25344, group=np.arange(500)))
 
 
 def across_objects(out: Path) -> Path:

@@ -19,7 +19,7 @@ from training.estimate.estimator import PoseEstimator
 from training.models import MODELS, model_named, recipe_of, register, variant_named
 from training.models.part import PinModel
 from training.models.recipes import Recipe
-from training.models.vgnn.network import mode_components
+from training.models.vgnn.model import mode_components
 from training.models.vgnn.registration import count_modes, fit_registration
 from training.runs.config import RunConfig
 from training.runs.packed import SHIPPED, WEIGHTS, pack, shipped_names

@@ -72,10 +72,10 @@ def unseen_ways(count=20):
 
 def test_slip_is_told_before_the_whole_contact_slides(learnt):
     found = compare_slip(learnt, unseen_ways())
-    assert found.contacts == 20 and found.whole_accuracy > 0.95
-    assert found.lead_mm > 0.5 and found.late < 0.1 and found.false_alarms < 0.05
-    assert found.share < 0.08 and 0.75 < found.share_covered <= 1.0
-    assert found.left_mm < 0.3 and 0.75 < found.left_covered <= 1.0 and found.direction_deg < 5
+    assert found["contacts"] == 20 and found["whole_accuracy"] > 0.95
+    assert found["lead_mm"] > 0.5 and found["late"] < 0.1 and found["false_alarms"] < 0.05
+    assert found["share"] < 0.08 and 0.75 < found["share_covered"] <= 1.0
+    assert found["left_mm"] < 0.3 and 0.75 < found["left_covered"] <= 1.0 and found["direction_deg"] < 5
 
 
 def test_a_press_or_a_stop_alone_is_no_slip_and_every_contact_is_a_new_one(learnt):

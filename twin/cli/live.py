@@ -21,6 +21,7 @@ from twin.types import FIRST, NONE
 
 if TYPE_CHECKING:
     from hardware.collect.collect import Collected
+    from hardware.emulators.faults import Fault
     from hardware.live.live import WatchResult
     from hardware.servo.following import Followed
 
@@ -278,7 +279,7 @@ FaultOption = Annotated[
 TimeScale = Annotated[float, typer.Option("--time-scale", help="speed relative to the real arm", min=1e-3)]
 
 
-def faults_of(wanted: list[str] | None, known: dict[str, tuple[float | None, str]]) -> tuple[str, ...]:
+def faults_of(wanted: list[str] | None, known: dict[str, "Fault"]) -> tuple[str, ...]:
     """The faults that the user asks for. If the user asks for help, the known faults are printed and the command ends."""
     from hardware.emulators.running import fault_lines
 

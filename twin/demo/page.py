@@ -3,12 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from scenes import load_sensor
-from twin.demo.stages import ContactResult, DepthRow
 from twin.frames.images import write_image
 from twin.report.charts import new_figure, write_chart
 from twin.report.numbers import force_interval, number
@@ -25,6 +25,9 @@ from twin.report.plots import (
 )
 from twin.report.table import Column
 from twin.types import Form
+
+if TYPE_CHECKING:
+    from twin.demo.make_demo import ContactResult, DepthRow
 
 # Commands that a reader of the page may try next, and what each shows.
 NEXT = (
@@ -58,7 +61,7 @@ class ContactContent:
     figures: list[tuple[str, str]]
 
 
-def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
+def contact_pictures(folder: Path, result: "ContactResult") -> dict[str, Path]:
     """Write the pictures of one contact, except the picture of the skin."""
     look, stem = result.look, f"{result.sensor}-{result.object_name}"
     graph, rest = look.graphs()
@@ -83,7 +86,7 @@ def motion_figure(motions: list[tuple[str, ObservedFrame]]) -> Figure:
     return figure
 
 
-def contact_figures(result: ContactResult, contact_px: np.ndarray) -> list[tuple[str, str]]:
+def contact_figures(result: "ContactResult", contact_px: np.ndarray) -> list[tuple[str, str]]:
     """Names and values of one contact's figures, as shown on the page."""
     look, force = result.look, result.state.force_n
     observation = look.observation
@@ -107,7 +110,7 @@ def write_page(
     contacts: Sequence[ContactContent],
     motions: Path,
     motion_sensor: str,
-    tables: Mapping[str, Sequence[DepthRow]],
+    tables: Mapping[str, Sequence["DepthRow"]],
     seconds: Mapping[str, float],
 ) -> Path:
     """Write the page with all pictures inside, and return its path.
@@ -193,7 +196,7 @@ def _motions_section(page: Page, motions: Path, sensor: str) -> None:
     )
 
 
-def _tables_section(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> None:
+def _tables_section(page: Page, tables: Mapping[str, Sequence["DepthRow"]]) -> None:
     page.section(
         "Against real recordings: displacement by depth",
         "Mean displacement of all pins on a flat plate, in pixels of the uncropped camera frame. Measured: the Tac-VGNN release's "

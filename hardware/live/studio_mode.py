@@ -350,7 +350,7 @@ class LiveMode(PageMode):
             self.disconnect()
             model = self._twin.contact.model
             if model is None:
-                raise TwinError("there is no model of this sensor yet; wait until it is loaded, or give one with --model")
+                raise TwinError("there is no model of this sensor yet; wait until it is loaded, or start the studio with one (`model`)")
             if not self._camera.value.strip():
                 raise TwinError("give a camera first: a number, /dev/videoN, http://..., a folder or a video")
             feed = CameraFeed(self._camera.value.strip(), self._arm.value.strip(), model)

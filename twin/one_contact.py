@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from scenes import SensorSpec
-from scenes.body import ASSUMED_FACTOR
 from scenes.object import ObjectSpec
 from twin.frames.images import write_image
 from twin.mechanics.path import ContactPose
@@ -44,7 +43,7 @@ class RenderedContact(ReadableResult):
     rendered: RenderedFrame
     look: ObservedFrame
     written: list[Path]
-    stiffness_factor: float = ASSUMED_FACTOR
+    stiffness_factor: float
 
     def lines(self) -> list[str]:
         """The result as lines of text: force with the 90 % interval of its size, contact area, visible caps, and what is found."""

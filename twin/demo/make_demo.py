@@ -60,6 +60,7 @@ class ContactResult:
     raw: RenderedFrame
     look: ObservedFrame
     seconds: dict[str, float]
+    stiffness_factor: float
 
 
 def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form: Form, *, progress: Step = unheard) -> ContactResult:
@@ -77,7 +78,7 @@ def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form:
     rendered = raw if form == Form.RAW else clock("capture", lambda: simulator.as_processed(raw, state))
     look = look_at(simulator, rendered)
     seconds["pins and graph"] = look.observation.ms["total"] / 1e3
-    return ContactResult(simulator.spec.name, object_name, pose, state, raw, look, seconds)
+    return ContactResult(simulator.spec.name, object_name, pose, state, raw, look, seconds, simulator.spec.skin.stiffness_factor)
 
 
 @dataclass(frozen=True)

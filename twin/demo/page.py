@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from scenes import load_sensor
 from twin.frames.images import write_image
 from twin.report.charts import new_figure, write_chart
 from twin.report.numbers import force_interval, number
@@ -90,7 +89,7 @@ def contact_figures(result: "ContactResult", contact_px: np.ndarray) -> list[tup
     """Names and values of one contact's figures, as shown on the page."""
     look, force = result.look, result.state.force_n
     observation = look.observation
-    ends = force_interval(force.tolist(), load_sensor(result.sensor).skin.stiffness_factor)
+    ends = force_interval(force.tolist(), result.stiffness_factor)
     parts = ", ".join(number(float(part), decimals=2, signed=True) for part in force)
     return [
         ("pins found", f"{observation.found} of {len(observation.pins_px)}"),

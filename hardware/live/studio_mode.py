@@ -18,7 +18,7 @@ from hardware.live.live import LiveSession, estimate_line
 from hardware.safety.decide import load_limits
 from hardware.safety.eyes import FreshFrames
 from hardware.safety.safe_arm import SafeArm, try_each
-from hardware.workcell.plan import check_standing
+from hardware.workcell.build import check_standing
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
 from twin.estimate import Estimate, SensorModel, pins_in

@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -10,31 +10,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.errors import DeviceError, in_short
-from hardware.rig.geometry import PlacedObject, shift_in_tool
+from hardware.rig.geometry import PlacedObject, matrix_of, pose_of, shift_in_tool
 from hardware.rig.last_axis import LastAxis, poses_along, turns_back_mm
 from hardware.servo.loop import ServoLoop, require_labels
-from hardware.servo.policy_law import policy_law
 from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
 from hardware.servo.timing import Timing
 from hardware.servo.trajectory import Measures, Trajectory, comparison_figure, measure, trajectory_figure, trajectory_of, write_csv
-from hardware.workcell.build import TWIN, Rig, build_rig, load_rest_frame
-from hardware.workcell.plan import check_plan
+from hardware.workcell.build import TWIN, Rig, build_rig, check_plan, load_rest_frame
 from scenes import ObjectSpec, ServoSpec, load_experiment
 from scenes.files import quote
 from twin.errors import OptionError, StoreError, TwinError
 from twin.estimate import Estimate, SensorModel
-from twin.policy import PolicyModel
+from twin.policy import KnownContacts, Policy, PolicyError, PolicyModel, load_policy
 from twin.progress import Progress, Step, silent, stage
 from twin.records import KeptAlso
 from twin.records.session import SessionWriter, plain
 from twin.report.charts import save_figure
 from twin.report.table import write_rows
+from twin.rig.mounting import Mounting
 from twin.store import write_json, writes
 from twin.types import FIRST, Frame, ReadableResult
 
+AROUND = ("SurfaceFollow", "ContourFollow")
+"""Tasks whose policies follow an object's outline, as a loop with an arm needs it."""
 # Measures that are printed, with their headings.
 SHOWN = {
     "smoothness": "S",
@@ -59,6 +61,35 @@ SLOWEST_HZ, FASTEST_HZ = 0.1, 1000.0
 CHECK_MM = 10.0
 # Most steps of a run. They take an arm days.
 MOST_STEPS = 1_000_000
+
+
+def policy_law(policy: Policy, mounting: Mounting) -> Callable[[np.ndarray, Estimate], np.ndarray]:
+    """Function from the arm's pose (6,) and the policy's answer to a frame to the next pose (6,)."""
+    T_tool_work = np.eye(4)
+    T_tool_work[:3, :3] = mounting.work_axes
+
+    def law(pose: np.ndarray, answer: Estimate) -> np.ndarray:
+        step = policy.step(np.asarray(answer.value, float))
+        move = np.eye(4)
+        move[:3, :3] = Rotation.from_rotvec(step[3:], degrees=True).as_matrix()
+        move[:3, 3] = step[:3]
+        return pose_of(matrix_of(pose) @ T_tool_work @ move @ T_tool_work.T, pose)
+
+    return law
+
+
+def load_for_outlines(path: Path, contacts_of: Callable[[Policy], KnownContacts | None] = lambda _: None) -> PolicyModel:
+    """Load a policy that follows an object's outline, ready for frames. ``contacts_of`` gives the contacts that it knows.
+
+    Raises
+    ------
+    PolicyError
+        The file holds no policy, or one of another task.
+    """
+    policy = load_policy(path)
+    if policy.about["task"] not in AROUND:
+        raise PolicyError(f"{path}: a policy of {policy.about['task']}; to follow an outline give a policy of {' or '.join(AROUND)}")
+    return PolicyModel(policy, contacts=contacts_of(policy))
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ from hardware.safety.safe_arm import SafeArm
 from hardware.servo.following import FollowPlan, follow
 from hardware.servo.loop import ServoLoop
 from hardware.servo.step import LoopHooks, LoopSettings
-from hardware.workcell.build import Rig
-from hardware.workcell.plan import check_plan
+from hardware.workcell.build import Rig, check_plan
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.pins import Pipeline, measure_reference, nominal_reference
 from twin.rig.mounting import Mounting

@@ -14,14 +14,13 @@ from training.data.targets import PRESETS
 from training.studies.label_audit import summary_of, write_audit
 from training.studies.objects import ObjectsPlan, verdicts
 from training.studies.tac_vgnn import page as study_report
-from training.studies.tac_vgnn.contacts import AreaChange, contacts_figure
 from training.studies.tac_vgnn.models import plan_run
+from training.studies.tac_vgnn.study import AreaChange, contacts_figure
 from twin.calibration.contact.report import write_calibration
 from twin.calibration.optics import Calibration
 from twin.calibration.optics import write_page as write_calibration_page
-from twin.demo.make_demo import DepthRow
-from twin.demo.page import ContactContent
-from twin.demo.page import write_page as write_demo_page
+from twin.demo.make_demo import ContactContent, DepthRow
+from twin.demo.make_demo import write_page as write_demo_page
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.evaluation.pictures import report as realism
 from twin.evaluation.pictures.compare import Pair
@@ -81,7 +80,7 @@ def sim_to_real(out: Path) -> Path:
 
 
 def across_objects(out: Path) -> Path:
-    from training.studies.objects.page import write_page
+    from training.studies.objects.study import write_page
 
     experiment = load_experiment("objects-2d")
     train, unseen = (load_object("plane"), load_object("sphere")), (load_object("edge"),)
@@ -244,7 +243,6 @@ def demo(out: Path) -> Path:
         machine="Rendered here.",
         contacts=[contact],
         motions=chart,
-        motion_sensor=SENSOR,
         tables={SENSOR: [DepthRow(1.5, 2.0, 1.9, 12.3, 0.5)]},
         seconds={"motions": 1.5},
     )

@@ -10,8 +10,7 @@ from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.part import OneFrame
 from training.models.touch.model import TOUCH
-from training.runs.packed import pack
-from training.runs.run_files import MAPS
+from training.runs.run_files import MAPS, pack
 from training.studies.evaluation import Predictions, write_frame_maps
 from training.touch.contact_maps import compare_maps, read_maps, write_maps
 from twin.errors import StoreError

@@ -27,7 +27,7 @@ from training.environments.observe import Eye
 from training.environments.tasks import TASKS, ObjectPush, ObjectRoll, SurfaceFollow
 from training.environments.world import AXES, Surfaces, Tool, inverse, motions, standing_on, turn_about, work_frame
 from training.estimate.estimator import PoseEstimator
-from training.runs.packed import shipped_names
+from training.runs.run_files import shipped_names
 from training.surrogate.reading import ContactReading, FiniteElements
 from twin.errors import ContactError, OptionError
 

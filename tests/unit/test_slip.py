@@ -13,8 +13,7 @@ from training.estimate.estimator import PoseEstimator
 from training.models import recipe_of
 from training.models.part import OneFrame, Unseen
 from training.runs.config import RunConfig
-from training.runs.packed import pack
-from training.runs.run_files import SLIP
+from training.runs.run_files import SLIP, pack
 from training.studies.evaluation import evaluate_run
 from training.studies.train import add_slip
 from training.surrogate.symmetry import symmetries

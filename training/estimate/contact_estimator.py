@@ -26,8 +26,7 @@ from training.data.pins import PinTable
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimate, PoseEstimator
 from training.models.part import Prediction, Unseen
-from training.runs.packed import folder_of, pack
-from training.runs.run_files import AGAIN, damage_error
+from training.runs.run_files import AGAIN, damage_error, folder_of, pack
 from twin.camera.capture import in_form
 from twin.frames import Recording
 from twin.frames.tables import numbers
@@ -349,7 +348,7 @@ def put_together(runs: Mapping[str, Path], kinds: Mapping[str, KindOfContact], o
     Parameters
     ----------
     runs : dict of str to Path
-        Finished runs by name; each must have a small copy (``training.runs.packed.pack``).
+        Finished runs by name; each must have a small copy (``training.runs.run_files.pack``).
     kinds : dict of str to KindOfContact
 
     Raises

@@ -23,7 +23,6 @@ from training.estimate.widening import Widening
 from training.models import model_named
 from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen
 from training.runs.assemble import Ensemble
-from training.runs.packed import WEIGHTS, folder_of, instead_of, unpack
 from training.runs.run_files import (
     CHECKPOINT,
     CONFIG,
@@ -32,10 +31,14 @@ from training.runs.run_files import (
     MAPS,
     SLIP,
     TENSORS,
+    WEIGHTS,
     damage_error,
+    folder_of,
+    instead_of,
     read_config,
     read_tensors,
     require_together,
+    unpack,
 )
 from training.touch.contact_maps import MapModel, read_maps
 from training.touch.contact_probability import TouchAnswer

@@ -15,7 +15,7 @@ from training.estimate.contact_estimator import ContactEstimator, contacts_folde
 from training.estimate.displacements import MOST_CONTACTS, OTHER_UNIT
 from training.estimate.estimator import PoseEstimate, PoseEstimator
 from training.runs.identity import changed_since, trained_before
-from training.runs.packed import folder_of
+from training.runs.run_files import folder_of
 from training.studies.judging import measure_changes, measure_errors, rows_to_evaluate, time_frames, write_evaluation
 from training.touch.contact_maps import compare_maps
 from training.touch.slip import CapView, compare_slip, name_drags, random_places, resample_path

@@ -328,7 +328,7 @@ def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, 
       twin pack study/sim_only --out training/weights/mg400-331 --force
     """
     from training.estimate.estimator import PoseEstimator
-    from training.runs.packed import WEIGHTS, pack
+    from training.runs.run_files import WEIGHTS, pack
 
     PoseEstimator.load(run)  # says what is wrong with a folder that holds no run
     size = pack(run, out)

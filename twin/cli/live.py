@@ -255,8 +255,7 @@ def run_policy(
       twin policy out/learnt/policy.safetensors --object can --out out/live \\
           --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1
     """
-    from hardware.servo.following import FollowPlan, follow
-    from hardware.servo.policy_law import load_for_outlines
+    from hardware.servo.following import FollowPlan, follow, load_for_outlines
     from scenes import load_object, load_servo
     from training.environments.policy_domain import contacts_of
 

@@ -14,13 +14,11 @@ from training.data.dataset import Dataset
 from training.data.targets import unit_of
 from training.studies.sim_to_real.model_inversion import READ
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
-from training.studies.sim_to_real.steps import CoKriging
-from training.studies.sim_to_real.variants import contact_of
+from training.studies.sim_to_real.steps import CoKriging, contact_of
 from twin.estimate import readable_labels
 from twin.report.charts import muted_colour, plain_log, sized_figure, write_chart
-from twin.report.numbers import number
 from twin.report.page import Page, PagePicture
-from twin.report.table import Column
+from twin.report.table import Column, number
 from twin.report.themes import BLUE, OLIVE, PURPLE, RED
 
 if TYPE_CHECKING:

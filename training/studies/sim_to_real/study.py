@@ -23,11 +23,14 @@ from training.studies.sim_to_real.page import write_page
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
 from training.studies.sim_to_real.steps import (
     StudyFrames,
+    Twin,
     arm_labels,
+    as_mounted,
     choose_frames,
     combine_co_kriging,
     designed_frames,
     evaluate_run_row,
+    full_twin,
     measured_of,
     quadratic_row,
     states_like,
@@ -36,8 +39,8 @@ from training.studies.sim_to_real.steps import (
     train_on_real,
     widen_intervals,
     with_missing,
+    without_one_ingredient,
 )
-from training.studies.sim_to_real.variants import Twin, as_mounted, full_twin, without_one_ingredient
 from twin.calibration.contact import fit_contact
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.estimate import readable_labels

@@ -123,7 +123,7 @@ def test_drags_of_a_data_set_are_as_long_as_their_moves(contacts):
 def test_a_model_that_remembers_tells_slip_besides_and_forgets_a_contact_that_ends(contacts):
     folder, run, sensor = contacts
     estimator = PoseEstimator.load(run)
-    assert estimator.with_history() is estimator  # too few drags to learn slip from
+    assert estimator.with_history().names == estimator.names  # too few drags to learn slip from
     data = load_dataset(folder, sensor, estimator.names)
     modes = estimator.modes_of(data.pins)
     network = slip.SlipNetwork(2 * modes.shape[1]).eval()

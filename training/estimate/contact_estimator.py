@@ -240,8 +240,8 @@ class ContactEstimator:
         return list(dict.fromkeys(line for part in self.parts.values() for line in part.caveats))
 
     def with_history(self) -> "ContactEstimator":
-        """The estimator itself, because models of several kinds of contact do not estimate slip."""
-        return self
+        """As for ``PoseEstimator``."""
+        return self._with({name: part.with_history() for name, part in self.parts.items()})
 
     def at_known_rest(self) -> "ContactEstimator":
         """As for ``PoseEstimator``."""

@@ -28,8 +28,9 @@ from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Vari
 from training.models.recipes import Recipe
 from training.models.vgnn.inputs import PinInputs, fill_lost, pin_features, seated_inputs
 from training.models.vgnn.registration import Registration, count_modes, fit_registration
+from twin.pins.flips import directed_edges
 from twin.pins.labelling.reference import Reference
-from twin.pins.voronoi import directed_edges, triangulate
+from twin.pins.voronoi import triangulate
 
 # Features of a node: dx, dy and the logarithm of the area ratio.
 FEATURES = 3

@@ -30,8 +30,8 @@ from training.mujoco.model import write_urdf as write_urdf
 from training.mujoco.scene import TactileScene as TactileScene
 from training.studies.degradation import DegradationResult as DegradationResult
 from training.studies.evaluation import Evaluation as Evaluation
+from training.studies.evaluation import Predictions as Predictions
 from training.studies.label_audit import LabelAudit as LabelAudit
-from training.studies.prediction import Predictions as Predictions
 from training.studies.realism import Realism as Realism
 from training.studies.train import TrainedRun as TrainedRun
 from training.studies.validation import Validation as Validation

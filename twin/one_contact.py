@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from scenes import SensorSpec
-from scenes.body import ASSUMED_FACTOR
 from scenes.object import ObjectSpec
 from twin.frames.images import write_image
 from twin.mechanics.path import ContactPose
@@ -15,9 +14,9 @@ from twin.pins.graph import make_graph
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.report.charts import save_figure
-from twin.report.numbers import force_interval
 from twin.report.plots import ObservedFrame, contact_panel
 from twin.report.skin3d import displaced_skin, draw_contact_skin, write_surface
+from twin.report.table import force_interval
 from twin.simulator import RenderedFrame, Simulator
 from twin.store import made_by, write_json, write_npz, writes
 from twin.types import ContactState, FloatArray, Form, Quality, ReadableResult
@@ -44,7 +43,7 @@ class RenderedContact(ReadableResult):
     rendered: RenderedFrame
     look: ObservedFrame
     written: list[Path]
-    stiffness_factor: float = ASSUMED_FACTOR
+    stiffness_factor: float
 
     def lines(self) -> list[str]:
         """The result as lines of text: force with the 90 % interval of its size, contact area, visible caps, and what is found."""

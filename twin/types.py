@@ -1,7 +1,7 @@
 """Frozen types of the data between the stages, with their shapes and units."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeAlias
@@ -255,7 +255,7 @@ class PinGraph:
         Directed edges, both directions present.
     area_px2 : (N,) float
         Voronoi cell areas (NaN for kinds without a tessellation).
-    cells : list of (k, 2) float
+    cells : sequence of (k, 2) float
         Cell polygons (empty for kinds without a tessellation).
     """
 
@@ -263,7 +263,7 @@ class PinGraph:
     nodes_px: FloatArray
     edges: IntArray
     area_px2: FloatArray
-    cells: list[FloatArray] = field(default_factory=list)
+    cells: Sequence[FloatArray] = ()
 
     def __repr__(self) -> str:
         return f"<PinGraph: {self.kind}, {len(self.nodes_px)} nodes, {len(self.edges)} edges>"

@@ -55,7 +55,8 @@ def _types_in(module: str) -> list[tuple[str, str]]:
     """The classes of results that a module of commands names, with the modules they come from."""
     source = inspect.getsource(import_module(module))
     block = re.search(r"^if TYPE_CHECKING:\n((?:    .*\n)+)", source, re.MULTILINE)
-    return [(kind, place) for place, kind in re.findall(r"from (\S+) import (\w+)", block[1])] if block else []
+    found = re.findall(r"from (\S+) import (.+)", block[1]) if block else []
+    return [(kind, place) for place, kinds in found for kind in kinds.split(", ")]
 
 
 def _function(name: str, signature: inspect.Signature) -> list[str]:

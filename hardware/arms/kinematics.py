@@ -7,7 +7,6 @@ and J3 are absolute angles of the two links, J2 from the vertical and J3 downwar
 """
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -37,26 +36,6 @@ class OutOfReachError(ValueError):
     """No joint angles reach the pose."""
 
 
-class Kinematics(Protocol):
-    """From joints to pose and back, and the limits of the joints."""
-
-    @property
-    def axes(self) -> int:
-        """Number of joints."""
-
-    def forward(self, joints_deg: np.ndarray) -> np.ndarray:
-        """Pose (6,) at the joints (J,)."""
-
-    def inverse(self, pose: np.ndarray) -> np.ndarray:
-        """Joints (J,) at the pose (6,); ``OutOfReachError`` where there are none."""
-
-    def violation(self, joints_deg: np.ndarray) -> Violation | None:
-        """The limit that the joints break, if any."""
-
-    def nearest_pose(self, pose: np.ndarray) -> np.ndarray:
-        """The pose (6,) without the turns that the arm does not have."""
-
-
 @dataclass(frozen=True)
 class LinkageKinematics:
     """An arm of four axes on a parallel linkage.
@@ -71,6 +50,8 @@ class LinkageKinematics:
         Smallest and largest angle of each joint.
     linkage_deg : float or None
         Largest J3 - J2; None if no such limit is known.
+    axes : int
+        Number of joints.
     """
 
     l1_mm: float
@@ -82,12 +63,14 @@ class LinkageKinematics:
     axes: int = 4
 
     def forward(self, joints_deg: np.ndarray) -> np.ndarray:
+        """Pose (6,) at the joints (J,)."""
         j1, j2, j3, _ = np.radians(joints_deg)
         rho = self.r0_mm + self.l1_mm * np.sin(j2) + self.l2_mm * np.cos(j3)
         z = self.z0_mm + self.l1_mm * np.cos(j2) - self.l2_mm * np.sin(j3)
         return np.array([rho * np.cos(j1), rho * np.sin(j1), z, 0.0, 0.0, joints_deg[0] + joints_deg[3]])
 
     def inverse(self, pose: np.ndarray) -> np.ndarray:
+        """Joints (J,) at the pose (6,); ``OutOfReachError`` where there are none."""
         x, y, z, _, _, turn = pose
         out, up = np.hypot(x, y) - self.r0_mm, z - self.z0_mm  # from the shoulder to the wrist
         span = np.hypot(out, up)
@@ -100,6 +83,7 @@ class LinkageKinematics:
         return np.array([j1, np.degrees(from_vertical - at_shoulder), np.degrees(from_vertical + at_wrist) - 90.0, turn - j1])
 
     def violation(self, joints_deg: np.ndarray) -> Violation | None:
+        """The limit that the joints break, if any."""
         for n, (angle, (low, high)) in enumerate(zip(joints_deg, self.limits_deg, strict=True)):
             if not low - LIMIT_TOLERANCE_DEG <= angle <= high + LIMIT_TOLERANCE_DEG:
                 code = FIRST_JOINT_ALARM + 2 * n + int(angle < low)
@@ -159,6 +143,10 @@ class StageKinematics:
 
     def nearest_pose(self, pose: np.ndarray) -> np.ndarray:
         return np.array(pose, float)
+
+
+# From joints to pose and back, and the limits of the joints.
+Kinematics = LinkageKinematics | StageKinematics
 
 
 def finite_numbers(what: str, given: np.ndarray, count: int) -> np.ndarray:

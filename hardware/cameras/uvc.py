@@ -1,7 +1,6 @@
 """A USB camera through OpenCV and Video4Linux."""
 
 import time
-from dataclasses import dataclass
 
 import cv2
 
@@ -17,26 +16,8 @@ MANUAL_EXPOSURE = 1
 CLOCK_SLACK_S = 5.0
 # Number of pictures that the driver may queue. With 1, the next picture is always the newest.
 BUFFERS = 1
-
-
-@dataclass(frozen=True)
-class UvcSettings:
-    """Requested settings of the camera; None leaves a setting unchanged.
-
-    Attributes
-    ----------
-    exposure : float
-        In 100 us units.
-    white_balance_k : float
-        Colour temperature.
-    """
-
-    width_px: int = 640
-    height_px: int = 480
-    fps: float = 30.0
-    exposure: float | None = 78.0
-    gain: float | None = None
-    white_balance_k: float | None = None
+# Requested settings: size and rate of the pictures if no sensor tells the size, and the exposure in 100 us units.
+WIDTH_PX, HEIGHT_PX, FPS, EXPOSURE = 640, 480, 30.0, 78.0
 
 
 class UvcCamera(LiveSource):
@@ -48,16 +29,12 @@ class UvcCamera(LiveSource):
         Number or device node of the camera.
     spec : SensorSpec, optional
     form : Form
-    settings : UvcSettings
     """
 
-    def __init__(self, node: int | str, spec: SensorSpec | None = None, form: Form = Form.RAW, settings: UvcSettings | None = None) -> None:
+    def __init__(self, node: int | str, spec: SensorSpec | None = None, form: Form = Form.RAW) -> None:
         super().__init__(f"camera {node}", form)
         self._node, self._spec = node, spec
-        size = {"width_px": spec.camera.width_px, "height_px": spec.camera.height_px} if spec else {}
-        self.settings = settings or UvcSettings(**size)
-        self.fps = self.settings.fps
-        self.report: list[tuple[str, float, float]] = []  # name, requested value and value read back of each setting
+        self.fps = FPS
         self._device: cv2.VideoCapture | None = None
 
     def _open(self) -> None:
@@ -65,9 +42,8 @@ class UvcCamera(LiveSource):
             device = cv2.VideoCapture(self._node, cv2.CAP_V4L2)
         if not device.isOpened():
             raise DeviceError(f"{self.name}: can't be opened; 'twin doctor' lists the cameras; check whether another program uses it")
-        self.report = apply_settings(device, self.settings)
-        reported = next(reported for name, _, reported in self.report if name == "fps")
-        self.fps = reported if reported > 0 else self.settings.fps  # a camera may be slower than requested
+        size = (self._spec.camera.width_px, self._spec.camera.height_px) if self._spec else (WIDTH_PX, HEIGHT_PX)
+        self.fps = apply_settings(device, *size)
         self._device = device
 
     def _close(self) -> None:
@@ -94,23 +70,20 @@ def exposed_s(position_ms: float) -> float:
     return position_ms / 1e3 if 0 <= now_s - position_ms / 1e3 < CLOCK_SLACK_S else now_s
 
 
-def apply_settings(device: cv2.VideoCapture, settings: UvcSettings) -> list[tuple[str, float, float]]:
-    """Apply the settings in the order that cameras need. Returns the name, the requested value and the value read back of each."""
-    wanted = [
-        ("fourcc", cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")),
-        ("width", cv2.CAP_PROP_FRAME_WIDTH, settings.width_px),
-        ("height", cv2.CAP_PROP_FRAME_HEIGHT, settings.height_px),
-        ("fps", cv2.CAP_PROP_FPS, settings.fps),
-        ("buffers", cv2.CAP_PROP_BUFFERSIZE, BUFFERS),
-    ]
-    if settings.exposure is not None:
-        wanted += [("auto exposure", cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE), ("exposure", cv2.CAP_PROP_EXPOSURE, settings.exposure)]
-    if settings.gain is not None:
-        wanted.append(("gain", cv2.CAP_PROP_GAIN, settings.gain))
-    wanted.append(("auto white balance", cv2.CAP_PROP_AUTO_WB, 0))
-    if settings.white_balance_k is not None:
-        wanted.append(("white balance", cv2.CAP_PROP_WB_TEMPERATURE, settings.white_balance_k))
-    wanted.append(("autofocus", cv2.CAP_PROP_AUTOFOCUS, 0))
-    for _, key, value in wanted:  # set() does not report failures
+def apply_settings(device: cv2.VideoCapture, width_px: int, height_px: int) -> float:
+    """Apply the settings in the order that cameras need. Returns the rate of the pictures, which may be lower than requested."""
+    wanted = {
+        cv2.CAP_PROP_FOURCC: cv2.VideoWriter.fourcc(*"MJPG"),
+        cv2.CAP_PROP_FRAME_WIDTH: width_px,
+        cv2.CAP_PROP_FRAME_HEIGHT: height_px,
+        cv2.CAP_PROP_FPS: FPS,
+        cv2.CAP_PROP_BUFFERSIZE: BUFFERS,
+        cv2.CAP_PROP_AUTO_EXPOSURE: MANUAL_EXPOSURE,
+        cv2.CAP_PROP_EXPOSURE: EXPOSURE,
+        cv2.CAP_PROP_AUTO_WB: 0,
+        cv2.CAP_PROP_AUTOFOCUS: 0,
+    }
+    for key, value in wanted.items():  # set() does not report failures
         device.set(key, value)
-    return [(name, float(value), float(device.get(key))) for name, key, value in wanted]
+    fps = device.get(cv2.CAP_PROP_FPS)
+    return fps if fps > 0 else FPS

@@ -23,9 +23,8 @@ from scipy.stats.qmc import Sobol
 from hardware.arms.arm import ArmState
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, matrix_of, pose_of
-from hardware.workcell.build import Rig, build_rig
+from hardware.workcell.build import Rig, build_rig, check_plan
 from hardware.workcell.mover import Mover
-from hardware.workcell.plan import check_plan
 from scenes import ObjectSpec, SensorSpec, ServoSpec
 from scenes.experiment import LABELS, ExperimentSpec
 from scenes.files import quote

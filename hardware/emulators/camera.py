@@ -9,23 +9,21 @@ import numpy as np
 
 from hardware.cameras.mjpeg import CONTENT_TYPE, hold_little, jpeg_of, write_part
 from hardware.cameras.source import FrameSource, await_frame
-from hardware.emulators.faults import EVERY_NTH, SECONDS, Emulator, Faults
+from hardware.emulators.faults import EVERY_NTH, SECONDS, Emulator, Fault, Faults
 from hardware.errors import DeviceError, cannot_listen
 from twin.errors import TwinError
 
 CLIENT_WAIT_S = 0.5
 FAULTS = {
-    "frozen": (None, "the same picture again and again"),
-    "black": (None, "the lamps are off"),
-    "resized": (None, "the pictures have half the height"),
-    "dropped": (2.0, "every n-th picture is lost"),
-    "late": (0.3, "pictures arrive this many seconds after their exposure"),
-    "torn": (3.0, "every n-th JPEG ends too early"),
-    "unplugged": (1.0, "the connection is cut and none taken for this many seconds, once"),
-    "silent": (None, "connections stay open, nothing comes"),
+    "frozen": Fault("the same picture again and again"),
+    "black": Fault("the lamps are off"),
+    "resized": Fault("the pictures have half the height"),
+    "dropped": Fault("every n-th picture is lost", 2.0, EVERY_NTH),
+    "late": Fault("pictures arrive this many seconds after their exposure", 0.3, SECONDS),
+    "torn": Fault("every n-th JPEG ends too early", 3.0, EVERY_NTH),
+    "unplugged": Fault("the connection is cut and none taken for this many seconds, once", 1.0, SECONDS),
+    "silent": Fault("connections stay open, nothing comes"),
 }
-# The values that the faults may have.
-RANGES = {"dropped": EVERY_NTH, "late": SECONDS, "torn": EVERY_NTH, "unplugged": SECONDS}
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ class CameraEmulator(Emulator):
     """
 
     def __init__(self, source: FrameSource, *, host: str = "127.0.0.1", port: int = 0, faults: tuple[str, ...] = ()) -> None:
-        self.faults = Faults(FAULTS, RANGES, faults)
+        self.faults = Faults(FAULTS, faults)
         self._source, self._address = source, (host, port)
         self._new = threading.Condition()
         self._part: _Part | None = None

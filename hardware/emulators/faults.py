@@ -1,7 +1,7 @@
 """What all emulated devices have: faults, switched on by name (``NAME`` or ``NAME=VALUE``), and a start and an end."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from threading import Timer
@@ -34,15 +34,22 @@ SHARE = Range(0.001, 1)
 SECONDS = Range(0, 100_000)
 
 
+@dataclass(frozen=True)
+class Fault:
+    """A fault that an emulated device can have: its effect, its value if none is given, and the values that it may have (None: a switch
+    without a value)."""
+
+    effect: str
+    default: float = 1.0
+    allowed: Range | None = None
+
+
 class Faults:
     """The faults that are switched on. They can be changed while the device runs.
 
     Parameters
     ----------
-    known : dict of str to (float or None, str)
-        Default value (None: a switch without a value) and effect of every fault.
-    ranges : mapping of str to Range
-        The values that are allowed, for every fault with a value.
+    known : dict of str to Fault
     given : iterable of str
         ``NAME`` or ``NAME=VALUE``.
 
@@ -52,8 +59,8 @@ class Faults:
         A fault is not known, or its value is not a number or not allowed.
     """
 
-    def __init__(self, known: dict[str, tuple[float | None, str]], ranges: Mapping[str, Range], given: tuple[str, ...] = ()) -> None:
-        self.known, self._ranges = known, ranges
+    def __init__(self, known: dict[str, Fault], given: tuple[str, ...] = ()) -> None:
+        self.known = known
         self._on: dict[str, float] = {}
         for text in given:
             self.add(text)
@@ -72,19 +79,16 @@ class Faults:
             raise TwinError(
                 f"no fault '{quote(name)}'{f' (did you mean {close[0]}?)' if close else ''}; there are: {', '.join(self.known)}"
             )
-        default = self.known[name][0]
-        if default is None:
-            if value:
-                raise TwinError(f"fault '{quote(text)}': {name} is a switch and takes no value; give {name} alone")
-            self._on[name] = 1.0
-            return
-        example = f"for example {name}={default:g}"
+        fault = self.known[name]
+        if fault.allowed is None and value:
+            raise TwinError(f"fault '{quote(text)}': {name} is a switch and takes no value; give {name} alone")
+        example = f"for example {name}={fault.default:g}"
         try:
-            number = float(value) if value else default
+            number = float(value) if value else fault.default
         except ValueError as error:
             raise TwinError(f"fault '{quote(text)}': '{quote(value)}' is not a number; {example}") from error
-        if number not in self._ranges[name]:
-            raise TwinError(f"fault '{quote(text)}': {name} must be {self._ranges[name]}, not {quote(value)}; {example}")
+        if fault.allowed is not None and number not in fault.allowed:
+            raise TwinError(f"fault '{quote(text)}': {name} must be {fault.allowed}, not {quote(value)}; {example}")
         self._on[name] = number
 
     def clear(self) -> None:

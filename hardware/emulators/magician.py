@@ -16,31 +16,24 @@ from threading import Event, Lock, Thread
 import numpy as np
 
 from hardware.arms.magician_wire import Message, take_message
-from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Faults, Range
+from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range
 from hardware.emulators.magician_controller import START_JOINTS_DEG, EmulatedController
 from twin.errors import TwinError
 
 LOG = logging.getLogger(__name__)
 SPLIT_AT = 4
 FAULTS = {
-    "noise": (5.0, "this many random bytes come before each reply"),
-    "split-frames": (0.02, "replies come in two pieces, this many seconds apart"),
-    "wrong-checksum": (3.0, "every n-th reply has a wrong checksum"),
-    "lost-reply": (3.0, "every n-th reply never comes"),
-    "mute": (None, "no reply ever comes"),
-    "unplugged": (5.0, "the cable is pulled, this many seconds after the start"),
-    "lost-steps": (0.5, "each move stops with an alarm after this share of its time"),
-    "stall": (0.5, "each move stops after this share of its time, and its command never ends"),
-    "ignore-moves": (None, "moves are accepted and not executed"),
-    "slow": (0.1, "moves at this share of the speed"),
-    "wide-queue-space": (None, "the queue's space is reported in 8 bytes instead of 4"),
-}
-# The values that the faults may have.
-RANGES = {
-    "noise": Range(1, 1000, whole=True),
-    **dict.fromkeys(("wrong-checksum", "lost-reply"), EVERY_NTH),
-    **dict.fromkeys(("split-frames", "unplugged"), SECONDS),
-    **dict.fromkeys(("lost-steps", "stall", "slow"), SHARE),
+    "noise": Fault("this many random bytes come before each reply", 5.0, Range(1, 1000, whole=True)),
+    "split-frames": Fault("replies come in two pieces, this many seconds apart", 0.02, SECONDS),
+    "wrong-checksum": Fault("every n-th reply has a wrong checksum", 3.0, EVERY_NTH),
+    "lost-reply": Fault("every n-th reply never comes", 3.0, EVERY_NTH),
+    "mute": Fault("no reply ever comes"),
+    "unplugged": Fault("the cable is pulled, this many seconds after the start", 5.0, SECONDS),
+    "lost-steps": Fault("each move stops with an alarm after this share of its time", 0.5, SHARE),
+    "stall": Fault("each move stops after this share of its time, and its command never ends", 0.5, SHARE),
+    "ignore-moves": Fault("moves are accepted and not executed"),
+    "slow": Fault("moves at this share of the speed", 0.1, SHARE),
+    "wide-queue-space": Fault("the queue's space is reported in 8 bytes instead of 4"),
 }
 
 
@@ -71,7 +64,7 @@ class MagicianEmulator(Emulator):
         joints_deg: Sequence[float] = START_JOINTS_DEG,
         time_scale: float = 1.0,
     ) -> None:
-        self.faults = Faults(FAULTS, RANGES, faults)
+        self.faults = Faults(FAULTS, faults)
         self.arm = EmulatedController(self.faults, joints_deg=joints_deg, time_scale=time_scale)
         self.device = ""
         self._link = link

@@ -24,7 +24,7 @@ from hardware.arms.mg400_wire import (
     Mode,
     require_ports,
 )
-from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Faults, Range
+from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range
 from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame
 from hardware.emulators.mg400_grammar import RefusedError, Request, take_request
@@ -42,37 +42,31 @@ SHORT_BYTES = 1000
 POLL_S = 0.002
 # Interval in s of the finite differences that give speeds: the period of the fastest feedback.
 DIFFERENCE_S = 0.008
-# Faults by name: the default value (None: a switch without a value) and what the fault does.
 FAULTS = {
-    "no-tcp-mode": (None, "not in TCP mode: every command is refused with -1"),
-    "split-refusals": (None, "a refusal arrives as two fragments: -1,{},;EnableRobot();"),
-    "needs-motion-client": (None, "the dashboard answers -10000 until a client is on the motion port"),
-    "motion-port-closed": (None, "nobody listens on the motion port and the dashboard answers -10000"),
-    "one-client": (None, "a port hangs up on a second client"),
-    "emergency-stop": (0.0, "the emergency stop is pressed, this many seconds after the start"),
-    "no-fast-feedback": (None, "nobody listens on 30004"),
-    "no-feedback": (None, "nobody listens on 30004 to 30006"),
-    "silent-feedback": (1.0, "each feedback connection falls silent after this many seconds"),
-    "late-feedback": (2.0, "feedback arrives this many seconds late"),
-    "short-packets": (10.0, "every n-th feedback packet is cut short"),
-    "wrong-test-value": (10.0, "every n-th feedback packet has a wrong test value"),
-    "collision": (0.5, "each move ends in a collision alarm after this share of its time"),
-    "stall": (0.5, "each move stops without an alarm after this share of its time"),
-    "ignore-moves": (None, "moves are accepted and not executed"),
-    "slow": (0.1, "moves at this share of the speed"),
-    "no-move-reply": (None, "moves are executed, and their replies are lost"),
-    "no-sync-reply": (None, "Sync() is never answered"),
-    "frozen": (5.0, "the controller answers nothing and sends no feedback, from this many seconds after the start; the arm goes on"),
-    "six-value-pose": (None, "GetPose() gives six values"),
-    "error-groups": (7.0, "GetErrorID() gives this many groups"),
-    "die": (5.0, "the arm goes dead, this many seconds after the start"),
-}
-# The values that the faults may have.
-RANGES = {
-    **dict.fromkeys(("short-packets", "wrong-test-value"), EVERY_NTH),
-    **dict.fromkeys(("emergency-stop", "silent-feedback", "late-feedback", "frozen", "die"), SECONDS),
-    **dict.fromkeys(("collision", "stall", "slow"), SHARE),
-    "error-groups": Range(1, 100, whole=True),
+    "no-tcp-mode": Fault("not in TCP mode: every command is refused with -1"),
+    "split-refusals": Fault("a refusal arrives as two fragments: -1,{},;EnableRobot();"),
+    "needs-motion-client": Fault("the dashboard answers -10000 until a client is on the motion port"),
+    "motion-port-closed": Fault("nobody listens on the motion port and the dashboard answers -10000"),
+    "one-client": Fault("a port hangs up on a second client"),
+    "emergency-stop": Fault("the emergency stop is pressed, this many seconds after the start", 0.0, SECONDS),
+    "no-fast-feedback": Fault("nobody listens on 30004"),
+    "no-feedback": Fault("nobody listens on 30004 to 30006"),
+    "silent-feedback": Fault("each feedback connection falls silent after this many seconds", 1.0, SECONDS),
+    "late-feedback": Fault("feedback arrives this many seconds late", 2.0, SECONDS),
+    "short-packets": Fault("every n-th feedback packet is cut short", 10.0, EVERY_NTH),
+    "wrong-test-value": Fault("every n-th feedback packet has a wrong test value", 10.0, EVERY_NTH),
+    "collision": Fault("each move ends in a collision alarm after this share of its time", 0.5, SHARE),
+    "stall": Fault("each move stops without an alarm after this share of its time", 0.5, SHARE),
+    "ignore-moves": Fault("moves are accepted and not executed"),
+    "slow": Fault("moves at this share of the speed", 0.1, SHARE),
+    "no-move-reply": Fault("moves are executed, and their replies are lost"),
+    "no-sync-reply": Fault("Sync() is never answered"),
+    "frozen": Fault(
+        "the controller answers nothing and sends no feedback, from this many seconds after the start; the arm goes on", 5.0, SECONDS
+    ),
+    "six-value-pose": Fault("GetPose() gives six values"),
+    "error-groups": Fault("GetErrorID() gives this many groups", 7.0, Range(1, 100, whole=True)),
+    "die": Fault("the arm goes dead, this many seconds after the start", 5.0, SECONDS),
 }
 
 
@@ -117,7 +111,7 @@ class Mg400Emulator(Emulator):
             raise TwinError(str(error)) from error
         require_ports(port_offset or 0)
         self.host, self._port_offset = host, port_offset
-        self.faults = Faults(FAULTS, RANGES, faults)
+        self.faults = Faults(FAULTS, faults)
         self.arm = Mg400Controller(self.faults, joints_deg=joints_deg, time_scale=time_scale)
         self._commands = Mg400Commands(self.arm, version)
         self._bare = version < FIRST_NUMBERED_REPLIES

@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+from hardware.emulators.faults import Fault
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import OLD_FIRMWARE, Mg400Emulator
 from hardware.errors import DeviceError
@@ -89,6 +90,6 @@ def _require_time_scale(time_scale: float) -> None:
         raise DeviceError(f"`time_scale` {time_scale:g}: expected {SLOWEST:g} to {FASTEST:g} times the real arm's speed")
 
 
-def fault_lines(known: dict[str, tuple[float | None, str]]) -> list[str]:
+def fault_lines(known: dict[str, Fault]) -> list[str]:
     """Lines of text about an emulator's faults: default values and effects."""
-    return [f"{name + ('' if default is None else f'={default:g}'):22} {meaning}" for name, (default, meaning) in known.items()]
+    return [f"{name + ('' if fault.allowed is None else f'={fault.default:g}'):22} {fault.effect}" for name, fault in known.items()]

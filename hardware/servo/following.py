@@ -1,6 +1,8 @@
-"""One run of surface following, from a plan to results that are also written to disk."""
+"""One run of surface following, from a plan to results that are also written to disk, and a comparison of models by such runs."""
 
 import logging
+import re
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -8,30 +10,43 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.errors import DeviceError, in_short
-from hardware.rig.geometry import PlacedObject, shift_in_tool
+from hardware.rig.geometry import PlacedObject, matrix_of, pose_of, shift_in_tool
 from hardware.rig.last_axis import LastAxis, poses_along, turns_back_mm
 from hardware.servo.loop import ServoLoop, require_labels
-from hardware.servo.policy_law import policy_law
 from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
 from hardware.servo.timing import Timing
-from hardware.servo.trajectory import Measures, Trajectory, measure, trajectory_figure, trajectory_of, write_csv
-from hardware.workcell.build import TWIN, Rig, build_rig, load_rest_frame
-from hardware.workcell.plan import check_plan
+from hardware.servo.trajectory import Measures, Trajectory, comparison_figure, measure, trajectory_figure, trajectory_of, write_csv
+from hardware.workcell.build import TWIN, Rig, build_rig, check_plan, load_rest_frame
 from scenes import ObjectSpec, ServoSpec, load_experiment
 from scenes.files import quote
-from twin.errors import OptionError, TwinError
+from twin.errors import OptionError, StoreError, TwinError
 from twin.estimate import Estimate, SensorModel
-from twin.policy import PolicyModel
+from twin.policy import KnownContacts, Policy, PolicyError, PolicyModel, load_policy
 from twin.progress import Progress, Step, silent, stage
 from twin.records import KeptAlso
 from twin.records.session import SessionWriter, plain
 from twin.report.charts import save_figure
+from twin.report.table import write_rows
+from twin.rig.mounting import Mounting
 from twin.store import write_json, writes
-from twin.types import FIRST, Frame
+from twin.types import FIRST, Frame, ReadableResult
 
+AROUND = ("SurfaceFollow", "ContourFollow")
+"""Tasks whose policies follow an object's outline, as a loop with an arm needs it."""
+# Measures that are printed, with their headings.
+SHOWN = {
+    "smoothness": "S",
+    "local_smoothness": "local S",
+    "path_error_mm": "path mm",
+    "depth_error_mm": "depth mm",
+    "angle_error_deg": "angle deg",
+    "completed": "completed",
+    "lost_contacts": "lost",
+}
 LOG = logging.getLogger(__name__)
 # Subfolder of the results with the session.
 SESSION = "session"
@@ -46,6 +61,35 @@ SLOWEST_HZ, FASTEST_HZ = 0.1, 1000.0
 CHECK_MM = 10.0
 # Most steps of a run. They take an arm days.
 MOST_STEPS = 1_000_000
+
+
+def policy_law(policy: Policy, mounting: Mounting) -> Callable[[np.ndarray, Estimate], np.ndarray]:
+    """Function from the arm's pose (6,) and the policy's answer to a frame to the next pose (6,)."""
+    T_tool_work = np.eye(4)
+    T_tool_work[:3, :3] = mounting.work_axes
+
+    def law(pose: np.ndarray, answer: Estimate) -> np.ndarray:
+        step = policy.step(np.asarray(answer.value, float))
+        move = np.eye(4)
+        move[:3, :3] = Rotation.from_rotvec(step[3:], degrees=True).as_matrix()
+        move[:3, 3] = step[:3]
+        return pose_of(matrix_of(pose) @ T_tool_work @ move @ T_tool_work.T, pose)
+
+    return law
+
+
+def load_for_outlines(path: Path, contacts_of: Callable[[Policy], KnownContacts | None] = lambda _: None) -> PolicyModel:
+    """Load a policy that follows an object's outline, ready for frames. ``contacts_of`` gives the contacts that it knows.
+
+    Raises
+    ------
+    PolicyError
+        The file holds no policy, or one of another task.
+    """
+    policy = load_policy(path)
+    if policy.about["task"] not in AROUND:
+        raise PolicyError(f"{path}: a policy of {policy.about['task']}; to follow an outline give a policy of {' or '.join(AROUND)}")
+    return PolicyModel(policy, contacts=contacts_of(policy))
 
 
 @dataclass(frozen=True)
@@ -321,3 +365,111 @@ def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, 
     }
     measures = write_json(out / "measures.json", plain(content))
     return [write_csv(out / "trajectory.csv", followed.path), save_figure(out / "trajectory.png", figure), measures]
+
+
+@dataclass(frozen=True)
+class ServoStudyPlan:
+    """Models, objects and settings of the comparison.
+
+    Attributes
+    ----------
+    models : mapping of str to SensorModel
+        The keys are the models' names in the results.
+    objects : tuple of ObjectSpec
+    servo : ServoSpec
+    steps : int or None
+        Number of steps for each object. None: once around the object.
+    seed : int
+        Seed of the twin's noise.
+    plain_light : bool
+        See ``build_rig``.
+    """
+
+    models: Mapping[str, SensorModel]
+    objects: tuple[ObjectSpec, ...]
+    servo: ServoSpec
+    steps: int | None = None
+    seed: int = 0
+    plain_light: bool = False
+
+
+@dataclass(frozen=True, repr=False)
+class ServoStudy(ReadableResult):
+    """The result of ``study_servo``.
+
+    Attributes
+    ----------
+    found : dict
+        For each model and object: the run, or the reason why it did not make a single step.
+    written : list of Path
+    """
+
+    found: dict[tuple[str, str], Followed | str]
+    written: list[Path]
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """``model``, ``object``, every measure and ``failure`` of each run that made a step."""
+        return [
+            {"model": model, "object": name, **asdict(run.measures), "failure": run.failure}
+            for (model, name), run in self.found.items()
+            if isinstance(run, Followed)
+        ]
+
+    def lines(self) -> list[str]:
+        """The comparison as a table in plain text."""
+        wide = max((len(model) for model, _ in self.found), default=0)
+        lines = [f"{'model':{wide}} {'object':10}" + "".join(f"{head:>11}" for head in SHOWN.values())]
+        for (model, name), run in self.found.items():
+            lines.append(f"{model:{wide}} {name:10}{f'  failed: {run}' if isinstance(run, str) else _cells(run)}")
+        return lines
+
+
+@writes("study.csv", "study.png")
+def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent) -> ServoStudy:
+    """Follow each object with each model in the twin, and write each run and the comparison to ``out``.
+
+    It writes a folder for each model and object as ``follow`` does, ``study.csv`` and ``study.png``. A run that can't make a single step
+    is also a result of the study.
+
+    Raises
+    ------
+    StoreError
+        A run can't be written.
+    TwinError
+        No run made a step.
+    """
+    found: dict[tuple[str, str], Followed | str] = {}
+    for label, model in plan.models.items():
+        for obj in plan.objects:
+            run_plan = FollowPlan(obj, plan.servo, steps=plan.steps, seed=plan.seed, plain_light=plan.plain_light)
+            folder = out / folder_name(label) / obj.name
+            try:
+                followed = follow(run_plan, model, folder, about={"model": label})
+                assert isinstance(followed, Followed)
+                found[label, obj.name] = followed
+            except StoreError:
+                raise
+            except TwinError as error:
+                found[label, obj.name] = str(error)
+            progress("objects followed", len(found), len(plan.models) * len(plan.objects))
+    reasons = [said for said in found.values() if isinstance(said, str)]
+    if reasons and len(reasons) == len(found):
+        raise TwinError(f"none of {len(found)} runs made a step; the first: {reasons[0]}")
+    made = ServoStudy(found, [])
+    made.written.append(write_rows(out / "study.csv", made.rows))
+    pictures = [(*key, run.path, run.outline_mm) for key, run in found.items() if isinstance(run, Followed)]
+    if pictures:
+        made.written.append(save_figure(out / "study.png", comparison_figure(pictures)))
+    return made
+
+
+def folder_name(label: str) -> str:
+    """A model's name as a valid name of a folder: one part of a path, and never the parent folder."""
+    return re.sub(r"^\.+|[^\w.-]+", "_", label) or "_"
+
+
+def _cells(run: Followed) -> str:
+    measures = asdict(run.measures)
+    cells = (f"{measures[key]:>11.0%}" if key == "completed" else f"{measures[key]:>11.4g}" for key in SHOWN)
+    return "".join(cells) + (f"  ended early: {run.failure}" if run.failure else "")

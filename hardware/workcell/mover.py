@@ -18,9 +18,8 @@ from hardware.rig.approach import path_around
 from hardware.rig.geometry import matrix_of, shift_in_tool
 from hardware.rig.last_axis import HOLD_DEG, LastAxis
 from hardware.safety.decide import Sensed
-from hardware.safety.eyes import FreshFrames
+from hardware.safety.eyes import ArmWatch, FreshFrames
 from hardware.safety.safe_arm import NoWayBackError, SafeArm, try_each
-from hardware.safety.watch import ArmWatch
 from hardware.workcell.build import Rig
 from twin.types import Frame
 

@@ -1,4 +1,6 @@
-"""Time the pipeline against the published method, frame by frame in the same run and thread.
+"""Time the pipeline against the published method, frame by frame in the same run and thread; and consecutive frames.
+
+Recorded contacts are in no order. Consecutive frames are made of them: each is followed by the one whose pins moved least.
 
 Run by ``make bench``, or: PYTHONPATH=.:tests/helpers python tests/bench/bench_pipeline.py [--sensor mg400-331] [--frames 200]. It takes
 the recordings named by TACTIP_REAL (default ../shared/real) where they are, else rasterised frames.
@@ -50,11 +52,16 @@ def timed(call, *arguments):
 
 @dataclass(frozen=True)
 class Times:
-    """ms of every frame by stage, ours and the published method's, and what the frames are."""
+    """ms of every frame by stage, ours and the published method's, and what the frames are.
+
+    ``sequence`` has the ms of consecutive frames, and ``same`` the share of them whose pins are those of the frame alone, to the last bit.
+    """
 
     what: str
     ours: dict[str, list[float]]
     theirs: dict[str, list[float]]
+    sequence: list[float]
+    same: float
 
     @property
     def ours_ms(self) -> float:
@@ -75,17 +82,35 @@ def measure(sensor: str, count: int) -> Times:
     pipeline, baseline = Pipeline(spec, Form.PROCESSED), Baseline(spec)
     ours: dict[str, list[float]] = {}
     theirs: dict[str, list[float]] = {}
+    observed = []
     for k, frame in enumerate(frames[:1] * WARM_UP + frames):
         observation, total = timed(pipeline, frame)
         _, feature_ms = timed(node_features, observation.graph, pipeline.reference) if observation.valid else (None, 0.0)
         nodes, detect_ms = timed(baseline.detect, frame.image)
         _, graph_ms = timed(baseline.graph, nodes)
         if k >= WARM_UP:
+            observed.append(observation)
             for stage, ms in {**observation.ms, "features": feature_ms, "total": total + feature_ms}.items():
                 ours.setdefault(stage, []).append(ms)
             for stage, ms in {"detect": detect_ms, "graph": graph_ms, "total": detect_ms + graph_ms}.items():
                 theirs.setdefault(stage, []).append(ms)
-    return Times(f"{len(frames)} {what}, {spec.name}", ours, theirs)
+    sequence, same = time_sequence(pipeline, frames, observed)
+    return Times(f"{len(frames)} {what}, {spec.name}", ours, theirs, sequence, same)
+
+
+def time_sequence(pipeline, frames, observed):
+    """The ms of frames in an order in which their pins move least, and the share of them with the same pins as alone."""
+    order, left = [0], set(range(1, len(frames)))
+    nodes_px = [seen.graph.nodes_px if seen.valid else np.full((pipeline.spec.pins.count, 2), np.inf) for seen in observed]
+    while left:
+        order.append(min(left, key=lambda k: np.abs(nodes_px[k] - nodes_px[order[-1]]).max()))
+        left.remove(order[-1])
+    following, spent_ms, same = pipeline.with_history(), [], []
+    for k in order[:1] * WARM_UP + order:
+        seen, ms = timed(following, frames[k])
+        spent_ms.append(ms)
+        same.append(np.array_equal(seen.pins_px, observed[k].pins_px, equal_nan=True))
+    return spent_ms[WARM_UP:], float(np.mean(same))
 
 
 def main() -> None:
@@ -100,6 +125,8 @@ def main() -> None:
     for title, stages in (("pipeline", found.ours), ("published method", found.theirs)):
         for stage, ms in stages.items():
             print(f"{title + ' ' + stage:24s}" + "".join(f"{value:9.3f}" for value in np.percentile(ms, (50, 95, 99))))
+    print(f"{'consecutive frames':24s}" + "".join(f"{value:9.3f}" for value in np.percentile(found.sequence, (50, 95, 99))))
+    print(f"pins of consecutive frames as alone: {found.same:.1%}")
     print(f"ratio of the median totals: {found.ratio:.1f}")
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from browser_page import open_page
 from studio_client import StudioClient
 
-from hardware.live.feed import CameraFeed
+from hardware.live.studio_mode import LiveMode
 from scenes import load_sensor
 from training.estimate.loading import models_by_sensor
 from twin.studio.pose import ObjectPose
@@ -60,7 +60,7 @@ def main() -> None:
     radius = load_sensor(SENSOR).skin.outer_radius_mm
     plan = StudioPlan(first_state(None, SENSOR, OBJECT), args.out, port=18190)
     film = FilmWriter(args.out / "studio.mp4")
-    with Studio(plan, models_by_sensor(None), CameraFeed) as studio, StudioClient(studio.page.url) as client:
+    with Studio(plan, models_by_sensor(None), LiveMode) as studio, StudioClient(studio.page.url) as client:
         client.wait(lambda u: "90 % interval" in u.html, 120)
         with open_page(studio.page.url, chromium=args.chromium) as (page, messages):
             for k in range(int(args.seconds * RATE_HZ) + 1):

@@ -22,7 +22,7 @@ from hardware.cameras.reader import DevicePicture
 from hardware.collect.collect import LIFT_MM, Collection, CollectPlan, collect, collect_frames
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
-from hardware.live.feed import CameraFeed
+from hardware.live.studio_mode import CameraFeed
 from hardware.rig.geometry import PlacedObject, shift_in_tool
 from hardware.safety.decide import SafetyLimits, load_limits
 from hardware.safety.eyes import NEAR_MM, PIECE_MM, BlindError, FreshFrames, pieces_to
@@ -30,8 +30,7 @@ from hardware.safety.safe_arm import SafeArm
 from hardware.servo.following import FollowPlan, follow
 from hardware.servo.loop import ServoLoop
 from hardware.servo.step import LoopHooks, LoopSettings
-from hardware.workcell.build import Rig
-from hardware.workcell.plan import check_plan
+from hardware.workcell.build import Rig, check_plan
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.pins import Pipeline, measure_reference, nominal_reference
 from twin.rig.mounting import Mounting
@@ -226,7 +225,7 @@ def studio_arm(monkeypatch):
     feeds = []
 
     def start(source):
-        monkeypatch.setattr("hardware.live.feed.open_camera", lambda *_: source)
+        monkeypatch.setattr("hardware.live.studio_mode.open_camera", lambda *_: source)
         feeds.append(CameraFeed("any", "simulated", StudioModel()))
         feeds[0].start(lambda shot: None, lambda why: None)
         return feeds[0].robot

@@ -17,8 +17,8 @@ from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.collect.collect import Collection, collect
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError, DeviceNotConnectedError
-from hardware.live.feed import CameraFeed
 from hardware.live.lerobot import LeRobotArm
+from hardware.live.studio_mode import CameraFeed
 from hardware.rig.geometry import PlacedObject
 from hardware.safety.decide import SafetyLimits
 from hardware.safety.safe_arm import SafeArm
@@ -225,7 +225,7 @@ class TestMg400:
 @pytest.fixture
 def feed(monkeypatch):
     """The studio's camera with an armed arm, an emulator of it, and the texts that it ended with."""
-    monkeypatch.setattr("hardware.live.feed.open_camera", lambda *_: shows(AT_REST))
+    monkeypatch.setattr("hardware.live.studio_mode.open_camera", lambda *_: shows(AT_REST))
     offset = free_offset()
     with Mg400Emulator(port_offset=offset) as emulator:
         made = CameraFeed("any", f"mg400:127.0.0.1:{29999 + offset}", StudioModel())

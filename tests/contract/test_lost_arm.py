@@ -16,8 +16,8 @@ from hardware.emulators.twin_camera import FeedbackPose
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
 from hardware.safety.decide import SafetyLimits
+from hardware.safety.eyes import ArmWatch
 from hardware.safety.safe_arm import SafeArm
-from hardware.safety.watch import ArmWatch
 from hardware.servo.loop import ServoLoop
 from hardware.servo.step import LoopHooks, LoopSettings
 from hardware.workcell.build import Rig

@@ -13,8 +13,8 @@ from hardware.arms.magician import Magician
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.errors import DeviceError
 from hardware.safety.decide import SafetyLimits
+from hardware.safety.eyes import ArmWatch
 from hardware.safety.safe_arm import SafeArm
-from hardware.safety.watch import ArmWatch
 
 STALLS_S = (0.5, 0.5, 1.2)  # the last is longer than feedback may be old
 NOTICED_S = 1.5

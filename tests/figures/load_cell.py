@@ -17,7 +17,7 @@ from twin.calibration.size import of_radius
 from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
-from twin.report.numbers import force_interval
+from twin.report.table import force_interval
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
@@ -51,24 +51,12 @@ def load_cell(work: Path) -> Measured:
     small = of_radius(sensor.model_copy(update={"rig": RigSpec(tcp_to_dome_mm=-sensor.skin.apex_mm)}), SMALL_MM)
     plain = validate_contacts(small, table, experiment, work / "small", across=ACROSS).summary["parts"]["evaluated"]
     fitted = calibrate_to_file(table, sensor, experiment, work / "fitted.toml", labels=ROWS, seed=SEED, workers=2, across=ACROSS).summary
-    held = fitted["parts"]["evaluated"]
-    errors = {"before": held["before_n"], "error": held["error_n"], "small": plain["error_n"]}
-    shapes = {
-        "correlation": held["correlation"],
-        "scale": held["scale"],
-        "small_correlation": plain["correlation"],
-        "small_scale": plain["scale"],
-    }
-    found = {f"{key}_{axis}": Value(value, "N") for key, of in errors.items() for axis, value in zip("xyz", of, strict=True)}
-    found |= {f"{key}_{axis}": Value(value) for key, of in shapes.items() for axis, value in zip("xyz", of, strict=True)}
-    found |= {"inside": Value(held["inside"]), "evaluated": Value(held["rows"]), "fitted": Value(fitted["parts"]["fitted"]["rows"])}
+    found = _fit_figures(fitted) | {"fitted": Value(fitted["parts"]["fitted"]["rows"])}
+    found |= {f"small_{axis}": Value(value, "N") for axis, value in zip("xyz", plain["error_n"], strict=True)}
+    for key in ("correlation", "scale"):
+        found |= {f"small_{key}_{axis}": Value(value) for axis, value in zip("xyz", plain[key], strict=True)}
     for name, each in zip(("sliding", "sticking"), fitted["slip"], strict=True):
         found |= {f"{name}.rows": Value(each["rows"]), f"{name}.ratio": Value(each["ratio"])}
-    for each in fitted["parameters"]:
-        name = each["name"].replace(".", "_")
-        found |= (
-            {f"{name}.{key}": Value(each[key]) for key in ("start", "value", "low", "high")} if "force_sensor" not in each["name"] else {}
-        )
     return found
 
 
@@ -205,17 +193,24 @@ def _simulated_levels(sensor: SensorSpec, label: ArmLabel) -> tuple[float, float
     return normal[0], side[top], side[top] / max(normal[top], 1e-9)
 
 
-def _of_fit(fitted: ForceComparison) -> Measured:
-    """Errors on rows kept out, fitted parameters with their intervals, and the force of a flat press with its interval."""
-    held, sensor = fitted.summary["parts"]["evaluated"], fitted.sensor
+def _fit_figures(summary: dict[str, Any]) -> Measured:
+    """Errors on rows kept out, and fitted parameters with their intervals."""
+    held = summary["parts"]["evaluated"]
     units: dict[str, tuple[str, Any]] = {"before": ("N", held["before_n"]), "error": ("N", held["error_n"])}
     units |= {"correlation": ("", held["correlation"]), "scale": ("", held["scale"])}
     found = {f"{key}_{axis}": Value(value, unit) for key, (unit, of) in units.items() for axis, value in zip("xyz", of, strict=True)}
-    found |= {"inside": Value(held["inside"]), "evaluated": Value(held["rows"]), "factor": Value(sensor.skin.stiffness_factor)}
-    for each in fitted.summary["parameters"]:
+    found |= {"inside": Value(held["inside"]), "evaluated": Value(held["rows"])}
+    for each in summary["parameters"]:
         name = each["name"].replace(".", "_")
         if "force_sensor" not in each["name"]:
-            found |= {f"{name}.{key}": Value(each[key]) for key in ("start", "value", "low", "high", "known")}
+            found |= {f"{name}.{key}": Value(each[key]) for key in ("start", "value", "low", "high")}
+    return found
+
+
+def _of_fit(fitted: ForceComparison) -> Measured:
+    """The figures of a fit, and the force of a flat press with its interval."""
+    sensor = fitted.sensor
+    found = _fit_figures(fitted.summary) | {"factor": Value(sensor.skin.stiffness_factor)}
     press = SkinSolver(sensor, resolution=Resolution(ACROSS)).press(load_object("plane"), ContactPose(indent_mm=REFERENCE_MM))
     low, high = force_interval(press.force_n.tolist(), sensor.skin.stiffness_factor)
     return found | {"reference": Value(float(press.force_n[2]), "N"), "reference.low": Value(low, "N"), "reference.high": Value(high, "N")}

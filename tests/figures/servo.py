@@ -21,7 +21,7 @@ COLUMNS = {
     "servo.mg400-331",
     "twin study servo --model mg400-331 --out OUT",
     sensors=("mg400-331",),
-    code=("hardware.servo.study", "training.estimate.estimator"),
+    code=("hardware.servo.following", "training.estimate.estimator"),
     shipped=("training/weights/mg400-331",),
     minutes=15,
     beside=DRAWN,

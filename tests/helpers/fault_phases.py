@@ -70,8 +70,8 @@ class Told:
 
 def measure(device: str, fault: str, phase: str) -> Told:
     """Bring an emulated arm into a phase of a move with a fault, and see what happens."""
-    known = DEVICES[device][fault][0]
-    text = fault if known is None else f"{fault}={VALUES.get(fault, known)}"
+    known = DEVICES[device][fault]
+    text = fault if known.allowed is None else f"{fault}={VALUES.get(fault, known.default)}"
     first = (text,) if phase == "before" and fault not in ("die", "unplugged") else ()
     emulator = Mg400Emulator(port_offset=None, faults=first) if device == "mg400" else MagicianEmulator(faults=first)
     calls = SimpleNamespace(fault_s=0.0, longest_s=0.0, told="", ended_s=0.0)

@@ -19,8 +19,8 @@ from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
+from hardware.servo.following import load_for_outlines, policy_law
 from hardware.servo.loop import ServoLoop
-from hardware.servo.policy_law import load_for_outlines, policy_law
 from hardware.servo.step import LoopHooks, LoopSettings
 from hardware.servo.trajectory import measure, trajectory_of
 from hardware.workcell.build import Rig

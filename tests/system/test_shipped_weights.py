@@ -13,7 +13,7 @@ import pytest
 from fresh_contacts import read_for, simulate_contacts
 
 from training.estimate.estimator import PoseEstimator
-from training.runs.packed import shipped_names
+from training.runs.run_files import shipped_names
 from training.studies.judging import measure_errors
 from twin.frames import open_recording
 from twin.types import Form

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from browser_page import open_page
 
-from hardware.live.feed import CameraFeed
+from hardware.live.studio_mode import LiveMode
 from training.estimate.loading import models_by_sensor
 from twin.studio.state import first_state
 from twin.studio.studio import Studio, StudioPlan
@@ -23,7 +23,7 @@ LEAST_LIT = 40  # gray level of the brightest 1 % of a drawn scene
 @pytest.fixture(scope="module")
 def studio(tmp_path_factory):
     plan = StudioPlan(first_state(None, "mg400-127", "sphere"), tmp_path_factory.mktemp("studio"), port=18290, traces=False)
-    with Studio(plan, models_by_sensor(None), CameraFeed) as made:
+    with Studio(plan, models_by_sensor(None), LiveMode) as made:
         yield made
 
 

@@ -18,7 +18,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.http11 import Request
 
 from hardware.errors import DeviceError
-from hardware.live.feed import CameraFeed, WatchedArm
+from hardware.live import studio_mode
+from hardware.live.studio_mode import CameraFeed, LiveMode, WatchedArm
 from scenes import load_sensor
 from training.estimate.loading import models_by_sensor
 from twin.errors import TwinError
@@ -39,7 +40,7 @@ WAIT_S = 40.0
 def studio(tmp_path_factory):
     out = tmp_path_factory.mktemp("studio")
     plan = StudioPlan(first_state(None, SENSOR, "sphere"), out, port=18090, traces=False)
-    with Studio(plan, models_by_sensor(None), CameraFeed) as made:
+    with Studio(plan, models_by_sensor(None), LiveMode) as made:
         yield made
 
 
@@ -318,7 +319,7 @@ def test_of_feeds_connected_at_the_same_time_one_stays_and_every_other_lets_go_o
             super().start(on_shot, on_end)
 
     feeds, live = [], studio.modes[3]
-    monkeypatch.setattr(live, "_open_feed", lambda *plan: feeds.append(Feed(*plan)) or feeds[-1])
+    monkeypatch.setattr(studio_mode, "CameraFeed", lambda *plan: feeds.append(Feed(*plan)) or feeds[-1])
     write_recording(tmp_path, load_sensor(SENSOR), 3)
     client.set("camera", "")
     until(lambda: not live._camera.value and live._twin.contact.model is not None)

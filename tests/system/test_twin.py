@@ -124,7 +124,7 @@ def test_a_picture_in_which_the_pipeline_finds_no_pins_is_said():
     blind = spec.model_copy(update={"pipeline": spec.pipeline.model_copy(update={"raw": aside})})
     simulator = Simulator(blind, quality="rasterised")
     rendered = simulator.render(simulator.rest)
-    said = RenderedContact(simulator.rest, rendered, look_at(simulator, rendered), []).lines()
+    said = RenderedContact(simulator.rest, rendered, look_at(simulator, rendered), [], simulator.spec.skin.stiffness_factor).lines()
     assert "note: the pipeline can't use the picture: too few pins" in said[1]
 
 

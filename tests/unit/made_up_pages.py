@@ -14,14 +14,13 @@ from training.data.targets import PRESETS
 from training.studies.label_audit import summary_of, write_audit
 from training.studies.objects import ObjectsPlan, verdicts
 from training.studies.tac_vgnn import page as study_report
-from training.studies.tac_vgnn.contacts import AreaChange, contacts_figure
 from training.studies.tac_vgnn.models import plan_run
+from training.studies.tac_vgnn.study import AreaChange, contacts_figure
 from twin.calibration.contact.report import write_calibration
 from twin.calibration.optics import Calibration
 from twin.calibration.optics import write_page as write_calibration_page
-from twin.demo.page import ContactContent
-from twin.demo.page import write_page as write_demo_page
-from twin.demo.stages import DepthRow
+from twin.demo.make_demo import ContactContent, DepthRow
+from twin.demo.make_demo import write_page as write_demo_page
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.evaluation.pictures import report as realism
 from twin.evaluation.pictures.compare import Pair
@@ -65,29 +64,23 @@ def sim_to_real(out: Path) -> Path:
         for name, n, model, e in told
     ]
     write_table(out / "study.csv", rows)
-    return write_page(
-        out,
-        sensor=SENSOR,
-        tested=752,
-        frames=3762,
-        labelled=40,
-        seed=0,
-        calibrated=False,
-        error_px=0.31,
-        modes=[{"share": 0.61, "told": 0.8}, {"share": 0.2, "told": 0.0}],
-        friction=FrictionSpread(low=0.14, high=1.3),
-        simulated=25344,
-        contacts=500,
-        names=LABELS,
-        left_out=np.array([0.071, 0.912]),
-        columns=list(rows[0]),
-        rows=rows,
-        problems=[f"no label: {HOSTILE}"],
+    recording = Rows(count=3762, targets=SimpleNamespace(names=LABELS), problems=[f"no label: {HOSTILE}"])
+    ground = SimpleNamespace(
+        setup=SimpleNamespace(sensor=load_sensor(SENSOR)),
+        plan=SimpleNamespace(labels=40, seed=0, calibrate=False),
+        out=out,
+        real=recording,
+        chosen=SimpleNamespace(test=range(752)),
+        residuals=SimpleNamespace(error_px=0.31),
+        full=SimpleNamespace(randomisation=SimpleNamespace(friction=FrictionSpread(low=0.14, high=1.3))),
     )
+    beside = SimpleNamespace(left_out=np.array([0.071, 0.912]))
+    modes = [{"share": 0.61, "told": 0.8}, {"share": 0.2, "told": 0.0}]
+    return write_page(ground, rows, beside, modes, Rows(count=25344, group=np.arange(500)))
 
 
 def across_objects(out: Path) -> Path:
-    from training.studies.objects.page import write_page
+    from training.studies.objects.study import write_page
 
     experiment = load_experiment("objects-2d")
     train, unseen = (load_object("plane"), load_object("sphere")), (load_object("edge"),)
@@ -250,7 +243,6 @@ def demo(out: Path) -> Path:
         machine="Rendered here.",
         contacts=[contact],
         motions=chart,
-        motion_sensor=SENSOR,
         tables={SENSOR: [DepthRow(1.5, 2.0, 1.9, 12.3, 0.5)]},
         seconds={"motions": 1.5},
     )

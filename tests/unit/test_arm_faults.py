@@ -12,25 +12,20 @@ from hardware.emulators.mg400 import Mg400Emulator
 from twin.errors import TwinError
 
 DEVICES = {"mg400": mg400, "magician": magician, "camera": camera}
-VALUED = [(device, name) for device, module in DEVICES.items() for name, (default, _) in module.FAULTS.items() if default is not None]
+VALUED = [(device, name) for device, module in DEVICES.items() for name, fault in module.FAULTS.items() if fault.allowed]
 
 
 def given(device, text):
     module = DEVICES[device]
-    faults = Faults(module.FAULTS, module.RANGES)
+    faults = Faults(module.FAULTS)
     faults.add(text)
     return faults
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_every_fault_with_a_value_and_no_other_has_a_range(device):
-    assert set(DEVICES[device].RANGES) == {name for known, name in VALUED if known == device}
-
-
 @pytest.mark.parametrize(("device", "name"), VALUED)
 def test_a_fault_takes_the_values_of_its_range_and_no_others(device, name):
-    allowed = DEVICES[device].RANGES[name]
-    for value in (DEVICES[device].FAULTS[name][0], allowed.low, allowed.high):
+    allowed = DEVICES[device].FAULTS[name].allowed
+    for value in (DEVICES[device].FAULTS[name].default, allowed.low, allowed.high):
         assert given(device, f"{name}={value}").value(name) == value
     beyond = [math.nextafter(allowed.low, -math.inf), math.nextafter(allowed.high, math.inf), math.nan, math.inf, -math.inf, -1.0]
     for value in (*beyond, *([allowed.low + 0.5] if allowed.whole else [])):

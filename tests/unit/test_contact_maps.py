@@ -10,9 +10,8 @@ from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.part import OneFrame
 from training.models.touch.model import TOUCH
-from training.runs.packed import pack
-from training.runs.run_files import MAPS
-from training.studies.prediction import Predictions, write_frame_maps
+from training.runs.run_files import MAPS, pack
+from training.studies.evaluation import Predictions, write_frame_maps
 from training.touch.contact_maps import compare_maps, read_maps, write_maps
 from twin.errors import StoreError
 from twin.geometry.mesh import build_mesh
@@ -74,12 +73,12 @@ def test_maps_of_simulated_contacts_are_learnt_and_agree_with_the_forces_told(co
     made = estimator.predict_table(data.pins)
     maps = estimator.maps_of(data.pins, made.mean)
     rated = compare_maps(maps, data, np.arange(len(data)))
-    assert rated.states > 20 and rated.patch_iou > 0.8 and rated.pressure_correlation > 0.9 and rated.skin_mm < 0.1
+    assert rated["states"] > 20 and rated["patch_iou"] > 0.8 and rated["pressure_correlation"] > 0.9 and rated["skin_mm"] < 0.1
     column = [estimator.names.index(name) for name in ("force_x", "force_y", "force_z")]
     k = int(made.mean[:, column[2]].argmax())
     np.testing.assert_allclose(maps[k].resultant_n, made.mean[k, column], atol=1e-6)
     turned = compare_maps([replace(each, force_n=each.force_n[::-1]) for each in maps], data, np.arange(len(data)))
-    assert turned.pressure_correlation < rated.pressure_correlation  # the classifier can tell
+    assert turned["pressure_correlation"] < rated["pressure_correlation"]  # the classifier can tell
 
 
 def test_a_small_copy_keeps_its_maps_and_damaged_ones_are_refused(contacts, tmp_path):

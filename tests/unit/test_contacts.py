@@ -14,8 +14,16 @@ from training.data.dataset import join_datasets
 from training.data.label_code import label_error
 from training.data.targets import Targets
 from training.errors import TrainingError
-from training.estimate.contact_estimator import ContactEstimator, KindOfContact, contacts_folder, put_together
-from training.estimate.contacts import CONTACTS, fit_contacts, read_contacts, write_contacts
+from training.estimate.contact_estimator import (
+    CONTACTS,
+    ContactEstimator,
+    KindOfContact,
+    contacts_folder,
+    fit_contacts,
+    put_together,
+    read_contacts,
+    write_contacts,
+)
 from training.estimate.estimator import PoseEstimator
 from training.runs.run import train_run
 from training.studies.judging import intervals_on, measure_errors

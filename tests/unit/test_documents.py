@@ -14,7 +14,7 @@ from generators.notebooks import blocks
 
 import twin
 import twin.extend
-from twin.demo.page import NEXT
+from twin.demo.make_demo import NEXT
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [path for path in tables.documents() if "generated" not in path.parts]

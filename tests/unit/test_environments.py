@@ -25,9 +25,9 @@ from training.environments.batch import Batch, Options
 from training.environments.environment import TactileEnv, TactileVectorEnv, _in_units
 from training.environments.observe import Eye
 from training.environments.tasks import TASKS, ObjectPush, ObjectRoll, SurfaceFollow
-from training.environments.world import Surfaces, Tool, inverse, motions, standing_on, turn_about, work_frame
+from training.environments.world import AXES, Surfaces, Tool, inverse, motions, standing_on, turn_about, work_frame
 from training.estimate.estimator import PoseEstimator
-from training.runs.packed import shipped_names
+from training.runs.run_files import shipped_names
 from training.surrogate.reading import ContactReading, FiniteElements
 from twin.errors import ContactError, OptionError
 
@@ -221,6 +221,41 @@ def test_reward_is_largest_where_the_task_wants_the_sensor():
         rewards.append(float(judged.reward[0]))
         assert judged.terms["off_mm"][0] == pytest.approx(off_mm)
     assert rewards[0] == pytest.approx(1.0) and rewards == sorted(rewards, reverse=True)
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_an_action_of_1_is_the_tasks_largest_motion(name):
+    batch = Batch(name, 1, Options(observation="oracle"))
+    batch.begin(0, np.random.default_rng(0))
+    batch.settle(np.zeros(1, int))
+    before = batch.T_work[0].copy()
+    batch.step(np.eye(len(batch.axes))[:1], np.zeros(1, int))
+    step = np.append(batch.task.feed_mm, np.zeros(3))
+    step[AXES.index(batch.axes[0])] += batch.task.largest_mm  # the first axis of all tasks is a shift
+    assert np.allclose(batch.T_work[0], before @ motions(step[None])[0])
+
+
+def test_a_sensor_that_stays_where_it_is_never_presses_gently():
+    """Nor does one that follows its object without touching it."""
+    env = TactileVectorEnv("GentlePress", 20, autoreset_mode="SameStep", observation="oracle")
+    env.reset(seed=5)
+    for still in (True, False):
+        for _ in range(env.batch.steps):
+            action = np.zeros((20, 2)) if still else env.batch.expert() * [1.0, 0.0]
+            *_, info = env.step(action)
+            assert not np.any(info.get("final_info", {}).get("is_success", False))
+        env.reset(seed=5)
+
+
+def test_every_force_of_a_gentle_press_can_be_reached():
+    """The stiffest demand on the softest contact: the expert presses the smallest ball with the largest force, without drift."""
+    batch = Batch("GentlePress", 1, Options(objects=("sphere",), observation="oracle"))
+    batch.begin(0, np.random.default_rng(0))
+    batch.settle(np.zeros(1, int))
+    batch.goal[:], batch.task.kept[:] = batch.task.forces_n[1], 0.0
+    while not (done := batch.step(batch.expert(), np.zeros(1, int))).truncated[0]:
+        assert not done.terminated[0]
+    assert done.info["is_success"][0]
 
 
 @pytest.mark.parametrize("task", ["EdgeFollow", "ObjectRoll"])

@@ -17,10 +17,9 @@ from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import emulate_magician, emulate_mg400
 from hardware.emulators.twin_camera import emulate_camera
 from hardware.errors import DeviceError
-from hardware.live.feed import require_feed
+from hardware.live.studio_mode import require_feed
 from hardware.safety.decide import load_limits
-from hardware.servo.following import FollowPlan
-from hardware.servo.study import ServoStudyPlan, folder_name, study_servo
+from hardware.servo.following import FollowPlan, ServoStudyPlan, folder_name, study_servo
 from scenes import SpecError, load_experiment, load_object, load_sensor, load_servo
 from scenes.body import MOST_POISSON
 from scenes.load import SHIPPED
@@ -172,7 +171,7 @@ def test_a_study_of_servos_in_which_nothing_moved_fails_with_the_first_reason(tm
     def fail(*_, **__):
         raise ContactError("out of reach")
 
-    monkeypatch.setattr("hardware.servo.study.follow", fail)
+    monkeypatch.setattr("hardware.servo.following.follow", fail)
     plan = ServoStudyPlan({"a": None}, (load_object("can"), load_object("square")), load_servo("surface"))
     with pytest.raises(TwinError, match="none of 2 runs made a step; the first: out of reach"):
         study_servo(plan, tmp_path / "out")

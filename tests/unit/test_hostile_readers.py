@@ -20,7 +20,7 @@ from safetensors.numpy import save
 from hardware.cameras.session import SessionSource
 from hardware.collect.collect import Collection
 from scenes import SpecError, load_sensor
-from training.runs.packed import unpack
+from training.runs.run_files import unpack
 from twin.errors import TwinError
 from twin.frames import open_recording, read_image
 from twin.frames.tables import order_by_table, read_metadata, read_table

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hardware.arms.magician_wire import QUEUED, WRITE, Id, Message, Ptp, take_message
 from hardware.emulators.faults import Faults
-from hardware.emulators.magician import FAULTS, RANGES
+from hardware.emulators.magician import FAULTS
 from hardware.emulators.magician_controller import JOG_SPEEDS, NUMBERS, PARAMETERS, SIZES, SPEEDS, EmulatedController
 
 CHECKED = {
@@ -65,7 +65,7 @@ def test_aa_within_a_payload_is_legal():
 
 @pytest.fixture
 def arm():
-    return EmulatedController(Faults(FAULTS, RANGES), time_scale=1e6)
+    return EmulatedController(Faults(FAULTS), time_scale=1e6)
 
 
 def ask(arm, id, params=b"", ctrl=0):

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from hardware.arms.dobot_alarms import ALARMS, explain
 from hardware.arms.mg400_wire import PACKET_BYTES, TEST_VALUE, Mode, newest_packet, take_reply, why_refused
 from hardware.emulators.faults import Faults
-from hardware.emulators.mg400 import FAULTS, RANGES, feedback_packet
+from hardware.emulators.mg400 import FAULTS, feedback_packet
 from hardware.emulators.mg400_commands import Mg400Commands
 from hardware.emulators.mg400_controller import Mg400Controller, PlanarFrame
 from hardware.emulators.mg400_grammar import LONGEST_REQUEST, RefusedError, take_request
 
 
 def commands(firmware=(1, 7, 0), faults=(), enabled=True):
-    arm = Mg400Controller(Faults(FAULTS, RANGES, faults), time_scale=1000.0)
+    arm = Mg400Controller(Faults(FAULTS, faults), time_scale=1000.0)
     table = Mg400Commands(arm, firmware)
 
     def run(text):

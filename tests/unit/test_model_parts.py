@@ -19,11 +19,11 @@ from training.estimate.estimator import PoseEstimator
 from training.models import MODELS, model_named, recipe_of, register, variant_named
 from training.models.part import PinModel
 from training.models.recipes import Recipe
-from training.models.vgnn.network import mode_components
+from training.models.vgnn.model import mode_components
 from training.models.vgnn.registration import count_modes, fit_registration
 from training.runs.config import RunConfig
-from training.runs.packed import SHIPPED, WEIGHTS, pack, shipped_names
 from training.runs.run import train_run
+from training.runs.run_files import SHIPPED, WEIGHTS, pack, shipped_names
 from training.studies.judging import measure_errors, rows_to_evaluate
 from twin.errors import FrameError
 from twin.pins import make_graph
@@ -267,7 +267,7 @@ def test_a_small_copy_holds_the_processes_beside_the_networks_up_to_a_number_of_
     rows = np.arange(len(data))
     close = {"rtol": 0, "atol": 0.02}  # of half precision, mm and deg
     np.testing.assert_allclose(small.predict_rows(data, rows).mean, whole.predict_rows(data, rows).mean, **close)
-    monkeypatch.setattr("training.runs.packed.MOST_ROWS", 1)
+    monkeypatch.setattr("training.runs.run_files.MOST_ROWS", 1)
     with pytest.raises(TrainingError, match="has Gaussian processes of .* frames beside its networks.*`kernel=False`"):
         pack(tmp_path / "run", tmp_path / "none")
 

@@ -9,7 +9,7 @@ import torch
 from training.models import MODELS
 from training.models.graphs.inputs import frame_edges
 from training.models.graphs.network import CHANNELS, Gcn, graph_rows
-from training.models.vgnn.network import Vgnn, VgnnSize, mode_components
+from training.models.vgnn.model import Vgnn, VgnnSize, mode_components
 from training.models.vgnn.registration import fit_registration
 from training.runs.assemble import conformal_quantile, group_quantiles
 from training.runs.loop import row_loss

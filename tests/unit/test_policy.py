@@ -10,7 +10,7 @@ from changed_views import altered, mirrored, moved, rolled, torn
 from typer.testing import CliRunner
 
 from hardware.rig.geometry import PlacedObject
-from hardware.servo.policy_law import load_for_outlines, policy_law
+from hardware.servo.following import load_for_outlines, policy_law
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.environments import learn, policy_domain
 from training.environments.batch import Batch, Options

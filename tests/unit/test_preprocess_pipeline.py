@@ -15,6 +15,7 @@ from twin.frames.forms import levels_at, raw_to_recording
 from twin.pins import Pipeline, measure_reference, nominal_reference
 from twin.pins.detectors.legacy import LegacyPipeline
 from twin.pins.finding.blobs import SPECK_LEVELS, circular_mask, despeckle, find_blobs
+from twin.pins.finding.components import find_components
 from twin.pins.labelling.matching import confirm, match, rematch
 from twin.pins.labelling.reference import folded_fraction
 from twin.pins.labelling.split import split_chains
@@ -586,3 +587,37 @@ def test_share_of_pins_between_caps_is_that_of_plain_arrays():
         above = levels_at(smooth, px[known]) - np.nanpercentile(between[known], 35, axis=1)
         plain = np.mean(above <= LEAST_ABOVE * np.percentile(above, 75)) if known.any() else 0.0
         assert share_between(gray, px, near, 35, 75) == plain
+
+
+def test_components_are_those_of_opencv():
+    """The same labels, numbers and boxes in pictures of any size and density."""
+    rng = np.random.default_rng(7)
+    for share in (0.02, 0.1, 0.3, 0.5, 0.7, 0.98) * 10:
+        bright = (255 * (rng.random(rng.integers(1, 70, 2)) < share)).astype(np.uint8)
+        _, expected, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
+        labels, boxes = find_components(bright)
+        assert np.array_equal(labels, expected) and np.array_equal(boxes[1:], stats[1:])
+
+
+def test_following_a_sequence_gives_the_observations_of_the_full_search(pipeline):
+    """Also after a jump, a lost pin, a picture without pins, and where the pins would be one row on."""
+    reference, rng = pipeline.reference, np.random.default_rng(3)
+    rest_px, pitch = reference.pins_px, pitch_px(pipeline)
+    wave_px = smooth_warp(rest_px, 0.8 * pitch, rng) - rest_px
+    places = [rest_px + share * wave_px for share in np.linspace(0, 1, 6)]
+    places += [rest_px, places[2], places[2], rest_px + 0.2 * wave_px]
+    step_px = rest_px[reference.neighbours[0, 0]] - rest_px[0]
+    places += [rest_px + share * step_px for share in np.linspace(0.2, 1, 5)]
+    shown, whole = [np.arange(len(rest_px))] * len(places), cap_radii_px(pipeline.spec, pipeline.form)
+    shown[7], shown[8] = np.delete(shown[7], 5), shown[8][:0]
+    following, followed_frames = pipeline.with_history(), 0
+    for centers_px, kept in zip(places, shown, strict=True):
+        frame = draw(pipeline, centers_px[kept], radius_px=whole[kept], rng=rng)
+        full, followed = pipeline(frame), following(frame)
+        assert (full.valid, full.reason) == (followed.valid, followed.reason)
+        assert np.array_equal(full.pins_px, followed.pins_px, equal_nan=True)
+        if full.graph is not None and followed.graph is not None:
+            assert np.array_equal(full.graph.edges, followed.graph.edges)
+            assert np.array_equal(full.graph.area_px2, followed.graph.area_px2)
+        followed_frames += following._before is not None
+    assert followed_frames > len(places) // 2

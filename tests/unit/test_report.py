@@ -17,9 +17,21 @@ from made_up_pages import HOSTILE, PAGES
 from sound_page import PageReader, read_sound_page
 
 from twin.report.charts import muted_colour, new_figure, write_chart
-from twin.report.numbers import GROUP, LONGEST, MINUS, NOTHING, column, force_interval, number
 from twin.report.page import Page, PagePicture, bad, code, good, link_to, sentence, strong
-from twin.report.table import Cell, Column, make_table, write_rows, write_table
+from twin.report.table import (
+    GROUP,
+    LONGEST,
+    MINUS,
+    NOTHING,
+    Cell,
+    Column,
+    column,
+    force_interval,
+    make_table,
+    number,
+    write_rows,
+    write_table,
+)
 from twin.report.themes import DARK, LIGHT, SERIES, Theme, dark_of, stylesheet
 
 TEXT_CONTRAST = 4.5  # WCAG 2.1, 1.4.3, level AA

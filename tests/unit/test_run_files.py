@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from scenes import SpecError
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
-from training.runs.packed import pack
 from training.runs.run import train_run
-from training.runs.run_files import read_tensors, write_tensors
+from training.runs.run_files import pack, read_tensors, write_tensors
 from twin.errors import FrameError
 
 CONFIGS = {

@@ -13,8 +13,7 @@ from training.estimate.estimator import PoseEstimator
 from training.models import recipe_of
 from training.models.part import OneFrame, Unseen
 from training.runs.config import RunConfig
-from training.runs.packed import pack
-from training.runs.run_files import SLIP
+from training.runs.run_files import SLIP, pack
 from training.studies.evaluation import evaluate_run
 from training.studies.train import add_slip
 from training.surrogate.symmetry import symmetries
@@ -72,10 +71,10 @@ def unseen_ways(count=20):
 
 def test_slip_is_told_before_the_whole_contact_slides(learnt):
     found = compare_slip(learnt, unseen_ways())
-    assert found.contacts == 20 and found.whole_accuracy > 0.95
-    assert found.lead_mm > 0.5 and found.late < 0.1 and found.false_alarms < 0.05
-    assert found.share < 0.08 and 0.75 < found.share_covered <= 1.0
-    assert found.left_mm < 0.3 and 0.75 < found.left_covered <= 1.0 and found.direction_deg < 5
+    assert found["contacts"] == 20 and found["whole_accuracy"] > 0.95
+    assert found["lead_mm"] > 0.5 and found["late"] < 0.1 and found["false_alarms"] < 0.05
+    assert found["share"] < 0.08 and 0.75 < found["share_covered"] <= 1.0
+    assert found["left_mm"] < 0.3 and 0.75 < found["left_covered"] <= 1.0 and found["direction_deg"] < 5
 
 
 def test_a_press_or_a_stop_alone_is_no_slip_and_every_contact_is_a_new_one(learnt):
@@ -124,7 +123,7 @@ def test_drags_of_a_data_set_are_as_long_as_their_moves(contacts):
 def test_a_model_that_remembers_tells_slip_besides_and_forgets_a_contact_that_ends(contacts):
     folder, run, sensor = contacts
     estimator = PoseEstimator.load(run)
-    assert estimator.with_history() is estimator  # too few drags to learn slip from
+    assert estimator.with_history().names == estimator.names  # too few drags to learn slip from
     data = load_dataset(folder, sensor, estimator.names)
     modes = estimator.modes_of(data.pins)
     network = slip.SlipNetwork(2 * modes.shape[1]).eval()

@@ -12,9 +12,9 @@ from training.data.label_code import LabelCode, label_error
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.steered.field import waves_of
-from training.models.steered.network import Steered, SteeredSize
-from training.runs.packed import pack
+from training.models.steered.model import Steered, SteeredSize
 from training.runs.run import train_run
+from training.runs.run_files import pack
 from training.studies.sim_to_real.steps import combine_co_kriging, model_for
 from twin.pins import nominal_reference
 from twin.types import Form

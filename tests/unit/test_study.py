@@ -9,8 +9,8 @@ import torch
 
 from training.errors import TrainingError
 from training.runs.run import is_finished, train_run
-from training.studies.tac_vgnn.contacts import AreaChange, compare_graphs, recorded_contacts
 from training.studies.tac_vgnn.models import PeakMemory, measure_training, ordering, plan_run, table_row, train_all
+from training.studies.tac_vgnn.study import AreaChange, compare_graphs, recorded_contacts
 from twin.pins import make_graph
 from twin.report.table import write_table
 

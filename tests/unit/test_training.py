@@ -21,12 +21,10 @@ from training.models import recipe_of
 from training.models.part import Prediction
 from training.runs.config import training_rows
 from training.runs.identity import changed_since, trained_before
-from training.runs.packed import folder_of
 from training.runs.run import fold_rows, is_finished, train_run
-from training.runs.run_files import read_tensors
-from training.studies.evaluation import Evaluation
+from training.runs.run_files import folder_of, read_tensors
+from training.studies.evaluation import Evaluation, Predictions
 from training.studies.judging import leak_check, measure_errors, rows_to_evaluate, write_evaluation
-from training.studies.prediction import Predictions
 from twin.errors import FrameError, warn_once
 from twin.pins import Pipeline, nominal_reference
 from twin.store import contents

@@ -6,7 +6,7 @@ import pytest
 from scenes import load_experiment, load_object, load_randomisation, load_sensor
 from scenes.randomisation import FrictionSpread
 from training.studies.sim_to_real.discrepancy import FRICTIONS
-from training.studies.sim_to_real.variants import Twin, as_mounted, without_one_ingredient
+from training.studies.sim_to_real.steps import Twin, as_mounted, without_one_ingredient
 
 
 @pytest.fixture(scope="module")

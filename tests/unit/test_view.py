@@ -11,7 +11,7 @@ from scenes import load_object, load_sensor
 from scenes.pins import PinsSpec
 from training.data.pins import PinTable
 from training.estimate.estimator import PoseEstimator
-from training.studies.prediction import predict_frames
+from training.studies.evaluation import predict_frames
 from twin.calibration.camera_view import register_files, registered_view
 from twin.camera.projection import pixel_rays, project
 from twin.errors import FrameError

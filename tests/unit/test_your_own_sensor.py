@@ -14,7 +14,7 @@ from unknown_sensor import RADIUS, SIZE, frames_of, rest_of
 from scenes import load_sensor
 from scenes.pins import PinsSpec
 from training.estimate.estimator import PoseEstimator
-from training.studies.prediction import predict_frames
+from training.studies.evaluation import predict_frames
 from twin.calibration.camera_pose import CameraReport
 from twin.calibration.new_sensor import _camera, _compare_layout, _doubtful, _health, new_sensor
 from twin.camera.projection import project

@@ -18,8 +18,7 @@ from training.estimate.domain import learn_domain, write_domain
 from training.estimate.estimator import PoseEstimator
 from training.generation import GenerationConfig, generate
 from training.models.part import LIKELY
-from training.runs.packed import SHIPPED
-from training.runs.run_files import DOMAIN
+from training.runs.run_files import DOMAIN, SHIPPED
 from training.touch.contact_probability import TouchAnswer
 from twin.rig.kinematics import rig_of
 

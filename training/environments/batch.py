@@ -28,8 +28,6 @@ BACKENDS: tuple[str, ...] = get_args(BackendName)
 """Names of the contact solvers."""
 PERIOD_S = 0.1
 """Duration of a step, s: an agent decides ten times per second."""
-LARGEST_MM, LARGEST_DEG = 1.0, 5.0
-"""Motion of a step, along and about each axis, by an action of 1."""
 MOST_STACK = 16
 """Most observations that can be stacked."""
 MOST_ORACLE = 100.0
@@ -220,7 +218,7 @@ class Batch:
                 del self.objects[name]  # of the task's own objects, only those that the backend knows remain
         self.eye = self._shows = self._make_eye()
         self.axes = options.axes or self.task.axes
-        self.action_scale = np.array([LARGEST_DEG if axis.startswith("R") else LARGEST_MM for axis in self.axes])
+        self.action_scale = np.array([self.task.largest_deg if axis.startswith("R") else self.task.largest_mm for axis in self.axes])
         self._rngs: list[np.random.Generator] = [np.random.default_rng(0)] * count
         self.contacts: list[EpisodeContact | None] = [None] * count
         self.T_work, self.T_object = np.tile(np.eye(4), (2, count, 1, 1))

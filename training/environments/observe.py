@@ -12,7 +12,7 @@ from scenes.sensor import SensorSpec
 from training.data.pins import PinTable, cap_light
 from training.estimate.estimator import PoseEstimator
 from training.models.part import PinModel
-from training.runs.packed import shipped_names
+from training.runs.run_files import shipped_names
 from training.surrogate.reading import Backend, ContactReading
 from twin.camera.capture import expose, record
 from twin.camera.projection import project

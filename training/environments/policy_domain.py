@@ -13,7 +13,7 @@ from scenes.sensor import SensorSpec
 from training.environments.environment import TactileVectorEnv
 from training.estimate.domain import Domain, domain_arrays, domain_of, learn_domain
 from training.estimate.estimator import PoseEstimator
-from training.runs.packed import shipped_names
+from training.runs.run_files import shipped_names
 from twin.pins import Reference, nominal_reference, view_of
 from twin.pins.labelling.view import camera_modes
 from twin.policy import Displacements, Policy, PolicyError

@@ -110,6 +110,8 @@ class Task(ABC):
         Number of steps of an episode.
     feed_mm : (3,) float
         Motion in the work frame that every step adds to the agent's.
+    largest_mm, largest_deg : float
+        Motion of a step, along and about each axis, by an action of 1.
     success_share : float
         Least share of good states in the second half of a successful episode. With 0 only ``reached`` counts.
     failed_reward : float
@@ -124,6 +126,8 @@ class Task(ABC):
     oracle_names: tuple[str, ...] = ("indent_mm", "angle / 10 deg", "force_n x", "force_n y", "force_n z", "area / 100 mm2", "slip share")
     steps: int = 60
     feed_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    largest_mm: float = 1.0
+    largest_deg: float = 5.0
     success_share: float = 0.9
     failed_reward: float = 0.0
     columns = 1
@@ -313,12 +317,16 @@ class GentlePress(Task):
     name, experiment = "GentlePress", "surface-2d"
     objects = ("plane", "can", "ball-40", "sphere", "cylinder")
     axes = ("x", "z")
-    goal_names = ("force_n",)
+    goal_names = ("force / 0.1 N",)
     steps = 40
-    forces_n = (0.5, 2.0)
+    largest_mm = 0.3
+    """Motion of a step by an action of 1, mm: twice that of the fastest object, and about 0.3 N."""
+    forces_n = (0.5, 1.5)
+    """Range of the goals, N. All objects press with them before the sensor is too deep; the smallest ball's 1.5 N needs 5.2 mm."""
     off_deg = 10.0
-    drift_mm = 0.25
-    good_share, slip_share = 0.1, 0.5
+    drift_mm = 0.15
+    good_n, slip_share = 0.1, 0.5
+    """Largest error of the force, N, about that of the twin's forces against a load cell; and largest share of the contact that slides."""
     soft_mm_per_n = 1.2
     """Motion of the expert, mm, per N that the force lacks."""
     columns = 1  # sideways drift per step
@@ -328,6 +336,10 @@ class GentlePress(Task):
         self.kept[row] = rng.uniform(-self.drift_mm, self.drift_mm)
         T = standing_on(tool, surfaces[obj], 0.0, -0.5, rng.uniform(-self.off_deg, self.off_deg))
         return Start(T, (float(rng.uniform(*self.forces_n)),), np.eye(4))
+
+    def goals_for_agents(self, goal: FloatArray, T_work: FloatArray) -> FloatArray:
+        """The forces in units of their largest error, so that a network sees as much of the goal as it must know."""
+        return goal / self.good_n
 
     def carry_object(self, reading: ContactReading, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
         drifted = T_object.copy()
@@ -339,8 +351,8 @@ class GentlePress(Task):
         off_n, gap_mm = np.abs(force - goal), np.maximum(-seen.touch.indent_mm, 0.0)
         slips = (seen.reading.slip > self.slip_share) & (force > 0.2)
         failed = (seen.touch.indent_mm > DEEPEST_MM) | (seen.touch.indent_mm < 2 * LOST_MM)
-        good = (off_n <= self.good_share * goal) & ~slips
-        reward = closeness(off_n / goal + gap_mm + seen.reading.slip)
+        good = (off_n <= self.good_n) & ~slips
+        reward = closeness(off_n / (2 * self.good_n) + gap_mm + seen.reading.slip / self.slip_share)
         return StepOutcome(reward, failed, np.zeros(len(failed), bool), good, {"off_n": off_n, "gap_mm": gap_mm})
 
     def expert(self, seen: WorldState) -> FloatArray:

@@ -23,7 +23,6 @@ from training.estimate.widening import Widening
 from training.models import model_named
 from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen
 from training.runs.assemble import Ensemble
-from training.runs.packed import WEIGHTS, folder_of, instead_of, unpack
 from training.runs.run_files import (
     CHECKPOINT,
     CONFIG,
@@ -32,10 +31,14 @@ from training.runs.run_files import (
     MAPS,
     SLIP,
     TENSORS,
+    WEIGHTS,
     damage_error,
+    folder_of,
+    instead_of,
     read_config,
     read_tensors,
     require_together,
+    unpack,
 )
 from training.touch.contact_maps import MapModel, read_maps
 from training.touch.contact_probability import TouchAnswer
@@ -143,6 +146,7 @@ class PoseEstimator:
         self.displacements: DisplacementModel | None = None
         self.domain: Domain | None = None
         self._tracker: SlipTracker | None = None
+        self._consecutive = False
         self._undecided = ""
 
     @classmethod
@@ -218,19 +222,20 @@ class PoseEstimator:
         return self._trained.reference if known is None else make_reference(known, self.sensor.pins)
 
     def with_history(self) -> "PoseEstimator":
-        """The model for consecutive frames, which uses earlier frames; the model itself if the run did not learn slip.
+        """The model for consecutive frames: it names pins as in the frame before, and uses earlier frames if the run learnt slip.
 
-        Its estimates also have the labels ``training.touch.slip.NAMES``: the probabilities that the contact has begun to slide and that
-        all of it slides, the sliding share, the remaining drag until all of it slides (mm), and the direction in which the object moves
-        over the skin (deg, sensor frame, from x towards y). A frame without an estimate ends the contact: the next frame belongs to a new
-        contact.
+        Then its estimates also have the labels ``training.touch.slip.NAMES``: the probabilities that the contact has begun to slide and
+        that all of it slides, the sliding share, the remaining drag until all of it slides (mm), and the direction in which the object
+        moves over the skin (deg, sensor frame, from x towards y). A frame without an estimate ends the contact: the next frame belongs to
+        a new contact.
         """
-        if self.slip is None:
-            return self
         found = copy(self)
-        found._tracker = SlipTracker(self.slip)
-        if self._tracker is None:
-            found.names, found.units = (*self.names, *SLIP_NAMES), (*self.units, *SLIP_UNITS)
+        found.pipeline, found._consecutive = self.pipeline.with_history(), True
+        found._trained = replace(self._trained, pipeline=found.pipeline)
+        if self.slip is not None:
+            found._tracker = SlipTracker(self.slip)
+            if self._tracker is None:
+                found.names, found.units = (*self.names, *SLIP_NAMES), (*self.units, *SLIP_UNITS)
         return found
 
     @property
@@ -300,7 +305,7 @@ class PoseEstimator:
         found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
         touched = TouchAnswer(reference) if measured else self._trained.touched
         found._trained = replace(self._trained, pipeline=found.pipeline, touched=touched)
-        return found if self._tracker is None else found.with_history()
+        return found.with_history() if self._consecutive else found
 
     def noting(self, undecided: str) -> "PoseEstimator":
         """The same model; its ``caveats`` say what is ``undecided`` about the camera's view."""

@@ -8,8 +8,7 @@ import torch
 
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
-from training.runs.packed import WEIGHTS, folder_of, shipped_names
-from training.runs.run_files import CONFIG, DOMAIN, TENSORS
+from training.runs.run_files import CONFIG, DOMAIN, TENSORS, WEIGHTS, folder_of, shipped_names
 from twin.store import fingerprint
 
 

@@ -37,7 +37,7 @@ def contact_finding(frames: list[Frame], sensor: SensorSpec, run: Path | None = 
     if run is None and find_spec("torch") is None:
         return None
     from training.estimate.estimator import PoseEstimator  # loads torch
-    from training.runs.packed import shipped_names
+    from training.runs.run_files import shipped_names
 
     if run is None and sensor.name not in shipped_names():
         return None

@@ -71,6 +71,8 @@ class LinearContacts:
 
     Attributes
     ----------
+    radius_mm : float
+        Radius of the dome.
     kind : (B,) int
         Kinds of the solids (see ``twin.objects.kernels.solid``).
     sizes : (B, SIZES) float
@@ -98,6 +100,7 @@ class LinearContacts:
     def __init__(self, node_mm: FloatArray, answer: FloatArray, count: int, *, bending: tuple[FloatArray, ...] | None = None) -> None:
         size = len(node_mm)
         self.node_mm, self.answer = node_mm, np.ascontiguousarray(answer.transpose(0, 3, 2, 1), np.float32)
+        self.radius_mm = float(np.linalg.norm(node_mm[0]))
         self.bending = unbent(size) if bending is None else bending
         self.kind, self.sizes, self.turning = np.zeros(count, np.int64), np.zeros((count, SIZES)), np.zeros((count, 10))
         self.friction, self.compliance_mm_per_n, self.used = np.zeros((3, count))
@@ -105,11 +108,6 @@ class LinearContacts:
         self.force_n, self.moved_mm, self.anchor_mm, self.seen_mm = np.zeros((4, count, size, 3))
         self.bent_mm, self.gap_mm = np.zeros((count, 3, size), np.float32), np.full((count, size), np.inf)
         self.held, self.slides = np.zeros((2, count, size), bool)
-
-    @property
-    def radius_mm(self) -> float:
-        """Radius of the dome."""
-        return float(np.linalg.norm(self.node_mm[0]))
 
     def begin(
         self, row: int, thing: CompiledSolid, friction: float, *, compliance_mm_per_n: float = 0.0, turning: ArmTurning | None = None

@@ -115,15 +115,7 @@ class MapModel:
         return maps.with_resultants(None if force is None else np.array(force), told.get(TORQUE))
 
 
-@dataclass(frozen=True)
-class _Truth:
-    """Averaged forces (M, 3 G), divided by the root of the nodes' areas, and places (M, 3 c) of the skin, of simulated states."""
-
-    force: np.ndarray
-    skin: np.ndarray
-
-
-def _truth(data: Dataset, rows: np.ndarray, geometry: GeometrySpec) -> _Truth:
+def _truth(data: Dataset, rows: np.ndarray, geometry: GeometrySpec) -> tuple[np.ndarray, np.ndarray]:
     """Known forces and places of rows (m,) of a data set. In joined data sets the folder stands before a frame's name."""
     grid = skin_grid(geometry)
     names = data.pins.image_name[rows]
@@ -143,7 +135,7 @@ def _truth(data: Dataset, rows: np.ndarray, geometry: GeometrySpec) -> _Truth:
         skin[mine] = arrays["skin_mm"][found].reshape(len(mine), -1)
     assert skin is not None  # every row is of one of the folders
     smooth = grid.smooth_values(force.reshape(-1, SIDE * SIDE), DETAIL_MM).reshape(len(rows), 3, SIDE * SIDE)
-    return _Truth((smooth / np.sqrt(grid.area_mm2)).transpose(0, 2, 1).reshape(len(rows), -1), skin)
+    return (smooth / np.sqrt(grid.area_mm2)).transpose(0, 2, 1).reshape(len(rows), -1), skin
 
 
 def learn_maps(modes: np.ndarray, data: Dataset, rows: np.ndarray, *, seed: int = 0) -> MapModel:
@@ -151,12 +143,12 @@ def learn_maps(modes: np.ndarray, data: Dataset, rows: np.ndarray, *, seed: int 
     rng = np.random.default_rng([seed, 4])
     rows = np.sort(rng.permutation(rows)[:MOST_STATES])
     geometry = data.pins.sensor.geometry
-    truth = _truth(data, rows, geometry)
-    force, skin = Directions.of(truth.force, FORCE_DIRECTIONS, rng), Directions.of(truth.skin, SKIN_DIRECTIONS, rng)
+    known_force, known_skin = _truth(data, rows, geometry)
+    force, skin = Directions.of(known_force, FORCE_DIRECTIONS, rng), Directions.of(known_skin, SKIN_DIRECTIONS, rng)
     x = modes[rows]
     gain = np.array([GAIN / max(float(x.std(axis=0).max()), 1e-12)])
     limit = HEADROOM * np.abs(x).max(axis=0)
-    y = np.concatenate([force.amplitudes(truth.force), skin.amplitudes(truth.skin)], axis=1)
+    y = np.concatenate([force.amplitudes(known_force), skin.amplitudes(known_skin)], axis=1)
     return MapModel(geometry, gain, limit, _layers(gain * x, y, seed), force, skin)
 
 
@@ -208,53 +200,39 @@ def read_maps(path: Path, geometry: GeometrySpec) -> MapModel:
         return MapModel(geometry, found["gain"], found["limit"], layers, force, skin)
 
 
-@dataclass(frozen=True)
-class MapErrors:
-    """Errors of maps on simulated states with more than ``PLAIN_N`` of normal force. Forces are averaged over ``DETAIL_MM``.
+def compare_maps(made: list[ContactMaps], data: Dataset, rows: np.ndarray) -> dict[str, float] | None:
+    """Compare maps with the known forces and places of rows (m,) of a simulated data set.
 
-    Attributes
-    ----------
-    states : int
-    patch_iou : float
-        Mean of intersection over union of the contact patches (see ``ContactMaps.patch``).
-    pressure_correlation, shear_correlation : float
-        Mean correlation of pressures, and of shear tractions, over the skin's nodes.
-    resultant : float
-        Median of the difference between the map's sum and the true force, relative to the true force.
-    skin_mm : float
-        Mean distance of the skin's nodes from their true places.
+    Returns
+    -------
+    dict or None
+        Errors on states with more than ``PLAIN_N`` of normal force, with forces averaged over ``DETAIL_MM``; None if all are lighter.
+
+        states : int
+        patch_iou : float
+            Mean of intersection over union of the contact patches (see ``ContactMaps.patch``).
+        pressure_correlation, shear_correlation : float
+            Mean correlation of pressures, and of shear tractions, over the skin's nodes.
+        resultant : float
+            Median of the difference between the map's sum and the true force, relative to the true force.
+        skin_mm : float
+            Mean distance of the skin's nodes from their true places.
     """
-
-    states: int
-    patch_iou: float
-    pressure_correlation: float
-    shear_correlation: float
-    resultant: float
-    skin_mm: float
-
-
-def compare_maps(made: list[ContactMaps], data: Dataset, rows: np.ndarray) -> MapErrors | None:
-    """Compare maps with the known forces and places of rows (m,) of a simulated data set; None if all contacts are too light."""
     geometry = data.pins.sensor.geometry
     grid, truth = skin_grid(geometry), _truth(data, rows, geometry)
     rated = []
-    for maps, per_root, places in zip(made, truth.force, truth.skin, strict=True):
+    for maps, per_root, places in zip(made, *truth, strict=True):
         force = per_root.reshape(-1, 3).astype(float) * np.sqrt(grid.area_mm2)[:, None]
         true = ContactMaps(between_nodes(places.reshape(-1, 3).astype(float)), grid.area_mm2, force)
         if true.resultant_n[2] <= PLAIN_N:
             continue
-        both, either = (maps.patch & true.patch).sum(), (maps.patch | true.patch).sum()
-        rated.append(
-            (
-                both / max(either, 1),
-                np.corrcoef(maps.pressure_mpa, true.pressure_mpa)[0, 1],
-                np.corrcoef(maps.traction_mpa.ravel(), true.traction_mpa.ravel())[0, 1],
-                np.linalg.norm(maps.resultant_n - true.resultant_n) / np.linalg.norm(true.resultant_n),
-                np.linalg.norm(maps.nodes_mm - true.nodes_mm, axis=1).mean(),
-            )
-        )
+        iou = (maps.patch & true.patch).sum() / max((maps.patch | true.patch).sum(), 1)
+        pressure = np.corrcoef(maps.pressure_mpa, true.pressure_mpa)[0, 1]
+        shear = np.corrcoef(maps.traction_mpa.ravel(), true.traction_mpa.ravel())[0, 1]
+        resultant = np.linalg.norm(maps.resultant_n - true.resultant_n) / np.linalg.norm(true.resultant_n)
+        rated.append((iou, pressure, shear, resultant, np.linalg.norm(maps.nodes_mm - true.nodes_mm, axis=1).mean()))
     if not rated:
         return None
-    iou, pressure, shear, resultant, skin = np.array(rated).T
-    means = [float(part.mean()) for part in (iou, pressure, shear)]
-    return MapErrors(len(rated), means[0], means[1], means[2], float(np.median(resultant)), float(skin.mean()))
+    names = ("patch_iou", "pressure_correlation", "shear_correlation", "resultant", "skin_mm")
+    columns = zip(names, np.array(rated).T, strict=True)
+    return {"states": len(rated)} | {name: float(np.median(c) if name == "resultant" else c.mean()) for name, c in columns}

@@ -503,49 +503,33 @@ def read_slip(path: Path) -> SlipModel:
         return SlipModel(network.eval(), limit=limit, **about)
 
 
-@dataclass(frozen=True)
-class SlipErrors:
-    """Errors of slip estimates on simulated drags.
+# Errors of slip that are means over frames or contacts, in the order of ``compare_slip``.
+MEANS = ("whole_accuracy", "false_alarms", "lead_mm", "late", "share", "share_covered", "left_mm", "left_covered")
 
-    Attributes
-    ----------
-    contacts, frames : int
-    whole_accuracy : float
-        Share of the frames in which slip of the whole contact is classified correctly.
-    false_alarms : float
-        Share of the frames without slip that raise the alarm.
-    lead_mm : float
-        Mean drag between the first alarm during the drag and slip of the whole contact. A later alarm gives a negative value; a missing
-        alarm counts as one at the drag's end.
-    late : float
-        Share of the contacts whose alarm came after the whole contact slid.
-    share, share_covered : float
-        Mean absolute error of the sliding share, and the part of the true shares inside the 90 % intervals.
-    left_mm, left_covered : float
-        Mean absolute error of the remaining drag, and the share of true values inside the 90 % intervals.
-    direction_deg : float
-        Median error of the direction.
+
+def compare_slip(model: SlipModel, paths: Sequence[DragPath]) -> dict[str, float]:
+    """Compare the estimates for simulated drags with the true values.
+
+    Returns
+    -------
+    dict
+        contacts, frames : int
+        whole_accuracy : float
+            Share of the frames in which slip of the whole contact is classified correctly.
+        false_alarms : float
+            Share of the frames without slip that raise the alarm.
+        lead_mm : float
+            Mean drag between the first alarm during the drag and slip of the whole contact. A later alarm gives a negative value; a
+            missing alarm counts as one at the drag's end.
+        late : float
+            Share of the contacts whose alarm came after the whole contact slid.
+        share, share_covered : float
+            Mean absolute error of the sliding share, and the part of the true shares inside the 90 % intervals.
+        left_mm, left_covered : float
+            Mean absolute error of the remaining drag, and the share of true values inside the 90 % intervals.
+        direction_deg : float
+            Median error of the direction.
     """
-
-    contacts: int
-    frames: int
-    whole_accuracy: float
-    false_alarms: float
-    lead_mm: float
-    late: float
-    share: float
-    share_covered: float
-    left_mm: float
-    left_covered: float
-    direction_deg: float
-
-
-# Entries of ``SlipErrors`` that are means over frames or contacts.
-MEANS = ("whole_accuracy", "false_alarms", "lead_mm", "share", "share_covered", "left_mm", "left_covered")
-
-
-def compare_slip(model: SlipModel, paths: Sequence[DragPath]) -> SlipErrors:
-    """Compare the estimates for paths with the true values."""
     found: dict[str, list[float]] = {name: [] for name in MEANS}
     turned: list[float] = []
     for path in paths:
@@ -564,9 +548,10 @@ def compare_slip(model: SlipModel, paths: Sequence[DragPath]) -> SlipErrors:
             found["left_covered"].append(slips[k].left_low_mm <= path.left_mm[k] <= slips[k].left_high_mm)
         true_deg = float(np.degrees(np.arctan2(path.direction[1], path.direction[0])))
         turned += [abs((slips[k].direction_deg - true_deg + 180) % 360 - 180) for k in np.flatnonzero(path.drag_mm > SEEN_DRAG_MM).tolist()]
-    means = {name: _mean(values) for name, values in found.items()} | {"late": _mean([lead < 0 for lead in found["lead_mm"]])}
+    found["late"] = [lead < 0 for lead in found["lead_mm"]]
+    counts = {"contacts": len(paths), "frames": len(found["whole_accuracy"])}
     direction_deg = float(np.median(turned)) if turned else float("nan")
-    return SlipErrors(contacts=len(paths), frames=len(found["whole_accuracy"]), direction_deg=direction_deg, **means)
+    return counts | {name: _mean(values) for name, values in found.items()} | {"direction_deg": direction_deg}
 
 
 def _mean(values: Sequence[float]) -> float:

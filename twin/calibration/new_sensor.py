@@ -28,8 +28,8 @@ from twin.pins.labelling.identify import STEADY, Candidate, Identified, identify
 from twin.pins.labelling.rest import Rest, rest_of, turn_of
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
-from twin.report.numbers import number
 from twin.report.page import Page, PagePicture
+from twin.report.table import number
 from twin.store import output, writes_file
 from twin.types import Form, Frame
 

@@ -52,8 +52,7 @@ if TYPE_CHECKING:
     from training.environments.demonstrations import Demonstrations
     from training.environments.learn import Learnt
     from training.generation.run import Simulated
-    from training.studies.evaluation import Evaluation
-    from training.studies.prediction import Predictions
+    from training.studies.evaluation import Evaluation, Predictions
     from training.studies.train import TrainedRun
     from training.surrogate.fit import Distilled
 
@@ -309,7 +308,7 @@ def predict(
       twin predict runs/forces recordings/mine --maps out/maps
       twin predict runs/forces drag.mp4 --sequence
     """
-    from training.studies.prediction import predict_frames
+    from training.studies.evaluation import predict_frames
     from twin.frames import frames_at
 
     return predict_frames(run, frames_at(frame, table, no_contact), maps=maps, sequence=sequence)
@@ -329,7 +328,7 @@ def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, 
       twin pack study/sim_only --out training/weights/mg400-331 --force
     """
     from training.estimate.estimator import PoseEstimator
-    from training.runs.packed import WEIGHTS, pack
+    from training.runs.run_files import WEIGHTS, pack
 
     PoseEstimator.load(run)  # says what is wrong with a folder that holds no run
     size = pack(run, out)

@@ -21,6 +21,7 @@ from twin.types import FIRST, NONE
 
 if TYPE_CHECKING:
     from hardware.collect.collect import Collected
+    from hardware.emulators.faults import Fault
     from hardware.live.live import WatchResult
     from hardware.servo.following import Followed
 
@@ -256,8 +257,7 @@ def run_policy(
       twin policy out/learnt/policy.safetensors --object can --out out/live \\
           --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1
     """
-    from hardware.servo.following import FollowPlan, follow
-    from hardware.servo.policy_law import load_for_outlines
+    from hardware.servo.following import FollowPlan, follow, load_for_outlines
     from scenes import load_object, load_servo
     from training.environments.policy_domain import contacts_of
 
@@ -280,7 +280,7 @@ FaultOption = Annotated[
 TimeScale = Annotated[float, typer.Option("--time-scale", help="speed relative to the real arm", min=1e-3)]
 
 
-def faults_of(wanted: list[str] | None, known: dict[str, tuple[float | None, str]]) -> tuple[str, ...]:
+def faults_of(wanted: list[str] | None, known: dict[str, "Fault"]) -> tuple[str, ...]:
     """The faults that the user asks for. If the user asks for help, the known faults are printed and the command ends."""
     from hardware.emulators.running import fault_lines
 

@@ -37,7 +37,7 @@ from twin.progress import Progress
 from twin.types import FINE
 
 if TYPE_CHECKING:
-    from hardware.servo.study import ServoStudy
+    from hardware.servo.following import ServoStudy
     from training.studies import objects, sim_to_real, tac_vgnn
 
 study = App(cls=FewCommands, help="Experiments that compare models.", no_args_is_help=True, rich_markup_mode=None)
@@ -69,7 +69,7 @@ def study_servo_command(
 
     Writes to --out: a folder for each model and object as 'twin servo' writes it, study.csv, study.png.
     """
-    from hardware.servo.study import ServoStudyPlan, study_servo
+    from hardware.servo.following import ServoStudyPlan, study_servo
     from scenes import load_object, load_servo
     from training.estimate.loading import load_by_name
 

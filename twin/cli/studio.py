@@ -61,7 +61,7 @@ def studio(
       twin studio --state out/studio/state-1.json
       twin studio --state '?sensor=mg400-331&object=edge&depth_mm=3'
     """
-    from hardware.live.feed import CameraFeed, require_feed
+    from hardware.live.studio_mode import LiveMode, require_feed
     from scenes import load_sensor
     from twin.studio.state import first_state
     from twin.studio.studio import StudioPlan, run_studio
@@ -72,7 +72,7 @@ def studio(
     plan = StudioPlan(first, saves, host=host, port=port, traces=not plain, recording=recording, camera=camera, arm=arm, seconds=seconds)
     print_lines(plan.warnings)
     with signals_as_ctrl_c():
-        run_studio(plan, lazy_models_by_sensor(model, shown.name), CameraFeed, on_open=print_address)
+        run_studio(plan, lazy_models_by_sensor(model, shown.name), LiveMode, on_open=print_address)
 
 
 def print_address(url: str) -> None:

@@ -1,26 +1,157 @@
-"""The demo: all stages in their order, and a page that shows them."""
+"""The demo: contacts through the whole chain, three motions and the depth table, in their order, and a page that shows them."""
 
 import os
 import platform
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter
+from typing import TypeVar
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from scenes import load_object, load_sensor
 from twin.camera.projection import project
-from twin.demo.page import ContactContent, contact_figures, contact_pictures, motion_figure, write_page
-from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, ContactResult, DepthRow, depth_table, run_contact
-from twin.frames.forms import from_raw
+from twin.frames.forms import form_named, from_raw
+from twin.frames.images import write_image
+from twin.mechanics.path import ContactPose
 from twin.objects import build_field
-from twin.progress import Progress, silent, stage
-from twin.report.charts import write_chart
+from twin.one_contact import look_at
+from twin.pins.graph import make_graph
+from twin.pins.labelling.reference import nominal_reference
+from twin.progress import Progress, Step, silent, stage, unheard
+from twin.report.charts import new_figure, write_chart
+from twin.report.page import Page, PagePicture, code, sentence
+from twin.report.plots import (
+    ObservedFrame,
+    area_change_at,
+    area_surface_figure,
+    draw_area_change,
+    draw_displacement,
+    draw_frame,
+    draw_graph,
+    draw_pins,
+)
 from twin.report.skin3d import draw_contact_skin
-from twin.simulator import Simulator
+from twin.report.table import Column, force_interval, number
+from twin.simulator import RenderedFrame, Simulator
 from twin.store import writes
-from twin.types import Form, ReadableResult
+from twin.types import ContactState, Form, ReadableResult
+
+Result = TypeVar("Result")
+
+# Contacts of the demo: sensor, object, pose, and the form of the frames in which the pins are found.
+CONTACTS = (
+    ("ur5-331", "edge", ContactPose(indent_mm=3.5), Form.RAW),
+    ("mg400-331", "plane", ContactPose(indent_mm=4.0, tilt_deg=(0.0, 8.0)), Form.PROCESSED),
+    ("mg400-127", "sphere", ContactPose(indent_mm=4.0, offset_mm=(3.0, -2.0)), Form.PROCESSED),
+)
+# The three motions of the paper's figure 1(d).
+MOTIONS = (
+    ("Z: pressed 4 mm", ContactPose(indent_mm=4.0)),
+    ("X: then dragged 3 mm along x", ContactPose(indent_mm=4.0, shear_mm=(3.0, 0.0))),
+    ("Y: then dragged 3 mm along y", ContactPose(indent_mm=4.0, shear_mm=(0.0, 3.0))),
+)
+# Mean pin displacement of pure presses in the Tac-VGNN release's recordings (Apache-2.0), px of the uncropped camera frame, for pose_2 in
+# four 1 mm bins from -4 to 0. The indentation is about pose_2 + 5 mm.
+MEASURED_DISPLACEMENT_PX = {"mg400-331": (1.9, 3.4, 5.0, 7.5), "mg400-127": (2.2, 3.8, 6.0, 8.9)}
+# Middles of these bins as indentations, mm.
+TABLE_INDENTS_MM = (1.5, 2.5, 3.5, 4.5)
+# Commands that a reader of the page may try next, and what each shows.
+NEXT = (
+    ("twin studio", "a page on which you drag the object over the skin, and see picture, graph, forces and the estimated pose at once"),
+    ("twin render --sensor ur5-331 --object ball-40 --indent-mm 2 --out out/ball", "a contact of your own; 'twin objects' names others"),
+    ("twin servo --object can --steps 30 --out out/can", "the sensor follows a can, by the pose that a model reads from its frames"),
+    ("twin new FRAMES --out mine.toml", "your own sensor, from a folder of its frames"),
+    ("twin --help", "all commands; each one's help ends with an example"),
+)
+
+
+@dataclass(frozen=True)
+class ContactResult:
+    """One contact through the whole chain."""
+
+    sensor: str
+    object_name: str
+    pose: ContactPose
+    state: ContactState
+    raw: RenderedFrame
+    look: ObservedFrame
+    seconds: dict[str, float]
+    stiffness_factor: float
+
+
+def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form: Form, *, progress: Step = unheard) -> ContactResult:
+    """Press, render, capture, detect, and build the graph, for one contact."""
+    form, seconds = form_named(form), {}
+
+    def clock(stage: str, work: Callable[[], Result]) -> Result:
+        start = perf_counter()
+        result = work()
+        seconds[stage] = perf_counter() - start
+        return result
+
+    state = clock("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
+    raw = clock("render", lambda: simulator.render(state))
+    rendered = raw if form == Form.RAW else clock("capture", lambda: simulator.as_processed(raw, state))
+    look = look_at(simulator, rendered)
+    seconds["pins and graph"] = look.observation.ms["total"] / 1e3
+    return ContactResult(simulator.spec.name, object_name, pose, state, raw, look, seconds, simulator.spec.skin.stiffness_factor)
+
+
+@dataclass(frozen=True)
+class DepthRow:
+    """One depth of the table: mean displacement of all pins and growth of the cells at the contact."""
+
+    indent_mm: float
+    simulated_px: float
+    measured_px: float
+    contact_area_change_percent: float
+    force_n: float
+
+
+def depth_table(sensor: str, *, progress: Step = unheard) -> list[DepthRow]:
+    """Press a plane to the four depths of the recordings' table (true caps, no rendering)."""
+    spec = load_sensor(sensor)
+    simulator = Simulator(spec)
+    rest_px = project(spec.view, simulator.rest.caps_mm)
+    outmost = nominal_reference(spec, Form.RAW).outmost
+    rest_area_px2 = make_graph("voronoi", rest_px, outmost=outmost).area_px2
+    middle = np.argsort(np.hypot(*(rest_px - rest_px[0]).T))[: spec.pins.count // 8]
+    rows = []
+    for k, (indent_mm, measured_px) in enumerate(zip(TABLE_INDENTS_MM, MEASURED_DISPLACEMENT_PX[sensor], strict=True)):
+        state = simulator.press(load_object("plane"), ContactPose(indent_mm=indent_mm))
+        caps_px = project(spec.view, state.caps_mm)
+        areas = make_graph("voronoi", caps_px, outmost=outmost).area_px2
+        change = 100 * float(np.mean(areas[middle] / rest_area_px2[middle]) - 1)
+        moved = float(np.hypot(*(caps_px - rest_px).T).mean())
+        rows.append(DepthRow(indent_mm, moved, measured_px, change, float(state.force_n[2])))
+        progress((k + 1) / len(TABLE_INDENTS_MM))
+    return rows
+
+
+@dataclass(frozen=True)
+class ContactContent:
+    """The content of the page about one contact.
+
+    Attributes
+    ----------
+    title, description : str
+    pictures : dict of str to Path
+        Pictures from `contact_pictures`, and ``skin``.
+    raw_size : str
+        Size of the raw frame.
+    figures : list of (str, str)
+        As `contact_figures` gives them.
+    """
+
+    title: str
+    description: str
+    pictures: dict[str, Path]
+    raw_size: str
+    figures: list[tuple[str, str]]
 
 
 @dataclass(frozen=True, repr=False)
@@ -79,9 +210,9 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
     start = perf_counter()
     looks = []
     with bar(f"{motion_sensor}: motions along Z, X and Y") as step:
-        for number, (title, pose) in enumerate(MOTIONS):
+        for k, (title, pose) in enumerate(MOTIONS):
             looks.append((title, run_contact(simulators[motion_sensor], "plane", pose, Form.RAW).look))
-            step((number + 1) / len(MOTIONS))
+            step((k + 1) / len(MOTIONS))
         motions = write_chart(pictures / "motions.png", lambda: motion_figure(looks))
     seconds["motions"] = perf_counter() - start
 
@@ -96,15 +227,7 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
     machine = f"Rendered with Mitsuba variant {renderer['variant']} on {os.cpu_count()} cores ({platform.machine()}). " + " ".join(
         sorted(notes)
     )
-    page = write_page(
-        out / "index.html",
-        machine=machine,
-        contacts=contacts,
-        motions=motions,
-        motion_sensor=motion_sensor,
-        tables=tables,
-        seconds=seconds,
-    )
+    page = write_page(out / "index.html", machine=machine, contacts=contacts, motions=motions, tables=tables, seconds=seconds)
     return Demo(tables, [page, *sorted(pictures.iterdir())])
 
 
@@ -122,3 +245,178 @@ def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pi
         raw_size=f"{width} x {height} px",
         figures=contact_figures(result, contact_px),
     )
+
+
+def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
+    """Write the pictures of one contact, except the picture of the skin."""
+    look, stem = result.look, f"{result.sensor}-{result.object_name}"
+    graph, rest = look.graphs()
+    written = {
+        "raw": write_image(folder / f"{stem}-frame.png", result.raw.frame.image),
+        "pins": write_chart(folder / f"{stem}-graph.png", lambda: _graph_figure(look)),
+        "areas": write_chart(folder / f"{stem}-areas.png", lambda: _areas_figure(look)),
+        "surfaces": write_chart(folder / f"{stem}-surfaces.png", lambda: area_surface_figure(rest, graph)),
+    }
+    if look.frame.form == Form.PROCESSED:
+        written["recorded"] = write_image(folder / f"{stem}-recorded.png", look.frame.image)
+    return written
+
+
+def motion_figure(motions: list[tuple[str, ObservedFrame]]) -> Figure:
+    """Displacement (top) and area change (bottom) for each motion, as in the paper's figure 1(d)."""
+    figure, axes = new_figure(len(motions), 2, panel_inch=4.2)
+    for column, (title, look) in enumerate(motions):
+        graph, rest = look.graphs()
+        draw_displacement(axes[column], rest.nodes_px, graph.nodes_px, title)
+        draw_area_change(axes[column + len(motions)], graph, rest.area_px2, "")
+    return figure
+
+
+def contact_figures(result: ContactResult, contact_px: np.ndarray) -> list[tuple[str, str]]:
+    """Names and values of one contact's figures, as shown on the page."""
+    look, force = result.look, result.state.force_n
+    observation = look.observation
+    ends = force_interval(force.tolist(), result.stiffness_factor)
+    parts = ", ".join(number(float(part), decimals=2, signed=True) for part in force)
+    return [
+        ("pins found", f"{observation.found} of {len(observation.pins_px)}"),
+        ("directed edges (Delaunay)", number(len(look.graphs()[0].edges))),
+        ("force on the object, N", f"({parts})"),
+        ("90 % interval of its size, N", " to ".join(number(each, decimals=2) for each in ends)),
+        ("contact area, mm²", number(float(result.state.area_mm2), decimals=1)),
+        ("cell area at the contact against no contact", f"{number(area_change_at(look, contact_px, count=12), decimals=1, signed=True)} %"),
+        *((f"{name}, s", number(value, decimals=3)) for name, value in result.seconds.items()),
+    ]
+
+
+def write_page(
+    path: Path,
+    *,
+    machine: str,
+    contacts: Sequence[ContactContent],
+    motions: Path,
+    tables: Mapping[str, Sequence[DepthRow]],
+    seconds: Mapping[str, float],
+) -> Path:
+    """Write the page with all pictures inside, and return its path.
+
+    Parameters
+    ----------
+    path : Path
+    machine : str
+        Renderer and machine.
+    contacts : sequence of ContactContent
+    motions : Path
+        Chart of `motion_figure`.
+    tables : mapping of str to sequence of DepthRow
+        By sensor.
+    seconds : mapping of str to float
+        Time of each stage.
+    """
+    page = Page("TacTip twin", "twin demo", topic="Demo")
+    page.lead = sentence(
+        "A skin pressed by finite elements, the view of the camera inside it path-traced, and the pins found in that picture by the same "
+        "pipeline that runs on a real sensor. Everything on this page was computed by",
+        code("make demo") + ".",
+        machine,
+    )
+    for contact in contacts:
+        _contact_section(page, contact)
+    _motions_section(page, motions)
+    _tables_section(page, tables)
+    _time_section(page, seconds)
+    page.section(
+        "What to try next", "The tutorials in docs/tutorials go through each of these; 'make docs' builds the whole documentation."
+    )
+    page.items([sentence(code(command) + ":", what + ".") for command, what in NEXT])
+    return page.write(path, embed=True)
+
+
+def _contact_section(page: Page, contact: ContactContent) -> None:
+    at, title = contact.pictures, contact.title
+    page.section(title, contact.description)
+    shown = [
+        PagePicture(
+            at["skin"], f"{title}: deformed skin in 3D", "The skin, cut open, coloured by its displacement, with pins and object.", "photo"
+        ),
+        PagePicture(at["raw"], f"{title}: rendered camera frame", f"What the camera inside sees ({contact.raw_size}).", "frame"),
+    ]
+    if "recorded" in at:
+        said = "The same frame in the form of this sensor's recordings: cropped, adaptively thresholded, resized."
+        shown.append(PagePicture(at["recorded"], f"{title}: frame in the form of a recording", said, "frame"))
+    page.figures(*shown, layout="row")
+    page.figures(
+        PagePicture(
+            at["pins"],
+            f"{title}: pins and Voronoi graph",
+            "Pins found (green), graph edges (blue) and Voronoi cells (white); yellow crosses are spots that are not pins.",
+        ),
+        PagePicture(
+            at["areas"], f"{title}: Voronoi area change", "Voronoi cell areas against no contact: cells grow where the dome flattens."
+        ),
+        layout="row",
+    )
+    page.figures(
+        PagePicture(
+            at["surfaces"],
+            f"{title}: interpolated area surfaces",
+            "Cell area interpolated over the image: no contact, contact, difference.",
+        )
+    )
+    page.table([{"name": name, "value": value} for name, value in contact.figures], [Column("name", "figure"), Column("value", "value")])
+
+
+def _motions_section(page: Page, motions: Path) -> None:
+    page.section(
+        "Three motions, three signatures",
+        "Pressing (Z) spreads the pins outwards. Dragging along x or y carries them with the object until they slip.",
+    )
+    page.figures(
+        PagePicture(
+            motions,
+            "Displacement of the pins and change of the Voronoi areas for motions along Z, X and Y",
+            f"Pin displacement (top) and Voronoi area change (bottom) for motions along Z, X and Y, on {CONTACTS[0][0]}.",
+        )
+    )
+
+
+def _tables_section(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> None:
+    page.section(
+        "Against real recordings: displacement by depth",
+        "Mean displacement of all pins on a flat plate, in pixels of the uncropped camera frame. Measured: the Tac-VGNN release's "
+        "recordings, pure presses in 1 mm bins. Simulated: true cap positions at the middle of each bin, with nominal stiffness; the "
+        "hexagonal sensor's camera distance and pin spacing were chosen with these figures in view. The differences are those of a skin "
+        "that is not calibrated: 'twin calibrate contact' fits skin and arm to a recording, and docs/results says how small they are then.",
+    )
+    columns = [
+        Column("indent_mm", "indentation", "mm", decimals=1),
+        Column("measured_px", "measured", "px", decimals=1),
+        Column("simulated_px", "simulated", "px", decimals=1),
+        Column("contact_area_change_percent", "cell area at the contact", "%", decimals=1, signed=True),
+        Column("force_n", "force", "N", decimals=2),
+    ]
+    for sensor, rows in tables.items():
+        page.table([vars(row) for row in rows], columns, caption=sensor)
+
+
+def _time_section(page: Page, seconds: Mapping[str, float]) -> None:
+    page.section("Time")
+    total = {"stage": "all", "seconds": sum(seconds.values())}
+    stages = [{"stage": name, "seconds": value} for name, value in seconds.items()]
+    page.table([*stages, total], [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
+
+
+def _graph_figure(look: ObservedFrame) -> Figure:
+    figure, (ax,) = new_figure(1, panel_inch=6)
+    graph, rest = look.graphs()
+    draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
+    draw_graph(ax, graph)
+    draw_pins(ax, look.observation)
+    return figure
+
+
+def _areas_figure(look: ObservedFrame) -> Figure:
+    figure, (ax,) = new_figure(1, panel_inch=6)
+    graph, rest = look.graphs()
+    draw_area_change(ax, graph, rest.area_px2, "")
+    return figure

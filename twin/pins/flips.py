@@ -3,16 +3,96 @@
 One more node lies at infinity. It makes a triangle with each side of the outline, so that the same flips also make the outline convex.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 
 from twin.compiled import compiled
 
-Net = tuple[np.ndarray, np.ndarray]
-"""Triangles (t, 3) of n nodes, with node n at infinity, and the triangle (t, 3) beyond the side opposite to each corner."""
 AMBIGUOUS = 1e-9
 """Least distance of a node from a circle, relative to its size. The order of nearer ones depends on rounding."""
 MOST_FLIPS = 50
 """Largest number of flips for each triangle."""
+
+
+@dataclass(frozen=True)
+class Net:
+    """Triangles of n nodes, with node n at infinity.
+
+    Attributes
+    ----------
+    triangles : (t, 3) int
+    beyond : (t, 3) int
+        The triangle beyond the side opposite to each corner.
+    px : (n, 2) float or None
+        The nodes of which these are the Delaunay triangles, if they were tested.
+    """
+
+    triangles: np.ndarray
+    beyond: np.ndarray
+    px: np.ndarray | None = None
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """Directed edges (E, 2) of the triangles, as ``directed_edges`` gives them."""
+        return directed_edges(self.triangles, self.triangles.max())
+
+    def move(self, px: np.ndarray) -> "Net | None":
+        """The net of the Delaunay triangles of nodes (n, 2) that moved.
+
+        None if one of the net's triangles is turned over, or if four nodes on a circle or three on the outline make them ambiguous.
+        """
+        if self.px is not None and np.array_equal(px, self.px):
+            return self
+        triangles, beyond, flips = _flip(px, self.triangles, self.beyond)
+        if flips < 0:
+            return None
+        found = Net(triangles, beyond, px)
+        if not flips:
+            found.__dict__["edges"] = self.edges
+        return found
+
+
+@compiled()
+def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
+    """Directed edges (E, 2), sorted: both directions of each side of the triangles over ``n`` nodes. Nodes from ``n`` on are left out."""
+    start = np.zeros(n + 1, np.int64)
+    for t in range(len(triangles)):
+        for k in range(3):
+            if triangles[t, k] < n:
+                start[triangles[t, k] + 1] += 2
+    start = np.cumsum(start)
+    fill = start[:-1].copy()
+    ends = np.empty(start[-1], np.int64)
+    for t in range(len(triangles)):
+        for k in range(3):
+            i, j = triangles[t, k], triangles[t, (k + 1) % 3]
+            if i < n and j < n and triangles[t, (k + 2) % 3] < n:
+                _insert(ends, start[i], fill, i, j)
+                _insert(ends, start[j], fill, j, i)
+    edges = np.empty((len(ends), 2), np.int64)
+    count = 0
+    for i in range(n):
+        for k in range(start[i], fill[i]):
+            edges[count, 0] = i
+            edges[count, 1] = ends[k]
+            count += 1
+    return edges[:count]
+
+
+@compiled()
+def _insert(ends: np.ndarray, first: int, fill: np.ndarray, i: int, j: int) -> None:
+    """Put node j among the sorted ends of node i's edges, once: a side of two triangles occurs twice."""
+    k = fill[i]
+    while k > first and ends[k - 1] > j:
+        k -= 1
+    if k > first and ends[k - 1] == j:
+        return
+    for later in range(fill[i], k, -1):
+        ends[later] = ends[later - 1]
+    ends[k] = j
+    fill[i] += 1
 
 
 def net_of(triangles: np.ndarray, n: int) -> Net | None:
@@ -25,7 +105,7 @@ def net_of(triangles: np.ndarray, n: int) -> Net | None:
         return None
     sides = {(int(t[k]), int(t[(k + 1) % 3])): number for number, t in enumerate(whole) for k in range(3)}
     beyond = [[sides[int(t[(k + 2) % 3]), int(t[(k + 1) % 3])] for k in range(3)] for t in whole]
-    return whole, np.array(beyond)
+    return Net(whole, np.array(beyond))
 
 
 @compiled()
@@ -50,18 +130,15 @@ def _inside(px: np.ndarray, p: int, q: int, r: int, s: int) -> float:
 
 
 @compiled()
-def delaunay_by_flips(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray) -> np.ndarray:
-    """Delaunay triangles (t, 3) of nodes (n, 2) from a ``Net``.
-
-    Empty if one of its triangles is turned over, or if four nodes on a circle or three on the outline make the triangles ambiguous.
-    """
-    n, nothing = len(px), np.empty((0, 3), np.int64)
+def _flip(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Triangles and neighbours (t, 3) of a net after flips that make it Delaunay, and the number of flips: -1 if that is not possible."""
+    n = len(px)
     triangles, beyond = triangles.copy(), beyond.copy()
     for a, b, c in triangles:
         if max(a, b, c) < n and _area(px, a, b, c) <= 0:
-            return nothing
-    doubtful = [(t, k) for t in range(len(triangles)) for k in range(3)]
-    left = MOST_FLIPS * len(triangles)
+            return triangles, beyond, -1
+    doubtful = [(t, k) for t in range(len(triangles)) for k in range(3) if t < beyond[t, k]]
+    flips = 0
     while doubtful:
         t, i = doubtful.pop()
         u = beyond[t, i]
@@ -70,13 +147,11 @@ def delaunay_by_flips(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray)
             j += 1
         p, q, r, s = triangles[t, i], triangles[t, (i + 1) % 3], triangles[t, (i + 2) % 3], triangles[u, j]
         inside = _inside(px, p, q, r, s)
-        if abs(inside) < AMBIGUOUS:
-            return nothing
+        if abs(inside) < AMBIGUOUS or flips > MOST_FLIPS * len(triangles):
+            return triangles, beyond, -1
         if inside < 0:
             continue
-        left -= 1
-        if left < 0:
-            return nothing
+        flips += 1
         beside_t, opposite = beyond[t, (i + 1) % 3], beyond[u, (j + 1) % 3]  # beyond r p, and beyond q s
         triangles[t, (i + 2) % 3], triangles[u, (j + 2) % 3] = s, p
         beyond[t, i], beyond[u, j] = opposite, beside_t
@@ -89,4 +164,4 @@ def delaunay_by_flips(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray)
         for k in range(3):
             doubtful.append((t, k))
             doubtful.append((u, k))
-    return triangles[(triangles < n).sum(axis=1) == 3]
+    return triangles, beyond, flips

@@ -5,9 +5,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from twin.pins.flips import Net
+from twin.pins.flips import Net, directed_edges
 from twin.pins.labelling.reference import Reference, median_px
-from twin.pins.voronoi import directed_edges, triangulate, voronoi
+from twin.pins.voronoi import triangulate, voronoi
 from twin.types import PinGraph
 
 GraphKind = Literal["knn", "delaunay", "voronoi"]
@@ -27,6 +27,15 @@ def knn_edges(nodes_px: np.ndarray, k: int = KNN) -> np.ndarray:
     return np.stack([np.repeat(np.arange(n), k), index[others].ravel()], axis=1)
 
 
+def _delaunay_edges(nodes_px: np.ndarray, net: Net | None) -> np.ndarray | None:
+    """Directed edges (E, 2) of the nodes' Delaunay triangles, from a net if one is given and leads to them; None if there are none."""
+    moved = None if net is None else net.move(nodes_px)
+    if moved is not None:
+        return moved.edges
+    triangles = triangulate(nodes_px)
+    return None if triangles is None else np.asarray(directed_edges(triangles, len(nodes_px)))
+
+
 def make_graph(kind: GraphKind, nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, net: Net | None = None) -> PinGraph:
     """A graph over nodes (N, 2).
 
@@ -43,8 +52,7 @@ def make_graph(kind: GraphKind, nodes_px: np.ndarray, *, outmost: np.ndarray | N
     none = np.full(len(nodes_px), np.nan)
     if kind == "knn":
         return PinGraph(kind, nodes_px, knn_edges(nodes_px), none)
-    triangles = triangulate(nodes_px, net)
-    edges = None if triangles is None else directed_edges(triangles, len(nodes_px))
+    edges = _delaunay_edges(nodes_px, net)
     if kind == "voronoi":
         tessellation = voronoi(nodes_px, outmost=outmost, edges=edges)
         return PinGraph(kind, nodes_px, knn_edges(nodes_px) if edges is None else edges, tessellation.area_px2, tessellation.cells)

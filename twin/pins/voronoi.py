@@ -10,19 +10,44 @@ A cell is the part of the region on the pin's side of the bisectors to all its D
 the areas of the cells sum to that of the region up to rounding errors, for a region of any shape.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from twin.compiled import compiled
-from twin.pins.flips import Net, delaunay_by_flips
+from twin.pins.flips import directed_edges
 
 # Factor by which the outline is enlarged about its centroid: half way to the release's additional sites, which lie at 1.1.
 BOUNDARY_SCALE = 1.05
 # The strip that replaces the hull of nodes on a line reaches beyond them by half this share of their length, and at least by half this
 # many px.
 STRIP_SHARE, LEAST_STRIP_PX = 0.05, 1.0
+
+
+class Polygons(Sequence[np.ndarray]):
+    """Polygons whose corners are in one array.
+
+    Parameters
+    ----------
+    corners : (V, 2) float
+    first : (n + 1,) int
+        Where each polygon's corners begin.
+    """
+
+    def __init__(self, corners: np.ndarray, first: np.ndarray) -> None:
+        self._corners, self._first = corners, first
+
+    def __len__(self) -> int:
+        return len(self._first) - 1
+
+    def __getitem__(self, k: Any) -> Any:
+        if isinstance(k, slice):
+            return [self[i] for i in range(len(self))[k]]
+        k = range(len(self))[k]
+        return self._corners[self._first[k] : self._first[k + 1]]
 
 
 @dataclass(frozen=True)
@@ -32,60 +57,26 @@ class Tessellation:
     Attributes
     ----------
     area_px2 : (N,) float
-    cells : list of (k, 2) float
+    cells : sequence of (k, 2) float
         Cell polygons. Nodes at the same place have the same cell, and each has an equal part of its area.
     region_px : (m, 2) float
         The polygon that the cells tile.
     """
 
     area_px2: np.ndarray
-    cells: list[np.ndarray]
+    cells: Sequence[np.ndarray]
     region_px: np.ndarray
 
 
-def triangulate(nodes_px: np.ndarray, net: Net | None = None) -> np.ndarray | None:
-    """Delaunay triangles (t, 3) of the nodes (N, 2); None if there are none (nodes are collinear, coincide, or are fewer than 3).
-
-    They are found from a ``net`` of the nodes at rest, if it is given and the nodes turn none of its triangles over.
-    """
+def triangulate(nodes_px: np.ndarray) -> np.ndarray | None:
+    """Delaunay triangles (t, 3) of the nodes (N, 2); None if there are none (nodes are collinear, coincide, or are fewer than 3)."""
     if len(nodes_px) < 3:
         return None
-    if net is not None and len(triangles := delaunay_by_flips(nodes_px, *net)):
-        return triangles
     try:
         mesh = Delaunay(nodes_px)
     except QhullError:
         return None
     return None if len(mesh.coplanar) else mesh.simplices
-
-
-@compiled()
-def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
-    """Directed edges (E, 2), sorted: both directions of each side of the triangles over ``n`` nodes."""
-    start = np.zeros(n + 1, np.int64)
-    for t in range(len(triangles)):
-        for k in range(3):
-            start[triangles[t, k] + 1] += 2
-    start = np.cumsum(start)
-    fill = start[:-1].copy()
-    ends = np.empty(start[-1], np.int64)
-    for t in range(len(triangles)):
-        for k in range(3):
-            i = triangles[t, k]
-            ends[fill[i]] = triangles[t, (k + 1) % 3]
-            ends[fill[i] + 1] = triangles[t, (k + 2) % 3]
-            fill[i] += 2
-    edges = np.empty((len(ends), 2), np.int64)
-    count = 0
-    for i in range(n):
-        last = -1
-        for j in np.sort(ends[start[i] : start[i + 1]]):
-            if j != last:  # a side of two triangles occurs twice
-                edges[count, 0] = i
-                edges[count, 1] = j
-                count += 1
-                last = j
-    return edges[:count]
 
 
 @compiled()
@@ -275,9 +266,7 @@ def voronoi(nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, edges: n
     if region is None or not (area > 0).all():
         region = _hull_region(nodes)
         area, store, first = _cells(sites, start, neighbours, region)
-    store = store[: first[-1]] + origin
-    ends = first.tolist()
-    cells = [store[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    cells: Sequence[np.ndarray] = Polygons(store[: first[-1]] + origin, first)
     if back is not None:
         area, cells = (area / share)[back], [cells[k] for k in back]
     return Tessellation(area, cells, region + origin)

@@ -14,7 +14,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from twin.report.numbers import number
+from twin.report.table import number
 from twin.report.themes import DARK, LIGHT, SERIES, Theme, dark_of
 from twin.store import write_bytes
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from twin.studio.modes.degrade_mode import DegradeMode
-from twin.studio.modes.live_mode import FeedOpener, LiveMode
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.new_mode import NewMode
 from twin.studio.modes.recording_mode import RecordingMode
@@ -17,6 +16,8 @@ from twin.studio.state import StudioState, heading
 
 PORT = 8090
 """Port of the page."""
+LIVE = "Live"
+"""Title of the mode that shows a camera and an arm. It is handed in, because this package does not depend on the devices."""
 LOOK_S = 0.2
 """Interval, s, at which the end condition is checked."""
 
@@ -62,6 +63,9 @@ class StudioPlan:
         ]
 
 
+ModeMaker = Callable[[StudioPage, TwinMode, StudioPlan], PageMode]
+
+
 class Studio:
     """The page with its modes. A context manager.
 
@@ -70,17 +74,17 @@ class Studio:
     plan : StudioPlan
     model_of : callable
         Function from a sensor's name to a trained model, or None.
-    open_feed : callable
-        Opens a camera, and an arm, for the mode 'Live'.
+    live_mode : callable
+        Makes the mode 'Live' from the page, the mode 'Twin' and the plan.
     """
 
-    def __init__(self, plan: StudioPlan, model_of: ModelOf, open_feed: FeedOpener) -> None:
+    def __init__(self, plan: StudioPlan, model_of: ModelOf, live_mode: ModeMaker) -> None:
         self.page = StudioPage(heading(plan.state), host=plan.host, port=plan.port)
-        self.page.add_mode_choice([mode.title for mode in (TwinMode, DegradeMode, RecordingMode, LiveMode, NewMode)])
+        self.page.add_mode_choice([mode.title for mode in (TwinMode, DegradeMode, RecordingMode)] + [LIVE, NewMode.title])
         self.twin = TwinMode(self.page, plan.state, plan.out, model_of, traces=plan.traces)
         degrade = DegradeMode(self.page, self.twin)
         self.twin.followers.append(degrade.follow)
-        live = LiveMode(self.page, self.twin, open_feed, plan.out, camera=plan.camera, arm=plan.arm)
+        live = live_mode(self.page, self.twin, plan)
         recording, new = RecordingMode(self.page, self.twin, plan.recording), NewMode(self.page, self.twin, plan.out)
         self.modes: list[PageMode] = [self.twin, degrade, recording, live, new]
         self.page.set_modes(self.modes)
@@ -97,12 +101,12 @@ class Studio:
         self._open.close()  # closes all, even if one fails, so that an arm is always released
 
 
-def run_studio(plan: StudioPlan, model_of: ModelOf, open_feed: FeedOpener, *, on_open: Callable[[str], None] = lambda url: None) -> None:
+def run_studio(plan: StudioPlan, model_of: ModelOf, live_mode: ModeMaker, *, on_open: Callable[[str], None] = lambda url: None) -> None:
     """Serve the studio until Ctrl-C, or for the plan's time.
 
     Parameters
     ----------
-    plan, model_of, open_feed
+    plan, model_of, live_mode
         As for ``Studio``.
     on_open : callable
         Called with the page's address once it can be opened.
@@ -112,7 +116,7 @@ def run_studio(plan: StudioPlan, model_of: ModelOf, open_feed: FeedOpener, *, on
     TwinError
         The server can't listen on the plan's host and port.
     """
-    with Studio(plan, model_of, open_feed) as studio:
+    with Studio(plan, model_of, live_mode) as studio:
         on_open(studio.page.url)
         begun = time.monotonic()
         try:

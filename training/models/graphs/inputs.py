@@ -4,8 +4,9 @@ import numpy as np
 import torch
 
 from training.models.graphs.network import GraphRows, graph_rows
+from twin.pins.flips import directed_edges
 from twin.pins.graph import knn_edges
-from twin.pins.voronoi import directed_edges, triangulate
+from twin.pins.voronoi import triangulate
 
 # Side in px of the resized image of the published code. The features are in px and px^2 of this image.
 RELEASE_PX = 300.0

@@ -1,7 +1,15 @@
-"""``steered``: our model of an edge's direction, a label that goes round the whole circle."""
+"""``steered``: our model of an edge's direction, a label that goes round the whole circle.
+
+Its network makes a first guess of the direction from the whole field, and takes a second look at the field turned by this guess. Both looks
+are multi-layer perceptrons on the principal components of the field's coefficients (``field``). In training, the first look gets every
+frame turned by a random angle, and its answer is turned back. Therefore it need not learn the same contact again for each direction. The
+second look gets the field turned back by the first guess and an error of some degrees. It estimates the rest of the direction and the other
+labels. In this view all contacts are similar, so that few principal components show small differences. Both looks also get the angle of the
+turn as an input, because no sensor is exactly the same all around.
+"""
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import cast
 
 import numpy as np
@@ -13,14 +21,193 @@ from training.data.pins import PinTable
 from training.errors import TrainingError
 from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Weights, refuse_sizes
 from training.models.recipes import Recipe
-from training.models.steered.field import waves_of
-from training.models.steered.network import Steered, SteeredSize
+from training.models.steered.field import Waves, waves_of
 from twin.pins.labelling.reference import Reference
 
+# Number of turns of a frame over which the first look's answers are averaged in use.
+TURNS = 6
+# Number of second looks in use. The first one uses the first look's direction, each further one that of the one before.
+LOOKS = 2
+# Standard deviation of the error that is added to the first guess in training, rad: 4 deg, some times the usual error.
+GUESS_ERROR_RAD = 0.07
+# Copies of each training frame, turned at random, from which the principal components are computed.
+COPIES = 3
+# Number of inputs that describe a turn: sine and cosine of the turn and of twice the turn.
+KNOWN_OF_TURN = 4
 # Buffers that a small copy leaves out, because they follow from the pins at rest.
 DERIVED = ("fit", "order")
 # Components of the turned field that are inputs of a Gaussian process. Finer ones are noise to it.
 PROCESS_MODES = 20
+
+
+@dataclass(frozen=True)
+class SteeredSize:
+    """Sizes: principal components of each look, width and depth of each perceptron."""
+
+    modes: int = 80
+    width: int = 192
+    depth: int = 3
+
+
+class ComponentsPerceptron(nn.Module):
+    """Principal components of coefficients, and a perceptron on them.
+
+    Parameters
+    ----------
+    coefficients : int
+        Number C of complex coefficients.
+    outputs : int
+    """
+
+    mean: torch.Tensor  # (2 C,)
+    components: torch.Tensor  # (2 C, modes)
+
+    def __init__(self, coefficients: int, outputs: int, size: SteeredSize) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(2 * coefficients))
+        self.register_buffer("components", torch.zeros(2 * coefficients, min(size.modes, 2 * coefficients)))
+        entered = self.components.shape[1]
+        self.linear = nn.Linear(entered, outputs)
+        nn.init.zeros_(self.linear.weight)
+        self.enter = nn.Linear(entered + KNOWN_OF_TURN, size.width)
+        self.trunk = nn.ModuleList([nn.Linear(size.width, size.width) for _ in range(size.depth - 1)])
+        self.head = nn.Linear(size.width, outputs)
+
+    def prepare(self, seen: torch.Tensor) -> None:
+        """Set the principal components from complex coefficients (M, C); each is scaled as in ``vgnn``."""
+        flat = _flat(seen).double()
+        self.mean.copy_(flat.mean(dim=0))
+        size, direction = torch.linalg.eigh((flat - flat.mean(dim=0)).T @ (flat - flat.mean(dim=0)) / len(flat))
+        keep = self.components.shape[1]
+        deviation = size.flip(0)[:keep].clamp(min=1e-12 * float(size.max())).sqrt()
+        self.components.copy_(direction.flip(1)[:, :keep] * (3 * (deviation / deviation[0]).sqrt() / deviation))
+
+    def amplitudes(self, seen: torch.Tensor) -> torch.Tensor:
+        """Principal components (B, modes) of coefficients (B, C)."""
+        return (_flat(seen) - self.mean) @ self.components
+
+    def forward(self, seen: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
+        """Numbers (B, outputs) from coefficients (B, C) that were turned by ``turn`` (B,) rad."""
+        z = self.amplitudes(seen)
+        h = torch.cat([z, turn.sin()[:, None], turn.cos()[:, None], (2 * turn).sin()[:, None], (2 * turn).cos()[:, None]], dim=1)
+        h = torch.nn.functional.silu(self.enter(h))
+        for layer in self.trunk:
+            h = torch.nn.functional.silu(layer(h))
+        return self.linear(z) + self.head(h)
+
+
+class Steered(nn.Module):
+    """See the module.
+
+    Parameters
+    ----------
+    waves : Waves
+    outputs : int
+        Number E of the labels' numbers (``LabelCode``); two of them are sine and cosine of the direction.
+    """
+
+    fit: torch.Tensor  # (2, C, N) real and imaginary part
+    order: torch.Tensor  # (C,)
+    sine: torch.Tensor  # () int64: place of the direction's sine among the numbers; its cosine follows
+    sense: torch.Tensor  # () 1 if the label grows when the contact turns from x to y in the picture, else -1
+
+    def __init__(self, waves: Waves, outputs: int, size: SteeredSize | None = None) -> None:
+        super().__init__()
+        self.size = size = size or SteeredSize()
+        self.outputs = outputs
+        self.register_buffer("fit", torch.from_numpy(np.stack([waves.fit.real, waves.fit.imag]).astype(np.float32)))
+        self.register_buffer("order", torch.from_numpy(waves.order.astype(np.float32)))
+        self.register_buffer("sine", torch.tensor(0))
+        self.register_buffer("sense", torch.tensor(1.0))
+        self.first = ComponentsPerceptron(len(waves.order), outputs, size)
+        self.second = ComponentsPerceptron(len(waves.order), 2 * outputs, size)
+
+    def coefficients(self, moved: torch.Tensor) -> torch.Tensor:
+        """Complex coefficients (B, C) of displacements (B, N, 2)."""
+        real, imaginary = self.fit
+        x, y = moved[..., 0], moved[..., 1]
+        return torch.complex(x @ real.T - y @ imaginary.T, x @ imaginary.T + y @ real.T)
+
+    def turn_coefficients(self, seen: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
+        """Coefficients (B, C) of the same contacts turned by ``turn`` (B,) rad in the picture, from x to y."""
+        return seen * torch.exp(1j * turn[:, None] * self.order)
+
+    def prepare(self, moved: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
+        """Set sense and principal components from training frames (M, N, 2) and their numbers (M, E)."""
+        sine = int(np.flatnonzero(np.repeat(code.circular, np.where(code.circular, 2, 1)))[0])
+        self.sine.fill_(sine)
+        seen, direction = self.coefficients(moved), torch.atan2(numbers[:, sine], numbers[:, sine + 1])
+        alike = [
+            float(self.turn_coefficients(seen, -sense * direction)[:, self.order != 0].mean(dim=0).abs().square().sum())
+            for sense in (1, -1)
+        ]
+        self.sense.fill_(1.0 if alike[0] >= alike[1] else -1.0)
+        copies = seen.repeat(COPIES, 1)
+        self.first.prepare(self.turn_coefficients(copies, 2 * torch.pi * torch.rand(len(copies))))
+        guess = (self.sense * direction).repeat(COPIES) + GUESS_ERROR_RAD * torch.randn(len(copies))
+        self.second.prepare(self.turn_coefficients(copies, -guess))
+
+    def forward(self, moved: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Numbers of the labels from displacements (B, N, 2).
+
+        Returns
+        -------
+        dict
+            ``mean`` and ``log_scale`` (B, E), standardised, and ``first`` (B, E), the first guess.
+        """
+        seen = self.coefficients(moved)
+        if self.training:
+            turn = 2 * torch.pi * torch.rand(len(seen), device=seen.device)
+            first = self._first(seen, turn)
+            guess = self._direction(first.detach()) + GUESS_ERROR_RAD * torch.randn(len(seen), device=seen.device)
+            mean, scale = self._second(seen, guess)
+            return {"mean": mean, "log_scale": scale, "first": first}
+        turns = 2 * torch.pi * torch.arange(TURNS, device=seen.device) / TURNS
+        first = torch.stack([self._first(seen, turn.expand(len(seen))) for turn in turns]).mean(dim=0)
+        guess = self._direction(first)
+        for _ in range(LOOKS):
+            mean, scale = self._second(seen, guess)
+            guess = self._direction(mean)
+        return {"mean": mean, "log_scale": scale, "first": first}
+
+    def view(self, moved: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The estimated numbers (B, E) of displacements (B, N, 2), and the components (B, modes) of the field turned by the estimate."""
+        mean = self(moved)["mean"]
+        return mean, self.second.amplitudes(self.turn_coefficients(self.coefficients(moved), -self._direction(mean)))
+
+    def _direction(self, numbers: torch.Tensor) -> torch.Tensor:
+        """(B,) direction in the picture, rad."""
+        return self.sense * torch.atan2(self._pair(numbers)[0], self._pair(numbers)[1])
+
+    def _pair(self, numbers: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return numbers[:, int(self.sine)], numbers[:, int(self.sine) + 1]
+
+    def _first(self, seen: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
+        said = self.first(self.turn_coefficients(seen, turn), turn)
+        return self._with_direction(said, *_spun(*self._pair(said), -self.sense * turn))
+
+    def _second(self, seen: torch.Tensor, guess: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        said = self.second(self.turn_coefficients(seen, -guess), -guess)
+        mean, scale = said[:, : self.outputs], said[:, self.outputs :]
+        rest = self._pair(mean)[0]  # rad: what is left of the direction
+        label = self.sense * guess + rest
+        length = torch.full_like(label, 2**0.5)  # standardised numbers of a direction are root 2 long
+        return self._with_direction(mean, length * label.sin(), length * label.cos()), scale
+
+    def _with_direction(self, numbers: torch.Tensor, sine: torch.Tensor, cosine: torch.Tensor) -> torch.Tensor:
+        """The numbers (B, E) with another direction."""
+        columns = list(numbers.unbind(dim=1))
+        columns[int(self.sine)], columns[int(self.sine) + 1] = sine, cosine
+        return torch.stack(columns, dim=1)
+
+
+def _spun(sine: torch.Tensor, cosine: torch.Tensor, angle: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The pair (sin a, cos a) for the direction a + angle."""
+    return sine * angle.cos() + cosine * angle.sin(), cosine * angle.cos() - sine * angle.sin()
+
+
+def _flat(seen: torch.Tensor) -> torch.Tensor:
+    return torch.cat([seen.real, seen.imag], dim=1)
 
 
 class SteeredModel(PinModel):

@@ -13,10 +13,9 @@ import numpy as np
 
 from training.data.dataset import load_dataset
 from training.data.label_code import goes_round
-from training.studies.sim_to_real.inverse_estimates import read_row, read_twin
+from training.studies.sim_to_real.model_inversion import read_row, read_twin
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
-from training.studies.sim_to_real.steps import arm_labels, choose_frames, designed_frames, quadratic_row
-from training.studies.sim_to_real.variants import full_twin
+from training.studies.sim_to_real.steps import arm_labels, choose_frames, designed_frames, full_twin, quadratic_row
 from twin.progress import Progress, silent, stage
 
 UNLABELLED = (300, 3000)

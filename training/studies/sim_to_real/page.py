@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,15 +10,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from scenes.randomisation import FrictionSpread
+from training.data.dataset import Dataset
 from training.data.targets import unit_of
-from training.studies.sim_to_real.inverse_estimates import READ
+from training.studies.sim_to_real.model_inversion import READ
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
+from training.studies.sim_to_real.steps import CoKriging, contact_of
 from twin.estimate import readable_labels
 from twin.report.charts import muted_colour, plain_log, sized_figure, write_chart
-from twin.report.numbers import number
 from twin.report.page import Page, PagePicture
-from twin.report.table import Column
+from twin.report.table import Column, number
 from twin.report.themes import BLUE, OLIVE, PURPLE, RED
+
+if TYPE_CHECKING:
+    from training.studies.sim_to_real.study import Ground
 
 # Name of the row of the model trained in the twin alone. Names of rows without one ingredient begin with this word and a comma.
 SIMULATED = "simulated"
@@ -28,64 +33,34 @@ STYLES = ((RED, "o-"), (OLIVE, "s--"))
 
 
 def write_page(
-    folder: Path,
-    *,
-    sensor: str,
-    tested: int,
-    frames: int,
-    labelled: int,
-    seed: int,
-    calibrated: bool,
-    error_px: float,
-    modes: Sequence[Mapping[str, float]],
-    friction: FrictionSpread | None,
-    simulated: int,
-    contacts: int,
-    names: Sequence[str],
-    left_out: np.ndarray,
-    columns: Sequence[str],
-    rows: Sequence[Mapping],
-    problems: Sequence[str],
+    ground: "Ground", rows: Sequence[Mapping[str, Any]], beside: CoKriging, modes: Sequence[Mapping[str, float]], learnt: Dataset
 ) -> Path:
     """Write ``index.html`` and its charts, and return the page's path.
 
     Parameters
     ----------
-    folder : Path
-    sensor : str
-    tested, frames, labelled : int
-        Number of frames that are evaluated, of all frames of the recording, and of frames that are labelled for the twin.
-    seed : int
-        Seed with which the frames were sampled.
-    calibrated : bool
-        Whether the specification was fitted to the labelled frames.
-    error_px : float
-        Mean distance between the twin's pins and those of the labelled frames.
+    ground : Ground
+        What all models of the study have in common.
+    rows : sequence of mappings
+        The study's table.
+    beside : CoKriging
+        Result of the average with a Gaussian process, whose errors are stated.
     modes : sequence
         First modes of the discrepancy: the ``share`` of each, and the part of it that the label explains (``told``).
-    friction : FrictionSpread or None
-        Range in which friction was sampled for simulated contacts; None if all of them had the rig's friction.
-    simulated, contacts : int
-        Number of simulated states, and of the contacts that they belong to.
-    names : sequence of str
-        Labels.
-    left_out : (K,) float
-        Errors of the Gaussian process alone on each labelled frame, predicted from the others.
-    columns : sequence of str
-        Keys of the table, in their order.
-    rows : sequence of mappings
-    problems : sequence of str
-        Irregularities of the recording.
+    learnt : Dataset
+        The simulated states that the model was trained on, without a discrepancy or with its first draw.
     """
-    page = Page(f"From the twin to real frames: {sensor}", "twin study sim-to-real", topic="TacTip twin: study")
+    plan, folder, real, names = ground.plan, ground.out, ground.real, ground.real.targets.names
+    page = Page(f"From the twin to real frames: {ground.setup.sensor.name}", "twin study sim-to-real", topic="TacTip twin: study")
     page.lead = (
-        f"Mean absolute errors on the same {number(tested)} real frames, a random fifth of {number(frames)}, which were used for no "
-        f"training and for no choice. The {number(labelled)} labelled frames were sampled at random from the others (seed {seed})."
+        f"Mean absolute errors on the same {number(len(ground.chosen.test))} real frames, a random fifth of {number(len(real))}, which "
+        f"were used for no training and for no choice. The {number(plan.labels)} labelled frames were sampled at random from the others "
+        f"(seed {plan.seed})."
     )
-    page.notice("Notes on the recording", problems)
-    page.figures(*_charts(folder, rows, names, labelled))
+    page.notice("Notes on the recording", real.problems)
+    page.figures(*_charts(folder, rows, names, plan.labels))
     page.section("Errors")
-    page.table(rows, [_column(key, names) for key in columns], caption="The least error of each column is marked.")
+    page.table(rows, [_column(key, names) for key in rows[0]], caption="The least error of each column is marked.")
     page.text(
         "Corrected labels have the shear moves that were never executed taken out; all models were trained on these. The leak slope is "
         "that of the angle's error on such moves: a model that reads the contact has 0. Inside 90 %: share of the frames whose label lies "
@@ -94,10 +69,10 @@ def write_page(
     page.section("How it was made")
     page.items(
         [
-            _describe_twin(simulated, contacts, calibrated=calibrated),
-            _describe_pins(error_px, friction),
+            _describe_twin(len(learnt), len(np.unique(contact_of(learnt))), calibrated=plan.calibrate),
+            _describe_pins(ground.residuals.error_px, ground.full.randomisation.friction),
             _describe_missing(modes, bare=bool(_of(rows, BARE))),
-            _describe_combination(names, left_out),
+            _describe_combination(names, beside.left_out),
             "Model inversion: the labels whose simulated pins are most like the frame's. The twin's error is a quadratic function of the "
             "label, fitted to the labelled frames. Even: these frames are not sampled at random; they are nearest to an even sequence.",
             "Pins are counted from the no-contact frame of the recording, or of each simulated sensor.",

@@ -1,5 +1,11 @@
-"""The sim-to-real study, from its plan to its tables and runs."""
+"""The sim-to-real study, from its plan to its tables and runs.
 
+One of its networks is trained on real frames without labels: model inversion estimates their labels (pseudo-labels). The twin is read in
+seconds for hundreds of frames, but not by a live loop. The network has nearly its errors, and is a run as any other. It needs no label of
+these frames, only more of them.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,18 +14,23 @@ import numpy as np
 
 from scenes import load_randomisation
 from training.data.dataset import Dataset, join_datasets, load_dataset
+from training.data.targets import Targets
+from training.estimate.estimator import PoseEstimator
+from training.runs.assemble import intervals
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
-from training.studies.sim_to_real.inverse_estimates import TwinRead, read_row, read_twin
+from training.studies.sim_to_real.model_inversion import TwinRead, named_labels, read_row, read_twin
 from training.studies.sim_to_real.page import write_page
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
 from training.studies.sim_to_real.steps import (
-    CoKriging,
     StudyFrames,
+    Twin,
     arm_labels,
+    as_mounted,
     choose_frames,
     combine_co_kriging,
     designed_frames,
     evaluate_run_row,
+    full_twin,
     measured_of,
     quadratic_row,
     states_like,
@@ -28,21 +39,82 @@ from training.studies.sim_to_real.steps import (
     train_on_real,
     widen_intervals,
     with_missing,
+    without_one_ingredient,
 )
-from training.studies.sim_to_real.taught import teach
-from training.studies.sim_to_real.variants import Twin, as_mounted, contact_of, full_twin, without_one_ingredient
 from twin.calibration.contact import fit_contact
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.estimate import readable_labels
 from twin.evaluation.labelled.model import MeasuredFrames
-from twin.progress import Progress, silent, stage
+from twin.progress import Progress, Step, silent, stage
 from twin.report.table import write_table
+from twin.rig.labels import ArmLabel
 from twin.store import writes
 from twin.types import ReadableResult
 
 SEEDS_APART = 1000  # between the draws of one study, so that those of seeds 0, 1, 2... differ
 BESIDE, TAUGHT = "sim_plus_real", "sim_taught"  # folders of the run with labelled frames beside it, and of the one that the twin taught
 SHOWN_MODES = 4  # of what the twin misses, that the page names
+
+
+def teach(
+    twin: TwinRead,
+    real: Dataset,
+    labels: Sequence[ArmLabel],
+    few: np.ndarray,
+    unlabelled: np.ndarray,
+    out: Path,
+    *,
+    seed: int,
+    epochs: int | None,
+    progress: Step | None = None,
+) -> None:
+    """Train a run on labelled frames and on frames whose labels that model inversion estimates, or continue it.
+
+    The intervals are at least as wide as the twin's errors on labelled frames that are estimated from other ones.
+
+    Parameters
+    ----------
+    real : Dataset
+        A recording.
+    labels : sequence of ArmLabel
+        Of all its frames. Those of the frames ``unlabelled`` are not used.
+    few, unlabelled : (n,) and (u,) int
+        Rows of the labelled frames, and of the others to learn from.
+    out : Path
+        Folder of the run.
+    epochs : int or None
+        None: the recipe's own.
+    """
+    moved, known = real.pins.nodes_px - real.pins.reference.pins_px, [labels[row] for row in few]
+    told = named_labels(twin.estimate(moved[few], known, moved[unlabelled], moved[unlabelled]), real.targets.names)
+    rows = np.sort(np.concatenate([few, unlabelled]))
+    train_on_real(
+        replace(real, targets=_with_estimated(real.targets, few, unlabelled, told)).rows(rows),
+        out,
+        seed=seed,
+        epochs=epochs,
+        progress=progress,
+    )
+    judged, found = twin.left_out(moved[few], known)
+    part = real.rows(few[judged])
+    if not len(part):
+        return
+    estimator = PoseEstimator.load(out)
+    inputs, index = estimator.inputs_of(part.pins, together=not part.pins.measured)
+    mean, scale, executed = estimator.ensemble.outputs(inputs, index)
+    _, scale = estimator.ensemble.destandardise(mean, scale)
+    made = named_labels(found, part.targets.names)
+    said = intervals(made, scale, part.targets.corrected, part.targets.raw, executed, part.targets.units)
+    widen_intervals(out, {key: np.maximum(getattr(estimator.ensemble, key), width) for key, width in said.items()})
+
+
+def _with_estimated(targets: Targets, few: np.ndarray, unlabelled: np.ndarray, told: np.ndarray) -> Targets:
+    """Targets with the labels (u, K) that are estimated for frames without; nothing is known of their moves."""
+    corrected, nothing = targets.corrected.copy(), np.full(len(targets.executed), np.nan)
+    corrected[unlabelled] = told
+    raw = corrected.copy()
+    raw[few] = targets.raw[few]
+    return replace(targets, raw=raw, corrected=corrected, executed=nothing, move=np.full_like(targets.move, np.nan))
 
 
 @dataclass(frozen=True, repr=False)
@@ -78,7 +150,7 @@ class SimToRealResult(ReadableResult):
 
 
 @dataclass(frozen=True)
-class _Ground:
+class Ground:
     """What all models of a study have in common.
 
     Attributes
@@ -147,11 +219,11 @@ def run(plan: SimToRealPlan, out: Path, *, progress: Progress = silent) -> SimTo
     read = read_twin(sets[ground.full.contacts], plan.target_object, plan.experiment, seed=plan.seed)
     rows += _invert_model_rows(ground, read)
     rows.append(_train_on_labelled(ground, read))
-    page = _write_page(ground, rows, beside, known[_residual_key(ground.full)], full_learnt)
+    page = write_page(ground, rows, beside, known[_residual_key(ground.full)].summary()[:SHOWN_MODES], full_learnt)
     return SimToRealResult(rows, beside.left_out, ground.residuals.error_px, [write_table(out / "study.csv", rows), page])
 
 
-def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> _Ground:
+def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> Ground:
     """Read and choose frames, fit the specification if the plan says so, and measure the residuals on the labelled frames."""
     with stage(progress, "frames") as step:
         real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
@@ -171,7 +243,7 @@ def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> _Ground:
     sheared = any(label.move.any() for label in measured.labels)
     full = full_twin(plan, setup.sensor, measured.labels, (residuals.friction_spread() or moves.friction) if sheared else None)
     others = without_one_ingredient(full, as_mounted(plan.sensor), moves, load_randomisation("contact")) if plan.ablate else []
-    return _Ground(plan, out, progress, setup, real, few, chosen, measured, residuals, full, [full, *others])
+    return Ground(plan, out, progress, setup, real, few, chosen, measured, residuals, full, [full, *others])
 
 
 def _residual_key(twin: Twin) -> tuple[int, tuple[float, ...]]:
@@ -179,7 +251,7 @@ def _residual_key(twin: Twin) -> tuple[int, tuple[float, ...]]:
     return twin.across, twin.frictions
 
 
-def _missing(ground: _Ground, twin: Twin, known: dict[tuple[int, tuple[float, ...]], Discrepancy]) -> Discrepancy | None:
+def _missing(ground: Ground, twin: Twin, known: dict[tuple[int, tuple[float, ...]], Discrepancy]) -> Discrepancy | None:
     """The discrepancy of a twin that uses one, else None. ``known`` stores it for other twins with the same residuals."""
     if not twin.learns:
         return None
@@ -190,7 +262,7 @@ def _missing(ground: _Ground, twin: Twin, known: dict[tuple[int, tuple[float, ..
     return known[_residual_key(twin)]
 
 
-def _training_sets(ground: _Ground, twin: Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
+def _training_sets(ground: Ground, twin: Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
     """The data sets to train on: the states once for each draw of the discrepancy, or once unchanged if there is none."""
     if missing is None:
         return [twin.part(join_datasets(sets))]
@@ -203,7 +275,7 @@ def _training_sets(ground: _Ground, twin: Twin, sets: list[Dataset], missing: Di
     return [twin.part(each) for each in drawn]
 
 
-def _invert_model_rows(ground: _Ground, twin: TwinRead) -> list[dict[str, Any]]:
+def _invert_model_rows(ground: Ground, twin: TwinRead) -> list[dict[str, Any]]:
     """Rows of the table for model inversion, with growing numbers of labelled frames."""
     labels, test = arm_labels(ground.real), ground.chosen.test
     rows = [read_row(BOTH, twin, ground.real, labels, rows, test) for rows in (np.zeros(0, int), *ground.chosen.nested)]
@@ -211,7 +283,7 @@ def _invert_model_rows(ground: _Ground, twin: TwinRead) -> list[dict[str, Any]]:
     return rows + [read_row(f"{BOTH}{EVENLY}", twin, ground.real, labels, rows, test) for rows in designed]
 
 
-def _train_on_labelled(ground: _Ground, twin: TwinRead) -> dict[str, Any]:
+def _train_on_labelled(ground: Ground, twin: TwinRead) -> dict[str, Any]:
     """Train a run on the labelled frames and on all others that are not evaluated, with the labels that model inversion estimates for
     them."""
     plan, real, few = ground.plan, ground.real, ground.chosen.few
@@ -221,7 +293,7 @@ def _train_on_labelled(ground: _Ground, twin: TwinRead) -> dict[str, Any]:
     return evaluate_run_row(BOTH + WITHOUT.format(count=len(others)), len(few), ground.out / TAUGHT, real, ground.chosen.test)
 
 
-def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
+def _without_the_twin(ground: Ground) -> list[dict[str, Any]]:
     """Rows of the table for the models that are trained on real frames alone."""
     rows = []
     for name, index in ground.chosen.trained.items():
@@ -235,25 +307,3 @@ def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
     rows += [quadratic_row(REAL, ground.real, index, ground.chosen.test) for index in others]
     designed = designed_frames(ground.real, ground.chosen, ground.plan.seed)
     return rows + [quadratic_row(f"{REAL}{EVENLY}", ground.real, index, ground.chosen.test) for index in designed]
-
-
-def _write_page(ground: _Ground, rows: list[dict[str, Any]], beside: CoKriging, missing: Discrepancy, learnt: Dataset) -> Path:
-    return write_page(
-        ground.out,
-        sensor=ground.setup.sensor.name,
-        tested=len(ground.chosen.test),
-        frames=len(ground.real),
-        labelled=ground.plan.labels,
-        seed=ground.plan.seed,
-        calibrated=ground.plan.calibrate,
-        error_px=ground.residuals.error_px,
-        modes=missing.summary()[:SHOWN_MODES],
-        friction=ground.full.randomisation.friction,
-        simulated=len(learnt),
-        contacts=len(np.unique(contact_of(learnt))),
-        names=ground.real.targets.names,
-        left_out=beside.left_out,
-        columns=list(rows[0]),
-        rows=rows,
-        problems=ground.real.problems,
-    )

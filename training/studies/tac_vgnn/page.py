@@ -11,9 +11,8 @@ from training.data.targets import unit_of
 from training.studies.tac_vgnn.models import PlannedRun, error_columns, ordering, read_curves
 from twin.estimate import readable_labels
 from twin.report.charts import new_figure, plain_log, sized_figure
-from twin.report.numbers import number
 from twin.report.page import Page, PagePicture
-from twin.report.table import Column
+from twin.report.table import Column, number
 from twin.report.themes import SERIES
 
 # Columns of the table of models that name a run.

@@ -16,7 +16,7 @@ from scenes.pins import PinsSpec
 from scenes.sensor import Polarity, RecordingSpec
 from twin.errors import FrameError
 from twin.frames.forms import gray_levels
-from twin.pins.voronoi import directed_edges
+from twin.pins.flips import directed_edges
 from twin.types import Form, Frame, PinGraph
 
 # Factor by which the hull's vertices are scaled about the origin (release).

@@ -8,6 +8,7 @@ import numpy as np
 from scenes.sensor import BlobSpec
 from twin.compiled import compiled
 from twin.pins.finding.bumps import find_bumps
+from twin.pins.finding.components import find_components
 
 GROWTH_PX = 4
 """Largest distance, px, by which a component is grown beyond its bounding box."""
@@ -20,6 +21,8 @@ SPECK_RATIO = 4.0
 """Least ratio of the difference of a hot or dead pixel to the usual difference."""
 MOST_ABOVE = 98
 """Percentile of the levels above the local mean to which brighter levels (glare, LEDs) are reduced before Otsu's method."""
+RING_PX = 2
+"""Width of the ring around a component, from which the level of the skin is measured, px."""
 NOISE_SIGMA_PX = 0.7
 """Standard deviation of the smoothing before an adaptive threshold, px. It halves white noise and keeps the edge of a 6 px cap."""
 LEAST_FILL = 0.25
@@ -141,58 +144,47 @@ def _smooth_window(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
 
 
 @compiled()
-def _boxes(labels: np.ndarray, grown: np.ndarray, count: int) -> np.ndarray:
-    """Left, top, width, height and area (count, 5) of each label. Its pixels are also written to ``grown``."""
-    height, width = labels.shape
-    boxes = np.zeros((count, 5), np.int64)
-    for y in range(height):
-        for x in range(width):
-            k = labels[y, x]
-            if k == 0:
-                continue
-            grown[y, x] = k
-            box = boxes[k]
-            if box[4] == 0:
-                box[0], box[1] = x, y
-            left = min(box[0], x)
-            box[2] = max(box[0] + box[2], x + 1) - left
-            box[0], box[3] = left, y + 1 - box[1]
-            box[4] += 1
-    return boxes
+def _measure_components(
+    gray: np.ndarray, grown: np.ndarray, ringed: np.ndarray, bright: np.ndarray, boxes: np.ndarray, reach: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bright pixels, weight and elongation (count, 3) of each component, and its weighted centre (count, 2).
 
-
-@compiled()
-def _centroids(gray: np.ndarray, grown: np.ndarray, ringed: np.ndarray, bright: np.ndarray, boxes: np.ndarray, reach: int) -> np.ndarray:
-    """Sums (count, 7) over the pixels of each label: weight, weight x, weight y, bright pixels, weight xx, weight xy, weight yy.
-
-    A pixel's weight is its level above the mean of the ring around its label; negative weights are left out. A label's pixels and its
-    ring lie within ``reach`` of its box.
+    A pixel's weight is its level above the mean of the ring around its component; negative weights are left out. A component's pixels in
+    ``grown`` lie within ``reach`` of its box. Its ring is where ``ringed`` has it and ``grown`` has nothing, ``RING_PX`` farther.
     """
     height, width = gray.shape
-    sums = np.zeros((len(boxes), 7))
+    sizes, middle = np.zeros((len(boxes), 3)), np.zeros((len(boxes), 2))
     for k in range(1, len(boxes)):
-        left, right = max(boxes[k, 0] - reach, 0), min(boxes[k, 0] + boxes[k, 2] + reach, width)
-        top, bottom = max(boxes[k, 1] - reach, 0), min(boxes[k, 1] + boxes[k, 3] + reach, height)
-        total, count = 0.0, 0.0
-        for y in range(top, bottom):
-            for x in range(left, right):
+        left, right = boxes[k, 0] - reach, boxes[k, 0] + boxes[k, 2] + reach
+        top, bottom = boxes[k, 1] - reach, boxes[k, 1] + boxes[k, 3] + reach
+        total, around = 0, 0
+        for y in range(max(top - RING_PX, 0), min(bottom + RING_PX, height)):
+            for x in range(max(left - RING_PX, 0), min(right + RING_PX, width)):
                 if ringed[y, x] == k and grown[y, x] == 0:
                     total += gray[y, x]
-                    count += 1
-        level = total / max(count, 1.0)
-        for y in range(top, bottom):
-            for x in range(left, right):
+                    around += 1
+        level, size, m = total / max(around, 1), 0, 0.0
+        mx = my = mxx = mxy = myy = 0.0
+        for y in range(max(top, 0), min(bottom, height)):
+            for x in range(max(left, 0), min(right, width)):
                 if grown[y, x] == k:
-                    sums[k, 3] += bright[y, x] > 0
+                    size += bright[y, x] > 0
                     weight = gray[y, x] - level
                     if weight > 0:
-                        sums[k, 0] += weight
-                        sums[k, 1] += weight * x
-                        sums[k, 2] += weight * y
-                        sums[k, 4] += weight * x * x
-                        sums[k, 5] += weight * x * y
-                        sums[k, 6] += weight * y * y
-    return sums
+                        m += weight
+                        mx += weight * x
+                        my += weight * y
+                        mxx += weight * x * x
+                        mxy += weight * x * y
+                        myy += weight * y * y
+        sizes[k, 0] = size
+        if m > 0:
+            cx, cy = mx / m, my / m
+            xx, xy, yy = mxx / m - cx * cx, mxy / m - cx * cy, myy / m - cy * cy
+            root = np.hypot(xx - yy, 2 * xy)
+            sizes[k, 1], sizes[k, 2] = m, (xx + yy + root) / max(xx + yy - root, 1e-3)
+            middle[k, 0], middle[k, 1] = cx, cy
+    return sizes, middle
 
 
 def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: float) -> Blobs:
@@ -205,20 +197,15 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
     eroded = bright
     if blob.erosion_px > 1:
         eroded = cv2.erode(bright, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
-    count, labels = cv2.connectedComponents(eroded, connectivity=8, ltype=cv2.CV_16U)
+    labels, boxes = find_components(eroded)
     grow = 2 * blob.erosion_px + 1
-    grown = cv2.dilate(labels, np.ones((grow, grow), np.uint8))
-    ringed = cv2.dilate(labels, np.ones((grow + 4, grow + 4), np.uint8))
-    boxes = _boxes(labels, grown, count)
-    sums = _centroids(gray, grown, ringed, bright, boxes, blob.erosion_px + 2)
-    area = sums[:, 3]
-    keep = np.flatnonzero((area >= blob.min_area_px2) & (area <= max_area_px2) & (sums[:, 0] > 0) & (np.arange(count) > 0))
-    keep = keep[boxes[keep, 4] >= LEAST_FILL * boxes[keep, 2] * boxes[keep, 3]]
-    mean = sums[keep, 1:3] / sums[keep, :1]
-    xx, xy, yy = (sums[keep, 4:] / sums[keep, :1] - np.stack([mean[:, 0] ** 2, mean[:, 0] * mean[:, 1], mean[:, 1] ** 2], axis=1)).T
-    root = np.hypot(xx - yy, 2 * xy)
-    elongation = (xx + yy + root) / np.maximum(xx + yy - root, 1e-3)
-    return Blobs(mean + mask.corner_px, area[keep], elongation, keep, area, boxes[:, :4], grown, gray, mask.corner_px)
+    grown = cv2.copyTo(labels, eroded, cv2.dilate(labels, np.ones((grow, grow), np.uint8)))
+    ringed = cv2.dilate(labels, np.ones((grow + 2 * RING_PX, grow + 2 * RING_PX), np.uint8))
+    sizes, middle = _measure_components(gray, grown, ringed, bright, boxes, blob.erosion_px)
+    area, weight, elongation = sizes.T
+    whole = boxes[:, 4] >= LEAST_FILL * boxes[:, 2] * boxes[:, 3]
+    keep = np.flatnonzero((area >= blob.min_area_px2) & (area <= max_area_px2) & (weight > 0) & whole)
+    return Blobs(middle[keep] + mask.corner_px, area[keep], elongation[keep], keep, area, boxes[:, :4], grown, gray, mask.corner_px)
 
 
 def find_spots(gray: np.ndarray, mask: Mask, blob: BlobSpec) -> Blobs:

@@ -86,6 +86,8 @@ NEAR = 6
 SEAM = 0.7
 """Least difference between the motions of neighbouring pins, in spacings, at which a seam may separate them. It is 1 where names are
 shifted by a pin; in contacts with true names at most some 0.6, and 0.9 where the skin slips."""
+FOLLOW_GATE = 0.45
+"""Largest motion of a pin between consecutive frames, in spacings, with which its name is carried over: less than half a row."""
 PREDICTED_WEIGHT = 0.1
 """Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
 Stiffnesses = tuple[tuple[float, float], ...]
@@ -176,6 +178,33 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray, *, second_
     """
     found = _grow_labelling(reference, px, area_px2)
     return found if not second_look or proven(reference, px, found.blob) else look_again(reference, px, area_px2, found)
+
+
+def follow(reference: Reference, before_px: np.ndarray, px: np.ndarray, area_px2: np.ndarray) -> Match | None:
+    """The labelling of blobs (K, 2) with the names that the pins (N, 2) had in the frame before; None if it does not prove itself.
+
+    Each pin has one blob near its last place, no blob is left, no triangle is turned over, and the rim is near its place at rest: these
+    are the conditions under which ``match`` ends its search. A labelling that slipped by a row leaves a row of blobs.
+    """
+    if len(px) != len(before_px):
+        return None
+    blob = _carry_names(_layout(reference), before_px, _put_in_cells(reference, px, area_px2))
+    if (blob < 0).any() or _rim_displacement(reference, px, blob) >= HARDLY_MOVED or not proven(reference, px, blob):
+        return None
+    return Match(blob, px[blob], float(len(blob)))
+
+
+@compiled()
+def _carry_names(layout: LayoutArrays, before_px: np.ndarray, blobs: FrameBlobs) -> np.ndarray:
+    """Blob (N,) next to each pin's place in the frame before, -1 from the first pin on that has none of its own."""
+    found, taken, none = np.full(len(before_px), -1), np.zeros(len(blobs.px), np.bool_), np.zeros(len(blobs.px), np.bool_)
+    for i in range(len(before_px)):
+        reach = FOLLOW_GATE * layout.spacing[i]
+        k, _ = nearest_free(before_px[i, 0], before_px[i, 1], reach, blobs.px, none, blobs.buckets, blobs.cell)
+        if k < 0 or taken[k]:
+            break
+        found[i], taken[k] = k, True
+    return found
 
 
 def proven(reference: Reference, px: np.ndarray, blob: np.ndarray) -> bool:

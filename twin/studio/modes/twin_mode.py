@@ -16,7 +16,7 @@ from twin.errors import TwinError
 from twin.estimate import SensorModel, readable_labels
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
-from twin.report.numbers import force_interval
+from twin.report.table import force_interval
 from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
 from twin.studio.modes.mode import PageMode
 from twin.studio.page import LineChart, StudioPage, put, value_of

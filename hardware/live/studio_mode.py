@@ -1,4 +1,4 @@
-"""Devices for the studio's mode 'Live': a camera with its estimates, and an arm that is only read until it is armed."""
+"""The studio's mode 'Live': a camera with its estimates and, if there is one, an arm that is only read until it is armed."""
 
 import os
 import threading
@@ -18,19 +18,27 @@ from hardware.live.live import LiveSession, estimate_line
 from hardware.safety.decide import load_limits
 from hardware.safety.eyes import FreshFrames
 from hardware.safety.safe_arm import SafeArm, try_each
-from hardware.workcell.plan import check_standing
+from hardware.workcell.build import check_standing
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
-from twin.estimate import Estimate, SensorModel
+from twin.estimate import Estimate, SensorModel, pins_in
 from twin.pins import Pipeline
+from twin.pins.check import Grade, examine
 from twin.records.session import SessionWriter
-from twin.studio.live_page import LiveFrame
+from twin.studio.live_page import LiveFrame, chart_values, frame_numbers, frame_pictures
+from twin.studio.modes.mode import PageMode
+from twin.studio.modes.twin_mode import TwinMode
+from twin.studio.page import LineChart, StudioPage, put
+from twin.studio.pictures import badge, paragraph
+from twin.studio.studio import LIVE, StudioPlan
 from twin.types import Frame
 
 # Speed, mm/s and deg/s, of an arm that the page moves. It is slow, so that a person can watch it.
 SLOW_MM_S, SLOW_DEG_S = 10.0, 10.0
 # Longest wait, s, for the last frame at the end of a feed.
 END_S = 10.0
+NUDGES = ("x -1", "x +1", "y -1", "y +1", "z -1", "z +1")
+"""Moves that an armed arm can be given, mm in its base frame."""
 
 
 class WatchedArm:
@@ -169,7 +177,7 @@ def require_feed(camera: str, arm: str, recording: str, sensor: SensorSpec) -> N
 
 
 class CameraFeed:
-    """A camera, its estimates, and an arm; a ``twin.studio.modes.live_mode.LiveFeed``.
+    """A camera, its estimates, and an arm.
 
     Parameters
     ----------
@@ -272,3 +280,161 @@ class CameraFeed:
     def _close_arm(self) -> None:
         if self.robot is not None:
             self.robot.close()
+
+
+class LiveMode(PageMode):
+    """The mode 'Live'.
+
+    Parameters
+    ----------
+    page : Page
+    twin : TwinMode
+        The mode whose model is used.
+    plan : StudioPlan
+        It has the folder for sessions, and the texts for camera and arm that are offered at first.
+    """
+
+    title = LIVE
+
+    def __init__(self, page: StudioPage, twin: TwinMode, plan: StudioPlan) -> None:
+        super().__init__(page)
+        self._twin, self._out = twin, plan.out
+        self._feed: CameraFeed | None = None
+        self._connecting = threading.RLock()  # the page calls from many threads, and a feed that is forgotten would keep its arm
+        self._pipeline: Pipeline | None = None
+        self._health: list[str] = []
+        self._last: LiveFrame | None = None
+        self._shots = self.newest(self._show, "live")
+        gui = page.gui
+        with self.folder:
+            self._camera = gui.add_text("camera", plan.camera, hint="a number, /dev/videoN, http://..., a folder or a video")
+            self._arm = gui.add_text("arm", plan.arm, hint="simulated, mg400:ADDRESS, magician:PORT, or empty")
+            page.button("Connect", self.connect)
+            page.button("Disconnect", self.disconnect)
+            self._record = gui.add_checkbox("record", False)
+            page.button("Check the sensor's health", self.check_health)
+            page.button("EMERGENCY STOP", self.emergency_stop, color="red", hint="stops the arm and cuts its power, armed or not")
+            self._armed = gui.add_checkbox("armed: the page may move the arm", False)
+            self._limits = gui.add_html("")
+            self._nudges = nudges = gui.add_button_group("move, mm", NUDGES, visible=False)
+        self._record.on_update(page.guard(self._toggle_record))
+        self._armed.on_update(page.guard(self._toggle_armed))
+        nudges.on_click(page.guard(lambda: self._nudge(nudges.value)))
+        gui.add_command("Emergency stop of the arm", hotkey="space", modifier="shift").on_trigger(page.guard(self.emergency_stop))
+        self._chart = LineChart(page, "live estimates")
+
+    def stop(self) -> None:
+        """End, and release camera and arm."""
+        self.disconnect()
+        super().stop()
+
+    def show(self) -> None:
+        """Show the camera. If the command named a camera, it is connected now."""
+        self._page.show_nothing("Give a camera and press 'Connect'.")
+        with self._connecting:
+            absent = self._feed is None and bool(self._camera.value)
+            if absent:
+                self._page.guard(self.connect)(self)
+        if not absent and self._last is not None:  # this frame came before the mode was entered, or after it was left
+            self._shots.give(self._last)
+
+    def connect(self) -> None:
+        """Connect the camera and the arm that the user named.
+
+        Raises
+        ------
+        TwinError
+            There is no model, camera or arm of that name.
+        """
+        with self._connecting:
+            self.disconnect()
+            model = self._twin.contact.model
+            if model is None:
+                raise TwinError("there is no model of this sensor yet; wait until it is loaded, or start the studio with one (`model`)")
+            if not self._camera.value.strip():
+                raise TwinError("give a camera first: a number, /dev/videoN, http://..., a folder or a video")
+            feed = CameraFeed(self._camera.value.strip(), self._arm.value.strip(), model)
+            self._pipeline = Pipeline(feed.model.sensor, feed.model.form, feed.model.pipeline.reference)
+            self._feed = feed
+            feed.start(self._shots.give, self.complain)
+            self._limits.content = "" if feed.robot is None else paragraph(f"{feed.robot.name}: {feed.robot.limits()}", "note")
+
+    def disconnect(self) -> None:
+        """Release camera and arm."""
+        with self._connecting:
+            feed, self._feed, self._last = self._feed, None, None
+            try:
+                if feed is not None and self._record.value:
+                    self._page.say(feed.end_record())
+            finally:  # even if the recording can't be ended, the arm does not stay armed
+                for control in (self._record, self._armed):
+                    put(control, False)
+                self._nudges.visible = False
+                if feed is not None:
+                    feed.stop()
+
+    def emergency_stop(self) -> None:
+        """Stop the arm. This is never refused."""
+        if self._feed is None or self._feed.robot is None:
+            raise TwinError("no arm is connected")
+        self._feed.robot.emergency_stop()
+        put(self._armed, False)
+        self._nudges.visible = False
+        self._page.say("The arm was stopped and its power cut. Look at it, then arm it again.", bad=True)
+
+    def check_health(self) -> None:
+        """Show the sensor's condition, evaluated from the newest frame."""
+        if self._last is None or self._feed is None:
+            raise TwinError("there is no frame yet; connect a camera first")
+        findings = examine([self._last.frame], self._feed.model.sensor)
+        ill = [f"{finding.text} {finding.remedy}".strip() for finding in findings if finding.verdict is not Grade.HEALTHY]
+        self._health = ill or [f"All {len(findings)} checks are good."]
+
+    def _toggle_record(self) -> None:
+        if self._feed is None:
+            put(self._record, False)
+            raise TwinError("connect a camera first")
+        if self._record.value:
+            self._feed.record(self._out / time.strftime("session-%Y%m%d-%H%M%S"))
+        else:
+            self._page.say(self._feed.end_record())
+
+    def _robot(self) -> WatchedArm:
+        if self._feed is None or self._feed.robot is None:
+            put(self._armed, False)
+            raise TwinError("no arm is connected")
+        return self._feed.robot
+
+    def _toggle_armed(self) -> None:
+        robot = self._robot()
+        try:
+            if self._armed.value:
+                self._page.say("; ".join(robot.arm()))
+            else:
+                robot.disarm()
+        finally:
+            put(self._armed, robot.armed)
+            self._nudges.visible = robot.armed
+
+    def _nudge(self, text: str) -> None:
+        axis, _, by = text.partition(" ")
+        self._robot().nudge("xyz".index(axis), float(by))
+
+    def _show(self, shot: LiveFrame) -> None:
+        feed, pipeline = self._feed, self._pipeline
+        self._last = shot
+        if feed is None or pipeline is None or not self._active:
+            return
+        seen = pins_in(shot.frame, shot.estimate, pipeline)
+        pictures = frame_pictures(feed.model.sensor, pipeline.reference, shot.frame, seen)
+        robot = feed.robot
+        numbers = [
+            badge("live", "moving") + (badge("recording", "moving") if self._record.value else ""),
+            paragraph(feed.name, "note"),
+            *frame_numbers(shot, seen),
+            "" if robot is None else badge("ARMED" if robot.armed else "arm: read only", "moving" if robot.armed else ""),
+            "" if robot is None else paragraph(robot.words(), "note"),
+            *(paragraph(line, "said") for line in self._health),
+        ]
+        label = f"live {shot.frame.form} frame {shot.frame.sequence}"
+        self.put_up(pictures, label, numbers, also=lambda: self._chart.add(chart_values(shot.estimate)))

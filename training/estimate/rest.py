@@ -58,6 +58,10 @@ class RestPlaces:
         reference = measure_reference(self.sensor, self.form, frame, known=self.known)
         return reference, self.require_view(reference.pins_px, frame.name or "frame").describe_ambiguity()
 
+    def same_unit(self, reference: Reference) -> bool:
+        """Whether pins at rest are those of the unit from which the weights were trained, by the tolerances of its print."""
+        return view_of(reference.pins_px, self.known, self.sensor.pins, camera_modes(self.sensor, self.form)).same
+
     def of_contacts(self, nodes_px: np.ndarray, name: str) -> tuple[Reference | None, str]:
         """The pins at rest estimated from contacts with pins (M, N, 2), if they are not the known ones, and what is undecided; raises as
         ``require_view_of_contacts``."""

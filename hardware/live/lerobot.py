@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from hardware.arms.newest import NewestTarget
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource
-from hardware.errors import DeviceError, StaleDataError, leave
+from hardware.errors import Connection, DeviceError, StaleDataError, leave
 from hardware.live.doctor import cameras
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
@@ -26,7 +25,7 @@ _POSE = ("x", "y", "z", "rx", "ry", "rz")
 MAX_AGE_MS = 500.0
 
 
-class LeRobotCamera:
+class LeRobotCamera(Connection):
     """A frame source with the interface of LeRobot's cameras. Its pictures are (H, W, 3), also those of a gray camera.
 
     Parameters
@@ -44,13 +43,6 @@ class LeRobotCamera:
         self.fps = fps if fps is not None else round(getattr(source, "fps", 0.0)) or None
         self.width = width if width is not None else known[0]
         self.height = height if height is not None else known[1]
-
-    def __enter__(self) -> Self:
-        self.connect()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
-        self.disconnect()
 
     @property
     def is_connected(self) -> bool:
@@ -133,7 +125,7 @@ class LeRobotArmConfig:
         return kind_of(self.arm)
 
 
-class LeRobotArm:
+class LeRobotArm(Connection):
     """An arm for LeRobot's scripts: observations and actions are dicts of floats, in mm and deg.
 
     Parameters
@@ -178,13 +170,6 @@ class LeRobotArm:
 
     def __str__(self) -> str:
         return f"{self.id} {type(self).__name__}"
-
-    def __enter__(self) -> Self:
-        self.connect()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
-        leave(self.disconnect, error)
 
     @property
     def observation_features(self) -> dict[str, Any]:

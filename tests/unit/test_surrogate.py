@@ -131,11 +131,11 @@ def test_the_skin_comes_to_bend_as_the_network_tells(surrogate):
     force[40:] = 0.0
     bent, moved = np.zeros((3, len(force)), np.float32), np.ones_like(force)
     for _ in range(30):
-        bend(force, bent, moved, *surrogate.bending.kernel(surrogate.read))
+        bend(force, bent, moved, surrogate.bending.kernel(surrogate.read))
     wanted = surrogate.bending.of(force.reshape(1, -1) @ surrogate.read.T)[0]
     assert np.abs(wanted).max() > 0.01
     assert np.allclose(bent.T, wanted, atol=1e-4) and np.allclose(moved, 1.0 + bent.T, atol=1e-5)
-    bend(0 * force, bent, moved, *surrogate.bending.kernel(surrogate.read))
+    bend(0 * force, bent, moved, surrogate.bending.kernel(surrogate.read))
     assert np.abs(bent).max() < 0.6 * np.abs(wanted).max()
 
 

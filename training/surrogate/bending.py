@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.compiled import compiled
-from twin.store import Layers
+from twin.store import Layers, silu, through_layers
 from twin.types import FloatArray
 
 AMPLE = 0.1
@@ -47,12 +47,8 @@ class Bending:
     def of(self, linear: FloatArray) -> FloatArray:
         """Displacements (S, M, 3) mm to add to the linear skin's. ``linear`` (S, K) is the linear skin's answer in the pins' modes."""
         x = linear / self.scale
-        out, gates = x, ample(x)
-        for number, (weights, offset) in enumerate(self.layers):
-            out = out @ weights.T + offset
-            if number < len(self.layers) - 1:
-                out = out / (1.0 + np.exp(-out))  # SiLU
-        return np.tensordot(x @ self.straight.T + gates[:, None] * out, self.modes, axes=1)
+        gated = ample(x)[:, None] * through_layers(self.layers, x, silu)
+        return np.tensordot(x @ self.straight.T + gated, self.modes, axes=1)
 
     def kernel(self, read: FloatArray) -> tuple[FloatArray, ...]:
         """The arrays that ``bend`` takes, in its memory layout; ``read`` (K, 3 M) is the linear skin's answer in the modes of the pins."""
@@ -74,24 +70,12 @@ def unbent(nodes: int) -> tuple[FloatArray, ...]:
 
 
 @compiled(nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
-def bend(
-    force: FloatArray,
-    bent: FloatArray,
-    moved: FloatArray,
-    read: FloatArray,
-    first: FloatArray,
-    a: FloatArray,
-    second: FloatArray,
-    b: FloatArray,
-    third: FloatArray,
-    c: FloatArray,
-    straight: FloatArray,
-    modes: FloatArray,
-) -> float:
+def bend(force: FloatArray, bent: FloatArray, moved: FloatArray, network: tuple[FloatArray, ...]) -> float:
     """Update the bending ``bent`` (3, M) float32 toward that of the forces (M, 3), and the displacements ``moved`` (M, 3) by the same.
 
-    Returns the largest change along an axis, mm.
+    ``network`` is as ``Bending.kernel`` gives it. Returns the largest change along an axis, mm.
     """
+    read, first, a, second, b, third, c, straight, modes = network
     count, width = len(c), len(a)
     if count == 0:
         return 0.0

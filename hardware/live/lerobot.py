@@ -17,6 +17,7 @@ from hardware.live.doctor import cameras
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 from scenes import SensorSpec, load_sensor
+from twin.errors import ErrorsAs
 from twin.frames.forms import frame_size
 from twin.types import Form, Frame
 
@@ -69,10 +70,8 @@ class LeRobotCamera(Connection):
 
     def read_latest(self, max_age_ms: float = MAX_AGE_MS) -> np.ndarray:
         """The newest image; ``TimeoutError`` if it is older than ``max_age_ms``."""
-        try:
+        with ErrorsAs(StaleDataError, lambda error: TimeoutError(str(error))):
             return self._picture(self._source.read_latest(max_age_s=max_age_ms / 1e3))
-        except StaleDataError as error:
-            raise TimeoutError(str(error)) from error
 
     def disconnect(self) -> None:
         """Close the camera."""

@@ -19,6 +19,7 @@ from scenes.base import Fraction, NonNegative, Positive, Section, SpecError
 from scenes.files import LONGEST_PATH, quote
 from scenes.load import read_section
 from scenes.plugins import other_files
+from twin.errors import ErrorsAs
 
 # Number of bisections of a path in the search for its last allowed place: 100 mm are divided to 0.01 mm.
 CLIP_HALVINGS = 14
@@ -112,10 +113,8 @@ def load_limits(name_or_path: str | Path) -> SafetyLimits:
     if not str(name_or_path) or not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
         problem = f"{quote(path, LONGEST_PATH)}: no such file" if path.suffix else f"no limits are called '{quote(name_or_path)}'"
         raise DeviceError(f"{problem}; give one of {', '.join(shipped)}, or the path of a TOML file like {example}")
-    try:
+    with ErrorsAs(SpecError, lambda error: DeviceError(f"{error}; a file like {example} is expected")):
         return read_section(path, SafetyLimits)
-    except SpecError as error:
-        raise DeviceError(f"{error}; a file like {example} is expected") from error
 
 
 class DecisionCode(StrEnum):

@@ -32,6 +32,7 @@ from training.runs.run_files import AGAIN
 from training.surrogate.symmetry import Symmetry, symmetries
 from training.touch.contact_maps import HEADROOM
 from twin.camera.projection import project
+from twin.errors import ErrorsAs
 from twin.frames.forms import from_raw
 from twin.frames.truth import arrays_of, open_truth
 from twin.geometry.pins import rest_pins
@@ -496,10 +497,8 @@ def read_slip(path: Path) -> SlipModel:
     with FILE.open_arrays(path) as (about, found):
         limit = found.pop("limit").astype(float)
         network = SlipNetwork(2 * len(limit))
-        try:
+        with ErrorsAs(RuntimeError, lambda error: ValueError("its arrays do not fit together")):
             network.load_state_dict({key: torch.from_numpy(value) for key, value in found.items()})
-        except RuntimeError as error:
-            raise ValueError("its arrays do not fit together") from error
         return SlipModel(network.eval(), limit=limit, **about)
 
 

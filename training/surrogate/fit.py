@@ -19,7 +19,7 @@ from training.surrogate.nodes import interpolation_matrix
 from training.surrogate.paths import DEEPEST_MM, STICKING
 from training.surrogate.reading import EpisodeContact
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
-from training.surrogate.symmetry import Symmetry, ring_directions, symmetries
+from training.surrogate.symmetry import Symmetry, about_z, ring_directions, symmetries
 from twin.camera.projection import project
 from twin.errors import OptionError
 from twin.frames.forms import from_raw
@@ -324,7 +324,7 @@ def sample_states(
     ``bending`` is that of ``LinearContacts``.
     """
     about = np.eye(4)
-    about[:3, :3] = turn = _about_z(turn_rad)
+    about[:3, :3] = turn = about_z(turn_rad)
     poses = about @ path.T
     obj = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
     assert isinstance(obj, CompiledSolid)
@@ -356,14 +356,9 @@ def _main(rows: FloatArray, count: int) -> FloatArray:
 
 def _carry_modes(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> FloatArray:
     """The modes (MODES, 6 P) of ``start``, a surrogate of another sensor of the family, on this sensor's lattice."""
-    turn = _about_z(np.radians(sensor.pins.phase_deg - start.phase_deg)).astype(np.float32)
+    turn = about_z(np.radians(sensor.pins.phase_deg - start.phase_deg)).astype(np.float32)
     modes = (start.modes @ turn.T).transpose(0, 2, 1, 3) * weights
     return np.ascontiguousarray(modes.reshape(len(modes), -1))
-
-
-def _about_z(angle_rad: float) -> FloatArray:
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _pins_and_rest(rows: _Samples, flat: FloatArray) -> tuple[FloatArray, FloatArray]:

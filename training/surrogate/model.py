@@ -117,8 +117,8 @@ class Surrogate:
         linear = by_row(force_n.reshape(len(force_n), -1).astype(np.float32), self.read.T)
         seen = by_row(within(gap_mm), self.view.T)
         x = (np.concatenate([linear, beside.astype(np.float32), seen], axis=1) - self.mean) / self.scale
-        x = through_layers(self.layers, x, silu, by_row) * (self.out_scale * gate(depth_mm)[:, None]).astype(np.float32)
-        return linear + x[:, : len(self.modes)], x[:, len(self.modes) :]
+        found = through_layers(self.layers, x, silu, by_row) * (self.out_scale * gate(depth_mm)[:, None]).astype(np.float32)
+        return linear + found[:, : len(self.modes)], found[:, len(self.modes) :]
 
     def save(self, path: Path) -> int:
         """Write it to a file and return the size in bytes.

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hardware.cameras.choose import open_camera
-from hardware.cameras.session import SessionSource
+from hardware.cameras.recorded import SessionSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.live.rerun_view import RerunView

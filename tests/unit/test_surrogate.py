@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from scenes import ObjectSpec, load_object, load_sensor
 from scenes.object import CylinderShape, EdgeShape, MeshShape, PrismShape, SphereShape
 from training.surrogate.bending import bend
-from training.surrogate.compliance import NODE_RINGS, compliance_of
+from training.surrogate.compliance import NODE_RINGS, AtNodes, compliance_of
 from training.surrogate.contact import LinearContacts, between
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.fit import _turn_states, average_compliance, cut, distil, require_dome, sample_states
 from training.surrogate.model import SurrogateError, load_surrogate, representatives, rest_of, surrogate_of, unfold_compliance
-from training.surrogate.nodes import AtNodes
 from training.surrogate.paths import FREE, FRICTION, STICKING, draw_path
 from training.surrogate.reading import EpisodeContact, FiniteElements
 from training.surrogate.samples import SolvedPath, lattice_sensor

@@ -8,8 +8,7 @@ from time import perf_counter
 import torch
 from torch import nn
 
-from training.models.part import Inputs
-from training.models.recipes import Recipe
+from training.models.part import Inputs, Recipe
 from training.runs.networks import device_of, predict_rows
 from twin.progress import Step
 

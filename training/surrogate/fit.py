@@ -11,11 +11,10 @@ import torch
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from training.surrogate.bending import Bending, ample
-from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of
+from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of, interpolation_matrix
 from training.surrogate.contact import LinearContacts
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.model import SHIPPED, SUFFIX, VIEWS, Surrogate, features, gate, load_surrogate, mechanics_of, within
-from training.surrogate.nodes import interpolation_matrix
 from training.surrogate.paths import DEEPEST_MM, STICKING
 from training.surrogate.reading import EpisodeContact
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths

@@ -26,8 +26,7 @@ from training.models.part import Prepared
 from training.runs.assemble import calibrate
 from training.runs.config import RunConfig, training_labels, training_rows
 from training.runs.identity import ASIDE, difference, frame_marks, identity_of
-from training.runs.loop import Loop, TrainingRows
-from training.runs.networks import parameter_count
+from training.runs.loop import Loop, TrainingRows, parameter_count
 from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damage_error, read_config, read_tensors, write_tensors
 from twin.errors import ErrorsAs
 from twin.frames.forms import blob_spec

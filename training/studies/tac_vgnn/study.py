@@ -21,7 +21,7 @@ from training.data.dataset import Dataset, load_dataset
 from training.data.pins import PinTable
 from training.data.targets import ANGLE, DEPTH
 from training.models import model_named
-from training.runs.networks import choose_device
+from training.runs.loop import choose_device
 from training.studies.tac_vgnn.models import SHOWN, PlannedRun, error_columns, measure_training, plan_run, table_row, train_all
 from training.studies.tac_vgnn.page import curves_figure, efficiency_figure, write_page
 from training.surrogate.symmetry import about_z

@@ -26,7 +26,7 @@ from training.generation import GenerationConfig, generate
 from training.models import recipe_of
 from training.runs.assemble import conformal_quantile
 from training.runs.config import RunConfig
-from training.runs.networks import predict_rows
+from training.runs.loop import predict_rows
 from training.runs.run import train_run
 from training.runs.run_files import CONFIG, DISPLACEMENTS, SHIPPED, TENSORS, pack, read_config, read_tensors, write_tensors
 from training.studies.judging import intervals_on, measure_errors

@@ -17,8 +17,7 @@ from training.data.targets import limits_of
 from training.errors import TrainingError
 from training.estimate.displacements import DisplacementModel, read_displacements
 from training.estimate.domain import Domain, DomainVerdict, read_domain
-from training.estimate.rest import RestPlaces
-from training.estimate.rest_seeking import RestSeeker
+from training.estimate.rest import RestPlaces, RestSeeker
 from training.estimate.widening import Widening
 from training.models import model_named
 from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen

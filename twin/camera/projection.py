@@ -22,9 +22,10 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from scenes.sensor import CameraSpec, HousingSpec, ViewSpec
+from scenes.sensor import CameraSpec, HousingSpec, SensorSpec, ViewSpec
 from twin.compiled import compiled
-from twin.types import FloatArray
+from twin.frames.forms import from_raw
+from twin.types import FloatArray, Form
 
 NEWTON_STEPS = 12
 """Steps of Newton's method. It converges quadratically, so the last steps change only the last digits."""
@@ -113,6 +114,11 @@ def project(view: ViewSpec, points_mm: FloatArray) -> FloatArray:
     in_sensor = np.concatenate([across, np.ones_like(across[..., :1])], axis=-1)
     in_camera = in_sensor @ sensor_to_camera(camera)[:3, :3].T
     return distort(camera, in_camera[..., :2] / in_camera[..., 2:]) * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+
+
+def project_in_form(spec: SensorSpec, form: Form, points_mm: FloatArray) -> FloatArray:
+    """As ``project``, to pixels (..., 2) of a sensor's frames of a form; raises as ``twin.frames.forms.from_raw``."""
+    return from_raw(spec.recording, form, project(spec.view, points_mm))
 
 
 def window_tangent(view: ViewSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behind_mm: float | None = None) -> FloatArray:

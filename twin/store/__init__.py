@@ -1,6 +1,6 @@
 """Storage of results: atomic writing of files, protected outputs, a cache, resumable work, and records of the code behind the results."""
 
-from twin.store.arrays import ArrayFile, Layers, layers_from, layers_to
+from twin.store.arrays import ArrayFile, Layers, layers_from, layers_to, silu, through_layers
 from twin.store.atomic import (
     lock_folder,
     remove_parts,

@@ -101,7 +101,7 @@ def load_object(name_or_path: str | Path | ObjectSpec) -> ObjectSpec:
                 f"{spec_path}: shape.sha256: {file} has another content ({digest}); put the right file there, or leave the key out"
             )
         found = {"file": str(file.resolve()), "sha256": digest}
-        spec = spec.model_copy(update={"shape": spec.shape.model_copy(update=found)})
+        spec = spec.alter(shape=found)
     return spec
 
 

@@ -134,9 +134,7 @@ def _with_mask(spec: SensorSpec, form: Form, rest_px: np.ndarray) -> SensorSpec:
     blob = getattr(spec.pipeline, form)
     shift = rest_px.mean(axis=0) - project_rest(spec, form).mean(axis=0)
     center = tuple((np.array(blob.mask_center_px) + shift).tolist())
-    return spec.model_copy(
-        update={"pipeline": spec.pipeline.model_copy(update={str(form): blob.model_copy(update={"mask_center_px": center})})}
-    )
+    return spec.alter(pipeline={str(form): blob.alter(mask_center_px=center)})
 
 
 def _with_view(spec: SensorSpec, form: Form, view: PinView, rest_px: np.ndarray) -> SensorSpec:

@@ -311,7 +311,7 @@ def _start_specification(name: str, frame: Frame, pins: PinsSpec, rest: Rest, so
     seen = rest.pins_px[np.isfinite(rest.pins_px[:, 0])]
     x, y = ((seen.max(axis=0) + seen.min(axis=0)) / 2).tolist()
     radius = float(np.linalg.norm(seen - [x, y], axis=1).max())
-    turned = pins.model_copy(update={"phase_deg": round(turn_of(pins, rest.pins_px), 2)})
+    turned = pins.alter(phase_deg=round(turn_of(pins, rest.pins_px), 2))
     focal = radius * PINHOLE_MM / 17.0  # the outermost caps of a TacTip are about 17 mm from the axis
     camera = CameraSpec(
         width_px=width,
@@ -380,19 +380,12 @@ def _camera(
     tried: list[tuple[float, SensorSpec, CameraReport]] = []
     best = 0
     for projection, spacing in (("perspective", "polar"), ("perspective", "plan"), ("fisheye", "polar"), ("fisheye", "plan")):
-        pins = start.pins.model_copy(update={"spacing": spacing})
+        pins = start.pins.alter(spacing=spacing)
         camera = start.camera
         if projection == "fisheye":
             focal = camera.fx_px * FISHEYE_MM / PINHOLE_MM
-            camera = camera.model_copy(
-                update={
-                    "projection": projection,
-                    "fx_px": focal,
-                    "fy_px": focal,
-                    "distance_mm": camera.distance_mm * FISHEYE_MM / PINHOLE_MM,
-                }
-            )
-        trial = _scale_camera(start.model_copy(update={"pins": pins, "camera": camera}), pins_px)
+            camera = camera.alter(projection=projection, fx_px=focal, fy_px=focal, distance_mm=camera.distance_mm * FISHEYE_MM / PINHOLE_MM)
+        trial = _scale_camera(start.alter(pins=pins, camera=camera), pins_px)
         fitted, report = fit_camera(trial, pins_px, free=FITTED_FISHEYE if projection == "fisheye" else FITTED_PINHOLE, named=True)
         fitted, uneven = _with_sizes(fitted, sizes_px)
         misfit = float(np.hypot(report.rms_px / sd_px, uneven / SIZE_SD))
@@ -421,14 +414,13 @@ def _with_sizes(sensor: SensorSpec, sizes_px: np.ndarray | None) -> tuple[Sensor
         return sensor, 0.0
     scale = float(np.exp(np.median(known)))
     cap_mm, pin_mm = (round(scale * value, 3) for value in (sensor.pins.cap_diameter_mm, sensor.pins.diameter_mm))
-    pins = sensor.pins.model_copy(update={"cap_diameter_mm": cap_mm, "diameter_mm": pin_mm})
-    return sensor.model_copy(update={"pins": pins}), float(np.std(known))
+    return sensor.alter(pins={"cap_diameter_mm": cap_mm, "diameter_mm": pin_mm}), float(np.std(known))
 
 
 def _scale_camera(sensor: SensorSpec, pins_px: np.ndarray) -> SensorSpec:
     """The sensor with a camera that sees the pins at the place and in the size of pins (N, 2); NaN where unknown."""
     known = np.flatnonzero(np.isfinite(pins_px[:, 0]))
-    return sensor.model_copy(update={"camera": camera_seeing(sensor, pins_px, known)})
+    return sensor.alter(camera=camera_seeing(sensor, pins_px, known))
 
 
 def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
@@ -436,16 +428,10 @@ def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
     tuned = with_detector(sensor, detector)
     if detector.form == Form.RAW:
         return tuned
-    usual = detector.blob.model_copy(
-        update={
-            "threshold": UNTUNED_OFFSET,
-            "threshold_block_px": UNKNOWN_BLOCK_PX,
-            "rest_px": (),
-            "rest_origin": "measured",
-            "spot_sigma_px": 0.0,
-        }
+    usual = detector.blob.alter(
+        threshold=UNTUNED_OFFSET, threshold_block_px=UNKNOWN_BLOCK_PX, rest_px=(), rest_origin="measured", spot_sigma_px=0.0
     )
-    return tuned.model_copy(update={"pipeline": tuned.pipeline.model_copy(update={"raw": usual})})
+    return tuned.alter(pipeline={"raw": usual})
 
 
 def _with_usual_caps(sensor: SensorSpec, frames: list[Frame]) -> SensorSpec:
@@ -457,7 +443,7 @@ def _with_usual_caps(sensor: SensorSpec, frames: list[Frame]) -> SensorSpec:
     seen = [(frame, pipeline(frame)) for frame in (frames[k] for k in spread_indices(len(frames), CAPS_MEASURED))]
     polarity = sensor.pipeline.raw.polarity
     usual = usual_caps([measure_caps(gray_levels(frame.image), o.pins_px, polarity=polarity) for frame, o in seen if o.valid])
-    return sensor.model_copy(update={"pipeline": sensor.pipeline.model_copy(update={"usual_caps": usual})})
+    return sensor.alter(pipeline={"usual_caps": usual})
 
 
 def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -> tuple[Health, list[Path]]:

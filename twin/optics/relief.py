@@ -53,10 +53,10 @@ def without(spec: SensorSpec, details: Iterable[str]) -> SensorSpec:
     relief = look.relief
     if relief is not None:
         kept = {"caps": relief.caps and "relief" not in given, "skin": relief.skin and "grain" not in given}
-        relief = relief.model_copy(update=kept) if any(kept.values()) else None
+        relief = relief.alter(**kept) if any(kept.values()) else None
     if "background" in given:
-        housing = housing.model_copy(update={"background": None})
-    return spec.model_copy(update={"appearance": look.model_copy(update={"relief": relief}), "housing": housing})
+        housing = housing.alter(background=None)
+    return spec.alter(appearance={"relief": relief}, housing=housing)
 
 
 @dataclass(frozen=True)

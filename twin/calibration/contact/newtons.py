@@ -55,17 +55,13 @@ class Newtons:
 
     def of(self, sensor: SensorSpec) -> SensorSpec:
         """The sensor with this stiffness. The rig's compliances are scaled so that the pins move as before."""
-        skin = sensor.skin.model_copy(
-            update={"young_modulus_mpa": self.scale * sensor.skin.young_modulus_mpa, "stiffness_factor": self.factor}
+        skin = sensor.skin.alter(young_modulus_mpa=self.scale * sensor.skin.young_modulus_mpa, stiffness_factor=self.factor)
+        gel = sensor.gel.alter(young_modulus_mpa=self.scale * sensor.gel.young_modulus_mpa)
+        rig = sensor.rig and sensor.rig.alter(
+            compliance_mm_per_n=sensor.rig.compliance_mm_per_n / self.scale,
+            turn_compliance_deg_per_n=sensor.rig.turn_compliance_deg_per_n / self.scale,
         )
-        gel = sensor.gel.model_copy(update={"young_modulus_mpa": self.scale * sensor.gel.young_modulus_mpa})
-        rig = sensor.rig and sensor.rig.model_copy(
-            update={
-                "compliance_mm_per_n": sensor.rig.compliance_mm_per_n / self.scale,
-                "turn_compliance_deg_per_n": sensor.rig.turn_compliance_deg_per_n / self.scale,
-            }
-        )
-        return sensor.model_copy(update={"skin": skin, "gel": gel, "rig": rig})
+        return sensor.alter(skin=skin, gel=gel, rig=rig)
 
 
 def assume_stiffness(sensor: SensorSpec, why: str) -> Newtons:

@@ -14,7 +14,7 @@ from scenes.sensor import SensorSpec
 from twin.camera.capture import expose
 from twin.camera.truth import CapTruth, cap_truth
 from twin.errors import ContactError, TwinError
-from twin.evaluation.degradation.condition import DegradedCase, PictureView, alter
+from twin.evaluation.degradation.condition import DegradedCase, PictureView
 from twin.evaluation.pictures.aligned import to_light
 from twin.geometry.pins import rest_pins
 from twin.mechanics.path import ContactPose
@@ -115,7 +115,7 @@ class RenderedSource:
         view = PictureView.of(spec, np.zeros((spec.pins.count, 2)))
         geometry = _with_light_of(self.spec, spec)
         shots = []
-        lit = spec.model_copy(update={"response": self.spec.response})
+        lit = spec.alter(response=self.spec.response)
         for film in _films(lit, geometry, geometry if case.solves else self.spec, self.contacts):
             view = replace(view, caps_px=film.truth.caps_px)
             light = case.on_light(film.light, severity, view, film.draw)
@@ -155,7 +155,7 @@ class RealSource:
 
     def render(self, case: DegradedCase, severity: float) -> list[DegradedFrame]:
         """The frames degraded by a case, which must be `image_level`."""
-        neutral = alter(self.spec, **NEUTRAL)
+        neutral = self.spec.alter(**NEUTRAL)
         spec = case.on_spec(neutral, severity)
         in_light = severity > 0 and self.form == Form.RAW and any(c.spec is not None or c.light is not None for c in case.conditions)
         view = PictureView.of(neutral, self.caps_px[0])
@@ -202,7 +202,7 @@ def degraded_state(
     for case, severity in cases:
         degraded = case.on_spec(degraded, severity)
     geometry = _with_light_of(spec, degraded)
-    lit = degraded.model_copy(update={"response": spec.response})
+    lit = degraded.alter(response=spec.response)
     truth = cap_truth(geometry, rest_pins(spec.geometry), state, Form.RAW)
     view = replace(PictureView.of(degraded, truth.caps_px), caps_px=truth.caps_px)
     light = Preview(lit, shading=shading).render(state)
@@ -250,8 +250,8 @@ def _degrade(
 def _with_light_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
     """``spec`` with the values of ``base`` that do not affect the pins' places. Under most conditions the result equals ``base``."""
     gel = {name: getattr(base.gel, name) for name in ("haze", "haze_sigma_px", "absorption_per_mm")}
-    alike = alter(spec, gel=gel, camera={"vignetting": base.camera.vignetting})
-    return alike.model_copy(update={name: getattr(base, name) for name in ("leds", "housing", "appearance", "response")})
+    alike = spec.alter(gel=gel, camera={"vignetting": base.camera.vignetting})
+    return alike.alter(**{name: getattr(base, name) for name in ("leds", "housing", "appearance", "response")})
 
 
 @dataclass(frozen=True)

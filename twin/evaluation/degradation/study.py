@@ -190,7 +190,7 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
                 folder.mkdir(parents=True, exist_ok=True)
                 tuned = tune(frames, spec, method).detector
                 write_detector(kept, tuned, f"Tuned on undegraded frames.\nmade_by = {json.dumps(item.made_by)}")
-            chosen.append(load_detector(kept).model_copy(update={"name": method}))
+            chosen.append(load_detector(kept).alter(name=method))
         progress(k + 1, len(names))
     return tuple(chosen)
 

@@ -128,7 +128,7 @@ class NewMode(PageMode):
             Nothing has been proposed yet.
         """
         written = str(self._proposal().written[0])
-        self._twin.open(self._twin.state.model_copy(update={"sensor": written, "form": "raw", "pose": {}}))
+        self._twin.open(self._twin.state.alter(sensor=written, form="raw", pose={}))
         self._page.choose(self._twin.title)
 
     def _proposal(self) -> NewSensor:

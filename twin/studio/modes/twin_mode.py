@@ -153,14 +153,12 @@ class TwinMode(PageMode):
     @property
     def state(self) -> StudioState:
         """The whole state."""
-        return self._state.model_copy(
-            update={
-                "friction": self.contact.setup.friction,
-                "pose": asdict(self._wish),
-                "form": str(self.contact.setup.form),
-                "colour": str(self._shown),
-                "drawn": str(self._drawn),
-            }
+        return self._state.alter(
+            friction=self.contact.setup.friction,
+            pose=asdict(self._wish),
+            form=str(self.contact.setup.form),
+            colour=str(self._shown),
+            drawn=str(self._drawn),
         )
 
     # wishes
@@ -315,7 +313,7 @@ class TwinMode(PageMode):
             put(self._object, self._state.object, send=True)
             raise
         put(self._object, name, send=True)
-        self._state = self._state.model_copy(update={"object": name})
+        self._state = self._state.alter(object=name)
 
         def change() -> None:
             self.contact.change(obj=obj)
@@ -330,7 +328,7 @@ class TwinMode(PageMode):
         chosen = self._sensor.value
         with self._rebuilding:
             try:
-                self.open(self.state.model_copy(update={"sensor": chosen, "form": str(Form.RAW)}))
+                self.open(self.state.alter(sensor=chosen, form=str(Form.RAW)))
             except (TwinError, SpecError):
                 put(self._sensor, self._state.sensor, send=True)
                 raise

@@ -75,7 +75,7 @@ def graph(
     path: Annotated[Path, typer.Argument(help="frame, folder of frames, or pins.npz")],
     sensor: Sensor,
     out: Out,
-    kind: Annotated[Literal["knn", "delaunay", "voronoi"], typer.Option("--kind", help="kind of graph")] = "voronoi",
+    kind: Annotated[Literal["knn", "delaunay", "voronoi"], typer.Option(help="kind of graph")] = "voronoi",
     form: FormOrAuto = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="method and boundary of the published code, for comparison")] = False,
     table: Table = None,
@@ -116,10 +116,10 @@ def graph(
 @app.command("tune")
 def tune(
     sensor: Sensor,
-    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="folder of frames, video or recording")],
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE.toml", help="the file to write")] = None,
+    frames: Annotated[Path, typer.Option(metavar="DIR", help="folder of frames, video or recording")],
+    out: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="the file to write")] = None,
     method: Annotated[
-        Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"], typer.Option("--method", help="method to tune")
+        Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"], typer.Option(help="method to tune")
     ] = "twin",
     form: FormOrAuto = None,
     max_frames: MaxFrames = 12,
@@ -161,21 +161,19 @@ def check(
     ],
     sensor: Sensor,
     form: FormOrAuto = None,
-    pipeline: Annotated[Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="file of 'twin tune'")] = None,
+    pipeline: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="file of 'twin tune'")] = None,
     max_frames: MaxFrames = 20,
-    no_contact: Annotated[Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, for --push")] = None,
+    no_contact: Annotated[Path | None, typer.Option(metavar="FRAME", help="frame without contact, for --push")] = None,
     push: Annotated[
         list[str] | None,
-        typer.Option("--push", metavar="SIDE:FRAME", help="contact whose object was moved to the sensor's x, y, -x or -y; repeat it"),
+        typer.Option(metavar="SIDE:FRAME", help="contact whose object was moved to the sensor's x, y, -x or -y; repeat it"),
     ] = None,
     twist: Annotated[
-        Path | None, typer.Option("--twist", metavar="FRAME", help="contact whose object was turned from x to y, instead of a second push")
+        Path | None, typer.Option(metavar="FRAME", help="contact whose object was turned from x to y, instead of a second push")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE.toml", help="copy of the specification with the view of --push")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="copy of the specification with the view of --push")] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", metavar="RUN", help="run that must know the contacts; by default the sensor's weights")
+        Path | None, typer.Option(metavar="RUN", help="run that must know the contacts; by default the sensor's weights")
     ] = None,
     *,
     progress: Progress,

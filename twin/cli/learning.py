@@ -67,20 +67,18 @@ TaskObjects = Annotated[str | None, typer.Option("--objects", callback=each_once
 def make_dataset(
     experiment: Experiment,
     sensor: Sensor,
-    count: Annotated[int, typer.Option("--count", min=1, metavar="N", help="contacts")],
+    count: Annotated[int, typer.Option(min=1, metavar="N", help="contacts")],
     out: Out,
     wide: Annotated[bool, typer.Option("--wide", help="slightly larger ranges, for a training set")] = False,
     obj: Annotated[
         str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
     ] = None,
-    images: Annotated[Literal["raw", "gray", "processed", "none"], typer.Option("--images", help="kind of pictures")] = "raw",
-    states: Annotated[Literal["all", "end"], typer.Option("--states", help="states of a contact that become frames")] = "end",
-    randomise: Annotated[
-        str | None, typer.Option("--randomise", metavar="R", help="domain randomisation: a name or a file; none by default")
-    ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of all samples; the experiment's own if not given")] = None,
+    images: Annotated[Literal["raw", "gray", "processed", "none"], typer.Option(help="kind of pictures")] = "raw",
+    states: Annotated[Literal["all", "end"], typer.Option(help="states of a contact that become frames")] = "end",
+    randomise: Annotated[str | None, typer.Option(metavar="R", help="domain randomisation: a name or a file; none by default")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="seed of all samples; the experiment's own if not given")] = None,
     workers: Workers = CORES,
-    scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
+    scheduler: Annotated[str, typer.Option(metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
     quality: Annotated[Quality | None, typer.Option(help=QUALITY, show_default="rasterised")] = None,
     residual: Residual = False,
     elements: Elements = FINE,
@@ -152,24 +150,22 @@ def require_one_recording(folders: list[Path], table: Path | None, no_contact: P
 
 @app.command("train", goes_on=True)
 def train(
-    model: Annotated[str, typer.Option("--model", help="vgnn, touch, steered, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
+    model: Annotated[str, typer.Option(help="vgnn, touch, steered, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
     sensor: Sensor,
-    data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give it once for each of several")],
-    out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
+    data: Annotated[list[Path], typer.Option(metavar="DIR", help="labelled recording; give it once for each of several")],
+    out: Annotated[Path, typer.Option(metavar="RUN", help="folder of the run; made if missing")],
     target: Target = "surface-2d",
-    label_kind: Annotated[str, typer.Option("--label-kind", help="corrected or raw"), Formerly("labels")] = "corrected",
-    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and order")] = 0,
-    split: Annotated[int, typer.Option("--split", min=-1, max=MOST_SEED, help="seed of the held-out fifth; -1: nothing is held out")] = 0,
-    epochs: Annotated[int | None, typer.Option("--epochs", help="epochs of training, instead of the model's own number")] = None,
-    batch: Annotated[int | None, typer.Option("--batch", help="batch size, instead of the model's own")] = None,
-    members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,
+    label_kind: Annotated[str, typer.Option(help="corrected or raw"), Formerly("labels")] = "corrected",
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="seed of weights and order")] = 0,
+    split: Annotated[int, typer.Option(min=-1, max=MOST_SEED, help="seed of the held-out fifth; -1: nothing is held out")] = 0,
+    epochs: Annotated[int | None, typer.Option(help="epochs of training, instead of the model's own number")] = None,
+    batch: Annotated[int | None, typer.Option(help="batch size, instead of the model's own")] = None,
+    members: Annotated[int | None, typer.Option(help="networks in the ensemble")] = None,
     kernel: Annotated[
         bool | None,
         typer.Option("--kernel/--no-kernel", help="Gaussian process beside the networks; slow for thousands of rows"),
     ] = None,
-    max_minutes: Annotated[
-        float | None, typer.Option("--max-minutes", min=0, callback=finite, help="stop after the epoch that passes this time")
-    ] = None,
+    max_minutes: Annotated[float | None, typer.Option(min=0, callback=finite, help="stop after the epoch that passes this time")] = None,
     threads: Threads = None,
     device: Device = "auto",
     form: FormOrAuto = None,
@@ -233,11 +229,11 @@ def train(
 @app.command("evaluate")
 def evaluate(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
-    data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give all that the run was trained on")],
+    data: Annotated[list[Path], typer.Option(metavar="DIR", help="labelled recording; give all that the run was trained on")],
     out: Out,
-    rows: Annotated[str, typer.Option("--rows", help="validation or all")] = "validation",
+    rows: Annotated[str, typer.Option(help="validation or all")] = "validation",
     label_kind: Annotated[
-        str, typer.Option("--label-kind", help="truth in predictions.csv and errors.png: corrected or raw"), Formerly("labels")
+        str, typer.Option(help="truth in predictions.csv and errors.png: corrected or raw"), Formerly("labels")
     ] = "corrected",
     robustness: Annotated[bool, typer.Option("--robustness", help="also evaluate changed images (five times the frames)")] = False,
     table: Table = None,
@@ -283,7 +279,7 @@ def evaluate(
 def predict(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
-    maps: Annotated[Path | None, typer.Option("--maps", metavar="DIR", help="folder for the contact maps of each frame")] = None,
+    maps: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for the contact maps of each frame")] = None,
     sequence: Annotated[bool, typer.Option("--sequence", help="the frames are a sequence in time: estimate slip, too")] = False,
     table: Table = None,
     no_contact: NoContact = None,
@@ -338,9 +334,9 @@ def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, 
 @app.command("surrogate")
 def make_surrogate(
     sensor: Sensor,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="file to write, *.safetensors")],
-    paths: Annotated[int, typer.Option("--paths", metavar="N", help="solved paths to train on, about 6 s each on one core")] = 120,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the sampled paths")] = 0,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="file to write, *.safetensors")],
+    paths: Annotated[int, typer.Option(metavar="N", help="solved paths to train on, about 6 s each on one core")] = 120,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the sampled paths")] = 0,
     workers: Workers = CORES,
     *,
     progress: Progress,
@@ -369,12 +365,12 @@ def demonstrate(
     task: TaskName,
     sensor: Sensor,
     out: Out,
-    episodes: Annotated[int, typer.Option("--episodes", min=1, metavar="N", help="solved episodes")] = 50,
+    episodes: Annotated[int, typer.Option(min=1, metavar="N", help="solved episodes")] = 50,
     randomise: RandomiseEpisodes = None,
     surrogate: OwnSurrogate = None,
     objects: TaskObjects = None,
     video: Annotated[bool, typer.Option("--video", help="pictures as video, which loses detail")] = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the episodes")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="seed of the episodes")] = 0,
     *,
     progress: Progress,
 ) -> "Demonstrations":
@@ -409,7 +405,7 @@ def learn(
     task: TaskName,
     sensor: Sensor,
     out: Out,
-    observation: Annotated[str, typer.Option("--observation", help="pins, image, graph, pose or oracle")] = "pins",
+    observation: Annotated[str, typer.Option(help="pins, image, graph, pose or oracle")] = "pins",
     randomise: RandomiseEpisodes = None,
     surrogate: OwnSurrogate = None,
     objects: TaskObjects = None,
@@ -423,10 +419,10 @@ def learn(
         typer.Option("--state-estimator/--no-state-estimator", help="first train a state estimator of place and force"),
         Formerly("sight"),
     ] = True,
-    minutes: Annotated[float, typer.Option("--minutes", min=0, callback=finite, help="maximum time")] = 30.0,
-    environments: Annotated[int, typer.Option("--environments", min=2, help="number of environments that are stepped together")] = 32,
-    fem: Annotated[int, typer.Option("--fem", min=0, metavar="N", help="episodes with finite elements for the evaluation")] = 0,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and episodes")] = 0,
+    minutes: Annotated[float, typer.Option(min=0, callback=finite, help="maximum time")] = 30.0,
+    environments: Annotated[int, typer.Option(min=2, help="number of environments that are stepped together")] = 32,
+    fem: Annotated[int, typer.Option(min=0, metavar="N", help="episodes with finite elements for the evaluation")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="seed of weights and episodes")] = 0,
     *,
     progress: Progress,
 ) -> "Learnt":

@@ -113,12 +113,12 @@ def demo(out: Out = Path("out/demo"), *, progress: Progress) -> "Demo":
 def render_contact_command(
     sensor: Sensor,
     obj: Object,
-    indent_mm: Annotated[float, typer.Option("--indent-mm", metavar="D", help="indentation from first touch; 0: no contact")],
+    indent_mm: Annotated[float, typer.Option(metavar="D", help="indentation from first touch; 0: no contact")],
     out: Out,
-    tilt_deg: Annotated[Pair, typer.Option("--tilt-deg", metavar="RX RY", help="turn of the object about x, then y")] = (0.0, 0.0),
-    shear_mm: Annotated[Pair, typer.Option("--shear-mm", metavar="X Y", help="drag after the press")] = (0.0, 0.0),
-    twist_deg: Annotated[float, typer.Option("--twist-deg", metavar="RZ", help="turn about z during the drag")] = 0.0,
-    offset_mm: Annotated[Pair, typer.Option("--offset-mm", metavar="X Y", help="sideways shift of the object before it approaches")] = (
+    tilt_deg: Annotated[Pair, typer.Option(metavar="RX RY", help="turn of the object about x, then y")] = (0.0, 0.0),
+    shear_mm: Annotated[Pair, typer.Option(metavar="X Y", help="drag after the press")] = (0.0, 0.0),
+    twist_deg: Annotated[float, typer.Option(metavar="RZ", help="turn about z during the drag")] = 0.0,
+    offset_mm: Annotated[Pair, typer.Option(metavar="X Y", help="sideways shift of the object before it approaches")] = (
         0.0,
         0.0,
     ),

@@ -22,6 +22,13 @@ if TYPE_CHECKING:
     from twin.one_contact import RenderedContact
 
 
+def _print_all(kind: str, *more: str) -> None:
+    """Print the specifications of a kind, and further lines."""
+    from scenes.catalog import list_all
+
+    print_lines([*list_all(kind).lines(), *more])
+
+
 @app.command("sensors")
 def sensors() -> None:
     """List the sensors, and the folder for your own.
@@ -30,9 +37,7 @@ def sensors() -> None:
     Example:
       twin sensors
     """
-    from scenes import catalog
-
-    print_lines(catalog.sensors().lines())
+    _print_all("sensors")
 
 
 @app.command("objects")
@@ -43,9 +48,7 @@ def objects() -> None:
     Example:
       twin objects
     """
-    from scenes import catalog
-
-    print_lines([*catalog.objects().lines(), "Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl"])
+    _print_all("objects", "Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl")
 
 
 @app.command("experiments")
@@ -58,9 +61,7 @@ def experiments() -> None:
     Example:
       twin experiments
     """
-    from scenes import catalog
-
-    print_lines(catalog.experiments().lines())
+    _print_all("experiments")
 
 
 @app.command("randomisations")
@@ -73,9 +74,7 @@ def randomisations() -> None:
     Example:
       twin randomisations
     """
-    from scenes import catalog
-
-    print_lines(catalog.randomisations().lines())
+    _print_all("randomisations")
 
 
 @app.command("doctor", exit_code=lambda machine: 0 if machine.can_render else 1)

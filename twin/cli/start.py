@@ -22,13 +22,6 @@ if TYPE_CHECKING:
     from twin.one_contact import RenderedContact
 
 
-def _print_all(kind: str, *more: str) -> None:
-    """Print the specifications of a kind, and further lines."""
-    from scenes.catalog import list_all
-
-    print_lines([*list_all(kind).lines(), *more])
-
-
 @app.command("sensors")
 def sensors() -> None:
     """List the sensors, and the folder for your own.
@@ -37,7 +30,9 @@ def sensors() -> None:
     Example:
       twin sensors
     """
-    _print_all("sensors")
+    from scenes.catalog import list_all
+
+    print_lines(list_all("sensors").lines())
 
 
 @app.command("objects")
@@ -48,7 +43,9 @@ def objects() -> None:
     Example:
       twin objects
     """
-    _print_all("objects", "Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl")
+    from scenes.catalog import list_all
+
+    print_lines([*list_all("objects").lines(), "Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl"])
 
 
 @app.command("experiments")
@@ -61,7 +58,9 @@ def experiments() -> None:
     Example:
       twin experiments
     """
-    _print_all("experiments")
+    from scenes.catalog import list_all
+
+    print_lines(list_all("experiments").lines())
 
 
 @app.command("randomisations")
@@ -74,7 +73,9 @@ def randomisations() -> None:
     Example:
       twin randomisations
     """
-    _print_all("randomisations")
+    from scenes.catalog import list_all
+
+    print_lines(list_all("randomisations").lines())
 
 
 @app.command("doctor", exit_code=lambda machine: 0 if machine.can_render else 1)

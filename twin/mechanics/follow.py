@@ -104,7 +104,7 @@ class Follower:
 
     def _free(self, T: np.ndarray) -> ContactState:
         rest = self._rest
-        return ContactState.undeformed(rest.nodes_mm, rest.base_mm, rest.axis, rest.caps_mm, T_sensor_object=T)
+        return replace(rest, T_sensor_object=T)
 
     def _press(self, T: np.ndarray, time_s: float) -> None:
         limit = deepest_mm(self._solver.spec.geometry)

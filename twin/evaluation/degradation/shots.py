@@ -16,7 +16,7 @@ from twin.camera.truth import CapTruth, cap_truth
 from twin.errors import ContactError, TwinError
 from twin.evaluation.degradation.condition import DegradedCase, PictureView
 from twin.evaluation.pictures.aligned import to_light
-from twin.geometry.pins import rest_pins
+from twin.geometry.pins import PinRest, rest_pins
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview, Shading
@@ -32,15 +32,6 @@ class ObjectContact:
     name: str
     object_name: str
     pose: ContactPose
-
-
-@dataclass(frozen=True)
-class ContactPins:
-    """Pins of a contact: feet, axes and caps, (N, 3) each, mm, sensor frame."""
-
-    base_mm: np.ndarray
-    axis: np.ndarray
-    caps_mm: np.ndarray
 
 
 CONTACTS = (
@@ -214,7 +205,7 @@ def degraded_state(
     return replace(_degrade("contact", image, Form.RAW, cases, view, truth.visible), touched=touched)
 
 
-def pins_under(spec: SensorSpec, contact: ObjectContact) -> ContactPins:
+def pins_under(spec: SensorSpec, contact: ObjectContact) -> PinRest:
     """The pins in a contact, from the cache if it was solved before.
 
     Raises
@@ -223,8 +214,7 @@ def pins_under(spec: SensorSpec, contact: ObjectContact) -> ContactPins:
         The contact can't be solved.
     """
     if contact.pose.indent_mm <= 0:
-        rest = rest_pins(spec.geometry)
-        return ContactPins(rest.base_mm, rest.axis, rest.caps_mm)
+        return rest_pins(spec.geometry)
 
     def solve() -> dict[str, np.ndarray]:
         state = SkinSolver(spec).press(load_object(contact.object_name), contact.pose)
@@ -233,7 +223,7 @@ def pins_under(spec: SensorSpec, contact: ObjectContact) -> ContactPins:
     optical = {"refractive_index", "absorption_per_mm", "haze", "haze_sigma_px"}
     key = {part: getattr(spec, part).model_dump(mode="json", exclude=optical) for part in ("skin", "gel", "lens", "pins")}
     key |= {"object": load_object(contact.object_name).model_dump(mode="json"), "pose": vars(contact.pose)}
-    return ContactPins(**cached_arrays("pins-under-contact", key, solve))
+    return PinRest(**cached_arrays("pins-under-contact", key, solve))
 
 
 def _degrade(
@@ -283,7 +273,7 @@ def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contac
 
 
 @lru_cache(maxsize=32)
-def _press(spec: SensorSpec, mechanics: SensorSpec, contact: ObjectContact) -> tuple[ContactPins, CapTruth]:
+def _press(spec: SensorSpec, mechanics: SensorSpec, contact: ObjectContact) -> tuple[PinRest, CapTruth]:
     """Pins in a contact of the sensor ``mechanics``, and their places in the picture of ``spec``'s camera."""
     state = pins_under(mechanics, contact)
     return state, cap_truth(spec, rest_pins(spec.geometry), state, Form.RAW)

@@ -94,8 +94,10 @@ def run(plan: DegradationPlan, out: Path, *, progress: Progress = silent) -> Deg
         load_models(runs, plan.sensor)  # each worker process loads its own; loading here reports an error once, before the work starts
         models, digests = partial(load_models, runs, plan.sensor), {each.name: digest_of(each) for each in runs}
         settings = replace(settings, models=models, model_digests=digests)
-    how = partial(real_study, path=plan.frames, limit=plan.limit, beside=plan.rendered) if plan.frames else rendered_study
-    return DegradationResult(*how(settings, pipelines, out=out, jobs=plan.jobs, progress=progress))
+    if plan.frames is None:
+        return DegradationResult(*rendered_study(settings, pipelines, out, jobs=plan.jobs, progress=progress))
+    real = real_study(settings, pipelines, plan.frames, plan.limit, out, beside=plan.rendered, jobs=plan.jobs, progress=progress)
+    return DegradationResult(*real)
 
 
 def load_models(

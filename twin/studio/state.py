@@ -13,7 +13,7 @@ from scenes import load_object, load_sensor
 from scenes.base import NonNegative, Section
 from scenes.files import read_regular
 from twin.errors import TwinError
-from twin.store import text_file, unwritten, write_json
+from twin.store import text_file, write_json, writing
 from twin.studio.pictures import OverlayChoices
 from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.scene import PinColour
@@ -215,10 +215,8 @@ def next_path(folder: Path, stem: str, suffix: str) -> Path:
     TwinError
         The folder can't be made.
     """
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritten(folder, error) from error
     number = 1
     while (path := folder / f"{stem}-{number}{suffix}").exists():
         number += 1

@@ -98,7 +98,12 @@ def write_image(path: Path, image: np.ndarray) -> Path:
     StoreError
         The file cannot be written.
     """
-    return write_bytes(path, cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes())
+    return write_bytes(path, png(image))
+
+
+def png(image: np.ndarray) -> bytes:
+    """A gray or RGB picture as the content of a PNG file."""
+    return cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes()
 
 
 def decode(path: Path) -> np.ndarray:

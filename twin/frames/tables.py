@@ -88,10 +88,8 @@ def _cells(text: str) -> list[list[str]]:
         if line.count(separator) >= MOST_COLUMNS:
             raise csv.Error(f"row {number} has {line.count(separator) + 1} cells, a table has at most {MOST_COLUMNS}")
         unclosed = line.count('"') % 2 == 1  # the csv reader would join such a line with the following lines
-        if unclosed:
-            (row,) = csv.reader([line], delimiter=separator, quoting=csv.QUOTE_NONE, skipinitialspace=True)
-        else:
-            (row,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+        quoting = csv.QUOTE_NONE if unclosed else csv.QUOTE_MINIMAL
+        (row,) = csv.reader([line], delimiter=separator, quoting=quoting, skipinitialspace=True)
         row = [cell.strip(AROUND_CELLS) for cell in row]
         if separator != ",":
             row = [re.sub(r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$", r"\1.\2", cell) for cell in row]
@@ -123,11 +121,8 @@ def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are 
     try:
         text = _text(path)
         rows = _cells(text)
-    except OSError as error:
-        problems.append(f"{path.name}: can't be read ({error.strerror}); {otherwise}")
-        return None
-    except csv.Error as error:
-        problems.append(f"{path.name}: can't be read ({error}); {otherwise}")
+    except (OSError, csv.Error) as error:
+        problems.append(f"{path.name}: can't be read ({getattr(error, 'strerror', error)}); {otherwise}")
         return None
     header = rows[0] if rows else []
     name_columns = [k for k, column in enumerate(header) if column.casefold() in NAME_COLUMNS]

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from scenes.base import SpecError
 from scenes.pins import PinsSpec, layout_from
 from scenes.sensor import SensorSpec
 from twin.calibration.new_sensor import NewSensor, new_sensor
@@ -146,12 +145,9 @@ class NewMode(PageMode):
             self._page.say(f"processing the frames: {stage}{share}")
 
         no_contact = Path(wish.no_contact) if wish.no_contact else None
-        try:
-            layout = layout_from(wish.layout) if wish.layout else None
-            out = next_path(self._out, "my-sensor", ".toml")
-            made = new_sensor(Path(wish.frames), out, layout=layout, no_contact=no_contact, progress=report)
-        except SpecError as error:
-            raise TwinError(str(error)) from error
+        layout = layout_from(wish.layout) if wish.layout else None
+        out = next_path(self._out, "my-sensor", ".toml")
+        made = new_sensor(Path(wish.frames), out, layout=layout, no_contact=no_contact, progress=report)
         recording = open_recording(frames_at(Path(wish.frames), None, no_contact), made.sensor)
         self._take(made, recording)
 

@@ -18,9 +18,10 @@ from twin.frames.images import write_image
 from twin.pins import nominal_reference
 from twin.report.table import force_interval
 from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
+from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
 from twin.studio.page import LineChart, StudioPage, put, value_of
-from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
+from twin.studio.pictures import OverlayChoices, badge, estimate_table, number_table, paragraph, pins_found
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of
 from twin.studio.scene import FULL_SCALE, PinColour, Scene
 from twin.studio.state import StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
@@ -372,10 +373,7 @@ class TwinMode(PageMode):
         """Show the state of a link, unless the page shows it already."""
         if link.partition("?")[2] == self.state.link().partition("?")[2]:
             return
-        try:
-            self.open(StudioState.of_link(link))
-        except SpecError as error:
-            raise TwinError(str(error)) from error
+        self.open(StudioState.of_link(link))
 
     # answers
 
@@ -410,9 +408,7 @@ class TwinMode(PageMode):
     def _show_answer(self, answer: ContactAnswer) -> None:
         contact = self.contact
         if self._active:
-            camera = camera_picture(answer.frame, answer.seen, self._rest.pins_px, self._drawn)
-            cells = cell_picture(answer.frame, answer.seen, self._rest.area_px2)
-            camera, cells = (contact.camera.crop(picture, answer.frame.form) for picture in (camera, cells))
+            camera, cells = frame_pictures(contact.setup.sensor, self._rest, answer.frame, answer.seen, self._drawn)
             if self._film is not None:
                 self._film.add(np.hstack([camera, cells]))
         numbers = self._numbers(answer)
@@ -456,7 +452,7 @@ class TwinMode(PageMode):
             "torque about z": f"{torque:+.1f} N mm",
             "indentation": f"{answer.indent_mm:+.2f} mm",
             "contact area, slipping": f"{state.area_mm2:.0f} mm2, {100 * state.slip_share:.0f} %",
-            "pins found": f"{seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}"),
+            "pins found": pins_found(seen),
         }
         full, unit = FULL_SCALE[self._shown]
         return [

@@ -13,29 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli import FewCommands, app
+from twin.cli import FewCommands, app, options
 from twin.cli.command import App
-from twin.cli.options import (
-    CORES,
-    QUALITY,
-    Elements,
-    Experiment,
-    Formerly,
-    FormOrAuto,
-    MaxFrames,
-    NoContact,
-    Out,
-    Residual,
-    Sensor,
-    Table,
-    Tuning,
-    Workers,
-    call,
-    load_if_named,
-    print_lines,
-    sensor_with,
-    with_residual_if,
-)
+from twin.cli.options import Formerly, call, load_if_named, print_lines, sensor_with, with_residual_if
 from twin.errors import OptionError
 from twin.progress import Progress
 from twin.types import FINE, Quality
@@ -74,14 +54,14 @@ def new_sensor(
     ] = None,
     contacts: Annotated[int, typer.Option(min=4, metavar="N", help="labelled frames to which the contact is fitted")] = 20,
     optics: Annotated[bool, typer.Option("--optics", help="also fit light and colours")] = False,
-    workers: Workers = CORES,
-    elements: Elements = FINE,
+    workers: options.Workers = options.CORES,
+    elements: options.Elements = FINE,
     layout: Annotated[str | None, typer.Option(metavar="L", help="the layout, if it is known")] = None,
     radius_mm: Annotated[float | None, typer.Option(metavar="R", help="radius of the tip's dome (20 if not given)")] = None,
-    no_contact: NoContact = None,
-    table: Table = None,
-    form: FormOrAuto = None,
-    max_frames: MaxFrames = 40,
+    no_contact: options.NoContact = None,
+    table: options.Table = None,
+    form: options.FormOrAuto = None,
+    max_frames: options.MaxFrames = 40,
     *,
     progress: Progress,
 ) -> "WholeSensor":
@@ -140,12 +120,12 @@ app.add_typer(calibrate_app, name="calibrate")
 
 @calibrate_app.command("optics")
 def calibrate_optics(
-    sensor: Sensor,
+    sensor: options.Sensor,
     frames: Annotated[Path, typer.Option(metavar="DIR", help="folder of raw frames, in contact or not")],
     out: Annotated[Path, typer.Option(metavar="SPEC.toml", help="the specification to write")],
     no_contact: Annotated[Path | None, typer.Option(metavar="FRAME", help="a raw frame without contact: fits the camera")] = None,
-    max_frames: MaxFrames = 6,
-    pipeline: Tuning = None,
+    max_frames: options.MaxFrames = 6,
+    pipeline: options.Tuning = None,
     *,
     progress: Progress,
 ) -> "OpticsCalibration":
@@ -180,22 +160,20 @@ def calibrate_optics(
 
 @calibrate_app.command("contact", goes_on=True)
 def calibrate_contact(
-    sensor: Sensor,
+    sensor: options.Sensor,
     frames: Annotated[Path, typer.Option(metavar="DIR", help="labelled recording with init_0.png, or TABLE.csv of forces")],
     out: Annotated[Path, typer.Option(metavar="SPEC.toml", help="the specification to write")],
     num_labelled: Annotated[int, typer.Option(min=4, metavar="N", help="frames to fit to, chosen at random"), Formerly("labels")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="seed of the choice of frames")] = 0,
-    experiment: Experiment = "surface-2d",
-    obj: Annotated[
-        str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
-    ] = None,
+    experiment: options.Experiment = "surface-2d",
+    obj: options.TouchedObject = None,
     hold: Annotated[list[str] | None, typer.Option(metavar="KEY", help="do not fit this parameter; may be repeated")] = None,
-    workers: Workers = CORES,
-    elements: Elements = FINE,
-    form: FormOrAuto = None,
-    table: Table = None,
-    no_contact: NoContact = None,
-    pipeline: Tuning = None,
+    workers: options.Workers = options.CORES,
+    elements: options.Elements = FINE,
+    form: options.FormOrAuto = None,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
+    pipeline: options.Tuning = None,
     column: Columns = None,
     *,
     progress: Progress,
@@ -242,21 +220,21 @@ def calibrate_contact(
 
 @app.command("validate")
 def validate(
-    sensor: Sensor,
+    sensor: options.Sensor,
     frames: Annotated[Path, typer.Option(metavar="DIR", help="labelled recording, or TABLE.csv of forces")],
-    out: Out,
-    experiment: Experiment = "surface-2d",
+    out: options.Out,
+    experiment: options.Experiment = "surface-2d",
     obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the touched object; the experiment's own if not given")] = None,
     max_frames: Annotated[int | None, typer.Option(min=1, metavar="N", help="N frames, chosen at random"), Formerly("limit")] = None,
     friction_frames: Annotated[
         int, typer.Option(min=0, metavar="N", help="frames for which the best friction is searched, 9 contacts each")
     ] = 5,
     seed: Annotated[int, typer.Option(min=0, help="seed of the choice of frames")] = 0,
-    elements: Elements = FINE,
-    form: FormOrAuto = None,
-    table: Table = None,
-    no_contact: NoContact = None,
-    pipeline: Tuning = None,
+    elements: options.Elements = FINE,
+    form: options.FormOrAuto = None,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
+    pipeline: options.Tuning = None,
     column: Columns = None,
     *,
     progress: Progress,
@@ -292,20 +270,20 @@ def validate(
 @app.command("realism")
 def realism(
     path: Annotated[Path, typer.Argument(help="folder of real raw frames")],
-    sensor: Sensor,
-    out: Out,
+    sensor: options.Sensor,
+    out: options.Out,
     pose_aligned: Annotated[bool, typer.Option("--pose-aligned", help="also render from the labels alone")] = False,
     max_frames: Annotated[int | None, typer.Option(min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")] = None,
     fitted: Annotated[int, typer.Option(min=0, metavar="N", help="leave out the frames that 'calibrate optics --max-frames N' fits")] = 0,
     without: Annotated[list[str] | None, typer.Option(metavar="DETAIL", help="relief, grain or background; may be repeated")] = None,
-    residual: Residual = False,
-    quality: Annotated[Quality, typer.Option(help=QUALITY)] = "standard",
+    residual: options.Residual = False,
+    quality: Annotated[Quality, typer.Option(help=options.QUALITY)] = "standard",
     two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
     thorough: Annotated[
         bool, typer.Option("--thorough", help="test with a stronger network, too, and with halves of the real frames (ten minutes)")
     ] = False,
-    table: Table = None,
-    pipeline: Tuning = None,
+    table: options.Table = None,
+    pipeline: options.Tuning = None,
     *,
     progress: Progress,
 ) -> "Realism":
@@ -366,8 +344,8 @@ def _list_conditions(asked: bool) -> None:
 
 @app.command("robustness", goes_on=True)
 def robustness(
-    sensor: Sensor,
-    out: Out,
+    sensor: options.Sensor,
+    out: options.Out,
     pipeline: Annotated[
         list[str] | None,
         typer.Option(
@@ -382,7 +360,7 @@ def robustness(
         int, typer.Option(min=2, metavar="N", help="at most N of the real frames, evenly spread"), Formerly("limit")
     ] = 12,
     rendered: Annotated[bool, typer.Option("--rendered/--no-rendered", help="raw --frames beside rendered ones")] = True,
-    jobs: Annotated[int, typer.Option(min=1, metavar="N", help="processes")] = CORES,
+    jobs: Annotated[int, typer.Option(min=1, metavar="N", help="processes")] = options.CORES,
     show: Annotated[bool, typer.Option("--list", is_eager=True, callback=_list_conditions, help="list the conditions and stop")] = False,
     *,
     progress: Progress,
@@ -447,12 +425,12 @@ def robustness(
 @app.command("audit")
 def audit(
     data: Annotated[Path, typer.Argument(help="labelled recording")],
-    sensor: Sensor,
-    out: Out,
-    form: FormOrAuto = None,
-    table: Table = None,
-    no_contact: NoContact = None,
-    pipeline: Tuning = None,
+    sensor: options.Sensor,
+    out: options.Out,
+    form: options.FormOrAuto = None,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
+    pipeline: options.Tuning = None,
     *,
     progress: Progress,
 ) -> "LabelAudit":

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli import FewCommands, app
+from twin.cli import FewCommands, app, options
 from twin.cli.command import App
-from twin.cli.options import Also, Experiment, Formerly, FormOrAuto, Object, Out, PlainLight, Sensor, ServoName, call, print_lines
+from twin.cli.options import Formerly, call, print_lines
 from twin.progress import Progress
 from twin.signals import signals_as_ctrl_c
 from twin.types import FIRST, NONE
@@ -58,7 +58,7 @@ def live(
     seconds: Annotated[float | None, typer.Option(min=0, help="stop after this time")] = None,
     count: Annotated[int | None, typer.Option(min=1, help="stop after this number of frames")] = None,
     at_rest: AtRest = NONE,
-    also: Also = None,
+    also: options.Also = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port of the page; if it is taken, the next free one")] = 8080,
 ) -> "WatchResult":
     """Show a model's estimates on a camera's frames.
@@ -99,18 +99,18 @@ def print_view(url: str) -> None:
 def collect(
     camera: Camera,
     arm: ArmOption,
-    sensor: Sensor,
-    out: Out,
-    experiment: Experiment = "surface-2d",
+    sensor: options.Sensor,
+    out: options.Out,
+    experiment: options.Experiment = "surface-2d",
     count: Annotated[int, typer.Option(min=1, help="contacts in the folder at the end")] = 100,
     obj: Annotated[str | None, typer.Option("--object", metavar="O", help="object; the experiment's own if not given")] = None,
-    servo: ServoName = "surface",
-    form: FormOrAuto = None,
+    servo: options.ServoName = "surface",
+    form: options.FormOrAuto = None,
     safety: Limits = None,
     seed: Annotated[int | None, typer.Option(min=0, help="seed of the sampled contacts; the experiment's own if not given")] = None,
     design: Annotated[str, typer.Option(help="random, or even (spread over the ranges)")] = "random",
-    plain_light: PlainLight = False,
-    also: Also = None,
+    plain_light: options.PlainLight = False,
+    also: options.Also = None,
     dry_run: DryRun = False,
     *,
     progress: Progress,
@@ -154,11 +154,11 @@ def ended_early(followed: "Followed") -> int:
 @app.command("servo", exit_code=ended_early)
 def servo(
     obj: Annotated[str, typer.Option("--object", metavar="O", help="can, mesh-can, square, prism, tin-box, or another")],
-    out: Out,
+    out: options.Out,
     model: Model = SHIPPED_MODEL,
     camera: Camera = "",
     arm: ArmOption = "simulated",
-    servo: ServoName = "surface",
+    servo: options.ServoName = "surface",
     steps: Steps = None,
     stream: Annotated[bool, typer.Option("--stream", help="decide at a fixed rate on the newest frame, without waiting for moves")] = False,
     rate: Annotated[float, typer.Option(min=0.1, help="decisions a second with --stream")] = 10.0,
@@ -166,9 +166,9 @@ def servo(
     record: Record = False,
     seed: NoiseSeed = 0,
     known_place: KnownPlace = False,
-    plain_light: PlainLight = False,
+    plain_light: options.PlainLight = False,
     at_rest: AtRest = FIRST,
-    also: Also = None,
+    also: options.Also = None,
     dry_run: DryRun = False,
     *,
     progress: Progress,
@@ -222,17 +222,17 @@ def servo(
 def run_policy(
     policy: Annotated[Path, typer.Argument(help="policy.safetensors of 'twin learn'")],
     obj: Annotated[str, typer.Option("--object", metavar="O", help="can, square, prism, tin-box, or another")],
-    out: Out,
+    out: options.Out,
     camera: Camera = "",
     arm: ArmOption = "simulated",
-    servo: ServoName = "surface",
+    servo: options.ServoName = "surface",
     steps: Steps = None,
     safety: Limits = None,
     record: Record = False,
     seed: NoiseSeed = 0,
     known_place: KnownPlace = False,
-    plain_light: PlainLight = False,
-    also: Also = None,
+    plain_light: options.PlainLight = False,
+    also: options.Also = None,
     dry_run: DryRun = False,
     *,
     progress: Progress,
@@ -334,14 +334,14 @@ def magician(
 @emulate.command("camera")
 def camera(
     arm: Annotated[str, typer.Option(metavar="A", help="mg400:ADDRESS[:DASHBOARD_PORT]")],
-    sensor: Sensor,
-    obj: Object,
+    sensor: options.Sensor,
+    obj: options.Object,
     host: Annotated[str, typer.Option(help="address to listen on")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: a free one")] = 8081,
     fps: Annotated[float, typer.Option(min=0.1, help="largest number of pictures a second")] = 30.0,
-    servo: ServoName = "surface",
+    servo: options.ServoName = "surface",
     fault: FaultOption = None,
-    plain_light: PlainLight = False,
+    plain_light: options.PlainLight = False,
 ) -> None:
     """Emulate the sensor's camera as a stream over HTTP.
 

@@ -5,6 +5,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -83,13 +84,12 @@ def _cells(text: str) -> list[list[str]]:
     """
     lines = [line for line in text.splitlines() if line.strip()]
     separator = max(SEPARATORS, key=lines[0].count) if lines else ","
-    rows = []
+    rows, reader = [], partial(csv.reader, delimiter=separator, skipinitialspace=True)
     for number, line in enumerate(lines, 1):
         if line.count(separator) >= MOST_COLUMNS:
             raise csv.Error(f"row {number} has {line.count(separator) + 1} cells, a table has at most {MOST_COLUMNS}")
         unclosed = line.count('"') % 2 == 1  # the csv reader would join such a line with the following lines
-        quoting = csv.QUOTE_NONE if unclosed else csv.QUOTE_MINIMAL
-        (row,) = csv.reader([line], delimiter=separator, quoting=quoting, skipinitialspace=True)
+        (row,) = reader([line], quoting=csv.QUOTE_NONE) if unclosed else reader([line])
         row = [cell.strip(AROUND_CELLS) for cell in row]
         if separator != ",":
             row = [re.sub(r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$", r"\1.\2", cell) for cell in row]

@@ -22,18 +22,9 @@ from twin.one_contact import look_at
 from twin.pins.graph import make_graph
 from twin.pins.labelling.reference import nominal_reference
 from twin.progress import Progress, Step, silent, stage, unheard
+from twin.report import plots
 from twin.report.charts import new_figure, write_chart
 from twin.report.page import Page, PagePicture, code, sentence
-from twin.report.plots import (
-    ObservedFrame,
-    area_change_at,
-    area_surface_figure,
-    draw_area_change,
-    draw_displacement,
-    draw_frame,
-    draw_graph,
-    draw_pins,
-)
 from twin.report.skin3d import draw_contact_skin
 from twin.report.table import Column, force_interval, number
 from twin.simulator import RenderedFrame, Simulator
@@ -78,7 +69,7 @@ class ContactResult:
     pose: ContactPose
     state: ContactState
     raw: RenderedFrame
-    look: ObservedFrame
+    look: plots.ObservedFrame
     seconds: dict[str, float]
     stiffness_factor: float
 
@@ -255,20 +246,20 @@ def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
         "raw": write_image(folder / f"{stem}-frame.png", result.raw.frame.image),
         "pins": write_chart(folder / f"{stem}-graph.png", lambda: _graph_figure(look)),
         "areas": write_chart(folder / f"{stem}-areas.png", lambda: _areas_figure(look)),
-        "surfaces": write_chart(folder / f"{stem}-surfaces.png", lambda: area_surface_figure(rest, graph)),
+        "surfaces": write_chart(folder / f"{stem}-surfaces.png", lambda: plots.area_surface_figure(rest, graph)),
     }
     if look.frame.form == Form.PROCESSED:
         written["recorded"] = write_image(folder / f"{stem}-recorded.png", look.frame.image)
     return written
 
 
-def motion_figure(motions: list[tuple[str, ObservedFrame]]) -> Figure:
+def motion_figure(motions: list[tuple[str, plots.ObservedFrame]]) -> Figure:
     """Displacement (top) and area change (bottom) for each motion, as in the paper's figure 1(d)."""
     figure, axes = new_figure(len(motions), 2, panel_inch=4.2)
     for column, (title, look) in enumerate(motions):
         graph, rest = look.graphs()
-        draw_displacement(axes[column], rest.nodes_px, graph.nodes_px, title)
-        draw_area_change(axes[column + len(motions)], graph, rest.area_px2, "")
+        plots.draw_displacement(axes[column], rest.nodes_px, graph.nodes_px, title)
+        plots.draw_area_change(axes[column + len(motions)], graph, rest.area_px2, "")
     return figure
 
 
@@ -277,6 +268,7 @@ def contact_figures(result: ContactResult, contact_px: np.ndarray) -> list[tuple
     look, force = result.look, result.state.force_n
     observation = look.observation
     ends = force_interval(force.tolist(), result.stiffness_factor)
+    grown = plots.area_change_at(look, contact_px, count=12)
     parts = ", ".join(number(float(part), decimals=2, signed=True) for part in force)
     return [
         ("pins found", f"{observation.found} of {len(observation.pins_px)}"),
@@ -284,7 +276,7 @@ def contact_figures(result: ContactResult, contact_px: np.ndarray) -> list[tuple
         ("force on the object, N", f"({parts})"),
         ("90 % interval of its size, N", " to ".join(number(each, decimals=2) for each in ends)),
         ("contact area, mm²", number(float(result.state.area_mm2), decimals=1)),
-        ("cell area at the contact against no contact", f"{number(area_change_at(look, contact_px, count=12), decimals=1, signed=True)} %"),
+        ("cell area at the contact against no contact", f"{number(grown, decimals=1, signed=True)} %"),
         *((f"{name}, s", number(value, decimals=3)) for name, value in result.seconds.items()),
     ]
 
@@ -406,17 +398,17 @@ def _time_section(page: Page, seconds: Mapping[str, float]) -> None:
     page.table([*stages, total], [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
 
 
-def _graph_figure(look: ObservedFrame) -> Figure:
+def _graph_figure(look: plots.ObservedFrame) -> Figure:
     figure, (ax,) = new_figure(1, panel_inch=6)
     graph, rest = look.graphs()
-    draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
-    draw_graph(ax, graph)
-    draw_pins(ax, look.observation)
+    plots.draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
+    plots.draw_graph(ax, graph)
+    plots.draw_pins(ax, look.observation)
     return figure
 
 
-def _areas_figure(look: ObservedFrame) -> Figure:
+def _areas_figure(look: plots.ObservedFrame) -> Figure:
     figure, (ax,) = new_figure(1, panel_inch=6)
     graph, rest = look.graphs()
-    draw_area_change(ax, graph, rest.area_px2, "")
+    plots.draw_area_change(ax, graph, rest.area_px2, "")
     return figure

@@ -10,19 +10,10 @@ from scenes.sensor import Polarity, SensorSpec
 from twin.camera.capture import expose
 from twin.camera.projection import Disc, project
 from twin.evaluation.labelled.compare import pin_errors
+from twin.evaluation.pictures import poses
 from twin.evaluation.pictures.fixed import cap_patches, fixed_share
 from twin.evaluation.pictures.frames import RealFrame
 from twin.evaluation.pictures.images import ImageFigures, compare_images
-from twin.evaluation.pictures.poses import (
-    EXPERIMENT,
-    PlateTaps,
-    TapBank,
-    bank_labels,
-    contacts_of,
-    fit_rig,
-    halves,
-    labels_of_rows,
-)
 from twin.evaluation.pictures.statistics import FrameStatistics, Statistics, compare_statistics, measure_frame
 from twin.frames.forms import gray_levels
 from twin.geometry.mesh import SensorMesh
@@ -99,24 +90,24 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
     FrameError
         The frames have no labels, or are too few.
     """
-    experiment, apex_mm = load_experiment(EXPERIMENT), spec.skin.apex_mm
-    labels, fitted = labels_of_rows([real.label for real in frames], experiment), halves(len(frames))
+    experiment, apex_mm = load_experiment(poses.EXPERIMENT), spec.skin.apex_mm
+    labels, fitted = poses.labels_of_rows([real.label for real in frames], experiment), poses.halves(len(frames))
     learnt = [label for label, used in zip(labels, fitted, strict=True) if used]
     solver, start = SkinSolver(spec), rig_of(spec)
-    taps = PlateTaps(solver, experiment)
+    taps = poses.PlateTaps(solver, experiment)
     with bar("simulate taps to fit the arm's rig") as progress:
-        spread = bank_labels(start, experiment, labels, apex_mm)
-        bank = TapBank(contacts_of(start, experiment, spread, apex_mm), taps.pins_px(start, spread, progress))
+        spread = poses.bank_labels(start, experiment, labels, apex_mm)
+        bank = poses.TapBank(poses.contacts_of(start, experiment, spread, apex_mm), taps.pins_px(start, spread, progress))
     with bar("fit the arm's rig") as progress:
         seen_px = np.stack([real.pins_px for real in frames])[fitted]
-        rig = fit_rig(bank, start, experiment, learnt, seen_px, apex_mm, simulate=lambda tried: taps.pins_px(tried, learnt, progress))
+        rig = poses.fit_rig(bank, start, experiment, learnt, seen_px, apex_mm, simulate=lambda tried: taps.pins_px(tried, learnt, progress))
     contact, shoot, pairs = taps.contact(rig), _Shooter(spec, disc, quality, mesh=solver.mesh), []
     with bar("press and render from the labels") as progress:
         for number, (real, label) in enumerate(reported(list(zip(frames, labels, strict=True)), progress)):
             state = contact.end(label)
             error_px = pin_errors(project(spec.view, state.caps_mm), real.pins_px)
             pairs.append(shoot(real, state, float(error_px), seed=number))
-    return PoseAligned(rig, fitted, contacts_of(rig, experiment, labels, apex_mm), pairs)
+    return PoseAligned(rig, fitted, poses.contacts_of(rig, experiment, labels, apex_mm), pairs)
 
 
 def statistics(pairs: list[Pair], disc: Disc, polarity: Polarity, *, progress: Step) -> Statistics:

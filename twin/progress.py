@@ -52,7 +52,7 @@ def unheard(done: float, total: float = 1.0, note: str = "") -> None:
     """The ``Step`` that reports nothing."""
 
 
-def reported(items: Sequence[Item], progress: Step) -> Iterator[Item]:
+def report_each(items: Sequence[Item], progress: Step) -> Iterator[Item]:
     """Each item; after the work on it, ``progress`` is told the number of finished ones."""
     for done, item in enumerate(items, 1):
         yield item

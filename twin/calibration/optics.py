@@ -34,7 +34,7 @@ from twin.optics.relief import DETAILS, without
 from twin.optics.render import Renderer
 from twin.pins.labelling.rest import require_even
 from twin.pins.pipeline import Pipeline
-from twin.progress import Bar, Progress, Step, reported, silent, stage
+from twin.progress import Bar, Progress, Step, report_each, silent, stage
 from twin.report.page import Page, PagePicture, code
 from twin.report.table import Column
 from twin.store import KEPT, Item, inputs_digest, kept_arrays, kept_json, output, writes_file
@@ -140,7 +140,7 @@ class _Studio:
         """Linear light (H, W[, channels]) of every frame's state."""
         renderer, light = Renderer(spec, spp=SAMPLES), []
         with self._bar(title) as progress:
-            for seed, frame in enumerate(reported(frames, progress)):
+            for seed, frame in enumerate(report_each(frames, progress)):
                 light.append(renderer.render(frame.state, seed=seed))
         return light
 
@@ -327,7 +327,7 @@ class _Log:
             fit = fit or SkinFit(spec)  # takes seconds to build, and is not needed if all frames were stored
             return vars(fit(pins_px))
 
-        for name, image, pins_px in reported(raw, progress):
+        for name, image, pins_px in report_each(raw, progress):
             item = Item(f"skin-{Path(name).stem}", (SkinFit,), [spec, pins_px])
             found = kept_arrays(self._folder, item, partial(fit_skin, pins_px))
             frames.append(Aligned(name, image, pins_px, FittedPins(**found)))

@@ -77,7 +77,7 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     bounds = BOUNDS | (CHROMA | FRINGES | SHIFTS if spec.camera.channels == "color" else {})
     names = list(bounds)
     frames, light = frames[:MOST_FRAMES], [hazed(np.asarray(x, np.float32), spec.gel) for x in light[:MOST_FRAMES]]
-    useful = _compared(frames, inside)
+    useful = _compared_pixels(frames, inside)
     real = np.concatenate([f.image[u].astype(float).ravel() for f, u in zip(frames, useful, strict=True)])
     images = [f.image for f in frames]
     stream = {"stream": stream_of(images), "chroma_columns": chroma_columns(images)}
@@ -123,7 +123,7 @@ def fit_haze(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], i
         The disc.
     """
     chosen = list(zip(frames, light, strict=True))[:MOST_FRAMES]
-    useful = _compared(frames[:MOST_FRAMES], inside)
+    useful = _compared_pixels(frames[:MOST_FRAMES], inside)
 
     def misfit(haze: float) -> float:
         shown = with_changes(spec, gel={"haze": haze}, response={"jpeg_quality": 0}).capture
@@ -135,7 +135,7 @@ def fit_haze(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], i
     return with_changes(spec, gel={"haze": haze}) if misfit(haze) < misfit(spec.gel.haze) else spec
 
 
-def _compared(frames: list[Aligned], inside: np.ndarray) -> list[np.ndarray]:
+def _compared_pixels(frames: list[Aligned], inside: np.ndarray) -> list[np.ndarray]:
     """The compared pixels of each frame, (H, W) bool: one in ``EVERY`` each way that is in the disc and not saturated."""
     pick = np.zeros_like(inside)
     pick[::EVERY, ::EVERY] = True

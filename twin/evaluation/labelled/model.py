@@ -20,7 +20,7 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.pins import Pipeline
 from twin.pins.batch import UNMEASURED, recording_reference
-from twin.progress import Step, reported, unheard
+from twin.progress import Step, report_each, unheard
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel, read_arm_labels
@@ -82,7 +82,7 @@ def measure_frames(
     pipeline = Pipeline(spec, recording.form, reference)
     chosen = np.random.default_rng(seed).permutation(len(recording))[:count]
     kept, pins = [], []
-    for row in reported(np.sort(chosen).tolist(), progress):
+    for row in report_each(np.sort(chosen).tolist(), progress):
         try:
             seen = pipeline(recording.read(row))
             if seen.valid:

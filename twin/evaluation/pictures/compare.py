@@ -21,7 +21,7 @@ from twin.mechanics.skin_fit import FittedPins, SkinFit
 from twin.mechanics.solver import SkinSolver
 from twin.optics.render import Renderer
 from twin.pins.pipeline import Pipeline
-from twin.progress import Bar, Step, reported
+from twin.progress import Bar, Step, report_each
 from twin.rig.kinematics import rig_of
 from twin.types import ContactState, Form, Quality
 
@@ -76,7 +76,7 @@ class PoseAligned:
 def pin_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: Quality, progress: Step) -> list[Pair]:
     """Fit the skin to each frame's pins, render and capture it. This tests camera and light, but not the mechanics."""
     fit, shoot, pairs = SkinFit(spec), _Shooter(spec, disc, quality), []
-    for number, real in enumerate(reported(frames, progress)):
+    for number, real in enumerate(report_each(frames, progress)):
         pins = fit(real.pins_px)
         pairs.append(shoot(real, pins, float(np.nanmedian(pins.remainder_px)), seed=number))
     return pairs
@@ -103,7 +103,7 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
         rig = poses.fit_rig(bank, start, experiment, learnt, seen_px, apex_mm, simulate=lambda tried: taps.pins_px(tried, learnt, progress))
     contact, shoot, pairs = taps.contact(rig), _Shooter(spec, disc, quality, mesh=solver.mesh), []
     with bar("press and render from the labels") as progress:
-        for number, (real, label) in enumerate(reported(list(zip(frames, labels, strict=True)), progress)):
+        for number, (real, label) in enumerate(report_each(list(zip(frames, labels, strict=True)), progress)):
             state = contact.end(label)
             error_px = pin_errors(project(spec.view, state.caps_mm), real.pins_px)
             pairs.append(shoot(real, state, float(error_px), seed=number))
@@ -113,7 +113,7 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
 def statistics(pairs: list[Pair], disc: Disc, polarity: Polarity, *, progress: Step) -> Statistics:
     """Compare real frames with pin-aligned renders: caps, skin, noise, spectrum, spots."""
     sets: tuple[list[FrameStatistics], list[FrameStatistics]] = ([], [])
-    for pair in reported(pairs, progress):
+    for pair in report_each(pairs, progress):
         for measured, image in zip(sets, (pair.real.frame.image, pair.image), strict=True):
             measured.append(measure_frame(gray_levels(image), pair.real.pins_px, disc, polarity=polarity))
     return compare_statistics(*sets)

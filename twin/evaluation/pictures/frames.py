@@ -12,7 +12,7 @@ from twin.frames import open_recording, spread_indices
 from twin.frames.forms import gray_levels
 from twin.frames.recording import BadFrame
 from twin.pins.pipeline import Pipeline
-from twin.progress import Step, reported, unheard
+from twin.progress import Step, report_each, unheard
 from twin.types import Form, Frame, Observation
 
 # A frame counts as dark if this percentile of the disc's gray levels is at most this level.
@@ -96,7 +96,7 @@ def read_real(
     chosen = left[spread_indices(len(left), len(left) if limit is None else limit)].tolist()
     frames: list[RealFrame] = []
     refused: list[BadFrame] = []
-    for index in reported(chosen, progress):
+    for index in report_each(chosen, progress):
         name = recording.names[index]
         try:
             frame = recording.read(index)

@@ -367,8 +367,8 @@ def demonstrate(
     from training.environments.demonstrations import DemonstrationPlan
     from training.environments.demonstrations import demonstrate as record
 
-    episodes = call(Options, locals(), objects=names_in(objects) if objects else None)
-    return record(call(DemonstrationPlan, locals(), options=episodes), out, video=video, progress=progress)
+    chosen = call(Options, locals(), objects=names_in(objects) if objects else None)
+    return record(call(DemonstrationPlan, locals(), options=chosen), out, video=video, progress=progress)
 
 
 @app.command("learn")
@@ -415,6 +415,6 @@ def learn(
     from training.environments.batch import Options
     from training.environments.learn import LearnPlan, learn_policy
 
-    episodes = call(Options, locals(), objects=names_in(objects) if objects else None)
-    plan = call(LearnPlan, locals(), options=episodes, fem_episodes=fem, sight=state_estimator)
+    chosen = call(Options, locals(), objects=names_in(objects) if objects else None)
+    plan = call(LearnPlan, locals(), options=chosen, fem_episodes=fem, sight=state_estimator)
     return learn_policy(plan, out, progress=progress)

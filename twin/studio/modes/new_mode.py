@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import viser
 
 from scenes.pins import PinsSpec, layout_from
 from scenes.sensor import SensorSpec
@@ -86,7 +85,7 @@ class NewMode(PageMode):
             self._number = gui.add_slider("frame shown", 0, 1, 1, 0, disabled=True)
             page.button("Use this sensor", self.use)
         correct.on_click(page.guard(lambda: self.correct(+1 if correct.value == LARGER else -1)))
-        self._number.on_update(self._follow_slider)
+        self._number.on_update(page.guard(lambda: self._looking.give(int(self._number.value))))
 
     def show(self) -> None:
         """Show the newest proposal."""
@@ -135,10 +134,6 @@ class NewMode(PageMode):
             raise TwinError("nothing has been proposed yet; press 'Propose a specification' first")
         return self._made
 
-    def _follow_slider(self, event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
-        if event.client is not None:  # otherwise this program moved the slider
-            self._looking.give(int(event.target.value))
-
     def _make(self, wish: Wish) -> None:
         def report(stage: str, done: float, total: float, note: str = "") -> None:
             share = f", {100 * done / total:.0f} %" if total else ""
@@ -149,9 +144,6 @@ class NewMode(PageMode):
         out = next_path(self._out, "my-sensor", ".toml")
         made = new_sensor(Path(wish.frames), out, layout=layout, no_contact=no_contact, progress=report)
         recording = open_recording(frames_at(Path(wish.frames), None, no_contact), made.sensor)
-        self._take(made, recording)
-
-    def _take(self, made: NewSensor, recording: Recording) -> None:
         self._made, self._recording = made, recording
         self._pipeline = Pipeline(made.sensor, recording.form)
         self._number.max, self._number.disabled = max(1, len(recording) - 1), False

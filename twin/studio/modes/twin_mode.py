@@ -197,8 +197,8 @@ class TwinMode(PageMode):
 
     def _follow_drag(self, T: np.ndarray, ended: bool) -> None:
         self.ask(ObjectPose.of(T, self.contact.setup.sensor.skin.apex_mm))
-        if ended and self.worker.newest is not None:
-            self._publisher.give(self.worker.newest)
+        if ended:
+            self.show()
 
     # controls
 
@@ -216,7 +216,7 @@ class TwinMode(PageMode):
                     getattr(self._wish, name),
                     hint=f"{low:g} to {high:g}: {why}",
                 )
-                slider.on_update(self._slider_callback(name))
+                slider.on_update(guarded(partial(self._move_to_slider, name)))
             with gui.add_folder("Contact"):
                 sensors, objects = (tuple(sorted({*names(), chosen})) for names, chosen in (
                     (list_sensors, self._state.sensor), (list_objects, self._state.object)))  # fmt: skip
@@ -262,12 +262,8 @@ class TwinMode(PageMode):
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
         gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(self.tap_and_shear))
 
-    def _slider_callback(self, name: str) -> Callable[[viser.GuiEvent[viser.GuiSliderHandle[float]]], None]:
-        def moved(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
-            if event.client is not None:  # otherwise this program moved the slider
-                self.ask(replace(self._wish, **{name: float(event.target.value)}))
-
-        return moved
+    def _move_to_slider(self, name: str) -> None:
+        self.ask(replace(self._wish, **{name: float(self._sliders[name].value)}))
 
     def _own_friction(self) -> float:
         setup = self.contact.setup
@@ -291,8 +287,7 @@ class TwinMode(PageMode):
     def _change_look(self) -> None:
         self._shown = value_of(self._colour, PinColour, str(self._shown))
         self._drawn = value_of(self._drawing, OverlayChoices, str(self._drawn))
-        if self.worker.newest is not None:
-            self._publisher.give(self.worker.newest)
+        self.show()
 
     def _change_friction(self) -> None:
         friction = float(self._friction.value)

@@ -80,10 +80,8 @@ def uneven(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSp
 
 def pale(appearance: AppearanceSpec, value: float, rng: np.random.Generator) -> AppearanceSpec:
     """A skin that has lost its black; a bright skin has become as dark as the caps."""
-    if appearance.dark_caps:
-        return appearance.alter(skin_albedo=_towards(appearance.skin_albedo, appearance.cap_albedo, value))
-    old = appearance.skin_albedo
-    return appearance.alter(skin_albedo=tuple(a + value * (1 - a) for a in old))
+    end = appearance.cap_albedo if appearance.dark_caps else (1.0, 1.0, 1.0)
+    return appearance.alter(skin_albedo=_towards(appearance.skin_albedo, end, value))
 
 
 def translucent(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:

@@ -96,8 +96,8 @@ def undistort(camera: CameraSpec, seen: FloatArray, *, guess: FloatArray | None 
     for _ in range(NEWTON_STEPS):
         along_x, along_y = ((distort(camera, ideal + d) - distort(camera, ideal - d)) / (2 * step) for d in ([step, 0.0], [0.0, step]))
         miss = seen - distort(camera, ideal)
-        area = _cross(along_x, along_y)
-        move = np.stack([_cross(miss, along_y), _cross(along_x, miss)], axis=-1)
+        area = cross_plane(along_x, along_y)
+        move = np.stack([cross_plane(miss, along_y), cross_plane(along_x, miss)], axis=-1)
         ideal = ideal + np.clip(move / np.where(np.abs(area) > 1e-6, area, 1e-6)[..., None], -MOST_NEWTON_MOVE, MOST_NEWTON_MOVE)
     return ideal
 
@@ -231,5 +231,6 @@ def _fisheye(camera: CameraSpec, angle: FloatArray) -> FloatArray:
     return angle * (1 + camera.k1 * angle**2 + camera.k2 * angle**4)
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+def cross_plane(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The third component of the cross product of vectors (..., 2) in a plane."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -18,7 +18,7 @@ import numpy as np
 
 from scenes.files import quote, read_regular
 from twin.errors import FrameError
-from twin.frames.images import read_image
+from twin.frames.images import png, read_image
 from twin.frames.lerobot import RESTS
 from twin.records.record import About, Episode, RecordError, Records, RecordStep, digest, library
 from twin.store import contents, output, write_bytes, write_json
@@ -283,11 +283,6 @@ def whole_steps(path: Path, facts: dict[str, Any], steps: Callable[[], Iterator[
         yield step
     if count != facts["length"]:
         raise RecordError(f"{path}: damaged, {count} of {facts['length']} steps of {quote(facts['key'])} can be read; {AGAIN}")
-
-
-def png(image: ImageArray) -> bytes:
-    """A picture as PNG."""
-    return cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes()
 
 
 def image_of(data: bytes, gray: bool, name: str) -> ImageArray:

@@ -380,9 +380,7 @@ def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Recor
     at = {key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}
     path, number = folder / DATA_PATH.format(**at), row["episode_index"]
     video = f"videos/{IMAGE}/from_timestamp" in row
-    pictures: Iterator[np.ndarray] = iter(())
-    if video:
-        pictures = _film_pictures(folder, row, about)
+    pictures = _film_pictures(folder, row, about) if video else iter(())
     try:
         file = parquet.ParquetFile(path, page_checksum_verification=True)
         leaf = next(k for k in range(len(file.schema)) if file.schema.column(k).path == "episode_index")

@@ -26,7 +26,7 @@ from twin.frames.images import read_image, write_image
 from twin.frames.videos import describe_pauses
 from twin.records.record import CHANNELS, About, Episode, Records, RecordStep, digest, float32, seconds
 from twin.rig.mounting import Mounting
-from twin.store import contents, unwritten, write_json
+from twin.store import contents, write_json, writing
 from twin.types import Form, Frame
 
 ABOUT, STEPS, FRAMES, REST = "session.json", "steps.jsonl", "frames", "rest.png"
@@ -79,11 +79,9 @@ class SessionWriter:
             self._written = {frame.sequence: name}
         about_frame = {"file": name, "name": frame.name, "form": str(frame.form), "time_s": frame.time_s, "sequence": frame.sequence}
         line = {"step": self.count, "frame": about_frame, **{key: plain(value) for key, value in step.items()}}
-        try:
+        with writing(self.folder / STEPS):
             self._lines.write(json.dumps(line) + "\n")
             self._lines.flush()
-        except OSError as error:
-            raise unwritten(self.folder / STEPS, error) from error
         self.count += 1
 
     def keep_rest(self, frame: Frame) -> None:
@@ -98,10 +96,8 @@ class SessionWriter:
         StoreError
             A line that could not be written before can't be written now.
         """
-        try:
+        with writing(self.folder / STEPS):
             self._lines.close()
-        except OSError as error:
-            raise unwritten(self.folder / STEPS, error) from error
 
     def __enter__(self) -> Self:
         return self

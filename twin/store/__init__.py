@@ -13,6 +13,7 @@ from twin.store.atomic import (
     write_result,
     write_text,
     write_with,
+    writing,
 )
 from twin.store.cache import cache_folder, cached_arrays
 from twin.store.fingerprint import code_of, fingerprint

@@ -3,17 +3,18 @@
 import csv
 import io
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
+import numpy as np
 from pydantic import ValidationError
 
 from scenes import load_object, load_sensor
 from scenes.base import NonNegative, Section
 from scenes.files import read_regular
 from twin.errors import TwinError
-from twin.store import text_file, unwritten, write_json
+from twin.store import text_file, write_json, writing
 from twin.studio.pictures import OverlayChoices
 from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.scene import PinColour
@@ -187,24 +188,12 @@ def read_trajectory(content: bytes, name: str) -> Way:
     return [(at - times[0], pose) for at, pose in zip(times, poses, strict=True)]
 
 
-def tap_and_shear(pose: ObjectPose, *, depth_mm: float = 3.0, shear_mm: float = 3.0) -> Way:
-    """A tap from 2 mm above the tip down to a depth, a shear along x and back, and the lift. Tilts and twist are not changed."""
-    knots = [
-        (0.0, -2.0, 0.0),
-        (1.5, depth_mm, 0.0),
-        (3.0, depth_mm, shear_mm),
-        (5.0, depth_mm, -shear_mm),
-        (6.5, depth_mm, 0.0),
-        (8.0, -2.0, 0.0),
-    ]
-    way: Way = []
-    for (t0, d0, x0), (t1, d1, x1) in zip(knots, knots[1:], strict=False):
-        steps = round((t1 - t0) / 0.1)
-        for k in range(steps):
-            s = k / steps
-            turned = asdict(pose) | {"x_mm": x0 + s * (x1 - x0), "y_mm": 0.0, "depth_mm": d0 + s * (d1 - d0)}
-            way.append((t0 + s * (t1 - t0), ObjectPose(**turned)))
-    return [*way, (knots[-1][0], ObjectPose(**(asdict(pose) | {"x_mm": 0.0, "y_mm": 0.0, "depth_mm": knots[-1][1]})))]
+def tap_and_shear(pose: ObjectPose) -> Way:
+    """A tap from 2 mm above the tip down to 3 mm, a shear along x by 3 mm and back, and the lift. Tilts and twist are not changed."""
+    knots_s, depths_mm, shears_mm = (0.0, 1.5, 3.0, 5.0, 6.5, 8.0), (-2.0, 3.0, 3.0, 3.0, 3.0, -2.0), (0.0, 0.0, 3.0, -3.0, 0.0, 0.0)
+    times_s = np.linspace(0.0, 8.0, 81)
+    moves = zip(times_s.tolist(), *(np.interp(times_s, knots_s, values).tolist() for values in (depths_mm, shears_mm)), strict=True)
+    return [(at_s, replace(pose, x_mm=shear, y_mm=0.0, depth_mm=depth)) for at_s, depth, shear in moves]
 
 
 def next_path(folder: Path, stem: str, suffix: str) -> Path:
@@ -215,10 +204,8 @@ def next_path(folder: Path, stem: str, suffix: str) -> Path:
     TwinError
         The folder can't be made.
     """
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritten(folder, error) from error
     number = 1
     while (path := folder / f"{stem}-{number}{suffix}").exists():
         number += 1

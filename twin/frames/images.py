@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from scenes.files import read_regular
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.store import write_bytes
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -119,10 +119,8 @@ def decode(path: Path) -> np.ndarray:
 
 def _read_levels(path: Path) -> tuple[np.ndarray, str]:
     """Levels as of ``decode``, and a note on irregularities of the file ("" if there are none)."""
-    try:
+    with ErrorsAs(OSError, lambda error: FrameError(f"{path.name}: can't be read ({error.strerror})")):
         data = read_regular(path, LARGEST_BYTES)
-    except OSError as error:
-        raise FrameError(f"{path.name}: can't be read ({error.strerror})") from error
     if not data:
         raise FrameError(f"{path.name}: the file is empty; copy it again")
     try:

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from scenes.files import quote, require_regular
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.frames.av1 import decode_av1
 from twin.frames.forms import times
 from twin.frames.images import NOT_TURNED, overheard, picture_of
@@ -86,10 +86,8 @@ def open_video(path: Path) -> Video:
     FrameError
         The video can't be read, or has no usable frame.
     """
-    try:
+    with ErrorsAs(OSError, lambda error: FrameError(f"{path}: can't be read ({error.strerror}); give a video")):
         require_regular(path)
-    except OSError as error:
-        raise FrameError(f"{path}: can't be read ({error.strerror}); give a video") from error
     stored = _read_properties(path)
     times_s: list[float] = []
     said: dict[int, str] = {}

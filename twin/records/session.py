@@ -20,7 +20,7 @@ from pydantic import BaseModel, ValidationError
 from scenes import load_experiment, load_sensor
 from scenes.base import Name, SpecError
 from scenes.files import quote, read_regular
-from twin.errors import FrameError, StoreError
+from twin.errors import ErrorsAs, FrameError, StoreError
 from twin.frames.forms import times
 from twin.frames.images import read_image, write_image
 from twin.frames.videos import describe_pauses
@@ -134,10 +134,8 @@ def _steps_and_note(folder: Path) -> tuple[list[dict], str]:
     FrameError
         The file can't be read.
     """
-    try:
+    with ErrorsAs(OSError, lambda error: FrameError(f"{folder}: {STEPS} can't be read ({error.strerror}); give the folder of a session")):
         text = read_regular(folder / STEPS, LARGEST_BYTES).decode("utf-8", "replace")
-    except OSError as error:
-        raise FrameError(f"{folder}: {STEPS} can't be read ({error.strerror}); give the folder of a session") from error
     steps: list[dict] = []
     lines = text.split("\n")
     for line in lines[:-1]:
@@ -221,10 +219,8 @@ class Session:
         path = self.folder / name
         if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(self.folder)):
             raise FrameError(f"{self.folder}: {name} is a link to outside the session; put the picture itself there")
-        try:
+        with ErrorsAs(FrameError, lambda error: FrameError(f"{self.folder}: {error}")):
             return read_image(path)[0]
-        except FrameError as error:
-            raise FrameError(f"{self.folder}: {error}") from error
 
     def stills(self) -> list[str]:
         """Pauses between frames, frames that the camera took and nobody read, and steps that use a frame again, one line each."""

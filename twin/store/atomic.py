@@ -21,7 +21,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from twin.errors import StoreError
+from twin.errors import ErrorsAs, StoreError
 
 PART = ".part"
 """End of the name of a temporary file. The name begins with a dot."""
@@ -155,10 +155,8 @@ def unwritten(path: Path, error: OSError) -> StoreError:
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Context that converts an error of the operating system to the ``StoreError`` of ``unwritten``."""
-    try:
+    with ErrorsAs(OSError, lambda error: unwritten(path, error)):
         yield
-    except OSError as error:
-        raise unwritten(path, error) from error
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from scenes import load_object, load_sensor
 from scenes.base import NonNegative, Section
 from scenes.files import read_regular
-from twin.errors import TwinError
+from twin.errors import ErrorsAs, TwinError
 from twin.store import text_file, write_json, writing
 from twin.studio.pictures import OverlayChoices
 from twin.studio.pose import NAMES, ObjectPose
@@ -88,10 +88,8 @@ class StudioState(Section):
     @classmethod
     def load(cls, path: Path) -> "StudioState":
         """Read a state's file; raises as ``read``."""
-        try:
+        with ErrorsAs(OSError, lambda error: TwinError(f"{path}: can't be read ({error.strerror}); give a file that 'Save state' wrote")):
             return cls.read(read_regular(path, MOST_BYTES), str(path))
-        except OSError as error:
-            raise TwinError(f"{path}: can't be read ({error.strerror}); give a file that 'Save state' wrote") from error
 
     def link(self, page: str = "") -> str:
         """The state as a link to a page of the studio, which then shows it. Without ``page`` it is the link's query alone."""
@@ -111,11 +109,9 @@ class StudioState(Section):
         """
         remedy = "copy the link from the page's folder 'Save'"
         name = f"link {link[:MOST_SHOWN]}{'...' if len(link) > MOST_SHOWN else ''}".replace("\n", " ")
-        try:
+        with ErrorsAs(ValueError, lambda error: TwinError(f"{name}: not a link to a state of the studio ({error}); {remedy}")):
             given = dict(parse_qsl(urlsplit(link).query, keep_blank_values=True, strict_parsing=True, max_num_fields=50))
             numbers = {key: float(given.pop(key)) for key in (*NAMES, "friction") if key in given}
-        except ValueError as error:
-            raise TwinError(f"{name}: not a link to a state of the studio ({error}); {remedy}") from error
         friction = {key: numbers.pop(key) for key in ("friction",) if key in numbers}
         pose = numbers or {"depth_mm": FIRST_DEPTH_MM}
         return cls.read(json.dumps({**given, **friction, "pose": pose}).encode(), name, remedy)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError, OptionError, TwinError
+from twin.errors import ErrorsAs, FrameError, OptionError, TwinError
 from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.envelope import Envelope, evaluate_sweep
 from twin.evaluation.degradation.report import write_report
@@ -182,10 +182,8 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
 
 def _check_detector(detector: DetectorSpec, frame: Frame) -> DetectorSpec:
     """A detector whose function works on an undegraded frame. On degraded frames its failure is a result."""
-    try:
+    with ErrorsAs(FrameError, lambda error: OptionError(f"`pipeline` {detector.finder}, on the undegraded frame {frame.name}: {error}")):
         own_places(detector, frame)
-    except FrameError as error:
-        raise OptionError(f"`pipeline` {detector.finder}, on the undegraded frame {frame.name}: {error}") from error
     return detector
 
 

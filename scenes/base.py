@@ -74,6 +74,12 @@ class Section(BaseModel):
         """The keys of the section in a file."""
         return cls.model_fields
 
+    def alter(self, **values: Any) -> Self:
+        """A copy with other values. A dict for a section changes these keys of it. Values are not validated: they are computed in range."""
+        parts = {key: getattr(self, key) for key, value in values.items() if isinstance(value, dict)}
+        sections = {key: part.alter(**values[key]) for key, part in parts.items() if isinstance(part, Section)}
+        return self.model_copy(update=values | sections)
+
 
 class OpenSection(Section, extra="allow"):
     """A section of which one key names a part, as a layout or a law, and which holds the keys of this part beside its own."""

@@ -1,27 +1,12 @@
 """Lists of all specifications: shipped ones, and a user's own."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
-
-from pydantic import BaseModel
+from typing import Any
 
 from scenes.base import SpecError
-from scenes.load import (
-    SHIPPED,
-    list_experiments,
-    list_objects,
-    list_randomisations,
-    list_sensors,
-    load_experiment,
-    load_object,
-    load_randomisation,
-    load_sensor,
-    user_spec_dir,
-)
-
-Spec = TypeVar("Spec", bound=BaseModel)
+from scenes.load import SHIPPED, list_specifications, load_experiment, load_object, load_randomisation, load_sensor, user_spec_dir
 
 
 @dataclass(frozen=True)
@@ -72,33 +57,23 @@ class Catalog:
         ]
 
 
-def sensors() -> Catalog:
-    """All sensors."""
-    return _catalog("sensors", list_sensors(), load_sensor, lambda spec: f"{spec.pins.count} pins, {spec.camera.channels}")
+# Of each kind: the function that loads a specification, and a detail of it that its line states.
+KINDS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
+    "sensors": (load_sensor, lambda spec: f"{spec.pins.count} pins, {spec.camera.channels}"),
+    "objects": (load_object, lambda spec: spec.shape.kind),
+    "experiments": (load_experiment, lambda spec: ", ".join(spec.targets)),
+    "randomisations": (load_randomisation, lambda spec: f"{len(spec.sensor)} numbers of the sensor"),
+}
 
 
-def objects() -> Catalog:
-    """All objects. Any STL, OBJ or PLY file can also be used as an object."""
-    return _catalog("objects", list_objects(), load_object, lambda spec: spec.shape.kind)
+def list_all(kind: str) -> Catalog:
+    """All specifications of a kind, which is one of ``KINDS``."""
+    return Catalog(kind, [_entry(name, path, *KINDS[kind]) for name, path in list_specifications(kind).items()])
 
 
-def experiments() -> Catalog:
-    """All experiments (contacts in the robot's coordinates)."""
-    return _catalog("experiments", list_experiments(), load_experiment, lambda spec: ", ".join(spec.targets))
-
-
-def randomisations() -> Catalog:
-    """All randomisations (distributions of quantities that are sampled for each simulated contact)."""
-    return _catalog("randomisations", list_randomisations(), load_randomisation, lambda spec: f"{len(spec.sensor)} numbers of the sensor")
-
-
-def _catalog(kind: str, found: Mapping[str, Path], load: Callable[[str], Spec], detail: Callable[[Spec], str]) -> Catalog:
-    return Catalog(kind, [_entry(name, path, load, detail) for name, path in found.items()])
-
-
-def _entry(name: str, path: Path, load: Callable[[str], Spec], detail: Callable[[Spec], str]) -> Entry:
+def _entry(name: str, path: Path, load: Callable[[str], Any], detail: Callable[[Any], str]) -> Entry:
     try:
         spec = load(name)
     except SpecError as error:
         return Entry(name, path, str(error), broken=True)
-    return Entry(name, path, f"{spec.description} ({detail(spec)})")  # type: ignore[attr-defined]  # every specification has one
+    return Entry(name, path, f"{spec.description} ({detail(spec)})")

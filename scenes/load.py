@@ -42,22 +42,22 @@ def user_spec_dir() -> Path:
 
 def list_sensors() -> dict[str, Path]:
     """Sensor names and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return _list("sensors")
+    return list_specifications("sensors")
 
 
 def list_objects() -> dict[str, Path]:
     """Object names and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return _list("objects")
+    return list_specifications("objects")
 
 
 def list_experiments() -> dict[str, Path]:
     """Experiment names and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return _list("experiments")
+    return list_specifications("experiments")
 
 
 def list_randomisations() -> dict[str, Path]:
     """Names of randomisations and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return _list("randomisations")
+    return list_specifications("randomisations")
 
 
 def load_sensor(name_or_path: str | Path | SensorSpec) -> SensorSpec:
@@ -101,7 +101,7 @@ def load_object(name_or_path: str | Path | ObjectSpec) -> ObjectSpec:
                 f"{spec_path}: shape.sha256: {file} has another content ({digest}); put the right file there, or leave the key out"
             )
         found = {"file": str(file.resolve()), "sha256": digest}
-        spec = spec.model_copy(update={"shape": spec.shape.model_copy(update=found)})
+        spec = spec.alter(shape=found)
     return spec
 
 
@@ -159,7 +159,8 @@ def _load(given: str | Path | Spec, kind: str, model: type[Spec]) -> Spec:
     return given if isinstance(given, model) else read_section(_find(given, kind), model)
 
 
-def _list(kind: str) -> dict[str, Path]:
+def list_specifications(kind: str) -> dict[str, Path]:
+    """Names and files of a kind, which is also the name of their folders: a user's own, others', and shipped ones, in this precedence."""
     shipped, own = ({path.stem: path for path in sorted(folder.glob("*.toml"))} for folder in (SHIPPED / kind, user_spec_dir() / kind))
     return shipped | other_files(kind, shipped) | own
 
@@ -167,7 +168,7 @@ def _list(kind: str) -> dict[str, Path]:
 def _find(name_or_path: object, kind: str) -> Path:
     if not isinstance(name_or_path, str | os.PathLike):
         raise SpecError(f"expected a name or a file of {kind}, got {name_or_path!r}")
-    path, known = Path(name_or_path), _list(kind)
+    path, known = Path(name_or_path), list_specifications(kind)
     listed = f"known: {', '.join(known)}" if kind in UNLISTED else f"'twin {kind}' lists them"
     if path.suffix != ".toml" and os.path.isfile(path):
         suffixes = ", ".join((".toml", *MESH_SUFFIXES) if kind == "objects" else (".toml",))

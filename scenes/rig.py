@@ -141,7 +141,7 @@ class RigSpec(Section):
         """The rig in front of the object with this name, without ``placed``."""
         own = next((each for each in self.placed if each.object == name), None)
         known = {} if own is None else own.model_dump(exclude_none=True, exclude={"object"})
-        return self.model_copy(update=known | {"placed": ()})
+        return self.alter(**known | {"placed": ()})
 
     @model_validator(mode="after")
     def _check(self) -> Self:

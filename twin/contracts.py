@@ -256,9 +256,9 @@ class LayoutContract:
 
     def test_the_pipeline_finds_all_its_pins_in_a_rasterised_frame(self) -> None:
         sensor = load_sensor("ur5-331")
-        plain = sensor.appearance.model_copy(update={"cap_levels": (), "cap_shapes": (), "cap_offsets": (), "relief": None})
+        plain = sensor.appearance.alter(cap_levels=(), cap_shapes=(), cap_offsets=(), relief=None)
         pins = PinsSpec(layout=self.name, cap_diameter_mm=1.0, **self.layout.model_dump())
-        spec = sensor.model_copy(update={"pins": pins, "appearance": plain})
+        spec = sensor.alter(pins=pins, appearance=plain)
         rendered = Simulator(spec, quality="rasterised").render_rest()
         observation = Pipeline(spec, rendered.frame.form)(rendered.frame)
         assert observation.valid and observation.found == self.layout.count, observation.reason

@@ -1,10 +1,14 @@
 """Errors and warnings for the user. The command line prints each of them as one line."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
+from typing import Generic, TypeVar
+
+E = TypeVar("E", bound=Exception)
 
 
 class TwinError(Exception):
@@ -53,6 +57,22 @@ class WorkersError(TwinError):
 
 class ExtraError(TwinError):
     """A library that is installed with an extra of this program is missing."""
+
+
+@dataclass(frozen=True)
+class ErrorsAs(Generic[E]):
+    """Context in which errors of some kinds are raised as other errors, of which they are the cause."""
+
+    kinds: type[E] | tuple[type[E], ...]
+    other: Callable[[E], Exception]
+
+    def __enter__(self) -> None:
+        """Enter the context."""
+
+    def __exit__(self, _: object, error: BaseException | None, trace: object) -> None:
+        """Raise the other error."""
+        if isinstance(error, self.kinds):
+            raise self.other(error) from error
 
 
 EXTRAS = {

@@ -51,7 +51,7 @@ _PLACES = {
     "PinsSpec": "scenes.pins",
     "Preview": "twin.optics.preview",
     "ReadFailed": "hardware.cameras.reader",
-    "Recipe": "training.models.recipes",
+    "Recipe": "training.models.part",
     "SensorModel": "twin.estimate",
     "SkinSolver": "twin.mechanics",
     "Start": "training.environments.tasks",

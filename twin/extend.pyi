@@ -27,8 +27,8 @@ from training.environments.world import standing_on as standing_on
 from training.models import register as register
 from training.models.part import Model as Model
 from training.models.part import PinModel as PinModel
+from training.models.part import Recipe as Recipe
 from training.models.part import refuse_sizes as refuse_sizes
-from training.models.recipes import Recipe as Recipe
 from twin.camera.projection import project as project
 from twin.contracts import ArmContract as ArmContract
 from twin.contracts import CameraContract as CameraContract

@@ -13,7 +13,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
 from twin.pins import Pipeline, Reference, measure_reference, nominal_reference
-from twin.store import ArrayFile, Layers, layers_from, layers_to
+from twin.store import ArrayFile, Layers, layers_from, layers_to, through_layers
 from twin.types import BoolArray, FloatArray, Form, Frame, ImageArray, Observation
 
 
@@ -77,11 +77,11 @@ class Policy:
         """Inputs (B, K + G + S) of the network of the actions, from observations (B, ...) and goals (B, G)."""
         seen = (flatten(tactile) - self.mean) @ self.basis.T
         x = np.concatenate([seen, goal], axis=1).astype(np.float32)
-        return np.concatenate([x, _through(self.sight, x)], axis=1) if self.sight else x
+        return np.concatenate([x, through_layers(self.sight, x, np.tanh)], axis=1) if self.sight else x
 
     def act(self, tactile: FloatArray, goal: FloatArray) -> FloatArray:
         """Actions (B, A) in [-1, 1]."""
-        return np.clip(_through(self.layers, self.reduce_inputs(tactile, goal)), -1.0, 1.0)
+        return np.clip(through_layers(self.layers, self.reduce_inputs(tactile, goal), np.tanh), -1.0, 1.0)
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -124,15 +124,6 @@ def flatten(tactile: FloatArray | ImageArray) -> FloatArray:
     cells = (height // PICTURE_CELL_PX, PICTURE_CELL_PX, width // PICTURE_CELL_PX, PICTURE_CELL_PX)
     means: FloatArray = tactile.reshape(count, *cells, stack).mean(axis=(2, 4), dtype=np.float32)
     return means.reshape(count, -1) / 255.0
-
-
-def _through(layers: Layers, x: FloatArray) -> FloatArray:
-    """Output of a network with tanh between its layers for inputs (B, i)."""
-    for number, (weights, offset) in enumerate(layers):
-        x = x @ weights.T + offset
-        if number < len(layers) - 1:
-            x = np.tanh(x)
-    return x
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,11 @@ A function that is one stage of a larger work does not know its title. It takes 
 makes the ``Step`` from its own ``progress`` with ``stage``.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol
+from typing import Protocol, TypeVar
+
+Item = TypeVar("Item")
 
 
 class Progress(Protocol):
@@ -48,6 +50,13 @@ def silent(stage: str, done: float, total: float, note: str = "") -> None:
 
 def unheard(done: float, total: float = 1.0, note: str = "") -> None:
     """The ``Step`` that reports nothing."""
+
+
+def report_each(items: Sequence[Item], progress: Step) -> Iterator[Item]:
+    """Each item; after the work on it, ``progress`` is told the number of finished ones."""
+    for done, item in enumerate(items, 1):
+        yield item
+        progress(done, len(items))
 
 
 @contextmanager

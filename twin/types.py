@@ -1,7 +1,7 @@
 """Frozen types of the data between the stages, with their shapes and units."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeAlias
@@ -100,6 +100,11 @@ def _save(folder: str | Path, name: str, arrays: dict[str, Any]) -> list[Path]:
     return [Path(folder) / name]
 
 
+def _zeros(*shape: int, kind: type = float) -> Any:
+    """Default of an attribute of a data class: zeros of a shape."""
+    return field(default_factory=lambda: np.zeros(shape, kind))
+
+
 class PinState(Protocol):
     """Positions of the pins of a sensor in the sensor frame: at rest, in a contact, or fitted to a frame.
 
@@ -126,7 +131,7 @@ class PinState(Protocol):
 
 @dataclass(frozen=True)
 class ContactState:
-    """A converged state of the sensor pressed against an object (sensor frame).
+    """A converged state of the sensor pressed against an object (sensor frame). By default nothing is in contact.
 
     Attributes
     ----------
@@ -165,20 +170,20 @@ class ContactState:
     base_mm: FloatArray
     axis: FloatArray
     caps_mm: FloatArray
-    force_n: FloatArray
-    torque_nmm: FloatArray
-    area_mm2: float
-    contact_mm: FloatArray
-    contact_place: ComplexArray
-    point_area_mm2: FloatArray
-    normal: FloatArray
-    normal_n: FloatArray
-    tangential_n: FloatArray
-    slipping: BoolArray
-    T_sensor_object: FloatArray
-    elastic_nmm: float
-    dissipated_nmm: float
-    residual: float
+    force_n: FloatArray = _zeros(3)
+    torque_nmm: FloatArray = _zeros(3)
+    area_mm2: float = 0.0
+    contact_mm: FloatArray = _zeros(0, 3)
+    contact_place: ComplexArray = _zeros(0, kind=complex)
+    point_area_mm2: FloatArray = _zeros(0)
+    normal: FloatArray = _zeros(0, 3)
+    normal_n: FloatArray = _zeros(0)
+    tangential_n: FloatArray = _zeros(0, 3)
+    slipping: BoolArray = _zeros(0, kind=bool)
+    T_sensor_object: FloatArray = field(default_factory=lambda: np.eye(4))
+    elastic_nmm: float = 0.0
+    dissipated_nmm: float = 0.0
+    residual: float = 0.0
 
     def __repr__(self) -> str:
         x, y, z = self.force_n.round(2) + 0.0  # 0.0 turns negative zeros into positive ones
@@ -220,27 +225,8 @@ class ContactState:
         cls, nodes_mm: FloatArray, base_mm: FloatArray, axis: FloatArray, caps_mm: FloatArray, *, T_sensor_object: FloatArray | None = None
     ) -> "ContactState":
         """The state of the undeformed sensor without contact."""
-        no_vectors, no_numbers = np.zeros((0, 3)), np.zeros(0)
-        return cls(
-            nodes_mm=nodes_mm,
-            base_mm=base_mm,
-            axis=axis,
-            caps_mm=caps_mm,
-            force_n=np.zeros(3),
-            torque_nmm=np.zeros(3),
-            area_mm2=0.0,
-            contact_mm=no_vectors,
-            contact_place=np.zeros(0, complex),
-            point_area_mm2=no_numbers,
-            normal=no_vectors,
-            normal_n=no_numbers,
-            tangential_n=no_vectors,
-            slipping=np.zeros(0, bool),
-            T_sensor_object=np.eye(4) if T_sensor_object is None else T_sensor_object,
-            elastic_nmm=0.0,
-            dissipated_nmm=0.0,
-            residual=0.0,
-        )
+        state = cls(nodes_mm, base_mm, axis, caps_mm)
+        return state if T_sensor_object is None else replace(state, T_sensor_object=T_sensor_object)
 
 
 @dataclass(frozen=True)

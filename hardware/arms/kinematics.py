@@ -12,6 +12,7 @@ import numpy as np
 
 from hardware.errors import DeviceError
 from scenes.files import quote
+from twin.errors import ErrorsAs
 
 # Numbers of the Dobots' alarms that planning raises (see ``hardware.arms.dobot_alarms``).
 NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23
@@ -178,10 +179,8 @@ def linear_target(name: str, kinematics: LinkageKinematics, pose: np.ndarray) ->
         The pose is not six finite numbers, or out of reach.
     """
     sent = kinematics.nearest_pose(finite_numbers(f"{name}: the pose", pose, 6))
-    try:
+    with ErrorsAs(OutOfReachError, lambda error: DeviceError(f"{name}: {error}; nothing was sent")):
         return sent, kinematics.inverse(sent)
-    except OutOfReachError as error:
-        raise DeviceError(f"{name}: {error}; nothing was sent") from error
 
 
 def joint_target(name: str, joints_deg: np.ndarray, axes: int = 4) -> np.ndarray:

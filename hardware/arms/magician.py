@@ -18,6 +18,7 @@ from hardware.arms.kinematics import MAGICIAN, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
 from hardware.arms.supervisor import Supervisor
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+from twin.errors import ErrorsAs
 
 # Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take as long as feedback may be old.
 REPLY_TIMEOUT_S = 0.2
@@ -120,11 +121,9 @@ class Magician(LinkageArm):
     def stop(self) -> None:
         self._require_connected()
         self._unstopped = True
-        try:
+        with ErrorsAs(DeviceError, lambda error: type(error)(f"{self.name}: can't be stopped and may move. Switch it off! {error}")):
             self._forget_queue()
             self._request(Id.QUEUE_START, ctrl=WRITE)  # the empty queue must run, or the next move would never begin
-        except DeviceError as error:
-            raise type(error)(f"{self.name}: can't be stopped and may move. Switch it off! {error}") from error
         self._unstopped = False
 
     def home(self, *, timeout_s: float = HOME_TIMEOUT_S) -> None:

@@ -3,8 +3,7 @@
 import os
 
 from hardware.cameras.mjpeg import MjpegCamera
-from hardware.cameras.recorded import RecordedSource
-from hardware.cameras.session import SessionSource
+from hardware.cameras.recorded import RecordedSource, SessionSource
 from hardware.cameras.source import FrameSource
 from hardware.cameras.uvc import UvcCamera
 from hardware.errors import DeviceError

@@ -13,7 +13,7 @@ import numpy as np
 from hardware.cameras.reader import DevicePicture, LiveSource, ReadFailed, TornPicture
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.frames.images import picture_of
 from twin.types import Form
 
@@ -84,10 +84,8 @@ class MjpegCamera(LiveSource):
 
     def _open(self) -> None:
         self._last = None
-        try:
+        with ErrorsAs(OSError, lambda error: DeviceError(f"{self.name}: {error}; start the stream or check the address")):
             self._request()
-        except OSError as error:
-            raise DeviceError(f"{self.name}: {error}; start the stream or check the address") from error
 
     def _request(self) -> None:
         """Request the stream; an ``OSError`` states the reason of a failure."""
@@ -165,10 +163,8 @@ def decode_jpeg(data: bytes) -> tuple[np.ndarray, str]:
     """
     if not data.startswith(START) or not data.rstrip(b"\0\r\n").endswith(END):
         raise TornPicture(f"an incomplete JPEG ({len(data)} bytes, without its {'end' if data.startswith(START) else 'start'})")
-    try:
+    with ErrorsAs(FrameError, lambda error: TornPicture(f"a damaged JPEG: {error}")):
         return picture_of(data)
-    except FrameError as error:
-        raise TornPicture(f"a damaged JPEG: {error}") from error
 
 
 def stamped_s(headers: dict[str, str]) -> float:

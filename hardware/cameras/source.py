@@ -4,6 +4,7 @@ from types import TracebackType
 from typing import Protocol
 
 from hardware.errors import DeviceError
+from twin.errors import ErrorsAs
 from twin.types import Form, Frame
 
 
@@ -80,7 +81,5 @@ def await_frame(source: FrameSource, *, timeout_s: float | None = None, after_s:
         No frame comes.
     """
     timeout_s = source.first_frame_s if timeout_s is None else timeout_s
-    try:
+    with ErrorsAs((TimeoutError, EOFError), lambda error: DeviceError(f"{error}; check the camera")):
         return source.read(timeout_s=timeout_s) if after_s is None else source.read_after(after_s, timeout_s=timeout_s)
-    except (TimeoutError, EOFError) as error:
-        raise DeviceError(f"{error}; check the camera") from error

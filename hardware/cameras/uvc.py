@@ -7,7 +7,7 @@ import cv2
 from hardware.cameras.reader import DevicePicture, LiveSource, ReadFailed
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
-from twin.frames.images import quiet
+from twin.frames.images import overheard
 from twin.types import Form
 
 # Value of Video4Linux's exposure mode for manual exposure (3 is automatic).
@@ -38,7 +38,7 @@ class UvcCamera(LiveSource):
         self._device: cv2.VideoCapture | None = None
 
     def _open(self) -> None:
-        with quiet():
+        with overheard():
             device = cv2.VideoCapture(self._node, cv2.CAP_V4L2)
         if not device.isOpened():
             raise DeviceError(f"{self.name}: can't be opened; 'twin doctor' lists the cameras; check whether another program uses it")

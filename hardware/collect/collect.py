@@ -28,7 +28,7 @@ from hardware.workcell.mover import Mover
 from scenes import ObjectSpec, SensorSpec, ServoSpec
 from scenes.experiment import LABELS, ExperimentSpec
 from scenes.files import quote
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
 from twin.pins import Pipeline, measure_reference
@@ -132,11 +132,9 @@ class Collection:
             The table is damaged.
         """
         table = self.folder / TABLE
-        try:
-            with table.open(newline="", encoding="utf-8") as file:
-                rows = list(csv.reader(file))
-        except (ValueError, csv.Error) as error:
-            raise DeviceError(f"{table}: is damaged ({quote(error)}); give another `out`") from error
+        damaged = ErrorsAs((ValueError, csv.Error), lambda error: DeviceError(f"{table}: is damaged ({quote(error)}); give another `out`"))
+        with damaged, table.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.reader(file))
         if rows[:1] != [list(COLUMNS)] or any(len(row) != len(COLUMNS) for row in rows):
             raise DeviceError(f"{table}: is not the table of a collection; give another `out`")
         return len(rows) - 1
@@ -169,10 +167,8 @@ class Collection:
 
     @staticmethod
     def _drop_torn_line(lines: Path) -> None:
-        try:
+        with ErrorsAs(ValueError, lambda error: DeviceError(f"{lines}: is damaged ({quote(error)}); give another `out`")):
             text = lines.read_text(encoding="utf-8")
-        except ValueError as error:
-            raise DeviceError(f"{lines}: is damaged ({quote(error)}); give another `out`") from error
         if not text.endswith("\n"):
             write_text(lines, text[: text.rfind("\n") + 1])
 

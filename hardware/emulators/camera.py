@@ -11,7 +11,7 @@ from hardware.cameras.mjpeg import CONTENT_TYPE, hold_little, jpeg_of, write_par
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.emulators.faults import EVERY_NTH, SECONDS, Emulator, Fault, Faults
 from hardware.errors import DeviceError, cannot_listen
-from twin.errors import TwinError
+from twin.errors import ErrorsAs, TwinError
 
 CLIENT_WAIT_S = 0.5
 FAULTS = {
@@ -75,10 +75,8 @@ class CameraEmulator(Emulator):
         return f"http://{self._address[0]}:{self._server.server_port}/stream.mjpg"
 
     def start(self) -> None:
-        try:
+        with ErrorsAs(OSError, lambda error: cannot_listen("camera emulator", *self._address, error)):
             self._server = _Server(self._address, _handler_of(self))
-        except OSError as error:
-            raise cannot_listen("camera emulator", *self._address, error) from error
         self._end.clear()
         self._source.connect()
         try:

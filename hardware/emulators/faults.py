@@ -8,7 +8,7 @@ from threading import Timer
 from typing import Self
 
 from scenes.files import quote
-from twin.errors import TwinError
+from twin.errors import ErrorsAs, TwinError
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,8 @@ class Faults:
         if fault.allowed is None and value:
             raise TwinError(f"fault '{quote(text)}': {name} is a switch and takes no value; give {name} alone")
         example = f"for example {name}={fault.default:g}"
-        try:
+        with ErrorsAs(ValueError, lambda error: TwinError(f"fault '{quote(text)}': '{quote(value)}' is not a number; {example}")):
             number = float(value) if value else fault.default
-        except ValueError as error:
-            raise TwinError(f"fault '{quote(text)}': '{quote(value)}' is not a number; {example}") from error
         if fault.allowed is not None and number not in fault.allowed:
             raise TwinError(f"fault '{quote(text)}': {name} must be {fault.allowed}, not {quote(value)}; {example}")
         self._on[name] = number

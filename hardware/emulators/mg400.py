@@ -29,7 +29,7 @@ from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame
 from hardware.emulators.mg400_grammar import RefusedError, Request, take_request
 from hardware.errors import cannot_listen
-from twin.errors import TwinError
+from twin.errors import ErrorsAs, TwinError
 
 LOG = logging.getLogger(__name__)
 PORTS = (DASHBOARD_PORT, MOTION_PORT, *FEEDBACK_PERIOD_S)
@@ -105,10 +105,8 @@ class Mg400Emulator(Emulator):
         joints_deg: Sequence[float] = START_JOINTS_DEG,
         time_scale: float = 1.0,
     ) -> None:
-        try:
+        with ErrorsAs(ValueError, lambda error: TwinError(str(error))):
             version = parse_firmware(firmware)
-        except ValueError as error:
-            raise TwinError(str(error)) from error
         require_ports(port_offset or 0)
         self.host, self._port_offset = host, port_offset
         self.faults = Faults(FAULTS, faults)

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 
@@ -70,41 +70,31 @@ class Mg400Commands:
             "getpose": self._get_pose,
             "geterrorid": self._plain(self._error_ids),
             "setcollisionlevel": lambda request: self._only_check(request, Parameter(integer=True, low=0, high=5)),
-            "user": lambda request: self._select(request, "user", arm.users),
-            "tool": lambda request: self._select(request, "tool", arm.tools),
+            "user": self._select,
+            "tool": self._select,
             "positivesolution": self._forward,
             "inversesolution": self._inverse,
-            "do": lambda request: self._output(request, queued=True),
-            "doexecute": lambda request: self._output(request, queued=False),
+            **dict.fromkeys(("do", "doexecute"), self._output),
             "dogroup": self._outputs,
-            "tooldo": self._tool_output,
-            "tooldoexecute": self._tool_output,
+            **dict.fromkeys(("tooldo", "tooldoexecute"), self._tool_output),
             "di": lambda request: self._only_check(request, INPUT, "0"),  # nothing is attached, so no input has a signal
             "tooldi": lambda request: self._only_check(request, TOOL_PORT, "0"),
-            "setpayload": self._payload,
-            "payload": self._payload,
+            **dict.fromkeys(("setpayload", "payload"), self._payload),
             "arch": lambda request: self._only_check(request, INDEX),
             "limz": lambda request: self._only_check(request, NUMBER),
             "startdrag": self._plain(lambda: arm.drag(True)),
             "stopdrag": self._plain(lambda: arm.drag(False)),
-            **{key: self._percentage for key in arm.percent},
+            **dict.fromkeys(arm.percent, self._percentage),
         }
         if firmware >= (1, 5, 9):
             self.dashboard["wait"] = self._wait
         if firmware >= (1, 6):
-            self.dashboard["setuser"] = lambda request: self._define(request, arm.users)
-            self.dashboard["settool"] = lambda request: self._define(request, arm.tools)
-            self.dashboard["calcuser"] = lambda request: self._calculate(request, arm.users)
-            self.dashboard["calctool"] = lambda request: self._calculate(request, arm.tools)
+            self.dashboard |= {"setuser": self._define, "settool": self._define, "calcuser": self._calculate, "calctool": self._calculate}
         self.motion: dict[str, Command] = {
-            "movj": lambda request: self._to_pose(request, linear=False),
-            "movl": lambda request: self._to_pose(request, linear=True),
-            "movlio": lambda request: self._to_pose(request, linear=True),
-            "movjio": lambda request: self._to_pose(request, linear=False),
+            **dict.fromkeys(("movj", "movl", "movlio", "movjio"), self._to_pose),
             "arc": self._arc,
             "circle": self._circle,
-            "jointmovj": lambda request: self._to_joints(request, relative=False),
-            "reljointmovj": lambda request: self._to_joints(request, relative=True),
+            **dict.fromkeys(("jointmovj", "reljointmovj"), self._to_joints),
             "movejog": self._jog,
             **{f"relmov{kind}{frame}": self._relative for kind in "jl" for frame in ("user", "tool", "")},
             "sync": self._plain(lambda: None),  # the server sends the reply when the queue is empty
@@ -135,10 +125,14 @@ class Mg400Commands:
         read_numbers(request, (parameter,), (1,))
         return reply
 
-    def _select(self, request: Request, attribute: str, frames: dict) -> None:
+    def _select(self, request: Request) -> None:
         (index,) = read_numbers(request, (INDEX,), (1,))
-        self._frame(frames, index)
-        setattr(self.arm, attribute, int(index))
+        self._frame(self._frames_named(request), index)
+        setattr(self.arm, request.name, int(index))
+
+    def _frames_named(self, request: Request) -> dict[int, PlanarFrame]:
+        """The user or the tool frames, whichever a command is about."""
+        return self.arm.users if request.name.endswith("user") else self.arm.tools
 
     def _frame_of(self, request: Request, first: int) -> PlanarFrame:
         """The frame ``{x,y,z,r}`` that begins at a parameter; its braces may be missing."""
@@ -147,22 +141,19 @@ class Mg400Commands:
         x, y, z = values[:3]
         return PlanarFrame(x, y, z, values[3] if len(values) == 4 else values[5])
 
-    def _define(self, request: Request, frames: dict) -> None:
+    def _define(self, request: Request) -> None:
         if len(request.values) not in (2, 5, 7):
             raise RefusedError(ErrorId.PARAMETER_COUNT)
         frame = self._frame_of(request, 1)
-        frames[self._whole(request, 0, INDEX)] = frame
+        self._frames_named(request)[self._whole(request, 0, INDEX)] = frame
 
-    def _calculate(self, request: Request, frames: dict) -> str:
+    def _calculate(self, request: Request) -> str:
         """A frame after an offset along the base's axes (1) or along its own (0)."""
         if len(request.values) not in (3, 6, 8):
             raise RefusedError(ErrorId.PARAMETER_COUNT)
-        frame, offset = self._frame(frames, self._whole(request, 0, INDEX)), self._frame_of(request, 2)
+        frame, offset = self._frame(self._frames_named(request), self._whole(request, 0, INDEX)), self._frame_of(request, 2)
         along_base = self._whole(request, 1, BIT)
-        found = (
-            PlanarFrame(frame.x + offset.x, frame.y + offset.y, frame.z + offset.z, frame.r + offset.r) if along_base else frame @ offset
-        )
-        return _text([found.x, found.y, found.z, found.r])
+        return _text(np.add(astuple(frame), astuple(offset)) if along_base else astuple(frame @ offset))
 
     @staticmethod
     def _whole(request: Request, n: int, parameter: Parameter) -> int:
@@ -179,9 +170,9 @@ class Mg400Commands:
         times_ms = read_numbers(request, (WAIT_MS,), (0, 1))
         self.arm.order(Order(np.zeros(6), True, self.arm.speeds(100.0, 100.0), wait_s=(times_ms[0] if times_ms else 0.0) / 1000.0))
 
-    def _output(self, request: Request, *, queued: bool) -> None:
+    def _output(self, request: Request) -> None:
         index, level = (int(value) for value in read_numbers(request, (OUTPUT, BIT), (2,)))
-        if queued and self.arm.busy():
+        if request.name == "do" and self.arm.busy():  # it waits in the queue
             self.arm.order(Order(np.zeros(6), True, self.arm.speeds(100.0, 100.0), outputs=((0.0, index, level),), wait_s=0.0))
         else:
             self.arm.set_output(index, level)
@@ -230,13 +221,13 @@ class Mg400Commands:
             raise RefusedError(ErrorId.FAILED)
         return _text(joints)
 
-    def _to_pose(self, request: Request, *, linear: bool) -> None:
+    def _to_pose(self, request: Request) -> None:
         place, groups = self._split_outputs(request)
         pose = read_numbers(place, (NUMBER,) * 4, (4,))
         flange = self._flange(pose, *self._frames(request))
         length_mm = float(np.linalg.norm(flange.pose[:3] - self.arm.last_target().pose[:3]))
         outputs = tuple(self._on_the_way(text, n, length_mm) for n, text in enumerate(groups, start=5))
-        self._order(flange, request, linear=linear, outputs=outputs)
+        self._order(flange, request, linear=request.name.startswith("movl"), outputs=outputs)
 
     @staticmethod
     def _split_outputs(request: Request) -> tuple[Request, tuple[str, ...]]:
@@ -303,9 +294,9 @@ class Mg400Commands:
                 order = replace(order, end=self.arm.joints_at(flange), linear=False)
         self.arm.order(order)
 
-    def _to_joints(self, request: Request, *, relative: bool) -> None:
+    def _to_joints(self, request: Request) -> None:
         joints = np.array(read_numbers(request, (NUMBER,) * 4, (4,)))
-        if relative:
+        if request.name == "reljointmovj":
             joints = joints + self.arm.joints_at(self.arm.last_target())
         self.arm.order(Order(joints, False, self._speeds(request, "j")))
 

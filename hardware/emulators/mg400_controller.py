@@ -12,6 +12,7 @@ from hardware.arms.mg400_wire import MAX_JOINT_DEG_S, MAX_LINEAR_MM_S, ErrorId, 
 from hardware.arms.motion import MotionTrack, Piece, Speeds, check_line
 from hardware.emulators.faults import Faults
 from hardware.emulators.mg400_grammar import RefusedError
+from twin.errors import ErrorsAs
 
 # Largest accelerations. They are chosen for the emulator, because those of a real arm are not known.
 MAX_LINEAR_MM_S2, MAX_JOINT_DEG_S2 = 4000.0, 3000.0
@@ -260,10 +261,8 @@ class Mg400Controller:
         RefusedError
             No joints reach the pose.
         """
-        try:
+        with ErrorsAs(OutOfReachError, lambda error: RefusedError(ErrorId.FAILED)):
             return self.kinematics.inverse(flange.pose)
-        except OutOfReachError as error:
-            raise RefusedError(ErrorId.FAILED) from error
 
     def speeds(self, percent: float, acceleration: float) -> Speeds:
         """Speeds at the given percentages."""

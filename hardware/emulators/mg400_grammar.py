@@ -5,6 +5,7 @@ import re
 from dataclasses import dataclass
 
 from hardware.arms.mg400_wire import ErrorId
+from twin.errors import ErrorsAs
 
 # Most characters of a request that is not complete. No command of the arm is nearly as long.
 LONGEST_REQUEST = 4096
@@ -104,10 +105,8 @@ def read_table(text: str, counts: tuple[int, ...], n: int) -> list[float]:
     RefusedError
         The values are not numbers (-3000n), or are not finite or have the wrong count (-4000n).
     """
-    try:
+    with ErrorsAs(ValueError, lambda error: RefusedError(ErrorId.PARAMETER_TYPE - n)):
         numbers = [float(part) for part in text.strip("{}() ").split(",")]
-    except ValueError as error:
-        raise RefusedError(ErrorId.PARAMETER_TYPE - n) from error
     if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
         raise RefusedError(ErrorId.PARAMETER_RANGE - n)
     return [_at_most(number, FARTHEST) for number in numbers]
@@ -121,10 +120,8 @@ def keyword_number(request: Request, key: str, parameter: Parameter, default: fl
 
 
 def _number(text: str, parameter: Parameter, n: int) -> float:
-    try:
+    with ErrorsAs(ValueError, lambda error: RefusedError(ErrorId.PARAMETER_TYPE - n)):
         number = int(text) if parameter.integer else float(text)
-    except ValueError as error:
-        raise RefusedError(ErrorId.PARAMETER_TYPE - n) from error
     if not (parameter.low <= number <= parameter.high and math.isfinite(number)):  # a whole number may be too large for isfinite
         raise RefusedError(ErrorId.PARAMETER_RANGE - n)
     return _at_most(number, parameter.most)

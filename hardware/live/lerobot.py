@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +12,12 @@ from hardware.arms.newest import NewestTarget
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource
-from hardware.errors import DeviceError, StaleDataError, leave
+from hardware.errors import Connection, DeviceError, StaleDataError, leave
 from hardware.live.doctor import cameras
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 from scenes import SensorSpec, load_sensor
+from twin.errors import ErrorsAs
 from twin.frames.forms import frame_size
 from twin.types import Form, Frame
 
@@ -26,7 +26,7 @@ _POSE = ("x", "y", "z", "rx", "ry", "rz")
 MAX_AGE_MS = 500.0
 
 
-class LeRobotCamera:
+class LeRobotCamera(Connection):
     """A frame source with the interface of LeRobot's cameras. Its pictures are (H, W, 3), also those of a gray camera.
 
     Parameters
@@ -44,13 +44,6 @@ class LeRobotCamera:
         self.fps = fps if fps is not None else round(getattr(source, "fps", 0.0)) or None
         self.width = width if width is not None else known[0]
         self.height = height if height is not None else known[1]
-
-    def __enter__(self) -> Self:
-        self.connect()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
-        self.disconnect()
 
     @property
     def is_connected(self) -> bool:
@@ -77,10 +70,8 @@ class LeRobotCamera:
 
     def read_latest(self, max_age_ms: float = MAX_AGE_MS) -> np.ndarray:
         """The newest image; ``TimeoutError`` if it is older than ``max_age_ms``."""
-        try:
+        with ErrorsAs(StaleDataError, lambda error: TimeoutError(str(error))):
             return self._picture(self._source.read_latest(max_age_s=max_age_ms / 1e3))
-        except StaleDataError as error:
-            raise TimeoutError(str(error)) from error
 
     def disconnect(self) -> None:
         """Close the camera."""
@@ -133,7 +124,7 @@ class LeRobotArmConfig:
         return kind_of(self.arm)
 
 
-class LeRobotArm:
+class LeRobotArm(Connection):
     """An arm for LeRobot's scripts: observations and actions are dicts of floats, in mm and deg.
 
     Parameters
@@ -178,13 +169,6 @@ class LeRobotArm:
 
     def __str__(self) -> str:
         return f"{self.id} {type(self).__name__}"
-
-    def __enter__(self) -> Self:
-        self.connect()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
-        leave(self.disconnect, error)
 
     @property
     def observation_features(self) -> dict[str, Any]:

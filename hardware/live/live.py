@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from hardware.cameras.choose import open_camera
-from hardware.cameras.session import SessionSource
+from hardware.cameras.recorded import SessionSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.live.rerun_view import RerunView
 from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import load_rest_frame
-from twin.errors import FrameError, OptionError, TwinError
+from twin.errors import ErrorsAs, FrameError, OptionError, TwinError
 from twin.estimate import Estimate, Estimator, SensorModel, pins_in, readable_labels
 from twin.pins import Pipeline
 from twin.records import KeptAlso
@@ -92,10 +92,8 @@ class LiveSession:
             except TimeoutError as error:
                 raise DeviceError(f"{error}; check the camera") from error
             taken_s = time.monotonic()
-            try:
+            with ErrorsAs(FrameError, lambda error: FrameError(f"{self.source.name}: {error}")):
                 estimate = self.estimator(frame)
-            except FrameError as error:
-                raise FrameError(f"{self.source.name}: {error}") from error
             now_s = time.monotonic()
             if self.source.is_live:
                 self._ages.append(taken_s - frame.time_s)

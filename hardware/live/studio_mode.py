@@ -375,9 +375,7 @@ class LiveMode(PageMode):
 
     def emergency_stop(self) -> None:
         """Stop the arm. This is never refused."""
-        if self._feed is None or self._feed.robot is None:
-            raise TwinError("no arm is connected")
-        self._feed.robot.emergency_stop()
+        self._robot().emergency_stop()
         put(self._armed, False)
         self._nudges.visible = False
         self._page.say("The arm was stopped and its power cut. Look at it, then arm it again.", bad=True)

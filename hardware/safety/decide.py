@@ -19,6 +19,7 @@ from scenes.base import Fraction, NonNegative, Positive, Section, SpecError
 from scenes.files import LONGEST_PATH, quote
 from scenes.load import read_section
 from scenes.plugins import other_files
+from twin.errors import ErrorsAs
 
 # Number of bisections of a path in the search for its last allowed place: 100 mm are divided to 0.01 mm.
 CLIP_HALVINGS = 14
@@ -112,10 +113,8 @@ def load_limits(name_or_path: str | Path) -> SafetyLimits:
     if not str(name_or_path) or not os.path.exists(path):  # unlike ``Path.exists``, this returns False for a text that can be no path
         problem = f"{quote(path, LONGEST_PATH)}: no such file" if path.suffix else f"no limits are called '{quote(name_or_path)}'"
         raise DeviceError(f"{problem}; give one of {', '.join(shipped)}, or the path of a TOML file like {example}")
-    try:
+    with ErrorsAs(SpecError, lambda error: DeviceError(f"{error}; a file like {example} is expected")):
         return read_section(path, SafetyLimits)
-    except SpecError as error:
-        raise DeviceError(f"{error}; a file like {example} is expected") from error
 
 
 class DecisionCode(StrEnum):
@@ -281,7 +280,7 @@ def decide(
     try:
         target = finite_numbers("the target", target, 6)
     except DeviceError as error:
-        return Decision(Action.REFUSE, DecisionCode.NOT_A_NUMBER, str(error))
+        return _refuse(DecisionCode.NOT_A_NUMBER, str(error))
     unwrapped = kinematics is not None and kinematics.axes == 4
     if kinematics is not None and unwrapped:
         target = kinematics.nearest_pose(target)
@@ -333,7 +332,7 @@ def decide_joints(
     try:
         end = finite_numbers("the joints", joints_deg, len(state.joints_deg))
     except DeviceError as error:
-        return Decision(Action.REFUSE, DecisionCode.NOT_A_NUMBER, str(error))
+        return _refuse(DecisionCode.NOT_A_NUMBER, str(error))
     steps = max(1, int(np.ceil(np.abs(end - state.joints_deg).max())))
     for n in range(1, steps + 1):
         joints = state.joints_deg + n / steps * (end - state.joints_deg)
@@ -341,9 +340,7 @@ def decide_joints(
         if refused := _broken_joints(joints, limits, kinematics) or _place(pose, pose, limits):
             return refused
     if shorten(state.pose, pose, limits)[1]:
-        return Decision(
-            Action.REFUSE, DecisionCode.STEP_TOO_LONG, f"it would carry the tool farther than a step of {limits.step_mm} mm; go in steps"
-        )
+        return _refuse(DecisionCode.STEP_TOO_LONG, f"it would carry the tool farther than a step of {limits.step_mm} mm; go in steps")
     return Decision(Action.MOVE, DecisionCode.OK, "", pose)
 
 
@@ -360,38 +357,41 @@ def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwr
     return (start + min(shares) * way, True) if shares else (target.copy(), False)
 
 
+def _refuse(code: DecisionCode, reason: str) -> Decision:
+    return Decision(Action.REFUSE, code, reason)
+
+
+def _hold(code: DecisionCode, reason: str) -> Decision:
+    return Decision(Action.HOLD, code, reason)
+
+
 def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed | None) -> Decision | None:
     if (age_s := now_s - state.time_s) > limits.feedback_age_s:
-        return Decision(Action.HOLD, DecisionCode.STALE_FEEDBACK, f"feedback is {age_s:.2f} s old (allowed {limits.feedback_age_s:g} s)")
+        return _hold(DecisionCode.STALE_FEEDBACK, f"feedback is {age_s:.2f} s old (allowed {limits.feedback_age_s:g} s)")
     if not (np.isfinite(state.pose).all() and np.isfinite(state.joints_deg).all()):
-        return Decision(Action.HOLD, DecisionCode.NOT_A_NUMBER, f"the arm reports the impossible pose {state.pose}; restart it")
+        return _hold(DecisionCode.NOT_A_NUMBER, f"the arm reports the impossible pose {state.pose}; restart it")
     if state.error:
-        return Decision(Action.HOLD, DecisionCode.ARM_ERROR, state.error)
+        return _hold(DecisionCode.ARM_ERROR, state.error)
     if not state.enabled:
-        return Decision(Action.REFUSE, DecisionCode.NOT_ENABLED, "the arm is not enabled; call enable() first")
+        return _refuse(DecisionCode.NOT_ENABLED, "the arm is not enabled; call enable() first")
     if sensed is None:
         return None
     if not (age_s := now_s - sensed.frame_time_s) <= limits.frame_age_s:
-        return Decision(
-            Action.HOLD, DecisionCode.STALE_FRAME, f"the sensor's frame is {age_s:.2f} s old (allowed {limits.frame_age_s:g} s)"
-        )
+        return _hold(DecisionCode.STALE_FRAME, f"the sensor's frame is {age_s:.2f} s old (allowed {limits.frame_age_s:g} s)")
     return next(filter(None, (rule.limit_decision(sensed, limits) for rule in _RULES)), None)
 
 
 def _place(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits) -> Decision | None:
     for axis, value, (low, high) in zip("xyz", pose[:3], limits.box_mm, strict=True):
         if not low <= value <= high:
-            return Decision(Action.REFUSE, DecisionCode.OUTSIDE_BOX, f"{axis} {value:.1f} mm is outside the box's [{low:g}, {high:g}] mm")
+            return _refuse(DecisionCode.OUTSIDE_BOX, f"{axis} {value:.1f} mm is outside the box's [{low:g}, {high:g}] mm")
     if limits.annulus_mm is None:
         return None
     inner, outer = limits.annulus_mm
     nearest = min(distance_to_axis(start[:2], pose[:2]), float(np.hypot(*pose[:2])))
     if np.hypot(*pose[:2]) > outer or (nearest < inner and nearest < np.hypot(*start[:2])):
-        return Decision(
-            Action.REFUSE,
-            DecisionCode.OUTSIDE_ANNULUS,
-            f"comes within {nearest:.1f} mm of the base's axis or beyond [{inner:g}, {outer:g}] mm",
-        )
+        reason = f"comes within {nearest:.1f} mm of the base's axis or beyond [{inner:g}, {outer:g}] mm"
+        return _refuse(DecisionCode.OUTSIDE_ANNULUS, reason)
     return None
 
 
@@ -400,22 +400,20 @@ def _joints(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematic
     try:
         joints = kinematics.inverse(pose)
     except OutOfReachError as error:
-        return Decision(Action.REFUSE, DecisionCode.OUT_OF_REACH, str(error))
+        return _refuse(DecisionCode.OUT_OF_REACH, str(error))
     if broken := _broken_joints(joints, limits, kinematics):
         return broken
     blocked = check_line(kinematics, kinematics.nearest_pose(start), pose)
-    return Decision(Action.REFUSE, DecisionCode.LINE_BLOCKED, blocked.text) if blocked else None
+    return _refuse(DecisionCode.LINE_BLOCKED, blocked.text) if blocked else None
 
 
 def _broken_joints(joints: np.ndarray, limits: SafetyLimits, kinematics: Kinematics) -> Decision | None:
     if own := kinematics.violation(joints):
         code = DecisionCode.LINKAGE_LIMIT if own.code in (LINKAGE_ABOVE, LINKAGE_BELOW) else DecisionCode.JOINT_LIMIT
-        return Decision(Action.REFUSE, code, own.text)
+        return _refuse(code, own.text)
     for n, (angle, (low, high)) in enumerate(zip(joints, limits.joints_deg or (), strict=False), start=1):
         if not low <= angle <= high:
-            return Decision(Action.REFUSE, DecisionCode.JOINT_LIMIT, f"J{n} at {angle:.1f} deg is outside [{low:g}, {high:g}] deg")
+            return _refuse(DecisionCode.JOINT_LIMIT, f"J{n} at {angle:.1f} deg is outside [{low:g}, {high:g}] deg")
     if limits.linkage_deg is not None and joints[2] - joints[1] > limits.linkage_deg:
-        return Decision(
-            Action.REFUSE, DecisionCode.LINKAGE_LIMIT, f"J3 - J2 = {joints[2] - joints[1]:.1f} deg is more than {limits.linkage_deg:g}"
-        )
+        return _refuse(DecisionCode.LINKAGE_LIMIT, f"J3 - J2 = {joints[2] - joints[1]:.1f} deg is more than {limits.linkage_deg:g}")
     return None

@@ -9,13 +9,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from hardware.arms.arm import FEEDBACK_AGE_S, Arm, ArmState
 from hardware.arms.kinematics import Kinematics
-from hardware.errors import DeviceError, StaleDataError, also, leave
+from hardware.errors import Connection, DeviceError, StaleDataError, also
 from hardware.rig.last_axis import LastAxis
 from hardware.safety.decide import Action, Decision, DecisionCode, SafetyLimits, Sensed, clip, decide, decide_joints
 
@@ -78,7 +78,7 @@ class LoggedDecision:
     decision: Decision
 
 
-class SafeArm:
+class SafeArm(Connection):
     """Wraps an arm. Every move is checked before it is sent, and every decision is logged.
 
     As a context manager it disconnects at the end. After any exception, Ctrl-C included, it stops the arm, retreats along the
@@ -140,16 +140,12 @@ class SafeArm:
     def disconnect(self) -> None:
         self._ungated("disconnect")
 
-    def __enter__(self) -> Self:
-        self.connect()
-        return self
-
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
         try:
             if kind is not None and self.is_connected:
                 self.shutdown(kind.__name__)
         finally:
-            leave(self.disconnect, error)
+            super().__exit__(kind, error, trace)
 
     def enable(self) -> None:
         self.arm.enable()

@@ -24,6 +24,7 @@ from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import Rig
 from hardware.workcell.mover import MOVE_TIMEOUT_S, Mover
 from scenes.servo import ServoSpec
+from twin.errors import ErrorsAs
 from twin.estimate import Estimate, Estimator
 from twin.rig.mounting import Mounting
 from twin.types import Frame
@@ -128,10 +129,8 @@ class ServoLoop:
         with self._watch.doing("moving clear of the object"):
             self.mover.go_around(self.mover.away_from(start_pose))
         if self.hooks.take_rest is not None:
-            try:
+            with ErrorsAs((TimeoutError, EOFError), lambda error: DeviceError(f"{error}; check the camera")):
                 rest = self._exposed_after(self.mover.state().time_s)
-            except (TimeoutError, EOFError) as error:
-                raise DeviceError(f"{error}; check the camera") from error
             self.estimator = self.hooks.take_rest(rest)
 
     def _touch(self, target: np.ndarray) -> None:
@@ -139,10 +138,8 @@ class ServoLoop:
         near_mm = max(self.servo.indent_mm, 0.0) + PIECES_MM if self.source.streams else 0.0
         for pose in pieces_to(self.mover.state().pose, self.mover.turned_for(target), near_mm):
             if near_mm:
-                try:
+                with ErrorsAs(TimeoutError, lambda error: BlindError(f"{error}; {self.arm.name} moves only with fresh frames")):
                     self._exposed_after(self.mover.state().time_s)
-                except TimeoutError as error:
-                    raise BlindError(f"{error}; {self.arm.name} moves only with fresh frames") from error
             self.mover.go(pose)
 
     def timing(self) -> Timing:

@@ -30,7 +30,7 @@ from hardware.safety.safe_arm import RETREAT_SHARES, SafeArm
 from scenes import ObjectSpec, PlacementSpec, SensorSpec
 from scenes.experiment import ExperimentSpec
 from scenes.plugins import offered, others
-from twin.errors import FrameError, RenderError
+from twin.errors import ErrorsAs, FrameError, RenderError
 from twin.estimate import SensorModel
 from twin.frames import open_recording
 from twin.optics.preview import Preview
@@ -183,10 +183,8 @@ def draw_window(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
     if plain_light:
         return preview
 
-    try:
+    with ErrorsAs(RenderError, lambda error: RenderError(f"{error}; or draw with `plain_light`, which needs no path tracing")):
         preview.shading = traced_shading(preview)
-    except RenderError as error:
-        raise RenderError(f"{error}; or draw with `plain_light`, which needs no path tracing") from error
     return preview
 
 
@@ -262,14 +260,12 @@ def check_sight(source: FrameSource, pipeline: Pipeline, *, at_rest: Callable[[F
     if source.streams:
         time.sleep(COUNT_S)
         rate = f", {(source.arrived - before) / COUNT_S:.0f} frames/s" if hasattr(source, "arrived") else ""
-    try:
+    with ErrorsAs(FrameError, lambda error: DeviceError(f"{source.name}: nothing was moved: {error}")):
         pins = pipeline(frame)
         if not pins.valid:
             raise FrameError(f"{pins.reason}; uncover and light the sensor, or give the camera of {pipeline.spec.name}")
         if at_rest is not None:
             at_rest(frame)
-    except FrameError as error:
-        raise DeviceError(f"{source.name}: nothing was moved: {error}") from error
     plain = "" if at_rest is None else ", as without contact"
     return [
         f"camera: {source.name}, {frame.image.shape[1]} x {frame.image.shape[0]} px{rate}",

@@ -12,11 +12,12 @@ import numpy as np
 from scenes import load_object, load_sensor
 from scenes.sensor import SensorSpec
 from training.data.pins import PinTable
-from training.environments.observe import Eye, caps_px
+from training.environments.observe import Eye
 from training.estimate.estimator import PoseEstimator
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.model import surrogate_of
 from training.surrogate.reading import EpisodeContact
+from twin.camera.projection import project_in_form
 from twin.errors import ContactError
 from twin.frames import open_recording
 from twin.geometry.pins import rest_pins
@@ -95,7 +96,7 @@ def measured(sensor: str, data: Path, frames: int = FRAMES) -> Beside:
 
 def moved_px(spec: SensorSpec, form: Form, caps_mm: np.ndarray) -> np.ndarray:
     """Displacements (P, 2) of caps (P, 3) from rest, in pixels of a form of frames."""
-    return caps_px(spec, form, caps_mm) - caps_px(spec, form, rest_pins(spec.geometry).caps_mm)
+    return project_in_form(spec, form, caps_mm) - project_in_form(spec, form, rest_pins(spec.geometry).caps_mm)
 
 
 def told(estimator: PoseEstimator, spec: SensorSpec, caps_mm: list[np.ndarray]) -> np.ndarray:

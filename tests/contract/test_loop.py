@@ -10,7 +10,7 @@ from true_estimator import TrueEstimate, TrueEstimator
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.mjpeg import MjpegCamera
-from hardware.cameras.session import SessionSource
+from hardware.cameras.recorded import SessionSource
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject

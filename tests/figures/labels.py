@@ -82,10 +82,8 @@ def inside(work: Path, *, recording: str) -> Measured:
     kinds = several.for_labels(open_recording(folder, several.sensor)) if several else []
     estimator = several.parts[kinds[0]] if several else PoseEstimator.load(sensor)
     data = load_dataset(folder, estimator.recorded_sensor, estimator.names, form=estimator.form)
-    if kept_out := estimator.config["rows"].get("kept_out"):
-        rows = np.flatnonzero(np.isin([f"{recording}/{name}" for name in data.pins.image_name], kept_out))
-    else:  # taught by the twin, with a few labelled frames
-        rows = np.flatnonzero(~np.isin(data.pins.image_name, list(estimator.config["labelled"])))
+    kept_out, names = estimator.config["rows"]["kept_out"], data.pins.image_name
+    rows = np.flatnonzero(np.isin(names, kept_out) | np.isin([f"{recording}/{name}" for name in names], kept_out))
     made = several.predict_rows(data, rows, kinds) if several else estimator.predict_rows(data, rows)
     judged = measure_errors(made, data, rows)["corrected"]
     shares = {f"{name}.inside": Value(judged[name]["coverage_90"]) for name in estimator.names}

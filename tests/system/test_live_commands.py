@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.reader import DevicePicture, LiveSource
-from hardware.cameras.session import SessionSource
+from hardware.cameras.recorded import SessionSource
 from hardware.cameras.twin import preview_of
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator

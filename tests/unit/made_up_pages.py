@@ -19,7 +19,7 @@ from training.studies.tac_vgnn.study import AreaChange, contacts_figure
 from twin.calibration.contact.report import write_calibration
 from twin.calibration.optics import Calibration
 from twin.calibration.optics import write_page as write_calibration_page
-from twin.demo.make_demo import ContactContent, DepthRow
+from twin.demo.make_demo import DepthRow, add_contact, add_motions, add_tables
 from twin.demo.make_demo import write_page as write_demo_page
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.evaluation.pictures import report as realism
@@ -30,6 +30,7 @@ from twin.evaluation.pictures.spectra import RadialRow
 from twin.evaluation.pictures.statistics import RADIAL_MEASURES
 from twin.pins import make_graph, nominal_reference
 from twin.report.charts import new_figure, write_chart
+from twin.report.page import Page
 from twin.report.table import write_table
 from twin.types import Form, Frame
 
@@ -237,15 +238,12 @@ def demo(out: Path) -> Path:
     cv2.imwrite(str(out / "picture.png"), drawn("picture.png").image)
     chart = write_chart(out / "chart.png", lambda: new_figure(1, panel_inch=1.0)[0])
     pictures = {kind: out / "picture.png" for kind in ("skin", "raw", "recorded")} | {kind: chart for kind in ("pins", "areas", "surfaces")}
-    contact = ContactContent(f"{SENSOR} against {HOSTILE}", "A plane.", pictures, "64 x 48 px", [("force on the object, N", "(0, 0, 1)")])
-    return write_demo_page(
-        out / "index.html",
-        machine="Rendered here.",
-        contacts=[contact],
-        motions=chart,
-        tables={SENSOR: [DepthRow(1.5, 2.0, 1.9, 12.3, 0.5)]},
-        seconds={"motions": 1.5},
-    )
+    page = Page("TacTip twin", "twin demo", topic="Demo")
+    page.section(f"{SENSOR} against {HOSTILE}", "A plane.")
+    add_contact(page, f"{SENSOR} against {HOSTILE}", pictures, "64 x 48 px", [("force on the object, N", "(0, 0, 1)")])
+    add_motions(page, chart)
+    add_tables(page, {SENSOR: [DepthRow(1.5, 2.0, 1.9, 12.3, 0.5)]})
+    return write_demo_page(out / "index.html", page, "Rendered here.", {"motions": 1.5})
 
 
 PAGES = {

@@ -318,7 +318,7 @@ def test_ctrl_c_is_one_line(monkeypatch):
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("scenes.catalog.sensors", interrupted)
+    monkeypatch.setattr("scenes.catalog.list_all", interrupted)
     ended = run_twin("sensors")
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "twin: interrupted\n")
 
@@ -389,7 +389,7 @@ def test_a_missing_device_is_one_line_though_it_is_also_an_error_of_the_system(m
     def absent(*_: object) -> None:
         raise DeviceNotConnectedError("MG400 at 127.0.0.1: no connection; check that the arm is on")
 
-    monkeypatch.setattr("scenes.catalog.sensors", absent)
+    monkeypatch.setattr("scenes.catalog.list_all", absent)
     monkeypatch.setattr("sys.argv", ["twin", "sensors"])
     with pytest.raises(SystemExit) as end:
         main()

@@ -12,7 +12,7 @@ from scenes import load_sensor
 from training.data.dataset import load_dataset, split_rows
 from training.data.pins import pin_table
 from training.data.targets import correct_labels, unit_of
-from training.models.cnn.inputs import image_inputs
+from training.models.cnn.model import image_inputs
 from twin.errors import FrameError
 from twin.pins import make_reference, nominal_reference
 from twin.rig.labels import label_slope, plate_slope

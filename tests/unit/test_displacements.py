@@ -20,8 +20,7 @@ from training.estimate.displacements import (
     write_displacements,
 )
 from training.estimate.estimator import PoseEstimator
-from training.estimate.rest import RestPlaces
-from training.estimate.rest_seeking import RestSeeker
+from training.estimate.rest import RestPlaces, RestSeeker
 from training.studies.evaluation import at_own_rest
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice

@@ -17,8 +17,7 @@ from training.data.pins import PinTable
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models import MODELS, model_named, recipe_of, register, variant_named
-from training.models.part import PinModel
-from training.models.recipes import Recipe
+from training.models.part import PinModel, Recipe
 from training.models.vgnn.model import mode_components
 from training.models.vgnn.registration import count_modes, fit_registration
 from training.runs.config import RunConfig

@@ -52,7 +52,7 @@ KEEPERS = (  # the module of every function whose results are kept between runs
     "training.data.dataset",
     "training.estimate.estimator",
     "training.generation.make",
-    "training.models.cnn.inputs",
+    "training.models.cnn.model",
     "twin.calibration.optics",
     "twin.pins.detectors.tune",
     "twin.mechanics.skin_fit",

@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from scenes import ObjectSpec, load_object, load_sensor
 from scenes.object import CylinderShape, EdgeShape, MeshShape, PrismShape, SphereShape
 from training.surrogate.bending import bend
-from training.surrogate.compliance import NODE_RINGS, compliance_of
+from training.surrogate.compliance import NODE_RINGS, AtNodes, compliance_of
 from training.surrogate.contact import LinearContacts, between
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.fit import _turn_states, average_compliance, cut, distil, require_dome, sample_states
 from training.surrogate.model import SurrogateError, load_surrogate, representatives, rest_of, surrogate_of, unfold_compliance
-from training.surrogate.nodes import AtNodes
 from training.surrogate.paths import FREE, FRICTION, STICKING, draw_path
 from training.surrogate.reading import EpisodeContact, FiniteElements
 from training.surrogate.samples import SolvedPath, lattice_sensor
@@ -131,11 +130,11 @@ def test_the_skin_comes_to_bend_as_the_network_tells(surrogate):
     force[40:] = 0.0
     bent, moved = np.zeros((3, len(force)), np.float32), np.ones_like(force)
     for _ in range(30):
-        bend(force, bent, moved, *surrogate.bending.kernel(surrogate.read))
+        bend(force, bent, moved, surrogate.bending.kernel(surrogate.read))
     wanted = surrogate.bending.of(force.reshape(1, -1) @ surrogate.read.T)[0]
     assert np.abs(wanted).max() > 0.01
     assert np.allclose(bent.T, wanted, atol=1e-4) and np.allclose(moved, 1.0 + bent.T, atol=1e-5)
-    bend(0 * force, bent, moved, *surrogate.bending.kernel(surrogate.read))
+    bend(0 * force, bent, moved, surrogate.bending.kernel(surrogate.read))
     assert np.abs(bent).max() < 0.6 * np.abs(wanted).max()
 
 

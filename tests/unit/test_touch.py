@@ -7,7 +7,6 @@ from drawn_frames import drawn_frame
 from scenes import load_object, load_sensor
 from twin.camera.projection import project
 from twin.errors import FrameError
-from twin.evaluation.degradation.condition import alter
 from twin.frames import open_recording
 from twin.frames.forms import from_raw
 from twin.geometry.pins import rest_pins
@@ -62,7 +61,7 @@ def dent_of(view):
 def test_another_camera_or_pin_is_no_contact(name, change):
     spec = load_sensor(name)
     added = {section: {key: getattr(getattr(spec, section), key) + by for key, by in keys.items()} for section, keys in change.items()}
-    moved = pins_at_rest(alter(spec, **added))
+    moved = pins_at_rest(spec.alter(**added))
     assert np.linalg.norm(moved - pins_at_rest(spec), axis=1).max() > 0.05  # px: there is something to be distinguished
     assert not seen_view(moved, spec).pressed
 

@@ -9,8 +9,7 @@ from drawn_recording import config_of, drawn_dataset
 
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
-from training.models.touch.features import Bases
-from training.models.touch.model import TOUCH
+from training.models.touch.model import TOUCH, Bases
 from training.runs.gaussian_process import fit_smooth_processes
 from training.runs.run import train_run
 

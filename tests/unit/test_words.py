@@ -91,7 +91,6 @@ PARTICIPLES_ALLOWED = {
     ("twin/evaluation/degradation/conditions/skin.py", "torn"),
     ("twin/optics/defocus.py", "defocused"),
     ("twin/pins/labelling/matching.py", "proven"),
-    ("twin/studio/modes/twin_mode.py", "moved"),
     ("twin/types.py", "undeformed"),
 }
 IRREGULAR = {

@@ -19,12 +19,14 @@ from domains import LEARNT, REAL
 from scenes import load_experiment, load_object, load_randomisation, load_sensor
 from scenes.object import CylinderShape, ObjectSpec
 from training.data.dataset import Dataset, join_datasets, load_dataset, split_rows
+from training.data.label_code import label_error
 from training.data.pins import voronoi_areas
 from training.estimate.estimator import PoseEstimator
 from training.generation import GenerationConfig, generate
 from training.models import recipe_of
+from training.runs.assemble import conformal_quantile
 from training.runs.config import RunConfig
-from training.runs.networks import predict_rows
+from training.runs.loop import predict_rows
 from training.runs.run import train_run
 from training.runs.run_files import CONFIG, DISPLACEMENTS, SHIPPED, TENSORS, pack, read_config, read_tensors, write_tensors
 from training.studies.judging import intervals_on, measure_errors
@@ -38,6 +40,8 @@ RECORDINGS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
 BARS_MM = (40, 100)
 """Diameters of the cylinders beside the shipped objects."""
 CONTACTS, ACROSS, SEED, EPOCHS, LABELLED = 100, 16, 171, 40, 40
+UNITS = 40
+"""Contacts with units of other skin and gel."""
 DRAWS, REAL_COPIES, NOISE_PX = 4, 4, 0.1
 """Draws of the discrepancy for each simulated contact, copies of each real frame, and noise of the pins of every copy but the first, px:
 the networks learn no row by heart."""
@@ -62,26 +66,28 @@ def objects() -> list[ObjectSpec]:
 
 
 def simulate(sensor, folder: Path) -> list[Dataset]:
-    """The simulated contacts, made if they are missing."""
-    found = []
-    for obj in objects():
-        out = folder / f"{sensor.name}-{obj.name}"
-        if not (out / "targets.csv").is_file():
-            out.mkdir(parents=True, exist_ok=True)
-            config = GenerationConfig(
-                sensor=sensor,
-                object=obj,
-                experiment=load_experiment("objects-2d", wide=True),
-                randomisation=load_randomisation("moves"),
-                friction=rig_of(sensor).friction,
-                seed=SEED,
-                images="none",
-                states="all",
-                across=ACROSS,
-            )
-            generate(out, config, CONTACTS)
-        found.append(load_dataset(out, sensor, TARGETS))
-    return found
+    """The simulated contacts."""
+    names = {each.name: each for each in objects()}
+    return [contacts_in(folder / f"{sensor.name}-{name}", sensor, each, "objects-2d", "moves") for name, each in names.items()]
+
+
+def contacts_in(out: Path, sensor, obj: ObjectSpec, experiment: str, randomisation: str, count: int = CONTACTS) -> Dataset:
+    """Simulated contacts with an object, made if they are missing."""
+    if not (out / "targets.csv").is_file():
+        out.mkdir(parents=True, exist_ok=True)
+        config = GenerationConfig(
+            sensor=sensor,
+            object=obj,
+            experiment=load_experiment(experiment, wide=randomisation == "moves"),
+            randomisation=load_randomisation(randomisation),
+            friction=rig_of(sensor).friction,
+            seed=SEED,
+            images="none",
+            states="all",
+            across=ACROSS,
+        )
+        generate(out, config, count)
+    return load_dataset(out, sensor, TARGETS)
 
 
 def with_noise(data: Dataset, seed: int) -> Dataset:
@@ -137,8 +143,14 @@ def fit_scales(run: Path, parts: list[Part]) -> None:
     widen_intervals(run, quantiles[0] | {"quantile": np.max([each["quantile"] for each in quantiles], axis=0)})
 
 
-def ship(name: str, run: Path) -> None:
-    """Replace the shipped weights by the small copy of a run, with the same places of the pins at rest."""
+def ship(name: str, run: Path, kept_out: list[str], units: Dataset) -> None:
+    """Replace the shipped weights by the small copy of a run. It keeps the places of the pins at rest, and the names of frames kept out.
+
+    It also has the factors with which the intervals contain 90 % of the labels of simulated ``units`` with other skin and gel.
+    """
+    estimator = PoseEstimator.load(run)
+    made, truth = estimator.predict_rows(units, np.arange(len(units))), units.targets
+    widens = conformal_quantile(np.abs(label_error(made.mean, truth.corrected, truth.units)) / made.half_width)
     out, old = SHIPPED / name, read_config(SHIPPED / name)
     rest = read_tensors(run / TENSORS)["reference_px"].numpy()
     assert np.abs(rest - PoseEstimator.load(name).trained_reference.pins_px).max() < REST_PX, "displacements are counted from other places"
@@ -146,7 +158,10 @@ def ship(name: str, run: Path) -> None:
     with overwriting():
         size = pack(run, out)
     (out / DISPLACEMENTS).write_bytes(kept)
-    write_json(out / CONFIG, read_config(out) | {"known_rest_px": old["known_rest_px"]})
+    config = read_config(out)
+    factors, rows = np.maximum(widens, 1.0).round(2).tolist(), config["rows"] | {"kept_out": kept_out}
+    about = {"other_unit_widens": factors, "known_rest_px": old["known_rest_px"], "split": 0, "rows": rows}
+    write_json(out / CONFIG, config | about)
     print(f"{name}: {size} bytes", flush=True)
 
 
@@ -172,7 +187,8 @@ def make(name: str, folder: Path) -> None:
     fit_scales(run, [(real, test[::2]), (clean, np.flatnonzero(half)), (drawn, np.flatnonzero(half))])
     others = np.flatnonzero(~half)
     report(name, run, {"real": (real, test[1::2]), "simulated": (clean, others), "with discrepancy": (drawn, others)})
-    ship(name, run)
+    units = contacts_in(folder / f"{name}-units", sensor, load_object("plane"), "surface-2d", "contact", UNITS)
+    ship(name, run, real.pins.image_name[test].tolist(), units)
 
 
 def report(name: str, run: Path, parts: dict[str, Part]) -> None:

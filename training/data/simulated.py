@@ -14,7 +14,7 @@ from scenes.sensor import SensorSpec
 from training.data.targets import CONTACT_UNITS
 from training.generation.config import GenerationConfig
 from training.generation.store import CONFIG, DRAWS, read_record
-from twin.errors import DatasetError, FrameError
+from twin.errors import DatasetError, ErrorsAs, FrameError
 from twin.frames import Recording
 from twin.frames.folders import image_folders
 from twin.frames.forms import frame_size, from_raw, recording_to_raw
@@ -87,10 +87,8 @@ def config_of(folder: Path) -> GenerationConfig:
         The file is missing or damaged.
     """
     path = folder / CONFIG
-    try:
+    with ErrorsAs(ValidationError, lambda error: DatasetError(f"{path}: damaged ({explain_problems(error, GenerationConfig)}); {AGAIN}")):
         return GenerationConfig.model_validate(read_record(path))
-    except ValidationError as error:
-        raise DatasetError(f"{path}: damaged ({explain_problems(error, GenerationConfig)}); {AGAIN}") from error
 
 
 def labels_of_surface(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:

@@ -15,9 +15,9 @@ from training.models.part import PinModel
 from training.runs.run_files import shipped_names
 from training.surrogate.reading import Backend, ContactReading
 from twin.camera.capture import expose, record
-from twin.camera.projection import project
+from twin.camera.projection import project_in_form
 from twin.errors import FrameError, OptionError
-from twin.frames.forms import frame_size, from_raw, gray_levels
+from twin.frames.forms import frame_size, gray_levels
 from twin.geometry.pins import rest_pins
 from twin.optics.preview import Preview
 from twin.optics.render import Renderer
@@ -53,7 +53,7 @@ class SensorView:
     @cached_property
     def rest_px(self) -> FloatArray:
         """The pins at rest in px of the sensor's frames, (N, 2)."""
-        return caps_px(self.sensor, self.form, rest_pins(self.sensor.geometry).caps_mm)
+        return project_in_form(self.sensor, self.form, rest_pins(self.sensor.geometry).caps_mm)
 
     @cached_property
     def paint(self) -> Callable[[PinState, np.random.Generator], Frame]:
@@ -163,8 +163,8 @@ class Eye:
         """Projected caps (R, N, 2) of some rows, px of the sensor's frames."""
         caps = reading.caps_mm[rows]
         if all(self._views[row] is self._nominal for row in rows.tolist()):
-            return caps_px(self.sensor, self.form, caps)
-        return np.stack([caps_px(self._views[row].sensor, self.form, seen) for row, seen in zip(rows.tolist(), caps, strict=True)])
+            return project_in_form(self.sensor, self.form, caps)
+        return np.stack([project_in_form(self._views[row].sensor, self.form, seen) for row, seen in zip(rows.tolist(), caps, strict=True)])
 
     def _of_pins(self, pins_px: FloatArray, light: FloatArray | None = None) -> FloatArray:
         """Observations (R, ...) from pins (R, N, 2), relative to the nominal layout, and from the light (R, N) on their caps."""
@@ -210,11 +210,6 @@ class Eye:
         scale = np.array([POSE_SCALES[unit] for unit in self._estimator.units])
         known = np.nan_to_num(np.asarray(executed, float).reshape(len(value), 1), nan=1.0)
         return np.clip(np.concatenate([value / scale, known], axis=1), -LARGEST, LARGEST).astype(np.float32)
-
-
-def caps_px(sensor: SensorSpec, form: Form, caps_mm: FloatArray) -> FloatArray:
-    """Caps (..., 3) in px (..., 2) of the sensor's frames of a form."""
-    return from_raw(sensor.recording, form, project(sensor.view, caps_mm))
 
 
 def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[PinState, np.random.Generator], Frame]:

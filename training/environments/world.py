@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
@@ -59,18 +60,8 @@ def inverse(T: FloatArray) -> FloatArray:
 
 def motions(step: FloatArray) -> FloatArray:
     """Rigid motions (B, 4, 4) of steps (B, 6): a shift in mm, and a turn vector in deg about the frame's origin."""
-    shift, turn = step[:, :3], np.radians(step[:, 3:])
-    angle = np.linalg.norm(turn, axis=1)
-    safe = np.maximum(angle, 1e-12)
-    x, y, z = (turn / safe[:, None]).T
-    sine, rest = np.sin(angle), 1 - np.cos(angle)
-    T = np.zeros((len(step), 4, 4))
-    T[:, 0, 0], T[:, 1, 1], T[:, 2, 2] = (1 - rest * (1 - a * a) for a in (x, y, z))
-    for i, j, a, b, c in ((0, 1, x, y, z), (1, 2, y, z, x), (2, 0, z, x, y)):
-        T[:, i, j], T[:, j, i] = rest * a * b - sine * c, rest * a * b + sine * c
-    still = angle < 1e-12
-    T[still, :3, :3] = np.eye(3)
-    T[:, :3, 3], T[:, 3, 3] = shift, 1.0
+    T = np.tile(np.eye(4), (len(step), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = Rotation.from_rotvec(step[:, 3:], degrees=True).as_matrix(), step[:, :3]
     return T
 
 

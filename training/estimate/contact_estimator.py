@@ -30,7 +30,7 @@ from training.runs.run_files import AGAIN, damage_error, folder_of, pack
 from twin.camera.capture import in_form
 from twin.frames import Recording
 from twin.frames.tables import numbers
-from twin.store import ArrayFile, Layers, layers_from, layers_to, write_json, writes
+from twin.store import ArrayFile, Layers, layers_from, layers_to, through_layers, write_json, writes
 from twin.types import Frame
 
 CONTACTS = "contacts.safetensors"
@@ -95,14 +95,8 @@ class Contacts:
         """(M,) str: the most probable of some kinds for each valid frame of a table."""
         names = [name for name in self.kinds if name in among]
         columns = [self.kinds.index(name) for name in names]
-        return np.array(names)[self._scores(moved_of(pins))[:, columns].argmax(axis=1)]
-
-    def _scores(self, moved: np.ndarray) -> np.ndarray:
-        h = self.modes(moved)
-        for weight, bias in self.layers[:-1]:
-            h = np.maximum(h @ weight.T + bias, 0)
-        weight, bias = self.layers[-1]
-        return h @ weight.T + bias
+        scores = through_layers(self.layers, self.modes(moved_of(pins)), lambda x: np.maximum(x, 0))
+        return np.array(names)[scores[:, columns].argmax(axis=1)]
 
 
 def moved_of(pins: PinTable) -> np.ndarray:

@@ -17,8 +17,7 @@ from training.data.targets import limits_of
 from training.errors import TrainingError
 from training.estimate.displacements import DisplacementModel, read_displacements
 from training.estimate.domain import Domain, DomainVerdict, read_domain
-from training.estimate.rest import RestPlaces
-from training.estimate.rest_seeking import RestSeeker
+from training.estimate.rest import RestPlaces, RestSeeker
 from training.estimate.widening import Widening
 from training.models import model_named
 from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen
@@ -147,6 +146,7 @@ class PoseEstimator:
         self.domain: Domain | None = None
         self._tracker: SlipTracker | None = None
         self._consecutive = False
+        self._other_unit = False
         self._undecided = ""
 
     @classmethod
@@ -305,6 +305,7 @@ class PoseEstimator:
         found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
         touched = TouchAnswer(reference) if measured else self._trained.touched
         found._trained = replace(self._trained, pipeline=found.pipeline, touched=touched)
+        found._other_unit = not self.rest.same_unit(reference)
         return found.with_history() if self._consecutive else found
 
     def noting(self, undecided: str) -> "PoseEstimator":
@@ -355,7 +356,8 @@ class PoseEstimator:
     def _widening(self) -> Widening:
         alone = self.pipeline.reference is self._trained.reference
         unmeasured = self.part.unmeasured_widens if isinstance(self.part, PinModel) and alone else 1.0
-        return Widening(self.sensor, self.domain, self.config["columns"], self.config["units"], unmeasured)
+        factors = tuple(self.config.get("other_unit_widens", ())) if self._other_unit else ()
+        return Widening(self.sensor, self.domain, self.config["columns"], self.config["units"], unmeasured, factors)
 
     def contact_maps(self, frame: Frame) -> tuple[PoseEstimate, ContactMaps | None]:
         """The estimate of one frame, with the pressure and shear over the skin; no maps if the estimate is not valid.

@@ -1,4 +1,4 @@
-"""What widens a model's intervals: lost pins, a strange frame, an unmeasured camera, and what is only assumed of the sensor."""
+"""What widens a model's intervals: lost pins, a strange frame, an unmeasured camera, another unit, and what is assumed of the sensor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,6 +33,8 @@ class Widening:
         Name and unit of each label.
     unmeasured : float
         Factor for a camera that may have moved; 1 if its place is known.
+    other_unit : tuple of float
+        Factors for a sensor that is not the unit of the weights, for each label; empty if it is, or if they are not known.
     """
 
     sensor: SensorSpec
@@ -40,6 +42,7 @@ class Widening:
     columns: Sequence[str]
     units: Sequence[str]
     unmeasured: float
+    other_unit: tuple[float, ...] = ()
 
     @property
     def caveats(self) -> list[str]:
@@ -54,6 +57,12 @@ class Widening:
             found.append(
                 f"without a frame without contact the camera's position is not known: all intervals are {self.unmeasured:g} times wider; "
                 "give one (--no-contact, --at-rest)"
+            )
+        if self.other_unit:
+            factors = ", ".join(f"{name} {factor:.2g}" for name, factor in zip(self.columns, self.other_unit, strict=True))
+            found.append(
+                "the pins at rest are not those of the unit that the weights learnt from, and its skin may differ: intervals are wider "
+                f"({factors} times); train with its own frames ('twin train')"
             )
         if self._assumes:
             mm = ASSUMED_MM * self.sensor.skin.outer_radius_mm
@@ -79,7 +88,7 @@ class Widening:
         lost = 1.0 + LOST_WIDENS * lost_share if lost_share > LOST_USUAL else 1.0
         if verdict.notes and self.domain is not None:
             half = np.maximum(half, self.domain.least) * verdict.factor + verdict.added
-        half = half * lost * self.unmeasured + excess + self._assumption_widths(value)
+        half = half * lost * self.unmeasured * (self.other_unit or 1.0) + excess + self._assumption_widths(value)
         stiffness = self.sensor.skin.stiffness_factor  # the true forces may be larger or smaller by this factor
         more, less = value * (stiffness - 1), value * (1 / stiffness - 1)
         low = value - half + np.where(self._force, np.minimum(more, less), 0.0)

@@ -21,7 +21,7 @@ from scenes.experiment import LABELS
 from scenes.files import read_regular
 from training.generation.config import DatasetError, GenerationConfig
 from training.generation.make import REST, Outcome, make_contact
-from twin.errors import StoreError
+from twin.errors import ErrorsAs, StoreError
 from twin.frames.truth import TRUTH, image_name
 from twin.store import (
     contents,
@@ -129,10 +129,8 @@ class Store:
         DatasetError
             The files can't be written: the disk is full, or the folder no longer exists.
         """
-        try:
+        with ErrorsAs(StoreError, self._unfinished_error):
             self._keep(outcome)
-        except StoreError as error:
-            raise self._unfinished_error(error) from error
 
     def _keep(self, outcome: Outcome) -> None:
         if outcome.index == REST:
@@ -272,9 +270,7 @@ class TruthFile:
             if not isinstance(array, zarr.Array):
                 shape, chunks = (0, *block.shape[1:]), (CHUNK_ROWS, *block.shape[1:])
                 array = self._group.create_array(key, shape=shape, chunks=chunks, dtype=block.dtype, attributes={"meaning": UNITS[key]})
-            start = array.shape[0]
-            array.resize((start + rows, *block.shape[1:]))
-            array[start:] = block
+            array.append(block)
 
 
 def _csv(rows: list[dict], columns: tuple | None = None) -> str:

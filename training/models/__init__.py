@@ -7,8 +7,7 @@ from scenes.plugins import others
 from training.errors import TrainingError
 from training.models.cnn.model import CNN_V1, CNN_V2
 from training.models.graphs.model import GNN, TAC_VGNN, TAC_VGNN_RELEASE
-from training.models.part import Model, Variant
-from training.models.recipes import Recipe
+from training.models.part import Model, Recipe, Variant
 from training.models.steered.model import STEERED
 from training.models.touch.model import TOUCH
 from training.models.vgnn.model import VGNN

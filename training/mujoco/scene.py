@@ -16,11 +16,12 @@ import mujoco
 import numpy as np
 
 from scenes import SensorSpec, load_sensor
-from training.environments.observe import Pictures, SensorView, caps_px
+from training.environments.observe import Pictures, SensorView
 from training.mujoco.geoms import MM, solid_of
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.model import surrogate_of
 from training.surrogate.solids import distances_to
+from twin.camera.projection import project_in_form
 from twin.compiled import compiled
 from twin.errors import OptionError
 from twin.pins import Pipeline
@@ -209,7 +210,7 @@ class TactileScene:
             self._wrench[sensor, :3].copy(),
             self._wrench[sensor, 3:].copy(),
             felt.caps_mm[row].copy(),
-            caps_px(spec, self.form(site), felt.caps_mm[row]),
+            project_in_form(spec, self.form(site), felt.caps_mm[row]),
             max(float(-gap[at]), 0.0) if at >= 0 else 0.0,
             float(felt.area_mm2[row]),
             float(felt.slip[row]),

@@ -20,7 +20,7 @@ from training.models import model_named
 from training.models.part import Inputs, Model, Modes, Prediction, Prepared
 from training.runs.config import RunConfig, training_labels
 from training.runs.gaussian_process import SMOOTH_AND_LINEAR, TWO_FIDELITIES, Points, Processes, fit_processes, fit_smooth_processes
-from training.runs.networks import predict_rows
+from training.runs.loop import predict_rows
 from twin.errors import warn_once
 from twin.pins.labelling.reference import Reference
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from training.data.dataset import Dataset, split_rows
 from training.errors import TrainingError
-from training.models.recipes import Recipe
+from training.models.part import Recipe
 
 MOST_SEED = 2**32 - 1  # largest seed. PyTorch takes seeds of 64 bits, and each network has its own seed
 

@@ -26,9 +26,9 @@ from training.models.part import Prepared
 from training.runs.assemble import calibrate
 from training.runs.config import RunConfig, training_labels, training_rows
 from training.runs.identity import ASIDE, difference, frame_marks, identity_of
-from training.runs.loop import Loop, TrainingRows
-from training.runs.networks import parameter_count
+from training.runs.loop import Loop, TrainingRows, parameter_count
 from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damage_error, read_config, read_tensors, write_tensors
+from twin.errors import ErrorsAs
 from twin.frames.forms import blob_spec
 from twin.report.table import write_rows
 from twin.store import fingerprint, write_text, writes
@@ -263,10 +263,8 @@ def _open_checkpoint(out: Path, resolved: dict) -> dict | None:
         write_text(out / CONFIG, json.dumps(resolved, indent=1) + "\n")
         return None
     state = read_tensors(path, BEGIN_ANEW)
-    try:
+    with ErrorsAs((KeyError, TypeError, ValueError), lambda error: damage_error(path, "it does not state of which run it is", BEGIN_ANEW)):
         before = dict(json.loads(state["identity"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise damage_error(path, "it does not state of which run it is", BEGIN_ANEW) from error
     _require_same(out, resolved, before, "not finished")
     return state
 

@@ -27,6 +27,7 @@ from scenes.sensor import SensorSpec
 from training.errors import TrainingError
 from training.models import model_named
 from training.runs.identity import ASIDE
+from twin.errors import ErrorsAs
 from twin.pins import make_reference
 from twin.store import write_bytes, write_text, write_with, writes
 from twin.types import Form
@@ -90,14 +91,10 @@ def read_config(run: Path) -> dict[str, Any]:
         config = json.loads(read_regular(path, LARGEST_CONFIG).decode())
     except (OSError, ValueError, RecursionError) as error:
         raise damage_error(path, getattr(error, "strerror", None) or "no readable JSON") from error
-    try:
+    with ErrorsAs(ValidationError, lambda error: damage_error(path, explain_problems(error, _Config))):
         _Config.model_validate(config)
-    except ValidationError as error:
-        raise damage_error(path, explain_problems(error, _Config)) from error
-    try:
+    with ErrorsAs(TrainingError, lambda error: damage_error(path, str(error))):
         model_named(config["model"])
-    except TrainingError as error:
-        raise damage_error(path, str(error)) from error
     return config
 
 
@@ -243,10 +240,8 @@ def unpack(config: dict, path: Path) -> dict:
     weights = path.read_bytes()
     if SHA256 in config and hashlib.sha256(weights).hexdigest() != config[SHA256]:
         raise ValueError(f"{path.name}: changed since it was written")  # the format has no checksums
-    try:
+    with ErrorsAs(SafetensorError, lambda error: ValueError(f"{path.name}: {error}")):
         arrays = load(weights)
-    except SafetensorError as error:
-        raise ValueError(f"{path.name}: {error}") from error
     content: dict = {KERNELS: {}, KERNEL_LABELS: torch.zeros(0), "aside": {}, NETWORKS: {}}
     for key, array in arrays.items():
         of_network = key.startswith(f"{NETWORKS}.")

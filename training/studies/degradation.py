@@ -1,10 +1,10 @@
 """Study: how far may a sensor degrade before pipelines lose its pins, and what do trained models estimate then?"""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from scenes import SensorSpec
 from scenes.sensor import RecordingSpec
@@ -12,9 +12,9 @@ from twin.camera.capture import in_form
 from twin.evaluation.degradation.envelope import Envelope
 from twin.evaluation.degradation.plan import SweepPlan
 from twin.evaluation.degradation.report import REPORT_FILES
-from twin.evaluation.degradation.shots import RealSource, RenderedSource
+from twin.evaluation.degradation.shots import CONTACTS, RealSource, RenderedSource
 from twin.evaluation.degradation.study import check_pipelines, real_study, rendered_study
-from twin.evaluation.degradation.sweep import ModelAnswer
+from twin.evaluation.degradation.sweep import ModelAnswer, SweepSettings
 from twin.progress import Progress, silent
 from twin.store import writes
 from twin.types import Frame, ReadableResult
@@ -87,19 +87,17 @@ def run(plan: DegradationPlan, out: Path, *, progress: Progress = silent) -> Deg
     """
     pipelines, runs = list(plan.pipelines), plan.models
     check_pipelines(pipelines, tuple(each.name for each in runs))
-    options: dict[str, Any] = {"jobs": plan.jobs, "progress": progress}
+    settings = SweepSettings(RenderedSource(plan.sensor, CONTACTS), (), plan.sweep.cases(), plan.sweep.severities())
     if runs:
         from training.estimate.loading import digest_of
 
         load_models(runs, plan.sensor)  # each worker process loads its own; loading here reports an error once, before the work starts
-        options["models"] = partial(load_models, runs, plan.sensor)
-        options["model_digests"] = {each.name: digest_of(each) for each in runs}
-    cases, severities = plan.sweep.cases(), plan.sweep.severities()
+        models, digests = partial(load_models, runs, plan.sensor), {each.name: digest_of(each) for each in runs}
+        settings = replace(settings, models=models, model_digests=digests)
     if plan.frames is None:
-        return DegradationResult(*rendered_study(plan.sensor, pipelines, cases, severities, out, **options))
-    return DegradationResult(
-        *real_study(plan.sensor, plan.frames, plan.limit, pipelines, cases, severities, out, beside=plan.rendered, **options)
-    )
+        return DegradationResult(*rendered_study(settings, pipelines, out, jobs=plan.jobs, progress=progress))
+    real = real_study(settings, pipelines, plan.frames, plan.limit, out, beside=plan.rendered, jobs=plan.jobs, progress=progress)
+    return DegradationResult(*real)
 
 
 def load_models(

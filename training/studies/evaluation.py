@@ -19,12 +19,11 @@ from training.runs.run_files import folder_of
 from training.studies.judging import measure_changes, measure_errors, rows_to_evaluate, time_frames, write_evaluation
 from training.touch.contact_maps import compare_maps
 from training.touch.slip import CapView, compare_slip, name_drags, random_places, resample_path
-from twin.camera.projection import project
+from twin.camera.projection import project_in_form
 from twin.errors import FrameError
 from twin.estimate import readable_labels
 from twin.frames import Recording, evenly_read, open_recording
 from twin.frames.folders import IMAGE_FOLDERS, references_in
-from twin.frames.forms import from_raw
 from twin.mechanics.skin_map import ContactMaps
 from twin.pins.batch import recording_reference
 from twin.progress import Progress, silent, stage
@@ -298,9 +297,8 @@ def write_frame_maps(folder: Path, estimator: PoseEstimator, frame: Frame, maps:
     """
     spec, name = estimator.sensor, Path(frame.name).stem
     along = maps.traction_mpa / np.maximum(np.linalg.norm(maps.traction_mpa, axis=1, keepdims=True), 1e-12)
-    nodes_px, ends_px = (
-        from_raw(spec.recording, estimator.form, project(spec.view, places)) for places in (maps.nodes_mm, maps.nodes_mm + ARROW_MM * along)
-    )
+    nodes_px = project_in_form(spec, estimator.form, maps.nodes_mm)
+    ends_px = project_in_form(spec, estimator.form, maps.nodes_mm + ARROW_MM * along)
     arrays = {key: getattr(maps, key) for key in ("nodes_mm", "area_mm2", "force_n", "pressure_mpa", "traction_mpa", "patch")}
     totals = {"resultant_n": maps.resultant_n, "torque_z_nmm": np.array(maps.torque_z_nmm)}
     write_npz(folder / f"{name}.npz", arrays | totals | {"nodes_px": nodes_px})

@@ -18,8 +18,7 @@ from training.models import model_named, recipe_of
 from training.models.part import LIKELY
 from training.models.touch.model import TOUCH
 from training.runs.config import RunConfig, training_labels, training_rows
-from training.runs.loop import epoch_step
-from training.runs.networks import choose_device
+from training.runs.loop import choose_device, epoch_step
 from training.runs.run import RUN_FILES, train_run
 from training.runs.run_files import BESIDE_FILES, CHECKPOINT, DISPLACEMENTS, DOMAIN, MAPS, SLIP
 from training.touch.contact_maps import FEWEST_STATES, learn_maps, write_maps

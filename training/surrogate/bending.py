@@ -14,11 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.compiled import compiled
-from twin.store import Layers
+from twin.store import Layers, silu, through_layers
 from twin.types import FloatArray
 
 AMPLE = 0.1
 """Mean square of the scaled inputs at which the gate of the network is three quarters open."""
+LOOSE = {"reassoc", "contract", "arcp", "nsz"}
+"""What the compiler may assume about sums and products of this module."""
 TAKEN = 0.5
 """Relaxation factor of an update of the bending. With 1, solutions of deep contacts oscillate: a skin that bends more bears less force."""
 
@@ -47,12 +49,8 @@ class Bending:
     def of(self, linear: FloatArray) -> FloatArray:
         """Displacements (S, M, 3) mm to add to the linear skin's. ``linear`` (S, K) is the linear skin's answer in the pins' modes."""
         x = linear / self.scale
-        out, gates = x, ample(x)
-        for number, (weights, offset) in enumerate(self.layers):
-            out = out @ weights.T + offset
-            if number < len(self.layers) - 1:
-                out = out / (1.0 + np.exp(-out))  # SiLU
-        return np.tensordot(x @ self.straight.T + gates[:, None] * out, self.modes, axes=1)
+        gated = ample(x)[:, None] * through_layers(self.layers, x, silu)
+        return np.tensordot(x @ self.straight.T + gated, self.modes, axes=1)
 
     def kernel(self, read: FloatArray) -> tuple[FloatArray, ...]:
         """The arrays that ``bend`` takes, in its memory layout; ``read`` (K, 3 M) is the linear skin's answer in the modes of the pins."""
@@ -73,26 +71,30 @@ def unbent(nodes: int) -> tuple[FloatArray, ...]:
     return tuple(np.zeros(shape, np.float32) for shape in shapes)
 
 
-@compiled(nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
-def bend(
-    force: FloatArray,
-    bent: FloatArray,
-    moved: FloatArray,
-    read: FloatArray,
-    first: FloatArray,
-    a: FloatArray,
-    second: FloatArray,
-    b: FloatArray,
-    third: FloatArray,
-    c: FloatArray,
-    straight: FloatArray,
-    modes: FloatArray,
-) -> float:
+@compiled(nogil=True, fastmath=LOOSE)
+def _add_product(x: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
+    """Add ``x`` (i,) times a matrix (i, o) to ``out`` (o,)."""
+    for k in range(len(x)):
+        row, value = matrix[k], x[k]
+        for o in range(len(out)):
+            out[o] += row[o] * value
+
+
+@compiled(nogil=True, fastmath=LOOSE)
+def _apply_silu(x: FloatArray) -> None:
+    """Apply the activation of the layers to ``x`` (i,)."""
+    for k in range(len(x)):
+        x[k] = x[k] / (np.float32(1.0) + np.exp(-x[k]))
+
+
+@compiled(nogil=True, fastmath=LOOSE)
+def bend(force: FloatArray, bent: FloatArray, moved: FloatArray, network: tuple[FloatArray, ...]) -> float:
     """Update the bending ``bent`` (3, M) float32 toward that of the forces (M, 3), and the displacements ``moved`` (M, 3) by the same.
 
-    Returns the largest change along an axis, mm.
+    ``network`` is as ``Bending.kernel`` gives it. Returns the largest change along an axis, mm.
     """
-    count, width = len(c), len(a)
+    read, first, a, second, b, third, c, straight, modes = network
+    count = len(c)
     if count == 0:
         return 0.0
     seen = read.shape[2]
@@ -109,35 +111,18 @@ def bend(
         size += x[k] * x[k]
     gate = np.float32(np.tanh(size / seen / AMPLE))
     one, two, out = a.copy(), b.copy(), c.copy()
-    for k in range(seen):
-        row, value = first[k], x[k]
-        for h in range(width):
-            one[h] += row[h] * value
-    for h in range(width):
-        one[h] = one[h] / (np.float32(1.0) + np.exp(-one[h]))
-    for k in range(width):
-        row, value = second[k], one[k]
-        for h in range(width):
-            two[h] += row[h] * value
-    for h in range(width):
-        two[h] = two[h] / (np.float32(1.0) + np.exp(-two[h]))
-    for k in range(width):
-        row, value = third[k], two[k]
-        for o in range(count):
-            out[o] += row[o] * value
+    _add_product(x, first, one)
+    _apply_silu(one)
+    _add_product(one, second, two)
+    _apply_silu(two)
+    _add_product(two, third, out)
     for o in range(count):
         out[o] *= gate
-    for k in range(seen):
-        row, value = straight[k], x[k]
-        for o in range(count):
-            out[o] += row[o] * value
+    _add_product(x, straight, out)
     most = np.float32(0.0)
     for p in range(3):
         whole = np.zeros(bent.shape[1], np.float32)
-        for o in range(count):
-            row, value = modes[o, p], out[o]
-            for j in range(len(whole)):
-                whole[j] += row[j] * value
+        _add_product(out, modes[:, p], whole)
         for j in range(len(whole)):
             change = np.float32(TAKEN) * (whole[j] - bent[p, j])
             most = max(most, abs(change))

@@ -13,6 +13,7 @@ turns under the force so far; at the end of the motion this is repeated until th
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,6 +53,39 @@ SETTLED_MM = 0.02
 """Motion across the dome up to which a compliant arm counts as at rest."""
 MOST_SETTLING = 2
 """Largest number of extra load steps at the end of a motion, until a compliant arm is at rest."""
+
+
+class Laws(NamedTuple):
+    """What B contacts obey: the attributes of ``LinearContacts`` of these names."""
+
+    kind: IntArray
+    sizes: FloatArray
+    friction: FloatArray
+    compliance_mm_per_n: FloatArray
+    turning: FloatArray
+
+
+class Nodes(NamedTuple):
+    """State of the nodes of all contacts, or of one contact: the attributes of ``LinearContacts`` of these names."""
+
+    force_n: FloatArray
+    moved_mm: FloatArray
+    bent_mm: FloatArray
+    anchor_mm: FloatArray
+    seen_mm: FloatArray
+    gap_mm: FloatArray
+    held: BoolArray
+    slides: BoolArray
+
+
+class Touching(NamedTuple):
+    """The q nodes near an object, its turn (3, 3), and the places, distances and normals of all nodes in its frame."""
+
+    near: IntArray
+    turn: FloatArray
+    here: FloatArray
+    gap: FloatArray
+    normal: FloatArray
 
 
 class LinearContacts:
@@ -130,12 +164,11 @@ class LinearContacts:
     def move(self, rows: IntArray, start: FloatArray, stop: FloatArray) -> None:
         """Move the objects of some rows (R,) from poses ``start`` (R, 4, 4) to ``stop``: in a straight line, with a turn about one axis."""
         steps = np.maximum(np.ceil(motion_mm(start, stop, self.radius_mm) / STEP_MM), 1).astype(np.int64)
-        state = (self.force_n, self.moved_mm, self.bent_mm, self.anchor_mm, self.seen_mm, self.gap_mm, self.held, self.slides, self.used)
-        laws = (self.kind, self.sizes, self.friction, self.compliance_mm_per_n, self.turning, self.taken)
+        laws, nodes = (kind(*(getattr(self, name) for name in kind._fields)) for kind in (Laws, Nodes))
 
         def follow(which: slice) -> None:
             given = [np.ascontiguousarray(values[which]) for values in (rows, start, stop, steps)]
-            _follow(*given, self.node_mm, self.answer, self.bending, *laws, *state)
+            _follow(*given, self.node_mm, self.answer, self.bending, laws, nodes, self.taken, self.used)
 
         threads = min(len(rows) // ROWS_OF_A_THREAD, MOST_THREADS)
         if threads < 2:
@@ -207,20 +240,9 @@ def _follow(
     node: FloatArray,
     answer: FloatArray,
     bending: tuple[FloatArray, ...],
-    kind: IntArray,
-    sizes: FloatArray,
-    friction: FloatArray,
-    compliance: FloatArray,
-    turning: FloatArray,
+    laws: Laws,
+    nodes: Nodes,
     taken: FloatArray,
-    force: FloatArray,
-    moved: FloatArray,
-    bent: FloatArray,
-    anchor: FloatArray,
-    seen: FloatArray,
-    before: FloatArray,
-    held: BoolArray,
-    slides: BoolArray,
     used: FloatArray,
 ) -> None:
     """Solve each row's motion from ``start`` to ``stop`` (R, 4, 4) in its load steps (R,).
@@ -230,12 +252,14 @@ def _follow(
     here = np.empty_like(node)
     shift = np.empty((3, len(node)), np.float32)
     near = np.empty(len(node), np.int64)
+    force, moved, bent, anchor, seen, before, held, slides = nodes
     for r in range(len(rows)):
         row = rows[r]
-        mu, soft, last = friction[row], compliance[row], steps[r] - 1
+        mu, soft, last = laws.friction[row], laws.compliance_mm_per_n[row], steps[r] - 1
         way = between(start[r], stop[r], steps[r])
+        mine = Nodes(force[row], moved[row], bent[row], anchor[row], seen[row], before[row], held[row], slides[row])
         for step in range(steps[r] + MOST_SETTLING):
-            T = _deflect_arm(way[min(step, last)], turning[row], force[row])
+            T = _deflect_arm(way[min(step, last)], laws.turning[row], mine.force_n)
             if step > last and _motion(taken[row], T, node[0, 2]) <= SETTLED_MM:
                 break
             taken[row] = T
@@ -245,11 +269,11 @@ def _follow(
             for part in range(len(SWEEPS) if step >= last else 1):
                 if part and not count:
                     break
-                change = bend(force[row], bent[row], moved[row], *bending)
+                change = bend(mine.force_n, mine.bent_mm, mine.moved_mm, bending)
                 if part > 1 and change < BENT_MM:
                     break
-                _to_object_frame(node, moved[row], turn, place, here)
-                gap, normal = distances_to(here, kind[row], sizes[row])
+                _to_object_frame(node, mine.moved_mm, turn, place, here)
+                gap, normal = distances_to(here, laws.kind[row], laws.sizes[row])
                 if part == 0:
                     for i in range(len(node)):
                         if gap[i] < REACH_MM or held[row, i]:
@@ -258,11 +282,10 @@ def _follow(
                             if not held[row, i]:
                                 _anchor(here[i], gap[i], anchor[row, i], seen[row, i], before[row, i])
                 if count:
-                    looked = near[:count]
-                    _solve(answer, looked, turn, here, gap, normal, force[row], moved[row], bent[row], anchor[row], shift, mu, soft, part)
+                    _solve(answer, Touching(near[:count], turn, here, gap, normal), mine, shift, mu, soft, part)
             if count:
-                _to_object_frame(node, moved[row], turn, place, here)
-                used[row] = _record_friction(near[:count], turn, here, normal, force[row], anchor[row], mu, held[row], slides[row])
+                _to_object_frame(node, mine.moved_mm, turn, place, here)
+                used[row] = _record_friction(Touching(near[:count], turn, here, gap, normal), mine, mu)
             before[row], seen[row] = gap, here
 
 
@@ -339,27 +362,14 @@ def _anchor(here: FloatArray, gap: float, anchor: FloatArray, seen: FloatArray, 
 
 
 @compiled(fastmath={"reassoc", "contract", "arcp", "nsz"})
-def _solve(
-    answer: FloatArray,
-    near: IntArray,
-    turn: FloatArray,
-    here: FloatArray,
-    gap: FloatArray,
-    normal: FloatArray,
-    force: FloatArray,
-    moved: FloatArray,
-    bent: FloatArray,
-    anchor: FloatArray,
-    shift: FloatArray,
-    friction: float,
-    compliance: float,
-    part: int,
-) -> None:
+def _solve(answer: FloatArray, at: Touching, nodes: Nodes, shift: FloatArray, friction: float, compliance: float, part: int) -> None:
     """Solve for the forces (M, 3) of the near nodes (q,) and the displacements (M, 3) of all nodes.
 
-    Distances and normals are linearised at ``here`` (M, 3). The displacements are the linear skin's plus ``bent`` (3, M) float32;
+    Distances and normals are linearised at ``here`` (M, 3). The displacements are the linear skin's plus ``bent_mm`` (3, M) float32;
     ``shift`` (3, M) float32 is working memory.
     """
+    near, turn, here, gap, normal = at
+    force, moved, bent, anchor, _, _, _, _ = nodes
     count = len(near)
     n, lag = np.empty((count, 3)), np.empty((count, 3))
     across, along = np.empty(count), np.empty(count)
@@ -438,21 +448,13 @@ def _solve(
 
 
 @compiled()
-def _record_friction(
-    near: IntArray,
-    turn: FloatArray,
-    here: FloatArray,
-    normal: FloatArray,
-    force: FloatArray,
-    anchor: FloatArray,
-    friction: float,
-    held: BoolArray,
-    slides: BoolArray,
-) -> float:
+def _record_friction(at: Touching, nodes: Nodes, friction: float) -> float:
     """Record which nodes press and which slide, and move the anchors of sliding nodes with them.
 
     Returns the ratio of the tangential forces to Coulomb's bound, each summed over the pressing nodes.
     """
+    near, turn, here, _, normal = at
+    force, _, _, anchor, _, _, held, slides = nodes
     held[:] = False
     slides[:] = False
     bound, borne = 0.0, 0.0

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +13,16 @@ import torch
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from training.surrogate.bending import Bending, ample
-from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of
+from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of, interpolation_matrix
 from training.surrogate.contact import LinearContacts
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.model import SHIPPED, SUFFIX, VIEWS, Surrogate, features, gate, load_surrogate, mechanics_of, within
-from training.surrogate.nodes import interpolation_matrix
 from training.surrogate.paths import DEEPEST_MM, STICKING
 from training.surrogate.reading import EpisodeContact
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
-from training.surrogate.symmetry import Symmetry, ring_directions, symmetries
-from twin.camera.projection import project
+from training.surrogate.symmetry import Symmetry, about_z, ring_directions, symmetries
+from twin.camera.projection import project_in_form
 from twin.errors import OptionError
-from twin.frames.forms import from_raw
 from twin.geometry.pins import rest_pins
 from twin.mechanics import Friction
 from twin.mechanics.law import ContactLaw
@@ -82,6 +82,8 @@ TOUCHES_MM = 0.05
 """Smallest depth of a contact that is used."""
 LARGE_PX = 2.0
 """Smallest displacement of a state's largest moved pin for the quantile of errors relative to that displacement."""
+MEASURED = ("error", "largest", "share", "depth_mm", "object", "force", "force_error", "slip", "shear_mm")
+"""What the errors are computed from, for each state."""
 BINS = {"depth_mm": (0.0, 1.5, 3.0, 6.0), "shear_mm": (0.0, 0.5, 1.5, 20.0)}
 """Ends of the ranges in which errors are reported. The shear is the largest sideways motion of a cap."""
 
@@ -324,7 +326,7 @@ def sample_states(
     ``bending`` is that of ``LinearContacts``.
     """
     about = np.eye(4)
-    about[:3, :3] = turn = _about_z(turn_rad)
+    about[:3, :3] = turn = about_z(turn_rad)
     poses = about @ path.T
     obj = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
     assert isinstance(obj, CompiledSolid)
@@ -356,14 +358,9 @@ def _main(rows: FloatArray, count: int) -> FloatArray:
 
 def _carry_modes(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> FloatArray:
     """The modes (MODES, 6 P) of ``start``, a surrogate of another sensor of the family, on this sensor's lattice."""
-    turn = _about_z(np.radians(sensor.pins.phase_deg - start.phase_deg)).astype(np.float32)
+    turn = about_z(np.radians(sensor.pins.phase_deg - start.phase_deg)).astype(np.float32)
     modes = (start.modes @ turn.T).transpose(0, 2, 1, 3) * weights
     return np.ascontiguousarray(modes.reshape(len(modes), -1))
-
-
-def _about_z(angle_rad: float) -> FloatArray:
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _pins_and_rest(rows: _Samples, flat: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -412,14 +409,9 @@ def measure_errors(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[So
     lattice, form = lattice_sensor(sensor), Form.PROCESSED if sensor.recording else Form.RAW
     onto, cap_mm = _interpolation(sensor), sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
     rest, lattice_rest = rest_pins(sensor.geometry), rest_pins(lattice.geometry)
-
-    def px(caps_mm: FloatArray) -> FloatArray:
-        return from_raw(sensor.recording, form, project(sensor.view, caps_mm))
-
-    columns: dict[str, list[Any]] = {
-        key: [] for key in ("error", "share", "force_error", "force", "slip", "depth_mm", "shear_mm", "object", "largest")
-    }
+    px = partial(project_in_form, sensor, form)
     rest_px = px(rest.caps_mm)
+    states: list[dict[str, Any]] = []
     for path in solved:
         obj = ObjectSpec(name="drawn", description="", shape=path.shape)
         contacts = SurrogateContacts(surrogate, sensor, 1)
@@ -433,17 +425,13 @@ def measure_errors(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[So
             true_px = px(rest.caps_mm + onto @ moved)
             off = np.linalg.norm(px(contacts.felt.caps_mm[0]) - true_px, axis=1)
             largest = float(np.linalg.norm(true_px - rest_px, axis=1).max())
-            columns["error"].append(off)
-            columns["largest"].append(largest)
-            columns["share"].append(off / max(largest, 1e-9))
-            columns["force_error"].append(float(np.linalg.norm(contacts.felt.force_n[0] - path.force_n[number])))
-            columns["force"].append(float(np.linalg.norm(path.force_n[number])))
-            columns["slip"].append(abs(float(contacts.felt.slip[0]) - path.slip[number]))
-            columns["depth_mm"].append(depth)
-            columns["shear_mm"].append(float(np.linalg.norm(moved[:, :2], axis=1).max()))
-            columns["object"].append(path.shape.kind)
-    values = {key: np.array(column) for key, column in columns.items()}
-
+            force = {"force": path.force_n[number], "force_error": contacts.felt.force_n[0] - path.force_n[number]}
+            state = {"error": off, "largest": largest, "share": off / max(largest, 1e-9), "depth_mm": depth, "object": path.shape.kind}
+            state |= {key: float(np.linalg.norm(value)) for key, value in force.items()}
+            state["slip"] = abs(float(contacts.felt.slip[0]) - path.slip[number])
+            state["shear_mm"] = float(np.linalg.norm(moved[:, :2], axis=1).max())
+            states.append(state)
+    values = {key: np.array([state[key] for state in states]) for key in MEASURED}
     large = values["largest"] >= LARGE_PX
 
     def summarise(rows: Any) -> dict[str, float]:
@@ -455,12 +443,10 @@ def measure_errors(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[So
             "slip": round(float(values["slip"][rows].mean()), 4),
         }
 
-    by: dict[str, dict[str, Any]] = {"object": {kind: summarise(values["object"] == kind) for kind in sorted(set(columns["object"]))}}
+    groups = {"object": {kind: values["object"] == kind for kind in sorted(set(values["object"].tolist()))}}
     for key, ends in BINS.items():
-        rows = [
-            (f"{low:g} to {high:g}", (values[key] >= low) & (values[key] < high)) for low, high in zip(ends[:-1], ends[1:], strict=True)
-        ]
-        by[key] = {name: summarise(inside) for name, inside in rows if inside.any()}
+        groups[key] = {f"{low:g} to {high:g}": (values[key] >= low) & (values[key] < high) for low, high in pairwise(ends)}
+    by = {key: {name: summarise(rows) for name, rows in parts.items() if rows.any()} for key, parts in groups.items()}
     return {"paths": len(solved), "all": summarise(np.ones(len(values["force"]), bool)), "by": by}
 
 

@@ -24,7 +24,7 @@ from training.surrogate.compliance import NODE_RINGS, POLAR_DEG
 from training.surrogate.symmetry import ring_directions, symmetries
 from twin.errors import ContactError, TwinError
 from twin.geometry.pins import rest_pins
-from twin.store import ArrayFile, Layers, layers_from, layers_to
+from twin.store import ArrayFile, Layers, layers_from, layers_to, silu, through_layers
 from twin.types import FloatArray
 
 SHIPPED = Path(__file__).parents[1] / "surrogates"
@@ -117,12 +117,8 @@ class Surrogate:
         linear = by_row(force_n.reshape(len(force_n), -1).astype(np.float32), self.read.T)
         seen = by_row(within(gap_mm), self.view.T)
         x = (np.concatenate([linear, beside.astype(np.float32), seen], axis=1) - self.mean) / self.scale
-        for number, (weights, offset) in enumerate(self.layers):
-            x = by_row(x, weights.T) + offset
-            if number < len(self.layers) - 1:
-                x = x / (1.0 + np.exp(-x))  # SiLU
-        x = x * (self.out_scale * gate(depth_mm)[:, None]).astype(np.float32)
-        return linear + x[:, : len(self.modes)], x[:, len(self.modes) :]
+        found = through_layers(self.layers, x, silu, by_row) * (self.out_scale * gate(depth_mm)[:, None]).astype(np.float32)
+        return linear + found[:, : len(self.modes)], found[:, len(self.modes) :]
 
     def save(self, path: Path) -> int:
         """Write it to a file and return the size in bytes.

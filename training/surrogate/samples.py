@@ -9,7 +9,7 @@ import numpy as np
 from scenes.object import ObjectSpec, Shape
 from scenes.pins import PinsSpec
 from scenes.sensor import SensorSpec
-from training.surrogate.nodes import AtNodes
+from training.surrogate.compliance import AtNodes
 from training.surrogate.paths import DrawnPath, draw_path
 from twin.errors import ContactError
 from twin.mechanics import Friction, SkinSolver

@@ -59,14 +59,18 @@ class Symmetry:
         return out
 
 
+def about_z(angle_rad: float) -> FloatArray:
+    """A turn (3, 3) about the sensor's axis."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
 def symmetries(phase_deg: float) -> list[Symmetry]:
     """The twelve symmetries of a lattice of rings, the identity first."""
-    phase = np.radians(phase_deg)
-    along = np.array([[np.cos(phase), -np.sin(phase), 0], [np.sin(phase), np.cos(phase), 0], [0, 0, 1.0]])
+    along = about_z(np.radians(phase_deg))
     found = []
     for mirrored in (False, True):
         for turns in range(6):
-            angle = np.radians(60.0 * turns)
-            turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+            turn = about_z(np.radians(60.0 * turns))
             found.append(Symmetry(turns, mirrored, along @ turn @ np.diag([1.0, -1.0 if mirrored else 1.0, 1.0]) @ along.T))
     return found

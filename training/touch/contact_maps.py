@@ -20,7 +20,7 @@ from training.errors import TrainingError
 from training.runs.run_files import AGAIN
 from twin.frames.truth import arrays_of, open_truth, row_of
 from twin.mechanics.skin_map import SIDE, ContactMaps, between_nodes, skin_grid
-from twin.store import ArrayFile, Layers, layers_from, layers_to
+from twin.store import ArrayFile, Layers, layers_from, layers_to, silu, through_layers
 
 """File of a run with its maps."""
 FILE = ArrayFile("file of contact maps", "twin train", version=1, error=TrainingError, again=AGAIN)
@@ -100,12 +100,7 @@ class MapModel:
         told : dict of str to float
             The model's estimates for the frame, by label. If they include the whole force or torque, the maps are corrected to these.
         """
-        h = self.gain * np.clip(modes, -self.limit, self.limit)
-        for weight, bias in self.layers[:-1]:
-            h = h @ weight.T + bias
-            h = h / (1 + np.exp(-h))
-        weight, bias = self.layers[-1]
-        said = h @ weight.T + bias
+        said = through_layers(self.layers, self.gain * np.clip(modes, -self.limit, self.limit), silu)
         count = len(self.force.rows)
         grid = skin_grid(self.geometry)
         per_root = (self.force.mean + said[:count] @ self.force.rows).reshape(SIDE * SIDE, 3)

@@ -31,8 +31,8 @@ from training.runs.assemble import COVERAGE, conformal_quantile
 from training.runs.run_files import AGAIN
 from training.surrogate.symmetry import Symmetry, symmetries
 from training.touch.contact_maps import HEADROOM
-from twin.camera.projection import project
-from twin.frames.forms import from_raw
+from twin.camera.projection import project_in_form
+from twin.errors import ErrorsAs
 from twin.frames.truth import arrays_of, open_truth
 from twin.geometry.pins import rest_pins
 from twin.mechanics.path import carry_points
@@ -334,16 +334,12 @@ class CapView:
 
     def __init__(self, modes_of: Callable[[PinTable], np.ndarray], pins: PinTable) -> None:
         self._modes_of, self._pins = modes_of, pins
-        self._rest_px = self._px(rest_pins(pins.sensor.geometry).caps_mm)
-
-    def _px(self, caps_mm: np.ndarray) -> np.ndarray:
-        spec = self._pins.sensor
-        return from_raw(spec.recording, self._pins.form, project(spec.view, caps_mm))
+        self._rest_px = project_in_form(pins.sensor, pins.form, rest_pins(pins.sensor.geometry).caps_mm)
 
     def __call__(self, caps_mm: np.ndarray, lost: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Modes (T, D) of caps (T, N, 3), of which some are ``lost`` (T, N)."""
         count, reference = len(caps_mm), self._pins.reference
-        moved_px = self._px(caps_mm) - self._rest_px
+        moved_px = project_in_form(self._pins.sensor, self._pins.form, caps_mm) - self._rest_px
         columns = {
             "image_name": np.full(count, ""),
             "nodes_px": reference.pins_px + moved_px + NOISE_PX * rng.normal(size=moved_px.shape),
@@ -496,10 +492,8 @@ def read_slip(path: Path) -> SlipModel:
     with FILE.open_arrays(path) as (about, found):
         limit = found.pop("limit").astype(float)
         network = SlipNetwork(2 * len(limit))
-        try:
+        with ErrorsAs(RuntimeError, lambda error: ValueError("its arrays do not fit together")):
             network.load_state_dict({key: torch.from_numpy(value) for key, value in found.items()})
-        except RuntimeError as error:
-            raise ValueError("its arrays do not fit together") from error
         return SlipModel(network.eval(), limit=limit, **about)
 
 

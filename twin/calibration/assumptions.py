@@ -63,8 +63,7 @@ class AssumptionCost:
 
 def _with(spec: SensorSpec, section: str, key: str, change: Callable[[float], float]) -> SensorSpec:
     """The specification with one number changed."""
-    part = getattr(spec, section)
-    return spec.model_copy(update={section: part.model_copy(update={key: change(getattr(part, key))})})
+    return spec.alter(**{section: {key: change(getattr(getattr(spec, section), key))}})
 
 
 def _changes(spec: SensorSpec) -> dict[tuple[str, str], tuple[SensorSpec, str]]:

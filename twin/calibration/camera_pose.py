@@ -195,7 +195,7 @@ def _with(spec: SensorSpec, values: dict[str, float]) -> SensorSpec:
         sections[PARAMETERS[name].section][name] = value
     if "fx_px" in values:
         sections["camera"]["fy_px"] = spec.camera.fy_px * values["fx_px"] / spec.camera.fx_px
-    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=given) for name, given in sections.items()})
+    return spec.alter(**sections)
 
 
 def _values(spec: SensorSpec, names: list[str]) -> dict[str, float]:

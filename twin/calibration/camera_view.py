@@ -11,7 +11,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.calibration.sensor_file import write_sensor
-from twin.camera.projection import project
+from twin.camera.projection import cross_plane, project
 from twin.errors import FrameError
 from twin.evaluation.pictures.aligned import with_changes
 from twin.frames import open_recording
@@ -85,10 +85,10 @@ def registered_view(
         fit += [_cosine(view.matrix @ along, moved) - 1 for view in views]
     if twist is not None:
         away, moved = rest_px - rest_px.mean(axis=0), _pin_motions(pipeline, twist)
-        turned = float(np.nansum(_cross(away, moved)) / np.sum(away**2))
+        turned = float(np.nansum(cross_plane(away, moved)) / np.sum(away**2))
         if abs(turned) * np.linalg.norm(away, axis=1).max() < LEAST_MOVED * nominal.spacing_px.mean():
             raise FrameError(f"{twist.name}: the twist hardly turns the pins; press firmly, then turn the object by 5 deg or more")
-        fit += [np.sign(turned * _cross(x, y) * np.linalg.det(view.matrix)) - 1 for view in views]
+        fit += [np.sign(turned * cross_plane(x, y) * np.linalg.det(view.matrix)) - 1 for view in views]
     best = int(np.argmax(fit))
     if fit[best] < len(pushes) * (np.cos(np.radians(MOST_OFF_DEG)) - 1):
         raise FrameError(f"the pushes {', '.join(pushes)} fit no view of {spec.pins.in_words()}: check their sides")
@@ -134,9 +134,7 @@ def _with_mask(spec: SensorSpec, form: Form, rest_px: np.ndarray) -> SensorSpec:
     blob = getattr(spec.pipeline, form)
     shift = rest_px.mean(axis=0) - project_rest(spec, form).mean(axis=0)
     center = tuple((np.array(blob.mask_center_px) + shift).tolist())
-    return spec.model_copy(
-        update={"pipeline": spec.pipeline.model_copy(update={str(form): blob.model_copy(update={"mask_center_px": center})})}
-    )
+    return spec.alter(pipeline={str(form): blob.alter(mask_center_px=center)})
 
 
 def _with_view(spec: SensorSpec, form: Form, view: PinView, rest_px: np.ndarray) -> SensorSpec:
@@ -158,7 +156,3 @@ def _with_view(spec: SensorSpec, form: Form, view: PinView, rest_px: np.ndarray)
 
 def _cosine(a: np.ndarray, b: np.ndarray) -> float:
     return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -259,15 +259,10 @@ def new_sensor(
         return made
 
 
-def _holds_its_axis(places: np.ndarray) -> bool:
-    """Whether the axis of the sensor, at 0,0, lies among places (N, 2), which do not lie on one line."""
-    return bool(Delaunay(places).find_simplex(np.zeros(2)) >= 0)
-
-
 def _compare_layout(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
     """The user's layout, compared with the frames."""
     alone = not isinstance(layout.shape, LatticeLayout)  # none of those that are searched for in frames
-    if alone and not _holds_its_axis(layout.shape.places()):
+    if alone and Delaunay(layout.shape.places()).find_simplex(np.zeros(2)) < 0:
         raise FrameError(
             f"the sensor's axis, 0,0, lies outside of the {layout.in_words()} that were given; x,y count from the axis: "
             "subtract the place of the middle pin, or of the middle of all pins"
@@ -311,7 +306,7 @@ def _start_specification(name: str, frame: Frame, pins: PinsSpec, rest: Rest, so
     seen = rest.pins_px[np.isfinite(rest.pins_px[:, 0])]
     x, y = ((seen.max(axis=0) + seen.min(axis=0)) / 2).tolist()
     radius = float(np.linalg.norm(seen - [x, y], axis=1).max())
-    turned = pins.model_copy(update={"phase_deg": round(turn_of(pins, rest.pins_px), 2)})
+    turned = pins.alter(phase_deg=round(turn_of(pins, rest.pins_px), 2))
     focal = radius * PINHOLE_MM / 17.0  # the outermost caps of a TacTip are about 17 mm from the axis
     camera = CameraSpec(
         width_px=width,
@@ -380,19 +375,13 @@ def _camera(
     tried: list[tuple[float, SensorSpec, CameraReport]] = []
     best = 0
     for projection, spacing in (("perspective", "polar"), ("perspective", "plan"), ("fisheye", "polar"), ("fisheye", "plan")):
-        pins = start.pins.model_copy(update={"spacing": spacing})
+        pins = start.pins.alter(spacing=spacing)
         camera = start.camera
         if projection == "fisheye":
             focal = camera.fx_px * FISHEYE_MM / PINHOLE_MM
-            camera = camera.model_copy(
-                update={
-                    "projection": projection,
-                    "fx_px": focal,
-                    "fy_px": focal,
-                    "distance_mm": camera.distance_mm * FISHEYE_MM / PINHOLE_MM,
-                }
-            )
-        trial = _scale_camera(start.model_copy(update={"pins": pins, "camera": camera}), pins_px)
+            camera = camera.alter(projection=projection, fx_px=focal, fy_px=focal, distance_mm=camera.distance_mm * FISHEYE_MM / PINHOLE_MM)
+        trial = start.alter(pins=pins, camera=camera)
+        trial = trial.alter(camera=camera_seeing(trial, pins_px, np.flatnonzero(np.isfinite(pins_px[:, 0]))))
         fitted, report = fit_camera(trial, pins_px, free=FITTED_FISHEYE if projection == "fisheye" else FITTED_PINHOLE, named=True)
         fitted, uneven = _with_sizes(fitted, sizes_px)
         misfit = float(np.hypot(report.rms_px / sd_px, uneven / SIZE_SD))
@@ -421,14 +410,7 @@ def _with_sizes(sensor: SensorSpec, sizes_px: np.ndarray | None) -> tuple[Sensor
         return sensor, 0.0
     scale = float(np.exp(np.median(known)))
     cap_mm, pin_mm = (round(scale * value, 3) for value in (sensor.pins.cap_diameter_mm, sensor.pins.diameter_mm))
-    pins = sensor.pins.model_copy(update={"cap_diameter_mm": cap_mm, "diameter_mm": pin_mm})
-    return sensor.model_copy(update={"pins": pins}), float(np.std(known))
-
-
-def _scale_camera(sensor: SensorSpec, pins_px: np.ndarray) -> SensorSpec:
-    """The sensor with a camera that sees the pins at the place and in the size of pins (N, 2); NaN where unknown."""
-    known = np.flatnonzero(np.isfinite(pins_px[:, 0]))
-    return sensor.model_copy(update={"camera": camera_seeing(sensor, pins_px, known)})
+    return sensor.alter(pins={"cap_diameter_mm": cap_mm, "diameter_mm": pin_mm}), float(np.std(known))
 
 
 def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
@@ -436,28 +418,21 @@ def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
     tuned = with_detector(sensor, detector)
     if detector.form == Form.RAW:
         return tuned
-    usual = detector.blob.model_copy(
-        update={
-            "threshold": UNTUNED_OFFSET,
-            "threshold_block_px": UNKNOWN_BLOCK_PX,
-            "rest_px": (),
-            "rest_origin": "measured",
-            "spot_sigma_px": 0.0,
-        }
+    usual = detector.blob.alter(
+        threshold=UNTUNED_OFFSET, threshold_block_px=UNKNOWN_BLOCK_PX, rest_px=(), rest_origin="measured", spot_sigma_px=0.0
     )
-    return tuned.model_copy(update={"pipeline": tuned.pipeline.model_copy(update={"raw": usual})})
+    return tuned.alter(pipeline={"raw": usual})
 
 
 def _with_usual_caps(sensor: SensorSpec, frames: list[Frame]) -> SensorSpec:
     """The specification with the usual light and focus of its caps, measured in raw frames."""
-    form = frames[0].form
-    if form != Form.RAW:
+    if frames[0].form != Form.RAW:
         return sensor
-    pipeline = Pipeline(sensor, form)
+    pipeline = Pipeline(sensor, Form.RAW)
     seen = [(frame, pipeline(frame)) for frame in (frames[k] for k in spread_indices(len(frames), CAPS_MEASURED))]
     polarity = sensor.pipeline.raw.polarity
     usual = usual_caps([measure_caps(gray_levels(frame.image), o.pins_px, polarity=polarity) for frame, o in seen if o.valid])
-    return sensor.model_copy(update={"pipeline": sensor.pipeline.model_copy(update={"usual_caps": usual})})
+    return sensor.alter(pipeline={"usual_caps": usual})
 
 
 def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -> tuple[Health, list[Path]]:
@@ -479,16 +454,12 @@ def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -
     worst = np.argsort([o.found / max(o.expected, 1) for o in seen], kind="stable")
     chosen = dict.fromkeys([int(worst[-1]), int(worst[0]), *worst[:: max(len(worst) // SHOWN_FRAMES, 1)].tolist()])
     pictures: list[Path] = []
+    scale = int(np.clip(round(900 / max(pipeline.size_px)), 1, 6))  # pins can be seen well
     for k in list(chosen)[:SHOWN_FRAMES]:
         path = folder / f"overlay-{len(pictures) + 1}.png"
-        write_image(path, draw_overlay(frames[k], seen[k], scale=_enlarge(pipeline.size_px)))
+        write_image(path, draw_overlay(frames[k], seen[k], scale=scale))
         pictures.append(path)
     return health, pictures
-
-
-def _enlarge(size_px: tuple[int, int]) -> int:
-    """Factor by which a frame is enlarged so that its pins can be seen well."""
-    return int(np.clip(round(900 / max(size_px)), 1, 6))
 
 
 def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:

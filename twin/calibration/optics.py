@@ -34,7 +34,7 @@ from twin.optics.relief import DETAILS, without
 from twin.optics.render import Renderer
 from twin.pins.labelling.rest import require_even
 from twin.pins.pipeline import Pipeline
-from twin.progress import Bar, Progress, Step, silent, stage
+from twin.progress import Bar, Progress, Step, report_each, silent, stage
 from twin.report.page import Page, PagePicture, code
 from twin.report.table import Column
 from twin.store import KEPT, Item, inputs_digest, kept_arrays, kept_json, output, writes_file
@@ -140,9 +140,8 @@ class _Studio:
         """Linear light (H, W[, channels]) of every frame's state."""
         renderer, light = Renderer(spec, spp=SAMPLES), []
         with self._bar(title) as progress:
-            for done, frame in enumerate(frames):
-                light.append(renderer.render(frame.state, seed=done))
-                progress(done + 1, len(frames))
+            for seed, frame in enumerate(report_each(frames, progress)):
+                light.append(renderer.render(frame.state, seed=seed))
         return light
 
     def shots(self, spec: SensorSpec, frames: list[Aligned], title: str) -> list[np.ndarray]:
@@ -328,11 +327,10 @@ class _Log:
             fit = fit or SkinFit(spec)  # takes seconds to build, and is not needed if all frames were stored
             return vars(fit(pins_px))
 
-        for done, (name, image, pins_px) in enumerate(raw):
+        for name, image, pins_px in report_each(raw, progress):
             item = Item(f"skin-{Path(name).stem}", (SkinFit,), [spec, pins_px])
             found = kept_arrays(self._folder, item, partial(fit_skin, pins_px))
             frames.append(Aligned(name, image, pins_px, FittedPins(**found)))
-            progress(done + 1, len(raw))
         return frames
 
     def stage(self, name: str, run: Stage, spec: SensorSpec) -> SensorSpec:

@@ -83,7 +83,7 @@ def before_stream(
     linear: FloatArray, capture: CaptureSpec, rng: np.random.Generator | None = None, *, origin_px: tuple[int, int] = (0, 0)
 ) -> FloatArray:
     """Gray levels (H, W[, 3]) float before columns share colour differences and a stream rounds them; parameters as for ``expose``."""
-    return _developed_light(linear, capture, capture.response.model_copy(update={"chroma_columns": 1}), rng, origin_px)
+    return _developed_light(linear, capture, capture.response.alter(chroma_columns=1), rng, origin_px)
 
 
 def _developed_light(

@@ -22,9 +22,10 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from scenes.sensor import CameraSpec, HousingSpec, ViewSpec
+from scenes.sensor import CameraSpec, HousingSpec, SensorSpec, ViewSpec
 from twin.compiled import compiled
-from twin.types import FloatArray
+from twin.frames.forms import from_raw
+from twin.types import FloatArray, Form
 
 NEWTON_STEPS = 12
 """Steps of Newton's method. It converges quadratically, so the last steps change only the last digits."""
@@ -95,8 +96,8 @@ def undistort(camera: CameraSpec, seen: FloatArray, *, guess: FloatArray | None 
     for _ in range(NEWTON_STEPS):
         along_x, along_y = ((distort(camera, ideal + d) - distort(camera, ideal - d)) / (2 * step) for d in ([step, 0.0], [0.0, step]))
         miss = seen - distort(camera, ideal)
-        area = _cross(along_x, along_y)
-        move = np.stack([_cross(miss, along_y), _cross(along_x, miss)], axis=-1)
+        area = cross_plane(along_x, along_y)
+        move = np.stack([cross_plane(miss, along_y), cross_plane(along_x, miss)], axis=-1)
         ideal = ideal + np.clip(move / np.where(np.abs(area) > 1e-6, area, 1e-6)[..., None], -MOST_NEWTON_MOVE, MOST_NEWTON_MOVE)
     return ideal
 
@@ -113,6 +114,11 @@ def project(view: ViewSpec, points_mm: FloatArray) -> FloatArray:
     in_sensor = np.concatenate([across, np.ones_like(across[..., :1])], axis=-1)
     in_camera = in_sensor @ sensor_to_camera(camera)[:3, :3].T
     return distort(camera, in_camera[..., :2] / in_camera[..., 2:]) * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+
+
+def project_in_form(spec: SensorSpec, form: Form, points_mm: FloatArray) -> FloatArray:
+    """As ``project``, to pixels (..., 2) of a sensor's frames of a form; raises as ``twin.frames.forms.from_raw``."""
+    return from_raw(spec.recording, form, project(spec.view, points_mm))
 
 
 def window_tangent(view: ViewSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behind_mm: float | None = None) -> FloatArray:
@@ -225,5 +231,6 @@ def _fisheye(camera: CameraSpec, angle: FloatArray) -> FloatArray:
     return angle * (1 + camera.k1 * angle**2 + camera.k2 * angle**4)
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+def cross_plane(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The third component of the cross product of vectors (..., 2) in a plane."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -30,11 +30,9 @@ def with_residual(spec: SensorSpec) -> SensorSpec:
     RenderError
         The specification has none.
     """
-    residual = spec.response.residual
-    if residual is None:
+    if spec.response.residual is None:
         raise RenderError(f"sensor {spec.name} has no residual network (response.residual); leave `residual` out, or use ur5-331")
-    response = spec.response.model_copy(update={"residual": residual.model_copy(update={"used": True})})
-    return spec.model_copy(update={"response": response})
+    return spec.alter(response={"residual": {"used": True}})
 
 
 def refine(

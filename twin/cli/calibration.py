@@ -13,29 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli import FewCommands, app
+from twin.cli import FewCommands, app, options
 from twin.cli.command import App
-from twin.cli.options import (
-    CORES,
-    QUALITY,
-    Elements,
-    Experiment,
-    Formerly,
-    FormOrAuto,
-    MaxFrames,
-    NoContact,
-    Out,
-    Residual,
-    Sensor,
-    Table,
-    Tuning,
-    Workers,
-    call,
-    load_if_named,
-    print_lines,
-    sensor_with,
-    with_residual_if,
-)
+from twin.cli.options import Formerly, call, load_if_named, print_lines, sensor_with, with_residual_if
 from twin.errors import OptionError
 from twin.progress import Progress
 from twin.types import FINE, Quality
@@ -63,25 +43,25 @@ def columns_in(pairs: list[str] | None) -> dict[str, str]:
 
 @app.command("new")
 def new_sensor(
-    out: Annotated[Path, typer.Option("--out", metavar="MY.toml", help="the specification to write")],
+    out: Annotated[Path, typer.Option(metavar="MY.toml", help="the specification to write")],
     frames: Annotated[Path | None, typer.Argument(help="folder of frames, video or recording")] = None,
-    camera: Annotated[str, typer.Option("--camera", metavar="C", help="a live camera instead: 0, /dev/videoN, http://...")] = "",
+    camera: Annotated[str, typer.Option(metavar="C", help="a live camera instead: 0, /dev/videoN, http://...")] = "",
     label_table: Annotated[
-        Path | None, typer.Option("--label-table", metavar="TABLE", help="table of labels: also fit the contact"), Formerly("labels")
+        Path | None, typer.Option(metavar="TABLE", help="table of labels: also fit the contact"), Formerly("labels")
     ] = None,
     experiment: Annotated[
-        str | None, typer.Option("--experiment", metavar="E", help="experiment of the labelled contacts; by default from the table")
+        str | None, typer.Option(metavar="E", help="experiment of the labelled contacts; by default from the table")
     ] = None,
-    contacts: Annotated[int, typer.Option("--contacts", min=4, metavar="N", help="labelled frames to which the contact is fitted")] = 20,
+    contacts: Annotated[int, typer.Option(min=4, metavar="N", help="labelled frames to which the contact is fitted")] = 20,
     optics: Annotated[bool, typer.Option("--optics", help="also fit light and colours")] = False,
-    workers: Workers = CORES,
-    elements: Elements = FINE,
-    layout: Annotated[str | None, typer.Option("--layout", metavar="L", help="the layout, if it is known")] = None,
-    radius_mm: Annotated[float | None, typer.Option("--radius-mm", metavar="R", help="radius of the tip's dome (20 if not given)")] = None,
-    no_contact: NoContact = None,
-    table: Table = None,
-    form: FormOrAuto = None,
-    max_frames: MaxFrames = 40,
+    workers: options.Workers = options.CORES,
+    elements: options.Elements = FINE,
+    layout: Annotated[str | None, typer.Option(metavar="L", help="the layout, if it is known")] = None,
+    radius_mm: Annotated[float | None, typer.Option(metavar="R", help="radius of the tip's dome (20 if not given)")] = None,
+    no_contact: options.NoContact = None,
+    table: options.Table = None,
+    form: options.FormOrAuto = None,
+    max_frames: options.MaxFrames = 40,
     *,
     progress: Progress,
 ) -> "WholeSensor":
@@ -140,14 +120,12 @@ app.add_typer(calibrate_app, name="calibrate")
 
 @calibrate_app.command("optics")
 def calibrate_optics(
-    sensor: Sensor,
-    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="folder of raw frames, in contact or not")],
-    out: Annotated[Path, typer.Option("--out", metavar="SPEC.toml", help="the specification to write")],
-    no_contact: Annotated[
-        Path | None, typer.Option("--no-contact", metavar="FRAME", help="a raw frame without contact: fits the camera")
-    ] = None,
-    max_frames: MaxFrames = 6,
-    pipeline: Tuning = None,
+    sensor: options.Sensor,
+    frames: Annotated[Path, typer.Option(metavar="DIR", help="folder of raw frames, in contact or not")],
+    out: Annotated[Path, typer.Option(metavar="SPEC.toml", help="the specification to write")],
+    no_contact: Annotated[Path | None, typer.Option(metavar="FRAME", help="a raw frame without contact: fits the camera")] = None,
+    max_frames: options.MaxFrames = 6,
+    pipeline: options.Tuning = None,
     *,
     progress: Progress,
 ) -> "OpticsCalibration":
@@ -182,24 +160,20 @@ def calibrate_optics(
 
 @calibrate_app.command("contact", goes_on=True)
 def calibrate_contact(
-    sensor: Sensor,
-    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording with init_0.png, or TABLE.csv of forces")],
-    out: Annotated[Path, typer.Option("--out", metavar="SPEC.toml", help="the specification to write")],
-    num_labelled: Annotated[
-        int, typer.Option("--num-labelled", min=4, metavar="N", help="frames to fit to, chosen at random"), Formerly("labels")
-    ] = 20,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the choice of frames")] = 0,
-    experiment: Experiment = "surface-2d",
-    obj: Annotated[
-        str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
-    ] = None,
-    hold: Annotated[list[str] | None, typer.Option("--hold", metavar="KEY", help="do not fit this parameter; may be repeated")] = None,
-    workers: Workers = CORES,
-    elements: Elements = FINE,
-    form: FormOrAuto = None,
-    table: Table = None,
-    no_contact: NoContact = None,
-    pipeline: Tuning = None,
+    sensor: options.Sensor,
+    frames: Annotated[Path, typer.Option(metavar="DIR", help="labelled recording with init_0.png, or TABLE.csv of forces")],
+    out: Annotated[Path, typer.Option(metavar="SPEC.toml", help="the specification to write")],
+    num_labelled: Annotated[int, typer.Option(min=4, metavar="N", help="frames to fit to, chosen at random"), Formerly("labels")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the choice of frames")] = 0,
+    experiment: options.Experiment = "surface-2d",
+    obj: options.TouchedObject = None,
+    hold: Annotated[list[str] | None, typer.Option(metavar="KEY", help="do not fit this parameter; may be repeated")] = None,
+    workers: options.Workers = options.CORES,
+    elements: options.Elements = FINE,
+    form: options.FormOrAuto = None,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
+    pipeline: options.Tuning = None,
     column: Columns = None,
     *,
     progress: Progress,
@@ -246,23 +220,21 @@ def calibrate_contact(
 
 @app.command("validate")
 def validate(
-    sensor: Sensor,
-    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording, or TABLE.csv of forces")],
-    out: Out,
-    experiment: Experiment = "surface-2d",
+    sensor: options.Sensor,
+    frames: Annotated[Path, typer.Option(metavar="DIR", help="labelled recording, or TABLE.csv of forces")],
+    out: options.Out,
+    experiment: options.Experiment = "surface-2d",
     obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the touched object; the experiment's own if not given")] = None,
-    max_frames: Annotated[
-        int | None, typer.Option("--max-frames", min=1, metavar="N", help="N frames, chosen at random"), Formerly("limit")
-    ] = None,
+    max_frames: Annotated[int | None, typer.Option(min=1, metavar="N", help="N frames, chosen at random"), Formerly("limit")] = None,
     friction_frames: Annotated[
-        int, typer.Option("--friction-frames", min=0, metavar="N", help="frames for which the best friction is searched, 9 contacts each")
+        int, typer.Option(min=0, metavar="N", help="frames for which the best friction is searched, 9 contacts each")
     ] = 5,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the choice of frames")] = 0,
-    elements: Elements = FINE,
-    form: FormOrAuto = None,
-    table: Table = None,
-    no_contact: NoContact = None,
-    pipeline: Tuning = None,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the choice of frames")] = 0,
+    elements: options.Elements = FINE,
+    form: options.FormOrAuto = None,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
+    pipeline: options.Tuning = None,
     column: Columns = None,
     *,
     progress: Progress,
@@ -298,26 +270,20 @@ def validate(
 @app.command("realism")
 def realism(
     path: Annotated[Path, typer.Argument(help="folder of real raw frames")],
-    sensor: Sensor,
-    out: Out,
+    sensor: options.Sensor,
+    out: options.Out,
     pose_aligned: Annotated[bool, typer.Option("--pose-aligned", help="also render from the labels alone")] = False,
-    max_frames: Annotated[
-        int | None, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")
-    ] = None,
-    fitted: Annotated[
-        int, typer.Option("--fitted", min=0, metavar="N", help="leave out the frames that 'calibrate optics --max-frames N' fits")
-    ] = 0,
-    without: Annotated[
-        list[str] | None, typer.Option("--without", metavar="DETAIL", help="relief, grain or background; may be repeated")
-    ] = None,
-    residual: Residual = False,
-    quality: Annotated[Quality, typer.Option(help=QUALITY)] = "standard",
+    max_frames: Annotated[int | None, typer.Option(min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")] = None,
+    fitted: Annotated[int, typer.Option(min=0, metavar="N", help="leave out the frames that 'calibrate optics --max-frames N' fits")] = 0,
+    without: Annotated[list[str] | None, typer.Option(metavar="DETAIL", help="relief, grain or background; may be repeated")] = None,
+    residual: options.Residual = False,
+    quality: Annotated[Quality, typer.Option(help=options.QUALITY)] = "standard",
     two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
     thorough: Annotated[
         bool, typer.Option("--thorough", help="test with a stronger network, too, and with halves of the real frames (ten minutes)")
     ] = False,
-    table: Table = None,
-    pipeline: Tuning = None,
+    table: options.Table = None,
+    pipeline: options.Tuning = None,
     *,
     progress: Progress,
 ) -> "Realism":
@@ -378,26 +344,23 @@ def _list_conditions(asked: bool) -> None:
 
 @app.command("robustness", goes_on=True)
 def robustness(
-    sensor: Sensor,
-    out: Out,
+    sensor: options.Sensor,
+    out: options.Out,
     pipeline: Annotated[
         list[str] | None,
         typer.Option(
-            "--pipeline",
             metavar="P",
             help="twin, legacy, adaptive, fixed, simple, log, dog, doh, a file of 'twin tune', or your own as FILE.py:FUNCTION",
         ),
     ] = None,
-    model: Annotated[list[Path] | None, typer.Option("--model", metavar="RUN", help="folder of a trained model")] = None,
-    conditions: Annotated[
-        Path | None, typer.Option("--conditions", metavar="FILE", help="TOML file: which conditions, ranges, steps, pairs")
-    ] = None,
-    frames: Annotated[Path | None, typer.Option("--frames", metavar="DIR", help="real frames instead of rendered ones")] = None,
+    model: Annotated[list[Path] | None, typer.Option(metavar="RUN", help="folder of a trained model")] = None,
+    conditions: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file: which conditions, ranges, steps, pairs")] = None,
+    frames: Annotated[Path | None, typer.Option(metavar="DIR", help="real frames instead of rendered ones")] = None,
     max_frames: Annotated[
-        int, typer.Option("--max-frames", min=2, metavar="N", help="at most N of the real frames, evenly spread"), Formerly("limit")
+        int, typer.Option(min=2, metavar="N", help="at most N of the real frames, evenly spread"), Formerly("limit")
     ] = 12,
     rendered: Annotated[bool, typer.Option("--rendered/--no-rendered", help="raw --frames beside rendered ones")] = True,
-    jobs: Annotated[int, typer.Option("--jobs", min=1, metavar="N", help="processes")] = CORES,
+    jobs: Annotated[int, typer.Option(min=1, metavar="N", help="processes")] = options.CORES,
     show: Annotated[bool, typer.Option("--list", is_eager=True, callback=_list_conditions, help="list the conditions and stop")] = False,
     *,
     progress: Progress,
@@ -462,12 +425,12 @@ def robustness(
 @app.command("audit")
 def audit(
     data: Annotated[Path, typer.Argument(help="labelled recording")],
-    sensor: Sensor,
-    out: Out,
-    form: FormOrAuto = None,
-    table: Table = None,
-    no_contact: NoContact = None,
-    pipeline: Tuning = None,
+    sensor: options.Sensor,
+    out: options.Out,
+    form: options.FormOrAuto = None,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
+    pipeline: options.Tuning = None,
     *,
     progress: Progress,
 ) -> "LabelAudit":

@@ -24,7 +24,7 @@ import typer
 from typer.models import ArgumentInfo, ParameterInfo
 
 from twin.cli.options import Force, Formerly, print_result
-from twin.errors import OptionError, extras_named, warn_once
+from twin.errors import ErrorsAs, OptionError, extras_named, warn_once
 from twin.progress import Progress, silent
 from twin.types import FORMER_VALUES, present_value
 
@@ -126,12 +126,10 @@ def as_function(work: Callable[..., Made], help: str) -> Callable[..., Made]:
 
         bound = signature.bind(*arguments, **with_present_names(given, former)).arguments
         force, progress = bound.pop("force", False), bound.pop("progress", None)
-        try:
+        with ErrorsAs(typer.BadParameter, lambda error: OptionError(f"{error.param_hint or ''} {error.message}".strip())):
             taken = {name: parse_argument(name, _plain(options[name]), marks[name], value) for name, value in bound.items()}
             with overwriting(force):
                 return _do_work(work, taken, progress=progress)
-        except typer.BadParameter as error:
-            raise OptionError(f"{error.param_hint or ''} {error.message}".strip()) from error
 
     function.__signature__ = signature  # type: ignore[attr-defined]
     function.__doc__ = docstring(help, public, marks)
@@ -208,10 +206,8 @@ def parse_argument(name: str, kind: Any, mark: ParameterInfo, value: Any) -> Any
         if mark.min is not None and value < mark.min or mark.max is not None and value > mark.max:
             raise OptionError(f"`{name}={value}`: expected {' and '.join(_range(mark))}")
         if mark.callback is not None:
-            try:
+            with ErrorsAs(typer.BadParameter, lambda error: OptionError(f"`{name}={value}`: {error.message}")):
                 return mark.callback(value)
-            except typer.BadParameter as error:
-                raise OptionError(f"`{name}={value}`: {error.message}") from error
     return value
 
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from twin.cli import app
-from twin.cli.options import FormOrAuto, MaxFrames, NoContact, Out, Sensor, Table, Tuning, call, load_if_named, sensor_with
+from twin.cli import app, options
+from twin.cli.options import call, load_if_named, sensor_with
 from twin.progress import Progress
 
 if TYPE_CHECKING:
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 @app.command("preprocess")
 def preprocess(
     path: Annotated[Path, typer.Argument(help="image, folder of frames, video or recording")],
-    sensor: Sensor,
-    out: Out,
-    form: FormOrAuto = None,
+    sensor: options.Sensor,
+    out: options.Out,
+    form: options.FormOrAuto = None,
     overlay: Annotated[bool, typer.Option("--overlay", help="also write a picture of every frame with its pins and graph")] = False,
-    table: Table = None,
-    no_contact: NoContact = None,
-    pipeline: Tuning = None,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
+    pipeline: options.Tuning = None,
     *,
     progress: Progress,
 ) -> "Preprocessed":
@@ -73,14 +73,14 @@ def preprocess(
 @app.command("graph")
 def graph(
     path: Annotated[Path, typer.Argument(help="frame, folder of frames, or pins.npz")],
-    sensor: Sensor,
-    out: Out,
-    kind: Annotated[Literal["knn", "delaunay", "voronoi"], typer.Option("--kind", help="kind of graph")] = "voronoi",
-    form: FormOrAuto = None,
+    sensor: options.Sensor,
+    out: options.Out,
+    kind: Annotated[Literal["knn", "delaunay", "voronoi"], typer.Option(help="kind of graph")] = "voronoi",
+    form: options.FormOrAuto = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="method and boundary of the published code, for comparison")] = False,
-    table: Table = None,
-    no_contact: NoContact = None,
-    pipeline: Tuning = None,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
+    pipeline: options.Tuning = None,
 ) -> "Graphs":
     """Build the graphs of frames or of found pins.
 
@@ -115,16 +115,16 @@ def graph(
 
 @app.command("tune")
 def tune(
-    sensor: Sensor,
-    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="folder of frames, video or recording")],
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE.toml", help="the file to write")] = None,
+    sensor: options.Sensor,
+    frames: Annotated[Path, typer.Option(metavar="DIR", help="folder of frames, video or recording")],
+    out: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="the file to write")] = None,
     method: Annotated[
-        Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"], typer.Option("--method", help="method to tune")
+        Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"], typer.Option(help="method to tune")
     ] = "twin",
-    form: FormOrAuto = None,
-    max_frames: MaxFrames = 12,
-    table: Table = None,
-    no_contact: NoContact = None,
+    form: options.FormOrAuto = None,
+    max_frames: options.MaxFrames = 12,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
     *,
     progress: Progress,
 ) -> "TunedOnFrames":
@@ -159,23 +159,21 @@ def check(
     source: Annotated[
         str, typer.Argument(metavar="FRAME", help="image, folder of frames, video, recording, or a camera: 0, /dev/video2, http://...")
     ],
-    sensor: Sensor,
-    form: FormOrAuto = None,
-    pipeline: Annotated[Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="file of 'twin tune'")] = None,
-    max_frames: MaxFrames = 20,
-    no_contact: Annotated[Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, for --push")] = None,
+    sensor: options.Sensor,
+    form: options.FormOrAuto = None,
+    pipeline: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="file of 'twin tune'")] = None,
+    max_frames: options.MaxFrames = 20,
+    no_contact: Annotated[Path | None, typer.Option(metavar="FRAME", help="frame without contact, for --push")] = None,
     push: Annotated[
         list[str] | None,
-        typer.Option("--push", metavar="SIDE:FRAME", help="contact whose object was moved to the sensor's x, y, -x or -y; repeat it"),
+        typer.Option(metavar="SIDE:FRAME", help="contact whose object was moved to the sensor's x, y, -x or -y; repeat it"),
     ] = None,
     twist: Annotated[
-        Path | None, typer.Option("--twist", metavar="FRAME", help="contact whose object was turned from x to y, instead of a second push")
+        Path | None, typer.Option(metavar="FRAME", help="contact whose object was turned from x to y, instead of a second push")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE.toml", help="copy of the specification with the view of --push")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="copy of the specification with the view of --push")] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", metavar="RUN", help="run that must know the contacts; by default the sensor's weights")
+        Path | None, typer.Option(metavar="RUN", help="run that must know the contacts; by default the sensor's weights")
     ] = None,
     *,
     progress: Progress,

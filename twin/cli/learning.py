@@ -15,35 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from twin.cli import app
-from twin.cli.options import (
-    CORES,
-    MOST_SEED,
-    QUALITY,
-    Also,
-    Device,
-    Elements,
-    Experiment,
-    Formerly,
-    FormOrAuto,
-    NoContact,
-    Out,
-    Residual,
-    Sensor,
-    Table,
-    Target,
-    Threads,
-    Tuning,
-    Workers,
-    call,
-    each_once,
-    finite,
-    load_if_named,
-    names_in,
-    print_lines,
-    sensor_with,
-    with_residual_if,
-)
+from twin.cli import app, options
+from twin.cli.options import Formerly, call, each_once, finite, load_if_named, names_in, print_lines, sensor_with, with_residual_if
 from twin.errors import OptionError
 from twin.progress import Progress
 from twin.types import FINE, Quality
@@ -65,26 +38,22 @@ TaskObjects = Annotated[str | None, typer.Option("--objects", callback=each_once
 
 @app.command("dataset", goes_on=True)
 def make_dataset(
-    experiment: Experiment,
-    sensor: Sensor,
-    count: Annotated[int, typer.Option("--count", min=1, metavar="N", help="contacts")],
-    out: Out,
+    experiment: options.Experiment,
+    sensor: options.Sensor,
+    count: Annotated[int, typer.Option(min=1, metavar="N", help="contacts")],
+    out: options.Out,
     wide: Annotated[bool, typer.Option("--wide", help="slightly larger ranges, for a training set")] = False,
-    obj: Annotated[
-        str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
-    ] = None,
-    images: Annotated[Literal["raw", "gray", "processed", "none"], typer.Option("--images", help="kind of pictures")] = "raw",
-    states: Annotated[Literal["all", "end"], typer.Option("--states", help="states of a contact that become frames")] = "end",
-    randomise: Annotated[
-        str | None, typer.Option("--randomise", metavar="R", help="domain randomisation: a name or a file; none by default")
-    ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of all samples; the experiment's own if not given")] = None,
-    workers: Workers = CORES,
-    scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
-    quality: Annotated[Quality | None, typer.Option(help=QUALITY, show_default="rasterised")] = None,
-    residual: Residual = False,
-    elements: Elements = FINE,
-    also: Also = None,
+    obj: options.TouchedObject = None,
+    images: Annotated[Literal["raw", "gray", "processed", "none"], typer.Option(help="kind of pictures")] = "raw",
+    states: Annotated[Literal["all", "end"], typer.Option(help="states of a contact that become frames")] = "end",
+    randomise: Annotated[str | None, typer.Option(metavar="R", help="domain randomisation: a name or a file; none by default")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="seed of all samples; the experiment's own if not given")] = None,
+    workers: options.Workers = options.CORES,
+    scheduler: Annotated[str, typer.Option(metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
+    quality: Annotated[Quality | None, typer.Option(help=options.QUALITY, show_default="rasterised")] = None,
+    residual: options.Residual = False,
+    elements: options.Elements = FINE,
+    also: options.Also = None,
     *,
     progress: Progress,
 ) -> "Simulated":
@@ -152,30 +121,28 @@ def require_one_recording(folders: list[Path], table: Path | None, no_contact: P
 
 @app.command("train", goes_on=True)
 def train(
-    model: Annotated[str, typer.Option("--model", help="vgnn, touch, steered, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
-    sensor: Sensor,
-    data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give it once for each of several")],
-    out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
-    target: Target = "surface-2d",
-    label_kind: Annotated[str, typer.Option("--label-kind", help="corrected or raw"), Formerly("labels")] = "corrected",
-    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and order")] = 0,
-    split: Annotated[int, typer.Option("--split", min=-1, max=MOST_SEED, help="seed of the held-out fifth; -1: nothing is held out")] = 0,
-    epochs: Annotated[int | None, typer.Option("--epochs", help="epochs of training, instead of the model's own number")] = None,
-    batch: Annotated[int | None, typer.Option("--batch", help="batch size, instead of the model's own")] = None,
-    members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,
+    model: Annotated[str, typer.Option(help="vgnn, touch, steered, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
+    sensor: options.Sensor,
+    data: Annotated[list[Path], typer.Option(metavar="DIR", help="labelled recording; give it once for each of several")],
+    out: Annotated[Path, typer.Option(metavar="RUN", help="folder of the run; made if missing")],
+    target: options.Target = "surface-2d",
+    label_kind: Annotated[str, typer.Option(help="corrected or raw"), Formerly("labels")] = "corrected",
+    seed: Annotated[int, typer.Option(min=0, max=options.MOST_SEED, help="seed of weights and order")] = 0,
+    split: Annotated[int, typer.Option(min=-1, max=options.MOST_SEED, help="seed of the held-out fifth; -1: nothing is held out")] = 0,
+    epochs: Annotated[int | None, typer.Option(help="epochs of training, instead of the model's own number")] = None,
+    batch: Annotated[int | None, typer.Option(help="batch size, instead of the model's own")] = None,
+    members: Annotated[int | None, typer.Option(help="networks in the ensemble")] = None,
     kernel: Annotated[
         bool | None,
         typer.Option("--kernel/--no-kernel", help="Gaussian process beside the networks; slow for thousands of rows"),
     ] = None,
-    max_minutes: Annotated[
-        float | None, typer.Option("--max-minutes", min=0, callback=finite, help="stop after the epoch that passes this time")
-    ] = None,
-    threads: Threads = None,
-    device: Device = "auto",
-    form: FormOrAuto = None,
-    table: Table = None,
-    no_contact: NoContact = None,
-    pipeline: Tuning = None,
+    max_minutes: Annotated[float | None, typer.Option(min=0, callback=finite, help="stop after the epoch that passes this time")] = None,
+    threads: options.Threads = None,
+    device: options.Device = "auto",
+    form: options.FormOrAuto = None,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
+    pipeline: options.Tuning = None,
     *,
     progress: Progress,
 ) -> "TrainedRun":
@@ -233,15 +200,15 @@ def train(
 @app.command("evaluate")
 def evaluate(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
-    data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give all that the run was trained on")],
-    out: Out,
-    rows: Annotated[str, typer.Option("--rows", help="validation or all")] = "validation",
+    data: Annotated[list[Path], typer.Option(metavar="DIR", help="labelled recording; give all that the run was trained on")],
+    out: options.Out,
+    rows: Annotated[str, typer.Option(help="validation or all")] = "validation",
     label_kind: Annotated[
-        str, typer.Option("--label-kind", help="truth in predictions.csv and errors.png: corrected or raw"), Formerly("labels")
+        str, typer.Option(help="truth in predictions.csv and errors.png: corrected or raw"), Formerly("labels")
     ] = "corrected",
     robustness: Annotated[bool, typer.Option("--robustness", help="also evaluate changed images (five times the frames)")] = False,
-    table: Table = None,
-    no_contact: NoContact = None,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
     *,
     progress: Progress,
 ) -> "Evaluation":
@@ -283,10 +250,10 @@ def evaluate(
 def predict(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
-    maps: Annotated[Path | None, typer.Option("--maps", metavar="DIR", help="folder for the contact maps of each frame")] = None,
+    maps: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for the contact maps of each frame")] = None,
     sequence: Annotated[bool, typer.Option("--sequence", help="the frames are a sequence in time: estimate slip, too")] = False,
-    table: Table = None,
-    no_contact: NoContact = None,
+    table: options.Table = None,
+    no_contact: options.NoContact = None,
 ) -> "Predictions":
     """Estimate the pose in every frame, with its 90 % interval.
 
@@ -315,7 +282,7 @@ def predict(
 
 
 @app.command("pack")
-def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, touch or steered")], out: Out) -> None:
+def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, touch or steered")], out: options.Out) -> None:
     """Write a small copy of a finished training run.
 
     Its numbers have half the precision, and its size is less than a tenth. Every command that takes a RUN takes it. This packs the run of
@@ -337,11 +304,11 @@ def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, 
 
 @app.command("surrogate")
 def make_surrogate(
-    sensor: Sensor,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="file to write, *.safetensors")],
-    paths: Annotated[int, typer.Option("--paths", metavar="N", help="solved paths to train on, about 6 s each on one core")] = 120,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the sampled paths")] = 0,
-    workers: Workers = CORES,
+    sensor: options.Sensor,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="file to write, *.safetensors")],
+    paths: Annotated[int, typer.Option(metavar="N", help="solved paths to train on, about 6 s each on one core")] = 120,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the sampled paths")] = 0,
+    workers: options.Workers = options.CORES,
     *,
     progress: Progress,
 ) -> "Distilled":
@@ -367,14 +334,14 @@ def make_surrogate(
 @app.command("demonstrate", goes_on=True)
 def demonstrate(
     task: TaskName,
-    sensor: Sensor,
-    out: Out,
-    episodes: Annotated[int, typer.Option("--episodes", min=1, metavar="N", help="solved episodes")] = 50,
+    sensor: options.Sensor,
+    out: options.Out,
+    episodes: Annotated[int, typer.Option(min=1, metavar="N", help="solved episodes")] = 50,
     randomise: RandomiseEpisodes = None,
     surrogate: OwnSurrogate = None,
     objects: TaskObjects = None,
     video: Annotated[bool, typer.Option("--video", help="pictures as video, which loses detail")] = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the episodes")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=options.MOST_SEED, help="seed of the episodes")] = 0,
     *,
     progress: Progress,
 ) -> "Demonstrations":
@@ -400,16 +367,16 @@ def demonstrate(
     from training.environments.demonstrations import DemonstrationPlan
     from training.environments.demonstrations import demonstrate as record
 
-    options = call(Options, locals(), objects=names_in(objects) if objects else None)
-    return record(call(DemonstrationPlan, locals()), out, video=video, progress=progress)
+    chosen = call(Options, locals(), objects=names_in(objects) if objects else None)
+    return record(call(DemonstrationPlan, locals(), options=chosen), out, video=video, progress=progress)
 
 
 @app.command("learn")
 def learn(
     task: TaskName,
-    sensor: Sensor,
-    out: Out,
-    observation: Annotated[str, typer.Option("--observation", help="pins, image, graph, pose or oracle")] = "pins",
+    sensor: options.Sensor,
+    out: options.Out,
+    observation: Annotated[str, typer.Option(help="pins, image, graph, pose or oracle")] = "pins",
     randomise: RandomiseEpisodes = None,
     surrogate: OwnSurrogate = None,
     objects: TaskObjects = None,
@@ -423,10 +390,10 @@ def learn(
         typer.Option("--state-estimator/--no-state-estimator", help="first train a state estimator of place and force"),
         Formerly("sight"),
     ] = True,
-    minutes: Annotated[float, typer.Option("--minutes", min=0, callback=finite, help="maximum time")] = 30.0,
-    environments: Annotated[int, typer.Option("--environments", min=2, help="number of environments that are stepped together")] = 32,
-    fem: Annotated[int, typer.Option("--fem", min=0, metavar="N", help="episodes with finite elements for the evaluation")] = 0,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and episodes")] = 0,
+    minutes: Annotated[float, typer.Option(min=0, callback=finite, help="maximum time")] = 30.0,
+    environments: Annotated[int, typer.Option(min=2, help="number of environments that are stepped together")] = 32,
+    fem: Annotated[int, typer.Option(min=0, metavar="N", help="episodes with finite elements for the evaluation")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=options.MOST_SEED, help="seed of weights and episodes")] = 0,
     *,
     progress: Progress,
 ) -> "Learnt":
@@ -448,6 +415,6 @@ def learn(
     from training.environments.batch import Options
     from training.environments.learn import LearnPlan, learn_policy
 
-    options = call(Options, locals(), objects=names_in(objects) if objects else None)
-    plan = call(LearnPlan, locals(), fem_episodes=fem, sight=state_estimator)
+    chosen = call(Options, locals(), objects=names_in(objects) if objects else None)
+    plan = call(LearnPlan, locals(), options=chosen, fem_episodes=fem, sight=state_estimator)
     return learn_policy(plan, out, progress=progress)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli import FewCommands, app
+from twin.cli import FewCommands, app, options
 from twin.cli.command import App
-from twin.cli.options import Also, Experiment, Formerly, FormOrAuto, Object, Out, PlainLight, Sensor, ServoName, call, print_lines
+from twin.cli.options import Formerly, call, print_lines
 from twin.progress import Progress
 from twin.signals import signals_as_ctrl_c
 from twin.types import FIRST, NONE
@@ -53,17 +53,15 @@ AtRest = Annotated[
 def live(
     model: Model = SHIPPED_MODEL,
     camera: Camera = "",
-    record: Annotated[Path | None, typer.Option("--record", metavar="DIR", help="new folder for the session")] = None,
-    replay: Annotated[Path | None, typer.Option("--replay", metavar="DIR", help="recorded session, instead of a camera")] = None,
+    record: Annotated[Path | None, typer.Option(metavar="DIR", help="new folder for the session")] = None,
+    replay: Annotated[Path | None, typer.Option(metavar="DIR", help="recorded session, instead of a camera")] = None,
     headless: Annotated[bool, typer.Option("--headless", help="no page: only print the figures at the end")] = False,
-    rerun: Annotated[
-        str | None, typer.Option("--rerun", metavar="T", help="viewer, a new file *.rrd, or a viewer's address rerun+http://...")
-    ] = None,
-    seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="stop after this time")] = None,
-    count: Annotated[int | None, typer.Option("--count", min=1, help="stop after this number of frames")] = None,
+    rerun: Annotated[str | None, typer.Option(metavar="T", help="viewer, a new file *.rrd, or a viewer's address rerun+http://...")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0, help="stop after this time")] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="stop after this number of frames")] = None,
     at_rest: AtRest = NONE,
-    also: Also = None,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="port of the page; if it is taken, the next free one")] = 8080,
+    also: options.Also = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port of the page; if it is taken, the next free one")] = 8080,
 ) -> "WatchResult":
     """Show a model's estimates on a camera's frames.
 
@@ -103,20 +101,18 @@ def print_view(url: str) -> None:
 def collect(
     camera: Camera,
     arm: ArmOption,
-    sensor: Sensor,
-    out: Out,
-    experiment: Experiment = "surface-2d",
-    count: Annotated[int, typer.Option("--count", min=1, help="contacts in the folder at the end")] = 100,
+    sensor: options.Sensor,
+    out: options.Out,
+    experiment: options.Experiment = "surface-2d",
+    count: Annotated[int, typer.Option(min=1, help="contacts in the folder at the end")] = 100,
     obj: Annotated[str | None, typer.Option("--object", metavar="O", help="object; the experiment's own if not given")] = None,
-    servo: ServoName = "surface",
-    form: FormOrAuto = None,
+    servo: options.ServoName = "surface",
+    form: options.FormOrAuto = None,
     safety: Limits = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="seed of the sampled contacts; the experiment's own if not given")
-    ] = None,
-    design: Annotated[str, typer.Option("--design", help="random, or even (spread over the ranges)")] = "random",
-    plain_light: PlainLight = False,
-    also: Also = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="seed of the sampled contacts; the experiment's own if not given")] = None,
+    design: Annotated[str, typer.Option(help="random, or even (spread over the ranges)")] = "random",
+    plain_light: options.PlainLight = False,
+    also: options.Also = None,
     dry_run: DryRun = False,
     *,
     progress: Progress,
@@ -160,21 +156,21 @@ def ended_early(followed: "Followed") -> int:
 @app.command("servo", exit_code=ended_early)
 def servo(
     obj: Annotated[str, typer.Option("--object", metavar="O", help="can, mesh-can, square, prism, tin-box, or another")],
-    out: Out,
+    out: options.Out,
     model: Model = SHIPPED_MODEL,
     camera: Camera = "",
     arm: ArmOption = "simulated",
-    servo: ServoName = "surface",
+    servo: options.ServoName = "surface",
     steps: Steps = None,
     stream: Annotated[bool, typer.Option("--stream", help="decide at a fixed rate on the newest frame, without waiting for moves")] = False,
-    rate: Annotated[float, typer.Option("--rate", min=0.1, help="decisions a second with --stream")] = 10.0,
+    rate: Annotated[float, typer.Option(min=0.1, help="decisions a second with --stream")] = 10.0,
     safety: Limits = None,
     record: Record = False,
     seed: NoiseSeed = 0,
     known_place: KnownPlace = False,
-    plain_light: PlainLight = False,
+    plain_light: options.PlainLight = False,
     at_rest: AtRest = FIRST,
-    also: Also = None,
+    also: options.Also = None,
     dry_run: DryRun = False,
     *,
     progress: Progress,
@@ -228,17 +224,17 @@ def servo(
 def run_policy(
     policy: Annotated[Path, typer.Argument(help="policy.safetensors of 'twin learn'")],
     obj: Annotated[str, typer.Option("--object", metavar="O", help="can, square, prism, tin-box, or another")],
-    out: Out,
+    out: options.Out,
     camera: Camera = "",
     arm: ArmOption = "simulated",
-    servo: ServoName = "surface",
+    servo: options.ServoName = "surface",
     steps: Steps = None,
     safety: Limits = None,
     record: Record = False,
     seed: NoiseSeed = 0,
     known_place: KnownPlace = False,
-    plain_light: PlainLight = False,
-    also: Also = None,
+    plain_light: options.PlainLight = False,
+    also: options.Also = None,
     dry_run: DryRun = False,
     *,
     progress: Progress,
@@ -292,10 +288,10 @@ def faults_of(wanted: list[str] | None, known: dict[str, "Fault"]) -> tuple[str,
 
 @emulate.command("mg400")
 def mg400(
-    host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
-    port_offset: Annotated[int, typer.Option("--port-offset", help="added to 29999 and 30003 to 30006")] = 0,
+    host: Annotated[str, typer.Option(help="address to listen on")] = "127.0.0.1",
+    port_offset: Annotated[int, typer.Option(help="added to 29999 and 30003 to 30006")] = 0,
     fault: FaultOption = None,
-    firmware: Annotated[str, typer.Option("--firmware", help="emulated version; below 1.5.6 replies are bare echoes")] = "1.7.0",
+    firmware: Annotated[str, typer.Option(help="emulated version; below 1.5.6 replies are bare echoes")] = "1.7.0",
     lenient: Annotated[bool, typer.Option("--lenient", help="like firmware 1.5.5: bare echoes, no reply to moves")] = False,
     time_scale: TimeScale = 1.0,
 ) -> None:
@@ -317,7 +313,7 @@ def mg400(
 
 @emulate.command("magician")
 def magician(
-    link: Annotated[Path | None, typer.Option("--link", help="symbolic link to make to the pseudo-terminal")] = None,
+    link: Annotated[Path | None, typer.Option(help="symbolic link to make to the pseudo-terminal")] = None,
     fault: FaultOption = None,
     time_scale: TimeScale = 1.0,
 ) -> None:
@@ -339,15 +335,15 @@ def magician(
 
 @emulate.command("camera")
 def camera(
-    arm: Annotated[str, typer.Option("--arm", metavar="A", help="mg400:ADDRESS[:DASHBOARD_PORT]")],
-    sensor: Sensor,
-    obj: Object,
-    host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: a free one")] = 8081,
-    fps: Annotated[float, typer.Option("--fps", min=0.1, help="largest number of pictures a second")] = 30.0,
-    servo: ServoName = "surface",
+    arm: Annotated[str, typer.Option(metavar="A", help="mg400:ADDRESS[:DASHBOARD_PORT]")],
+    sensor: options.Sensor,
+    obj: options.Object,
+    host: Annotated[str, typer.Option(help="address to listen on")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: a free one")] = 8081,
+    fps: Annotated[float, typer.Option(min=0.1, help="largest number of pictures a second")] = 30.0,
+    servo: options.ServoName = "surface",
     fault: FaultOption = None,
-    plain_light: PlainLight = False,
+    plain_light: options.PlainLight = False,
 ) -> None:
     """Emulate the sensor's camera as a stream over HTTP.
 

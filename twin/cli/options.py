@@ -45,6 +45,9 @@ QUALITY = "rasterised without noise, or path-traced with more and more samples"
 
 Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
 Object = Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]
+TouchedObject = Annotated[
+    str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
+]
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder to write to; made if missing")]
 Force = Annotated[bool, typer.Option("--force", help="overwrite files that this program did not write")]
 FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; found from size and content if not given")]

@@ -7,18 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    ProgressColumn,
-    SpinnerColumn,
-    Task,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.text import Text
 
 from twin.progress import Progress as Told
@@ -26,17 +16,17 @@ from twin.progress import Progress as Told
 LINE_S = 10.0  # time between two lines without a terminal, s
 
 
-class _CountColumn(ProgressColumn):
+class _CountColumn(progress.ProgressColumn):
     """Number done and total number of counted items; empty for a fraction, which the bar shows."""
 
-    def render(self, task: Task) -> Text:
+    def render(self, task: progress.Task) -> Text:
         return Text(f"{task.completed:.0f}/{task.total:.0f}" if task.total is not None and task.total > 1 else "")
 
 
-class _RateColumn(ProgressColumn):
+class _RateColumn(progress.ProgressColumn):
     """Items per second, or seconds per item if that is easier to read; empty for a fraction."""
 
-    def render(self, task: Task) -> Text:
+    def render(self, task: progress.Task) -> Text:
         speed = task.finished_speed or task.speed
         if not speed or task.total is None or task.total <= 1:
             return Text("")
@@ -52,16 +42,17 @@ class Bars:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._display: Progress | None = None
-        self._tasks: dict[str, TaskID] = {}
+        self._display: progress.Progress | None = None
+        self._tasks: dict[str, progress.TaskID] = {}
 
     def __call__(self, stage: str, done: float, total: float, note: str = "") -> None:
         begins = stage not in self._tasks or (done == 0 and total == 0)
         if begins and self._display is not None and self._display.finished:
             self.close()
         if self._display is None:
-            columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), _CountColumn(), _RateColumn())
-            self._display = Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=self._console)
+            shown = progress.SpinnerColumn(), progress.TextColumn("{task.description}"), progress.BarColumn()
+            times = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
+            self._display = progress.Progress(*shown, _CountColumn(), _RateColumn(), *times, console=self._console)
             self._display.start()
         if stage not in self._tasks:
             self._tasks[stage] = self._display.add_task(stage, total=None)

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from twin.cli import app
-from twin.cli.options import Out, load_if_named
+from twin.cli import app, options
+from twin.cli.options import load_if_named
 from twin.progress import Progress
 
 if TYPE_CHECKING:
@@ -19,12 +19,10 @@ Format = Literal["recording", "lerobot", "huggingface", "mcap"]
 @app.command("convert")
 def convert_command(
     sources: Annotated[list[Path], typer.Argument(metavar="SOURCE...", help="recordings, sessions, or converted records")],
-    to: Annotated[Format, typer.Option("--to", metavar="FORMAT", help="recording, lerobot, huggingface or mcap")],
-    out: Out,
-    sensor: Annotated[
-        str | None, typer.Option("--sensor", metavar="S", help="sensor for the pin detection; by default that of a source")
-    ] = None,
-    task: Annotated[str, typer.Option("--task", metavar="TEXT", help="task of the episodes; by default that of each source")] = "",
+    to: Annotated[Format, typer.Option(metavar="FORMAT", help="recording, lerobot, huggingface or mcap")],
+    out: options.Out,
+    sensor: Annotated[str | None, typer.Option(metavar="S", help="sensor for the pin detection; by default that of a source")] = None,
+    task: Annotated[str, typer.Option(metavar="TEXT", help="task of the episodes; by default that of each source")] = "",
     video: Annotated[bool, typer.Option("--video", help="with lerobot: pictures as video, which loses detail")] = False,
     *,
     progress: Progress,

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli import app
-from twin.cli.options import QUALITY, Object, Out, Pair, Sensor, call, print_lines
+from twin.cli import app, options
+from twin.cli.options import call, print_lines
 from twin.progress import Progress
 from twin.types import Form, Quality
 
@@ -30,9 +30,9 @@ def sensors() -> None:
     Example:
       twin sensors
     """
-    from scenes import catalog
+    from scenes.catalog import list_all
 
-    print_lines(catalog.sensors().lines())
+    print_lines(list_all("sensors").lines())
 
 
 @app.command("objects")
@@ -43,9 +43,9 @@ def objects() -> None:
     Example:
       twin objects
     """
-    from scenes import catalog
+    from scenes.catalog import list_all
 
-    print_lines([*catalog.objects().lines(), "Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl"])
+    print_lines([*list_all("objects").lines(), "Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl"])
 
 
 @app.command("experiments")
@@ -58,9 +58,9 @@ def experiments() -> None:
     Example:
       twin experiments
     """
-    from scenes import catalog
+    from scenes.catalog import list_all
 
-    print_lines(catalog.experiments().lines())
+    print_lines(list_all("experiments").lines())
 
 
 @app.command("randomisations")
@@ -73,9 +73,9 @@ def randomisations() -> None:
     Example:
       twin randomisations
     """
-    from scenes import catalog
+    from scenes.catalog import list_all
 
-    print_lines(catalog.randomisations().lines())
+    print_lines(list_all("randomisations").lines())
 
 
 @app.command("doctor", exit_code=lambda machine: 0 if machine.can_render else 1)
@@ -95,7 +95,7 @@ def doctor() -> "Machine":
 
 
 @app.command("demo")
-def demo(out: Out = Path("out/demo"), *, progress: Progress) -> "Demo":
+def demo(out: options.Out = Path("out/demo"), *, progress: Progress) -> "Demo":
     """Run the whole pipeline on shipped sensors, as one page.
 
     It presses, renders, finds pins and builds graphs for several sensors and objects. It writes pictures and a page (index.html).
@@ -111,19 +111,19 @@ def demo(out: Out = Path("out/demo"), *, progress: Progress) -> "Demo":
 
 @app.command("render")
 def render_contact_command(
-    sensor: Sensor,
-    obj: Object,
-    indent_mm: Annotated[float, typer.Option("--indent-mm", metavar="D", help="indentation from first touch; 0: no contact")],
-    out: Out,
-    tilt_deg: Annotated[Pair, typer.Option("--tilt-deg", metavar="RX RY", help="turn of the object about x, then y")] = (0.0, 0.0),
-    shear_mm: Annotated[Pair, typer.Option("--shear-mm", metavar="X Y", help="drag after the press")] = (0.0, 0.0),
-    twist_deg: Annotated[float, typer.Option("--twist-deg", metavar="RZ", help="turn about z during the drag")] = 0.0,
-    offset_mm: Annotated[Pair, typer.Option("--offset-mm", metavar="X Y", help="sideways shift of the object before it approaches")] = (
+    sensor: options.Sensor,
+    obj: options.Object,
+    indent_mm: Annotated[float, typer.Option(metavar="D", help="indentation from first touch; 0: no contact")],
+    out: options.Out,
+    tilt_deg: Annotated[options.Pair, typer.Option(metavar="RX RY", help="turn of the object about x, then y")] = (0.0, 0.0),
+    shear_mm: Annotated[options.Pair, typer.Option(metavar="X Y", help="drag after the press")] = (0.0, 0.0),
+    twist_deg: Annotated[float, typer.Option(metavar="RZ", help="turn about z during the drag")] = 0.0,
+    offset_mm: Annotated[options.Pair, typer.Option(metavar="X Y", help="sideways shift of the object before it approaches")] = (
         0.0,
         0.0,
     ),
     form: Annotated[Form, typer.Option(help="the camera's frame, or the cropped and thresholded form of the recordings")] = Form.RAW,
-    quality: Annotated[Quality, typer.Option(help=QUALITY)] = "standard",
+    quality: Annotated[Quality, typer.Option(help=options.QUALITY)] = "standard",
     seed: Annotated[int, typer.Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,
     *,
     progress: Progress,

@@ -17,24 +17,20 @@ if TYPE_CHECKING:
 
 @app.command("studio")
 def studio(
-    sensor: Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")] = "mg400-331",
+    sensor: Annotated[str, typer.Option(metavar="S", help="sensor name ('twin sensors') or specification file")] = "mg400-331",
     obj: Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")] = "sphere",
     state: Annotated[
-        str | None, typer.Option("--state", metavar="FILE", help="a state saved by the page, or its link, instead of sensor and object")
+        str | None, typer.Option(metavar="FILE", help="a state saved by the page, or its link, instead of sensor and object")
     ] = None,
-    model: Annotated[
-        Path | None, typer.Option("--model", metavar="RUN", help="folder of a run for its sensor; shipped weights if not given")
-    ] = None,
-    recording: Annotated[str, typer.Option("--recording", metavar="DIR", help="recording for the mode 'Recording'")] = "",
-    camera: Annotated[str, typer.Option("--camera", metavar="C", help="camera for the mode 'Live', as 'twin live' takes it")] = "",
-    arm: Annotated[
-        str, typer.Option("--arm", metavar="A", help="arm for the mode 'Live'; it does not move until you arm it on the page")
-    ] = "",
-    saves: Annotated[Path, typer.Option("--saves", metavar="DIR", help="folder for files that the page saves")] = Path("out/studio"),
-    host: Annotated[str, typer.Option("--host", help="address to listen on; a warning if other machines can reach it")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=1, max=65535, help="port of the page; the next free one if it is taken")] = 8090,
+    model: Annotated[Path | None, typer.Option(metavar="RUN", help="folder of a run for its sensor; shipped weights if not given")] = None,
+    recording: Annotated[str, typer.Option(metavar="DIR", help="recording for the mode 'Recording'")] = "",
+    camera: Annotated[str, typer.Option(metavar="C", help="camera for the mode 'Live', as 'twin live' takes it")] = "",
+    arm: Annotated[str, typer.Option(metavar="A", help="arm for the mode 'Live'; it does not move until you arm it on the page")] = "",
+    saves: Annotated[Path, typer.Option(metavar="DIR", help="folder for files that the page saves")] = Path("out/studio"),
+    host: Annotated[str, typer.Option(help="address to listen on; a warning if other machines can reach it")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="port of the page; the next free one if it is taken")] = 8090,
     plain: Annotated[bool, typer.Option("--plain", help="no path tracing: pictures stay rasterised")] = False,
-    seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="end after this time")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0, help="end after this time")] = None,
 ) -> None:
     """Move an object over the skin, on a page in the browser.
 

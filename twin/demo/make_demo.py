@@ -22,18 +22,9 @@ from twin.one_contact import look_at
 from twin.pins.graph import make_graph
 from twin.pins.labelling.reference import nominal_reference
 from twin.progress import Progress, Step, silent, stage, unheard
+from twin.report import plots
 from twin.report.charts import new_figure, write_chart
 from twin.report.page import Page, PagePicture, code, sentence
-from twin.report.plots import (
-    ObservedFrame,
-    area_change_at,
-    area_surface_figure,
-    draw_area_change,
-    draw_displacement,
-    draw_frame,
-    draw_graph,
-    draw_pins,
-)
 from twin.report.skin3d import draw_contact_skin
 from twin.report.table import Column, force_interval, number
 from twin.simulator import RenderedFrame, Simulator
@@ -78,7 +69,7 @@ class ContactResult:
     pose: ContactPose
     state: ContactState
     raw: RenderedFrame
-    look: ObservedFrame
+    look: plots.ObservedFrame
     seconds: dict[str, float]
     stiffness_factor: float
 
@@ -132,28 +123,6 @@ def depth_table(sensor: str, *, progress: Step = unheard) -> list[DepthRow]:
     return rows
 
 
-@dataclass(frozen=True)
-class ContactContent:
-    """The content of the page about one contact.
-
-    Attributes
-    ----------
-    title, description : str
-    pictures : dict of str to Path
-        Pictures from `contact_pictures`, and ``skin``.
-    raw_size : str
-        Size of the raw frame.
-    figures : list of (str, str)
-        As `contact_figures` gives them.
-    """
-
-    title: str
-    description: str
-    pictures: dict[str, Path]
-    raw_size: str
-    figures: list[tuple[str, str]]
-
-
 @dataclass(frozen=True, repr=False)
 class Demo(ReadableResult):
     """The result of the demo.
@@ -189,8 +158,8 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
     bar = partial(stage, progress)
     pictures = out / "pictures"
     pictures.mkdir(exist_ok=True)
+    page = Page("TacTip twin", "twin demo", topic="Demo")
     simulators: dict[str, Simulator] = {}
-    contacts: list[ContactContent] = []
     seconds: dict[str, float] = {}
     notes: set[str] = set()
     for sensor, object_name, pose, form in CONTACTS:
@@ -204,7 +173,7 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
             notes.add(
                 draw_contact_skin(simulator.solver.mesh, simulator.spec.pins, result.state, build_field(load_object(object_name)), skin)
             )
-            contacts.append(_contact_content(simulator, result, skin, pictures))
+            _add_contact(page, simulator, result, contact_pictures(pictures, result) | {"skin": skin})
 
     motion_sensor = CONTACTS[0][0]
     start = perf_counter()
@@ -213,7 +182,7 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
         for k, (title, pose) in enumerate(MOTIONS):
             looks.append((title, run_contact(simulators[motion_sensor], "plane", pose, Form.RAW).look))
             step((k + 1) / len(MOTIONS))
-        motions = write_chart(pictures / "motions.png", lambda: motion_figure(looks))
+        add_motions(page, write_chart(pictures / "motions.png", lambda: motion_figure(looks)))
     seconds["motions"] = perf_counter() - start
 
     tables = {}
@@ -222,29 +191,24 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
         with bar(f"{sensor}: displacement by depth") as step:
             tables[sensor] = depth_table(sensor, progress=step)
     seconds["displacement tables"] = perf_counter() - start
+    add_tables(page, tables)
 
     renderer = simulators[motion_sensor].describe()["renderer"]
     machine = f"Rendered with Mitsuba variant {renderer['variant']} on {os.cpu_count()} cores ({platform.machine()}). " + " ".join(
         sorted(notes)
     )
-    page = write_page(out / "index.html", machine=machine, contacts=contacts, motions=motions, tables=tables, seconds=seconds)
-    return Demo(tables, [page, *sorted(pictures.iterdir())])
+    return Demo(tables, [write_page(out / "index.html", page, machine, seconds), *sorted(pictures.iterdir())])
 
 
-def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pictures: Path) -> ContactContent:
+def _add_contact(page: Page, simulator: Simulator, result: ContactResult, pictures: dict[str, Path]) -> None:
     spec = simulator.spec
-    written = contact_pictures(pictures, result)
     touched = result.state.contact_mm
     contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.apex_mm])
     contact_px = from_raw(spec.recording, result.look.frame.form, project(spec.view, contact_mm[None]))[0]
     height, width = result.raw.frame.image.shape[:2]
-    return ContactContent(
-        title=f"{spec.name} against {result.object_name}",
-        description=f"{spec.description}. {load_object(result.object_name).description}, pressed in by {result.pose.indent_mm:g} mm.",
-        pictures=written | {"skin": skin},
-        raw_size=f"{width} x {height} px",
-        figures=contact_figures(result, contact_px),
-    )
+    title = f"{spec.name} against {result.object_name}"
+    page.section(title, f"{spec.description}. {load_object(result.object_name).description}, pressed in by {result.pose.indent_mm:g} mm.")
+    add_contact(page, title, pictures, f"{width} x {height} px", contact_figures(result, contact_px))
 
 
 def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
@@ -255,20 +219,20 @@ def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
         "raw": write_image(folder / f"{stem}-frame.png", result.raw.frame.image),
         "pins": write_chart(folder / f"{stem}-graph.png", lambda: _graph_figure(look)),
         "areas": write_chart(folder / f"{stem}-areas.png", lambda: _areas_figure(look)),
-        "surfaces": write_chart(folder / f"{stem}-surfaces.png", lambda: area_surface_figure(rest, graph)),
+        "surfaces": write_chart(folder / f"{stem}-surfaces.png", lambda: plots.area_surface_figure(rest, graph)),
     }
     if look.frame.form == Form.PROCESSED:
         written["recorded"] = write_image(folder / f"{stem}-recorded.png", look.frame.image)
     return written
 
 
-def motion_figure(motions: list[tuple[str, ObservedFrame]]) -> Figure:
+def motion_figure(motions: list[tuple[str, plots.ObservedFrame]]) -> Figure:
     """Displacement (top) and area change (bottom) for each motion, as in the paper's figure 1(d)."""
     figure, axes = new_figure(len(motions), 2, panel_inch=4.2)
     for column, (title, look) in enumerate(motions):
         graph, rest = look.graphs()
-        draw_displacement(axes[column], rest.nodes_px, graph.nodes_px, title)
-        draw_area_change(axes[column + len(motions)], graph, rest.area_px2, "")
+        plots.draw_displacement(axes[column], rest.nodes_px, graph.nodes_px, title)
+        plots.draw_area_change(axes[column + len(motions)], graph, rest.area_px2, "")
     return figure
 
 
@@ -277,6 +241,7 @@ def contact_figures(result: ContactResult, contact_px: np.ndarray) -> list[tuple
     look, force = result.look, result.state.force_n
     observation = look.observation
     ends = force_interval(force.tolist(), result.stiffness_factor)
+    grown = plots.area_change_at(look, contact_px, count=12)
     parts = ", ".join(number(float(part), decimals=2, signed=True) for part in force)
     return [
         ("pins found", f"{observation.found} of {len(observation.pins_px)}"),
@@ -284,47 +249,22 @@ def contact_figures(result: ContactResult, contact_px: np.ndarray) -> list[tuple
         ("force on the object, N", f"({parts})"),
         ("90 % interval of its size, N", " to ".join(number(each, decimals=2) for each in ends)),
         ("contact area, mm²", number(float(result.state.area_mm2), decimals=1)),
-        ("cell area at the contact against no contact", f"{number(area_change_at(look, contact_px, count=12), decimals=1, signed=True)} %"),
+        ("cell area at the contact against no contact", f"{number(grown, decimals=1, signed=True)} %"),
         *((f"{name}, s", number(value, decimals=3)) for name, value in result.seconds.items()),
     ]
 
 
-def write_page(
-    path: Path,
-    *,
-    machine: str,
-    contacts: Sequence[ContactContent],
-    motions: Path,
-    tables: Mapping[str, Sequence[DepthRow]],
-    seconds: Mapping[str, float],
-) -> Path:
-    """Write the page with all pictures inside, and return its path.
-
-    Parameters
-    ----------
-    path : Path
-    machine : str
-        Renderer and machine.
-    contacts : sequence of ContactContent
-    motions : Path
-        Chart of `motion_figure`.
-    tables : mapping of str to sequence of DepthRow
-        By sensor.
-    seconds : mapping of str to float
-        Time of each stage.
-    """
-    page = Page("TacTip twin", "twin demo", topic="Demo")
+def write_page(path: Path, page: Page, machine: str, seconds: dict[str, float]) -> Path:
+    """Add the lead, the time of each stage and what to try next to the page. It is written with all pictures inside."""
     page.lead = sentence(
         "A skin pressed by finite elements, the view of the camera inside it path-traced, and the pins found in that picture by the same "
         "pipeline that runs on a real sensor. Everything on this page was computed by",
         code("make demo") + ".",
         machine,
     )
-    for contact in contacts:
-        _contact_section(page, contact)
-    _motions_section(page, motions)
-    _tables_section(page, tables)
-    _time_section(page, seconds)
+    page.section("Time")
+    stages = [{"stage": name, "seconds": value} for name, value in (seconds | {"all": sum(seconds.values())}).items()]
+    page.table(stages, [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
     page.section(
         "What to try next", "The tutorials in docs/tutorials go through each of these; 'make docs' builds the whole documentation."
     )
@@ -332,14 +272,13 @@ def write_page(
     return page.write(path, embed=True)
 
 
-def _contact_section(page: Page, contact: ContactContent) -> None:
-    at, title = contact.pictures, contact.title
-    page.section(title, contact.description)
+def add_contact(page: Page, title: str, at: Mapping[str, Path], raw_size: str, figures: list[tuple[str, str]]) -> None:
+    """Add the pictures from `contact_pictures`, and ``skin``, of a contact whose raw frame has a size, and its `contact_figures`."""
     shown = [
         PagePicture(
             at["skin"], f"{title}: deformed skin in 3D", "The skin, cut open, coloured by its displacement, with pins and object.", "photo"
         ),
-        PagePicture(at["raw"], f"{title}: rendered camera frame", f"What the camera inside sees ({contact.raw_size}).", "frame"),
+        PagePicture(at["raw"], f"{title}: rendered camera frame", f"What the camera inside sees ({raw_size}).", "frame"),
     ]
     if "recorded" in at:
         said = "The same frame in the form of this sensor's recordings: cropped, adaptively thresholded, resized."
@@ -363,10 +302,11 @@ def _contact_section(page: Page, contact: ContactContent) -> None:
             "Cell area interpolated over the image: no contact, contact, difference.",
         )
     )
-    page.table([{"name": name, "value": value} for name, value in contact.figures], [Column("name", "figure"), Column("value", "value")])
+    page.table([{"name": name, "value": value} for name, value in figures], [Column("name", "figure"), Column("value", "value")])
 
 
-def _motions_section(page: Page, motions: Path) -> None:
+def add_motions(page: Page, motions: Path) -> None:
+    """Add the chart of `motion_figure`."""
     page.section(
         "Three motions, three signatures",
         "Pressing (Z) spreads the pins outwards. Dragging along x or y carries them with the object until they slip.",
@@ -380,7 +320,8 @@ def _motions_section(page: Page, motions: Path) -> None:
     )
 
 
-def _tables_section(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> None:
+def add_tables(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> None:
+    """Add the displacements by depth, by the sensor's name."""
     page.section(
         "Against real recordings: displacement by depth",
         "Mean displacement of all pins on a flat plate, in pixels of the uncropped camera frame. Measured: the Tac-VGNN release's "
@@ -399,24 +340,17 @@ def _tables_section(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> Non
         page.table([vars(row) for row in rows], columns, caption=sensor)
 
 
-def _time_section(page: Page, seconds: Mapping[str, float]) -> None:
-    page.section("Time")
-    total = {"stage": "all", "seconds": sum(seconds.values())}
-    stages = [{"stage": name, "seconds": value} for name, value in seconds.items()]
-    page.table([*stages, total], [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
-
-
-def _graph_figure(look: ObservedFrame) -> Figure:
+def _graph_figure(look: plots.ObservedFrame) -> Figure:
     figure, (ax,) = new_figure(1, panel_inch=6)
     graph, rest = look.graphs()
-    draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
-    draw_graph(ax, graph)
-    draw_pins(ax, look.observation)
+    plots.draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
+    plots.draw_graph(ax, graph)
+    plots.draw_pins(ax, look.observation)
     return figure
 
 
-def _areas_figure(look: ObservedFrame) -> Figure:
+def _areas_figure(look: plots.ObservedFrame) -> Figure:
     figure, (ax,) = new_figure(1, panel_inch=6)
     graph, rest = look.graphs()
-    draw_area_change(ax, graph, rest.area_px2, "")
+    plots.draw_area_change(ax, graph, rest.area_px2, "")
     return figure

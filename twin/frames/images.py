@@ -1,6 +1,6 @@
 """Reading one picture from a file as 8-bit levels, and writing one.
 
-The libraries that OpenCV uses print messages to the process's stderr, where Python code can't catch them. `quiet` redirects stderr
+The libraries that OpenCV uses print messages to the process's stderr, where Python code can't catch them. `overheard` redirects stderr
 during one decoder call.
 
 Pixels are taken as they are stored, because a sensor's calibration counts them so. An orientation flag (EXIF) is stated, never applied.
@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from scenes.files import read_regular
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.store import write_bytes
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -52,10 +52,7 @@ MOST_HEARD = 10_000
 STDERR = 2
 """File descriptor of the process's stderr."""
 
-_lock = threading.Lock()
 _hearing = threading.Lock()  # one decoder call at a time, so that the messages belong to this call
-_inside = 0  # number of calls that currently need stderr redirected
-_kept: int | None = None  # the original stderr while it is redirected
 
 
 def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
@@ -101,7 +98,12 @@ def write_image(path: Path, image: np.ndarray) -> Path:
     StoreError
         The file cannot be written.
     """
-    return write_bytes(path, cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes())
+    return write_bytes(path, png(image))
+
+
+def png(image: np.ndarray) -> bytes:
+    """A gray or RGB picture as the content of a PNG file."""
+    return cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes()
 
 
 def decode(path: Path) -> np.ndarray:
@@ -117,10 +119,8 @@ def decode(path: Path) -> np.ndarray:
 
 def _read_levels(path: Path) -> tuple[np.ndarray, str]:
     """Levels as of ``decode``, and a note on irregularities of the file ("" if there are none)."""
-    try:
+    with ErrorsAs(OSError, lambda error: FrameError(f"{path.name}: can't be read ({error.strerror})")):
         data = read_regular(path, LARGEST_BYTES)
-    except OSError as error:
-        raise FrameError(f"{path.name}: can't be read ({error.strerror})") from error
     if not data:
         raise FrameError(f"{path.name}: the file is empty; copy it again")
     try:
@@ -174,7 +174,7 @@ def _holds_several(path: Path, data: bytes) -> bool:
     """Whether a picture's file is an animation or has several pages."""
     if data.startswith(PNG_START):
         return any(kind == b"acTL" for kind, _, _ in _png_chunks(data))
-    with quiet():
+    with overheard():
         return data.startswith(SEVERAL_FROM_START) and cv2.imcount(str(path)) > 1
 
 
@@ -218,62 +218,36 @@ def to_eight_bits(image: np.ndarray, bits: int = 0) -> tuple[np.ndarray, str]:
     return np.round(image * (255.0 / ((1 << bits) - 1))).astype(np.uint8), f"16-bit levels taken as {bits}-bit data and scaled to 8 bits"
 
 
-def _silence_stderr() -> None:
-    """Redirect stderr to the null device, unless another call has already done so."""
-    global _inside, _kept
-    with _lock:
-        _inside += 1
-        if _inside > 1:
-            return
-        try:
-            _kept = os.dup(STDERR)
-        except OSError:  # the process has no stderr
-            return
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, STDERR)
-        os.close(nowhere)
-
-
-def _turn_back() -> None:
-    """Restore stderr when the last call that needs it redirected has ended."""
-    global _inside, _kept
-    with _lock:
-        _inside -= 1
-        if _inside == 0 and _kept is not None:
-            os.dup2(_kept, STDERR)
-            os.close(_kept)
-            _kept = None
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Context that drops what any thread prints to stderr. Use it for one decoder call only."""
-    _silence_stderr()
-    try:
-        yield
-    finally:
-        _turn_back()
-
-
 @contextlib.contextmanager
 def overheard() -> Iterator[list[str]]:
-    """Context like ``quiet`` that gives a list of one text. When the context ends, the text is what was printed to stderr."""
+    """Context that keeps from the terminal what any thread prints to stderr, for one decoder call only.
+
+    It gives a list of one text. When the context ends, the text is what was printed.
+    """
     said = [""]
-    with _hearing, quiet():  # stderr is the null device until this context ends
-        if _kept is None:
+    with _hearing:
+        kept = _own_stderr()
+        if kept is None:
             yield said
             return
         heard, ear = os.pipe()
         os.set_blocking(ear, False)  # text beyond the pipe's capacity is dropped
         os.set_blocking(heard, False)
-        nowhere = os.dup(STDERR)
         os.dup2(ear, STDERR)
         os.close(ear)
         try:
             yield said
         finally:
-            os.dup2(nowhere, STDERR)
-            os.close(nowhere)
+            os.dup2(kept, STDERR)
+            os.close(kept)
             with contextlib.suppress(BlockingIOError):
                 said[0] = os.read(heard, MOST_HEARD).decode("utf-8", "replace")
             os.close(heard)
+
+
+def _own_stderr() -> int | None:
+    """A second descriptor of the process's stderr; None if it has none."""
+    try:
+        return os.dup(STDERR)
+    except OSError:
+        return None

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from scenes.files import read_regular
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.frames.images import picture_of
 from twin.frames.tables import LARGEST_BYTES, called_here
 from twin.frames.videos import open_video
@@ -107,10 +107,8 @@ class LeRobotFrames:
         named = cell.get("path") if isinstance(cell, dict) else None
         if not named:
             raise FrameError("no picture in its row")
-        try:
+        with ErrorsAs(OSError, lambda error: FrameError(f"{named}: can't be read ({error.strerror})")):
             return read_regular(self.path / named, LARGEST_BYTES)
-        except OSError as error:
-            raise FrameError(f"{named}: can't be read ({error.strerror})") from error
 
     def _as_first(self, image: np.ndarray) -> np.ndarray:
         return image[..., 0] if image.ndim == 3 and self.first.ndim == 2 and self.first.size else image
@@ -162,10 +160,8 @@ def open_lerobot(path: Path) -> LeRobotFrames:
 
 
 def _info(path: Path) -> dict[str, Any]:
-    try:
+    with ErrorsAs((OSError, ValueError, RecursionError), lambda error: FrameError(f"{path / INFO}: can't be read ({error}); {DAMAGED}")):
         info = json.loads(read_regular(path / INFO, LARGEST_BYTES))
-    except (OSError, ValueError, RecursionError) as error:
-        raise FrameError(f"{path / INFO}: can't be read ({error}); {DAMAGED}") from error
     if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
         raise FrameError(f"{path / INFO}: names no features; {DAMAGED}")
     if not str(info.get("codebase_version")).startswith(VERSION):

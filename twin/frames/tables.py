@@ -5,6 +5,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -83,15 +84,12 @@ def _cells(text: str) -> list[list[str]]:
     """
     lines = [line for line in text.splitlines() if line.strip()]
     separator = max(SEPARATORS, key=lines[0].count) if lines else ","
-    rows = []
+    rows, reader = [], partial(csv.reader, delimiter=separator, skipinitialspace=True)
     for number, line in enumerate(lines, 1):
         if line.count(separator) >= MOST_COLUMNS:
             raise csv.Error(f"row {number} has {line.count(separator) + 1} cells, a table has at most {MOST_COLUMNS}")
         unclosed = line.count('"') % 2 == 1  # the csv reader would join such a line with the following lines
-        if unclosed:
-            (row,) = csv.reader([line], delimiter=separator, quoting=csv.QUOTE_NONE, skipinitialspace=True)
-        else:
-            (row,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+        (row,) = reader([line], quoting=csv.QUOTE_NONE) if unclosed else reader([line])
         row = [cell.strip(AROUND_CELLS) for cell in row]
         if separator != ",":
             row = [re.sub(r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$", r"\1.\2", cell) for cell in row]
@@ -123,11 +121,8 @@ def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are 
     try:
         text = _text(path)
         rows = _cells(text)
-    except OSError as error:
-        problems.append(f"{path.name}: can't be read ({error.strerror}); {otherwise}")
-        return None
-    except csv.Error as error:
-        problems.append(f"{path.name}: can't be read ({error}); {otherwise}")
+    except (OSError, csv.Error) as error:
+        problems.append(f"{path.name}: can't be read ({getattr(error, 'strerror', error)}); {otherwise}")
         return None
     header = rows[0] if rows else []
     name_columns = [k for k, column in enumerate(header) if column.casefold() in NAME_COLUMNS]

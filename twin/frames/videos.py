@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 
 from scenes.files import quote, require_regular
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.frames.av1 import decode_av1
 from twin.frames.forms import times
-from twin.frames.images import NOT_TURNED, overheard, picture_of, quiet
+from twin.frames.images import NOT_TURNED, overheard, picture_of
 
 MOTION_JPEG, AV1 = b"MJPG", b"AV01"
 """Four-letter codes of the codec whose frames are JPEG pictures, and of one that OpenCV can't decode."""
@@ -86,10 +86,8 @@ def open_video(path: Path) -> Video:
     FrameError
         The video can't be read, or has no usable frame.
     """
-    try:
+    with ErrorsAs(OSError, lambda error: FrameError(f"{path}: can't be read ({error.strerror}); give a video")):
         require_regular(path)
-    except OSError as error:
-        raise FrameError(f"{path}: can't be read ({error.strerror}); give a video") from error
     stored = _read_properties(path)
     times_s: list[float] = []
     said: dict[int, str] = {}
@@ -221,7 +219,7 @@ def _remedy(path: Path, codec: bytes, said: str) -> str:
 @contextmanager
 def _capture(path: Path) -> Iterator[tuple[cv2.VideoCapture, bytes]]:
     """An open video and its codec. One thread decodes it, so that messages belong to the frame that is read; nothing is turned."""
-    with quiet():
+    with overheard():
         capture = cv2.VideoCapture(str(path), cv2.CAP_ANY, [cv2.CAP_PROP_N_THREADS, 1])
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     code = int(capture.get(cv2.CAP_PROP_FOURCC)) if capture.isOpened() else 0
@@ -240,7 +238,7 @@ def _read_properties(path: Path) -> _Stored:
         known: dict[bytes, tuple[int, ...]] = {}
         more = codec != MOTION_JPEG and capture.set(cv2.CAP_PROP_FORMAT, AS_STORED)
         while more:
-            with quiet():
+            with overheard():
                 more, data = capture.read()
             if more and capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME):
                 packet = data.tobytes()

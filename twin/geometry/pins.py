@@ -150,6 +150,13 @@ def border_of(places: FloatArray) -> IntArray:
     return np.array(loop)
 
 
+def across_axis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors (N, 3) perpendicular to axes (N, 3): along the projection of the sensor's x, and a quarter turn towards y."""
+    u = np.array([1.0, 0.0, 0.0]) - axis[:, :1] * axis
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return u, np.cross(u, axis)
+
+
 def rest_pins(geometry: GeometrySpec) -> PinRest:
     """Pins of a sensor at rest: the layout, mapped to the inside of its skin by the skin's shape and ``PinsSpec.spacing``."""
     pins = geometry.pins

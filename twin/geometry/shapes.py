@@ -208,12 +208,12 @@ class Pad(SkinShape):
         angle = np.maximum(size * length_mm - flat_mm, 0) / self.edge_mm
         return np.sign(share) * (np.minimum(size * length_mm, flat_mm) + edge_mm * np.sin(angle)), np.cos(np.minimum(angle, np.pi / 2))
 
-    def _share(self, at_mm: FloatArray, half_mm: float) -> FloatArray:
+    def _share(self, at_mm: FloatArray, half_mm: float, radius_mm: float) -> FloatArray:
         """Inverse of the inside's profile: the relative distance for distances from the centre in mm."""
         size, flat_mm = np.abs(at_mm), half_mm - self.edge_mm
         if self.edge_mm == 0:
             return at_mm / half_mm
-        sine = np.clip((size - flat_mm) / self._inner_edge_mm, 0, 1)
+        sine = np.clip((size - flat_mm) / radius_mm, 0, 1)
         return np.sign(at_mm) * (np.minimum(size, flat_mm) + self.edge_mm * np.arcsin(sine)) / (flat_mm + self.edge_mm * np.pi / 2)
 
     def _check_flat(self, feet_mm: FloatArray, on_flat: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -274,7 +274,7 @@ class RoundPad(Pad):
     def place(self, inside_mm: FloatArray) -> ComplexArray:
         far = np.hypot(inside_mm[:, 0], inside_mm[:, 1])
         turn: ComplexArray = np.exp(1j * np.arctan2(inside_mm[:, 1], inside_mm[:, 0]))
-        return turn * self._share(far, self.skin.outer_radius_mm)
+        return turn * self._share(far, self.skin.outer_radius_mm, self._inner_edge_mm)
 
     def _outside_place(self, near_mm: FloatArray) -> ComplexArray:
         x, y, z = near_mm.T
@@ -328,18 +328,12 @@ class RectangularPad(Pad):
 
     def place(self, inside_mm: FloatArray) -> ComplexArray:
         width, height = self.skin.half_size_mm
-        return _complex(self._share(inside_mm[:, 0], width), self._share(inside_mm[:, 1], height))
+        return _complex(self._share(inside_mm[:, 0], width, self._inner_edge_mm), self._share(inside_mm[:, 1], height, self._inner_edge_mm))
 
     def _outside_place(self, near_mm: FloatArray) -> ComplexArray:
-        def along(at: FloatArray, half: float) -> FloatArray:
-            flat_mm = half - self.edge_mm
-            if self.edge_mm == 0:
-                return np.clip(at / half, -1, 1)
-            sine = np.clip((np.abs(at) - flat_mm) / self.edge_mm, 0, 1)
-            return np.sign(at) * (np.minimum(np.abs(at), flat_mm) + self.edge_mm * np.arcsin(sine)) / (flat_mm + self.edge_mm * np.pi / 2)
-
         width, height = self.skin.half_size_mm
-        return _complex(along(near_mm[:, 0], width), along(near_mm[:, 1], height))
+        x, y = self._share(near_mm[:, 0], width, self.edge_mm), self._share(near_mm[:, 1], height, self.edge_mm)
+        return _complex(np.clip(x, -1, 1), np.clip(y, -1, 1))
 
     def pins(self, layout: FloatArray, pins: PinsSpec) -> tuple[FloatArray, FloatArray]:
         feet = self._feet(layout, pins)

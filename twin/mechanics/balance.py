@@ -132,6 +132,8 @@ class Balance:
 
     Attributes
     ----------
+    control_mm, border : (n, 3) float, (2,) float
+        The trial state, as in ``LoadState``.
     elastic : (unknowns,) float
         Elastic force on the free controls.
     residual : (unknowns,) float
@@ -150,6 +152,8 @@ class Balance:
         See ``Body``.
     """
 
+    control_mm: FloatArray
+    border: FloatArray
     elastic: FloatArray
     residual: FloatArray
     border_residual: FloatArray
@@ -188,15 +192,10 @@ class Problem:
     compliance_mm_per_n : float
         Displacement of the object along z per N.
     state : LoadState
-        State at the start of the step. The slip of each point determines its coefficient of friction.
-    anchor_mm : (p, 3) float
-        Friction anchors of all contact points in the object's frame.
+        State at the start of the step, with the pose and the anchors of its end. The slip of each point determines its coefficient of
+        friction.
     looked : (q,) int
         Candidate points: the contact points that the equations include. The other points are assumed to be free.
-    penalty : float
-        Contact pressure for a unit of penetration, MPa/mm.
-    T : (4, 4) float
-        The object's pose without its displacement under the compliance.
     given : list of float arrays
         Given viscoelastic stress of each kind of elements (see ``Elements.add_forces``).
     """
@@ -208,22 +207,17 @@ class Problem:
         friction: Friction,
         compliance_mm_per_n: float,
         state: LoadState,
-        *,
-        anchor_mm: FloatArray,
         looked: IntArray,
-        penalty: float,
-        T: FloatArray,
         given: list[FloatArray],
     ) -> None:
         self.body, self.compliance, self._field = body, compliance_mm_per_n, field
         self.volume_force_n_per_mm3 = body.volume_force_n_per_mm3
-        self._given, self.T = given, T
-        self.looked, self.penalty = looked, penalty
+        self._given, self.T, self.looked = given, state.T, looked
         points = body.points
         self.controls, self.weights = points.controls[looked], points.weights[looked]
         self.lift = points.lift_mm[looked]
-        self.anchor_mm = anchor_mm[looked]
-        self.stiff = penalty * points.area_mm2[looked]
+        self.anchor_mm = state.anchor_mm[looked]
+        self.stiff = state.penalty_mpa_mm * points.area_mm2[looked]
         self.bound_n = friction.shear_strength_mpa * points.area_mm2[looked]
         self._law = friction
         self.slid_mm = state.slid_mm[looked]
@@ -253,12 +247,12 @@ class Problem:
             elastic_nmm -= border[1] * volume
         return self._with_contact(control, border, residual[body.free].ravel(), volume, elastic_nmm)
 
-    def again(self, before: Balance, control: FloatArray, border: FloatArray) -> Balance:
+    def again(self, before: Balance) -> Balance:
         """The balance at the state of ``before``, which these equations share except for contact and friction.
 
         The elastic forces of ``before`` are used again.
         """
-        return self._with_contact(control, border, before.elastic, float(before.border_residual[1]), before.elastic_nmm)
+        return self._with_contact(before.control_mm, before.border, before.elastic, float(before.border_residual[1]), before.elastic_nmm)
 
     def _with_contact(self, control: FloatArray, border: FloatArray, elastic: FloatArray, volume_mm3: float, elastic_nmm: float) -> Balance:
         contact = self.contact(in_object(positions(self.controls, self.weights, self.lift, control), self.T, border))
@@ -270,12 +264,12 @@ class Problem:
             border_residual[0] = border[0] / self.compliance + float(force[:, 2].sum())
         scale = max(float(np.linalg.norm(force, axis=1).sum()), FORCE_FLOOR_N)
         residual = elastic - pushed[self.body.free].ravel()
-        return Balance(elastic, residual, border_residual, contact, force, scale, elastic_nmm, self.volume_force_n_per_mm3)
+        return Balance(control, border, elastic, residual, border_residual, contact, force, scale, elastic_nmm, self.volume_force_n_per_mm3)
 
-    def stiffness(self, control: FloatArray, border: FloatArray, kept: list[KeptStiffness], *, fresh: bool) -> None:
+    def stiffness(self, at: Balance, kept: list[KeptStiffness], *, fresh: bool) -> None:
         """Update the elements' tangents to a state; ``fresh`` recomputes all of them."""
         for number, (kind, given, blocks) in enumerate(zip(self.body.kinds, self._given, kept, strict=True)):
-            blocks.update(kind, control, given, border[1] if number else 0.0, fresh=fresh)
+            blocks.update(kind, at.control_mm, given, at.border[1] if number else 0.0, fresh=fresh)
 
     def volume(self, control: FloatArray, out: FloatArray) -> float:
         """Increase of the gel's volume, mm^3; adds its gradient to ``out``."""

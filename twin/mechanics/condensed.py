@@ -137,19 +137,10 @@ class SmallContact:
     volume into a force (``Body.volume_force_n_per_mm3``), so that all residuals are in N and have one norm.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        near: Near,
-        pivot: float,
-        residual: FloatArray,
-        volume_residual: float,
-        control: FloatArray,
-        border: FloatArray,
-    ) -> None:
-        self._problem, self._border, self._near = problem, border, near
+    def __init__(self, problem: Problem, near: Near, pivot: float, residual: FloatArray, volume_residual: float, balance: Balance) -> None:
+        self._problem, self._border, self._near = problem, balance.border, near
         self.iterations = 0
-        self._at = positions(problem.controls, problem.weights, problem.lift, control)
+        self._at = positions(problem.controls, problem.weights, problem.lift, balance.control_mm)
         self._far_residual = lapack.strtrs(near.factor, residual[near.far], lower=1)[0] if len(near.far) else residual[near.far]
         self._r = residual[near.near] - near.coupling.T @ self._far_residual
         if near.turns is not None:

@@ -1,5 +1,6 @@
 """Simulation of a sensor that follows an object: one contact state for each new pose, continued from the state before."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -63,7 +64,7 @@ class Follower:
         """
         gap = self.gap_mm(T)
         if gap >= 0:
-            self._contact, self._state = None, self._free(T)
+            self._contact, self._state = None, replace(self._rest, T_sensor_object=T)
         elif self._T is None or not np.array_equal(T, self._T) or self._relaxes:
             try:
                 self._press(T, time_s)
@@ -101,10 +102,6 @@ class Follower:
 
     def _gaps(self, T: np.ndarray) -> np.ndarray:
         return self._field.distance((self._skin_mm - T[:3, 3]) @ T[:3, :3])
-
-    def _free(self, T: np.ndarray) -> ContactState:
-        rest = self._rest
-        return ContactState.undeformed(rest.nodes_mm, rest.base_mm, rest.axis, rest.caps_mm, T_sensor_object=T)
 
     def _press(self, T: np.ndarray, time_s: float) -> None:
         limit = deepest_mm(self._solver.spec.geometry)

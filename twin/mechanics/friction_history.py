@@ -50,8 +50,6 @@ def friction_substeps(
     turns: FloatArray | None,
     forward: FloatArray,
     local: IntArray,
-    control: FloatArray,
-    border: FloatArray,
     balance: Balance,
     *,
     count: int,
@@ -75,7 +73,7 @@ def friction_substeps(
         Elastic force at the end of the load step, after forward elimination.
     local : (q, 9) int
         Index of each candidate point's controls among the kept controls.
-    control, border, balance
+    balance : Balance
         State at the end of the load step, at least approximately solved.
     count : int
         Number of substeps.
@@ -84,12 +82,12 @@ def friction_substeps(
     -------
     LoadState
         The state at the start, except for ``held``, ``slid_mm``, ``limit_n`` and ``gap_mm``, which are those one substep before the end,
-        ``dissipated_nmm`` up to there, and ``anchor_mm`` for the last substep. None if a substep did not converge.
+        ``dissipated_nmm`` up to there, and ``T`` and ``anchor_mm`` of the last substep. None if a substep did not converge.
     """
     looked, kept = problem.looked, tangent.eliminated.kept
     volume = balance.border_residual[1]
-    start: FloatArray = (state.control_mm - control)[problem.body.free].ravel()[kept]
-    y = np.concatenate([start[near.near], state.border - border])
+    start: FloatArray = (state.control_mm - balance.control_mm)[problem.body.free].ravel()[kept]
+    y = np.concatenate([start[near.near], state.border - balance.border])
     if turns is not None:
         turns = turns[kept[::3] // 3]
         start = turned_back(turns, start)
@@ -103,7 +101,7 @@ def friction_substeps(
     residual_start = (spread[:-1].ravel() if turns is None else turned_back(turns, spread[:-1].ravel())) - tangent.matrix @ start
     if tangent.volume_column is not None:
         volume = volume - tangent.eliminated.inner(tangent.volume_column) @ tangent.eliminated.inner(forward)
-        pressure = state.border[1] - border[1]
+        pressure = state.border[1] - balance.border[1]
         residual_start -= tangent.volume_column[kept] * pressure
         volume_start = -float(tangent.volume_column[kept] @ start + tangent.volume_pivot * pressure)
 
@@ -114,15 +112,8 @@ def friction_substeps(
         share, predicted = number / count, y * (1 - 1 / (count + 1 - number))
         T = way.at(share)
         substep = problem.move_object(T, anchor, slid)
-        small = SmallContact(
-            substep,
-            near,
-            tangent.volume_pivot,
-            (1 - share) * residual_start + share * residual,
-            (1 - share) * volume_start + share * volume,
-            control,
-            border,
-        )
+        residual_now, volume_now = (1 - share) * residual_start + share * residual, (1 - share) * volume_start + share * volume
+        small = SmallContact(substep, near, tangent.volume_pivot, residual_now, volume_now, balance)
         after = small.places(predicted)
         substep.anchor_mm = anchor = first_touch(held, anchor, before, after, gap_before, field.distance(after))
         if number == count:
@@ -138,7 +129,8 @@ def friction_substeps(
     anchors, all_held, all_slid, all_limit = anchor_mm.copy(), state.held.copy(), state.slid_mm.copy(), state.limit_n.copy()
     gap = state.gap_mm.copy()
     anchors[looked], all_held[looked], all_slid[looked], all_limit[looked], gap[looked] = anchor, held, slid, limit, gap_before
-    return replace(state, anchor_mm=anchors, held=all_held, slid_mm=all_slid, limit_n=all_limit, gap_mm=gap, dissipated_nmm=lost)
+    history = replace(state, held=all_held, slid_mm=all_slid, limit_n=all_limit, gap_mm=gap, dissipated_nmm=lost)
+    return replace(history, T=problem.T, anchor_mm=anchors)
 
 
 def first_touch(

@@ -152,22 +152,10 @@ class LoadStepper:
         looked = np.flatnonzero((gap < _REACH_MM) | state.held)
         self._provide(looked, gap)
         anchors = first_touch(state.held, state.anchor_mm, before, after, gap_before, gap)
-        memory = replace(state, dissipated_nmm=0.0)
-        penalty = state.penalty_mpa_mm
+        memory = replace(state, T=T, anchor_mm=anchors, dissipated_nmm=0.0)
 
         def problem_now() -> Problem:
-            return Problem(
-                self._body,
-                self._field,
-                self._friction,
-                self._compliance,
-                memory,
-                anchor_mm=anchors,
-                looked=looked,
-                penalty=penalty,
-                T=T,
-                given=given,
-            )
+            return Problem(self._body, self._field, self._friction, self._compliance, memory, looked, given)
 
         known = control is not state.control_mm
         touched = state.held | ((gap_before > 0) & (gap < 0))
@@ -175,20 +163,18 @@ class LoadStepper:
         balance: Balance | None = None
         if count > 1:
             problem = problem_now()
-            control, border, balance = self._solve(problem, control, border, known, tolerance=_ROUGH_TOLERANCE)
+            balance = self._solve(problem, problem.balance(control, border), known, tolerance=_ROUGH_TOLERANCE)
             known = True
-            gap_now = self._field.distance(self._points_in_object_frame(control, border, T))
+            gap_now = self._field.distance(self._points_in_object_frame(balance.control_mm, balance.border, T))
             looked = np.flatnonzero((gap_now < _SOLVED_REACH_MM) | state.held)
             self._provide(looked, gap_now)
             problem = problem_now()
-            balance = problem.again(balance, control, border)
-            found = self._update_friction(problem, state, anchors, control, border, balance, count)
-            if found is not None:
-                memory, anchors = found, found.anchor_mm
+            balance = problem.again(balance)
+            memory = self._update_friction(problem, state, anchors, balance, count) or memory
         for _ in range(_PENALTY_RAISES):
             problem = problem_now()
-            control, border, balance = self._solve(problem, control, border, known, before=balance)
-            seen = self._points_in_object_frame(control, border, T)
+            balance = self._solve(problem, problem.again(balance) if balance else problem.balance(control, border), known)
+            seen = self._points_in_object_frame(balance.control_mm, balance.border, T)
             gap_seen = self._field.distance(seen)
             missed = gap_seen < 0
             missed[looked] = False
@@ -196,10 +182,10 @@ class LoadStepper:
                 looked = np.sort(np.concatenate([looked, np.flatnonzero(missed)]))
                 self._provide(looked, gap)
             elif balance.contact.penetration_mm.max(initial=0.0) > GAP_BOUND_MM:
-                penalty *= _PENALTY_GROWTH
+                memory = replace(memory, penalty_mpa_mm=_PENALTY_GROWTH * memory.penalty_mpa_mm)
             else:
-                self._last, self._touch = state, (control, seen, gap_seen)
-                return self._accept_step(memory, problem, control, border, balance, gap_seen), balance, looked
+                self._last, self._touch = state, (balance.control_mm, seen, gap_seen)
+                return self._accept_step(memory, problem, balance, gap_seen), balance, looked
         raise NoConvergence(balance.relative if balance else np.inf)
 
     def touching_mm2(self, state: LoadState) -> float:
@@ -245,9 +231,7 @@ class LoadStepper:
             return state.control_mm, state.border
         return state.control_mm + ratio * (state.control_mm - old.control_mm), state.border
 
-    def _accept_step(
-        self, state: LoadState, problem: Problem, control: FloatArray, border: FloatArray, balance: Balance, gap: FloatArray
-    ) -> LoadState:
+    def _accept_step(self, state: LoadState, problem: Problem, balance: Balance, gap: FloatArray) -> LoadState:
         """The state at the end of a converged step.
 
         ``state`` contains the history of friction, ``gap`` (p,) the distances of all contact points from the object in mm.
@@ -257,33 +241,23 @@ class LoadStepper:
         held[looked] = contact.penetration_mm > 0
         before = state.gap_mm[looked]
         anchor[looked], slid[looked], limit[looked], lost = update_friction(problem, contact, state.limit_n[looked], before, gap[looked])
-        return LoadState(
-            control, border, anchor, held, slid, limit, gap, problem.penalty, problem.T, balance.elastic_nmm, state.dissipated_nmm + lost
-        )
+        ended = LoadState(balance.control_mm, balance.border, anchor, held, slid, limit, gap, state.penalty_mpa_mm, problem.T)
+        return replace(ended, elastic_nmm=balance.elastic_nmm, dissipated_nmm=state.dissipated_nmm + lost)
 
     def _moved_mm(self, state: LoadState, T: FloatArray, which: BoolArray) -> float:
         """Largest displacement, mm, of the object at the selected contact points (``which``, (p,) bool) in a step to ``T`` (4, 4)."""
         at = self._body.points.positions(state.control_mm)[which]
         return float(np.linalg.norm(carry_points(at, state.T, T), axis=1).max(initial=0.0))
 
-    def _update_friction(
-        self,
-        problem: Problem,
-        state: LoadState,
-        anchors: FloatArray,
-        control: FloatArray,
-        border: FloatArray,
-        balance: Balance,
-        count: int,
-    ) -> LoadState | None:
+    def _update_friction(self, problem: Problem, state: LoadState, anchors: FloatArray, balance: Balance, count: int) -> LoadState | None:
         """The history of friction within the step (see ``rubbing.rubbed``)."""
         if self._tangent is None:
-            self._tangent = self._linearise(problem, control, border, 0.0)
-        self._turn(self._tangent, control)
+            self._tangent = self._linearise(problem, balance, 0.0)
+        self._turn(self._tangent, balance.control_mm)
         near, local = self._nearest(problem, self._tangent), self._local[problem.looked]
         forward = self._eliminate(self._tangent, balance.elastic)
         return friction_substeps(
-            problem, state, anchors, self._field, near, self._tangent, self._turned, forward, local, control, border, balance, count=count
+            problem, state, anchors, self._field, near, self._tangent, self._turned, forward, local, balance, count=count
         )
 
     def _nearest(self, problem: Problem, tangent: Tangent) -> Near:
@@ -312,17 +286,8 @@ class LoadStepper:
         """All contact points in the object's frame, (p, 3)."""
         return in_object(self._body.points.positions(control), T, border)
 
-    def _solve(
-        self,
-        problem: Problem,
-        control: FloatArray,
-        border: FloatArray,
-        extrapolated: bool,
-        *,
-        tolerance: float = RESIDUAL_TOLERANCE,
-        before: Balance | None = None,
-    ) -> tuple[FloatArray, FloatArray, Balance]:
-        balance = problem.balance(control, border) if before is None else problem.again(before, control, border)
+    def _solve(self, problem: Problem, balance: Balance | None, extrapolated: bool, *, tolerance: float = RESIDUAL_TOLERANCE) -> Balance:
+        """The balance that the iterations reach from the given one, whose residual is small enough."""
         if balance is None:
             raise NoConvergence(np.inf)
         astray = False
@@ -331,25 +296,25 @@ class LoadStepper:
         most_inner = self.inner_iterations + _INNER_ITERATIONS
         for _ in range(_ITERATIONS):
             if balance.relative <= tolerance:
-                return control, border, balance
+                return balance
             if self.inner_iterations > most_inner:
                 break
             self.iterations += 1
             if tangent is None or (not fresh and balance.absolute > _KEEP_TANGENT * last) or shift != self._shift:
-                self._tangent = tangent = self._linearise(problem, control, border, shift)
+                self._tangent = tangent = self._linearise(problem, balance, shift)
                 self._shift, fresh, secants = shift, True, None
             else:
                 fresh = False
-                if balance.relative > _ROUGH_TOLERANCE and self._turn(tangent, control):
+                if balance.relative > _ROUGH_TOLERANCE and self._turn(tangent, balance.control_mm):
                     secants = None
             elastic = balance.elastic + secants.correction(balance.residual) if secants else balance.elastic
             secants = secants or _Secants(balance.residual)
             soften = astray or not (accepted or extrapolated)
-            move, border_move = self._contact_move(problem, tangent, control, border, balance, elastic, soften)
+            move, border_move = self._contact_move(problem, tangent, balance, elastic, soften)
             size = min(1.0, LARGEST_MOVE_MM / max(np.abs(move).max(), 1e-300))
-            new, new_border = control.copy(), border + size * border_move
+            new = balance.control_mm.copy()
             new[self._body.free] += size * move.reshape(-1, 3)
-            trial = problem.balance(new, new_border)
+            trial = problem.balance(new, balance.border + size * border_move)
             # the first move contains the object's motion, so its residual may have any size; later moves may not increase it much
             if trial is None or size < 1 or (accepted and trial.absolute > _WORSE * balance.absolute):
                 astray, secants = True, None
@@ -361,18 +326,17 @@ class LoadStepper:
                         raise NoConvergence(balance.relative)
                 continue
             shift, astray = 0.0, False
-            last, accepted = balance.absolute, accepted + 1
-            control, border, balance = new, new_border, trial
+            last, accepted, balance = balance.absolute, accepted + 1, trial
         if balance.relative <= tolerance:
-            return control, border, balance
+            return balance
         raise NoConvergence(balance.relative)
 
-    def _linearise(self, problem: Problem, control: FloatArray, border: FloatArray, shift: float) -> Tangent:
+    def _linearise(self, problem: Problem, at: Balance, shift: float) -> Tangent:
         """The body's tangent at a state, with a shift added to its diagonal."""
         assert self._frontal is not None, "provide first"
         self.eliminations += 1
         self._tangent = self._turned = None  # the elimination below overwrites their memory
-        problem.stiffness(control, border, self._stiffness, fresh=shift > 0)
+        problem.stiffness(at, self._stiffness, fresh=shift > 0)
         blocks = [kept.blocks for kept in self._stiffness]
         while True:
             try:
@@ -382,11 +346,11 @@ class LoadStepper:
                 shift = max(_SHIFT_GROWTH * shift, _SMALLEST_SHIFT_N_MM)
                 if shift > _LARGEST_SHIFT_N_MM:
                     raise NoConvergence(np.inf) from None
-        matrix, strains = whole(eliminated.matrix, shift), self._turns.strains(control)
+        matrix, strains = whole(eliminated.matrix, shift), self._turns.strains(at.control_mm)
         if not self._body.sealed:
             return Tangent(eliminated, matrix, None, 0.0, strains)
-        column = np.zeros_like(control)
-        problem.volume(control, column)
+        column = np.zeros_like(at.control_mm)
+        problem.volume(at.control_mm, column)
         column = eliminated.forward(column[self._body.free].ravel())
         inner = eliminated.inner(column)
         return Tangent(eliminated, matrix, column, -float(inner @ inner), strains)
@@ -400,14 +364,7 @@ class LoadStepper:
         return kept[3]
 
     def _contact_move(
-        self,
-        problem: Problem,
-        tangent: Tangent,
-        control: FloatArray,
-        border: FloatArray,
-        balance: Balance,
-        elastic: FloatArray,
-        soften: bool,
+        self, problem: Problem, tangent: Tangent, balance: Balance, elastic: FloatArray, soften: bool
     ) -> tuple[FloatArray, FloatArray]:
         """The move of the controls (unknowns,) and of the border (2,) that balances the linearised body with the exact contact."""
         eliminated = tangent.eliminated
@@ -416,7 +373,7 @@ class LoadStepper:
         volume_residual, near = balance.border_residual[1], self._nearest(problem, tangent)
         if tangent.volume_column is not None:
             volume_residual = volume_residual - eliminated.inner(tangent.volume_column) @ eliminated.inner(forward)
-        small = SmallContact(problem, near, tangent.volume_pivot, forward[kept], volume_residual, control, border)
+        small = SmallContact(problem, near, tangent.volume_pivot, forward[kept], volume_residual, balance)
         kept_move, border_move = small.solve(balance, soften=soften, least=0.1 * RESIDUAL_TOLERANCE)
         self.inner_iterations += small.iterations
         if tangent.volume_column is not None:

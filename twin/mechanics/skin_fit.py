@@ -46,28 +46,14 @@ OUTLINE_CORNERS = 48
 PROBE_MM = 1e-4
 """Step of the difference quotient for the derivative of the projection."""
 
-
-@dataclass(frozen=True)
-class Prior:
-    """Prior of the fit: the expected error of the pins and the expected traction.
-
-    Attributes
-    ----------
-    sigma_px : float
-        Standard deviation of a pin's error in the image. It contains the detection's error, and errors of the specification's pin layout
-        and camera.
-    traction_mpa : float
-        Usual traction. On 1 mm^2 of skin it has the same cost as an error of ``sigma_px`` of one coordinate of a pin.
-    floor_mpa : float
-        Pressure that is added to the pressure of the previous step, so that the scales s are never 0.
-    friction : float
-        Tangential traction relative to the pressure.
-    """
-
-    sigma_px: float = 0.1
-    traction_mpa: float = 0.02
-    floor_mpa: float = 0.001
-    friction: float = 0.5
+SIGMA_PX = 0.1
+"""Standard deviation of a pin's error in the image: the detection's error, and errors of the specification's pin layout and camera."""
+TRACTION_MPA = 0.02
+"""Usual traction. On 1 mm^2 of skin it has the same cost as an error of ``SIGMA_PX`` of one coordinate of a pin."""
+FLOOR_MPA = 0.001
+"""Pressure that is added to the pressure of the previous step, so that the scales s are never 0."""
+FRICTION = 0.5
+"""Expected tangential traction relative to the pressure."""
 
 
 @dataclass(frozen=True)
@@ -103,16 +89,10 @@ def centroid_offset_px(view: ViewSpec, cap_diameter_mm: float, caps_mm: FloatArr
 
 
 class SkinFit:
-    """Fit of one sensor's skin to the pins of frames. Everything that depends on the sensor alone is computed once, in the constructor.
+    """Fit of one sensor's skin to the pins of frames. Everything that depends on the sensor alone is computed once, in the constructor."""
 
-    Parameters
-    ----------
-    spec : SensorSpec
-    prior : Prior, optional
-    """
-
-    def __init__(self, spec: SensorSpec, *, prior: Prior | None = None) -> None:
-        self.spec, self.prior = spec, prior or Prior()
+    def __init__(self, spec: SensorSpec) -> None:
+        self.spec = spec
         self._blas = ThreadpoolController()
         self._view = spec.view
         self._body = SoftBody(spec.geometry, spec.gel)
@@ -185,7 +165,7 @@ class SkinFit:
         reach = cho_solve(factor, per_control.T)  # (unknowns, 2 pins): displacement of the pins in the image per unit force
         rows = np.einsum("ab,bip->pai", self._mass, reach[self._loaded], optimize=True).reshape(len(per_control), -1)
         wanted = (target_px[seen] - seen_px).ravel() + reach.T @ force
-        sigma2 = self.prior.sigma_px**2
+        sigma2 = SIGMA_PX**2
         normal = rows.T @ rows / sigma2 + self._cost(control, traction, even=even)
         coefficients = cho_solve(cho_factor(normal), rows.T @ wanted / sigma2).reshape(-1, 3)
         load = -force
@@ -194,12 +174,11 @@ class SkinFit:
 
     def _cost(self, control: FloatArray, traction: FloatArray, *, even: bool) -> FloatArray:
         """Quadratic form (3 m, 3 m) of the prior of the traction's coefficients, with scales from the previous step's traction (q, 3)."""
-        prior = self.prior
         outward = np.cross(*(s @ control[self._outer] for s in self._slopes))
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-        pressure = np.full(len(outward), prior.traction_mpa) if even else np.maximum(-(traction * outward).sum(axis=1), 0)
-        across = self._area_mm2 / (prior.traction_mpa * (prior.friction * pressure + prior.floor_mpa))
-        along = self._area_mm2 / (prior.traction_mpa * (pressure + prior.floor_mpa)) - across
+        pressure = np.full(len(outward), TRACTION_MPA) if even else np.maximum(-(traction * outward).sum(axis=1), 0)
+        across = self._area_mm2 / (TRACTION_MPA * (FRICTION * pressure + FLOOR_MPA))
+        along = self._area_mm2 / (TRACTION_MPA * (pressure + FLOOR_MPA)) - across
         count = len(self._loaded)
         form = np.zeros((count, 3, count, 3))
         for i, j in PAIRS:

@@ -14,7 +14,7 @@ import trimesh
 from scipy.ndimage import spline_filter
 
 from scenes.object import MeshShape
-from twin.errors import MeshError
+from twin.errors import ErrorsAs, MeshError
 from twin.objects.level_set import Probe, Wrapped, rows, unit_normals
 from twin.objects.spline import spline_probe, spline_value
 from twin.store import cached_arrays
@@ -83,10 +83,8 @@ def load_mesh_field(shape: MeshShape) -> MeshField:
     path = Path(shape.file)
     if not path.is_file():
         raise MeshError(f"{path}: no such mesh file; give the path of an existing STL, OBJ or PLY")
-    try:
+    with ErrorsAs(OSError, lambda error: MeshError(f"{path}: not readable ({error.strerror}); give a file that may be read")):
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise MeshError(f"{path}: not readable ({error.strerror}); give a file that may be read") from error
     if shape.sha256 not in ("", digest):
         raise MeshError(
             f"{path}: has changed since it was loaded or simulated; put the former file back, or give the object and `out` again"

@@ -67,14 +67,9 @@ class LightModel:
         self._view = GelView(mi, renderer.spec, renderer.window_px, renderer.surfaces(state), BOUNCES)
         self._pixels = mi.UInt32(with_room(pixels, np.uint32))
         emitters = self._view.tracer.emitters
-        self._led_count = sum(bool(p.half_mm.any()) for p in emitters.patches)
+        self.led_count = sum(bool(p.half_mm.any()) for p in emitters.patches)
         self._radiance = [mi.Spectrum(r) for r in emitters.radiance]
         self._shapes = {shape.id(): mi.ShapePtr(shape) for shape in self._view.tracer.scene.shapes()}
-
-    @property
-    def led_count(self) -> int:
-        """Number of lit LEDs."""
-        return self._led_count
 
     def light(self, knobs: Knobs) -> FloatArray:
         """Light (n, channels) from the gel on the film."""
@@ -88,7 +83,7 @@ class LightModel:
         same kernel.
         """
         mi, dr = self._mi, self._dr
-        names = [*(f"led{k}" for k in range(self._led_count)), "skin", "caps", "stems"]
+        names = [*(f"led{k}" for k in range(self.led_count)), "skin", "caps", "stems"]
         found = {}
         for name in names:
             steps = {each: mi.Float(0.0) for each in names}
@@ -107,9 +102,9 @@ class LightModel:
         def factor(knob: str, value: DrJit) -> DrJit:
             return value * (1 + steps[knob]) if knob in steps else value
 
-        lit = self._radiance[: self._led_count]
+        lit = self._radiance[: self.led_count]
         turned = [base * factor(f"led{k}", dr.opaque(mi.Float, float(knobs.leds[k]))) for k, base in enumerate(lit)]
-        tracer.emitters.radiance[:] = [*turned, *self._radiance[self._led_count :]]
+        tracer.emitters.radiance[:] = [*turned, *self._radiance[self.led_count :]]
         tracer.tints[:] = []
         for part, shape in self._shapes.items():
             tint = spectrum(mi, getattr(knobs, part))

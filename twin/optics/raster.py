@@ -9,6 +9,7 @@ import numpy as np
 from scenes.sensor import AppearanceSpec, PinsSpec, ViewSpec
 from twin.camera.projection import project
 from twin.compiled import compiled
+from twin.geometry.pins import across_axis
 from twin.optics.surfaces import CAP_BEVEL, STEM_SIDES, cap_outlines
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -72,9 +73,8 @@ def side_normals(axis: FloatArray) -> FloatArray:
 
 def _around(axis: FloatArray, turn: FloatArray) -> FloatArray:
     """Unit vectors (N, k, 3) perpendicular to axes (N, 3) at azimuths (k,), which start at the sensor's x (as `surfaces` does)."""
-    u = np.array([1.0, 0.0, 0.0]) - axis[:, :1] * axis
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return np.cos(turn)[:, None] * u[:, None] + np.sin(turn)[:, None] * np.cross(u, axis)[:, None]
+    u, v = across_axis(axis)
+    return np.cos(turn)[:, None] * u[:, None] + np.sin(turn)[:, None] * v[:, None]
 
 
 def _hull(near: FloatArray, far: FloatArray) -> FloatArray:

@@ -14,6 +14,7 @@ from scenes.sensor import PinsSpec, ReliefSpec, SensorSpec, ViewSpec
 from twin.camera.projection import project
 from twin.compiled import compiled
 from twin.errors import FrameError, RenderError
+from twin.geometry.pins import across_axis
 from twin.optics.direct_light import DirectLight
 from twin.optics.lights import lights
 from twin.optics.measured import values_of
@@ -53,10 +54,10 @@ def without(spec: SensorSpec, details: Iterable[str]) -> SensorSpec:
     relief = look.relief
     if relief is not None:
         kept = {"caps": relief.caps and "relief" not in given, "skin": relief.skin and "grain" not in given}
-        relief = relief.model_copy(update=kept) if any(kept.values()) else None
+        relief = relief.alter(**kept) if any(kept.values()) else None
     if "background" in given:
-        housing = housing.model_copy(update={"background": None})
-    return spec.model_copy(update={"appearance": look.model_copy(update={"relief": relief}), "housing": housing})
+        housing = housing.alter(background=None)
+    return spec.alter(appearance={"relief": relief}, housing=housing)
 
 
 @dataclass(frozen=True)
@@ -173,11 +174,9 @@ def cap_planes(view: ViewSpec, pins: PinsSpec, state: PinState) -> tuple[FloatAr
 
     The first direction of a plane is the projection of the sensor's x, the second turns towards y.
     """
-    u = np.array([1.0, 0.0, 0.0]) - state.axis[:, :1] * state.axis
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
     face, radius = state.caps_mm + 0.5 * pins.cap_height_mm * state.axis, 0.5 * pins.cap_diameter_mm
     middle = project(view, face)
-    return middle, np.stack([project(view, face + radius * way) - middle for way in (u, np.cross(u, state.axis))], axis=-1)
+    return middle, np.stack([project(view, face + radius * way) - middle for way in across_axis(state.axis)], axis=-1)
 
 
 def cap_places(view: ViewSpec, pins: PinsSpec, state: PinState, window_px: tuple[int, int, int, int], reach: float) -> CapPlaces:

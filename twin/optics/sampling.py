@@ -11,6 +11,7 @@ import numpy as np
 
 from scenes.sensor import AppearanceSpec, PinsSpec, ViewSpec
 from twin.camera.projection import project
+from twin.geometry.pins import across_axis
 from twin.optics.variants.variant import DrJit
 from twin.types import BoolArray, PinState
 
@@ -29,11 +30,10 @@ def near_pins(
 ) -> BoolArray:
     """Pixels (H, W) bool of a window of the raw frame that may show a part of a pin, from its foot to its cap."""
     x0, y0, x1, y1 = window_px
-    across = np.array([1.0, 0.0, 0.0]) - state.axis[:, :1] * state.axis
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    across, back = across_axis(state.axis)
     middle = project(view, state.caps_mm)
     reach_mm = 0.5 * pins.cap_diameter_mm * _largest_outline(appearance)
-    sides = [project(view, state.caps_mm + reach_mm * way) for way in (across, np.cross(state.axis, across))]
+    sides = [project(view, state.caps_mm + reach_mm * way) for way in (across, -back)]
     radius = np.max([np.linalg.norm(side - middle, axis=1) for side in sides], axis=0) + MARGIN_PX
     feet = project(view, state.base_mm)
     mask, ends = np.zeros((y1 - y0, x1 - x0), np.uint8), np.stack([feet, middle], axis=1) - [x0, y0]

@@ -45,8 +45,8 @@ def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tupl
     cover : (H, W) float32
         Share of the gel's light that is hidden: the film gets ``light + (1 - cover) * gel``. The array is shared and can't be written to.
     """
-    view = spec.view.model_copy(update={"camera": spec.camera.model_copy(update={"vignetting": 0.0})})
-    ring = spec.housing.model_copy(update={"background": None})
+    view = spec.view.alter(camera={"vignetting": 0.0})
+    ring = spec.housing.alter(background=None)
     light, cover = _compute_light(view, spec.leds, ring, spec.appearance.specks, tuple(window_px))
     return light + background_light(spec, window_px), cover
 

@@ -11,6 +11,7 @@ from scipy.interpolate import RBFInterpolator
 
 from scenes.body import SkinSpec
 from scenes.sensor import AppearanceSpec, PinsSpec
+from twin.geometry.pins import across_axis
 from twin.geometry.shapes import shape_of
 from twin.types import FloatArray, IntArray
 
@@ -81,7 +82,7 @@ def stems(pins: PinsSpec, base_mm: FloatArray, axis: FloatArray) -> PaintedSurfa
     """All pin stems as one surface: cylinders from the skin to the cap."""
     length = pins.length_mm
     profile = np.array([[0.5 * pins.diameter_mm, -STEM_ROOT_MM], [0.5 * pins.diameter_mm, length]])
-    return _lathe(profile, base_mm, axis, STEM_SIDES)
+    return lathe(profile, base_mm, axis, STEM_SIDES)
 
 
 def caps(pins: PinsSpec, appearance: AppearanceSpec, caps_mm: FloatArray, axis: FloatArray) -> PaintedSurface:
@@ -90,7 +91,7 @@ def caps(pins: PinsSpec, appearance: AppearanceSpec, caps_mm: FloatArray, axis: 
     bevel = min(CAP_BEVEL * pins.cap_height_mm, 0.5 * radius)
     radius *= np.sqrt(2 * np.pi / CAP_SIDES / np.sin(2 * np.pi / CAP_SIDES))  # the polygon has the disc's area
     profile = np.array([[radius, -half], [radius, half - bevel], [radius - bevel, half], [0, half]])
-    body = _lathe(profile, caps_mm, axis, CAP_SIDES, cap_outlines(appearance, CAP_SIDES))
+    body = lathe(profile, caps_mm, axis, CAP_SIDES, cap_outlines(appearance, CAP_SIDES))
     return PaintedSurface(
         body.vertices_mm, body.faces, np.repeat(cap_albedo(appearance, pins.count), len(body.vertices_mm) // len(caps_mm), axis=0)
     )
@@ -148,15 +149,13 @@ def _ring_grid(bands: int, around: int) -> IntArray:
     return np.concatenate([np.stack([a, a + around, b], axis=1), np.stack([b, a + around, b + around], axis=1)])
 
 
-def _lathe(profile: FloatArray, origin_mm: FloatArray, axis: FloatArray, sides: int, outlines: FloatArray | None = None) -> PaintedSurface:
+def lathe(profile: FloatArray, origin_mm: FloatArray, axis: FloatArray, sides: int, outlines: FloatArray | None = None) -> PaintedSurface:
     """Copies of a body of revolution with the profile (k, 2) of (radius, height), at each origin along its axis; normals outwards.
 
     The azimuth starts at the projection of the sensor's x onto the body's plane and increases towards y. ``outlines`` (N, sides) scale
     the radius.
     """
-    u = np.array([1.0, 0.0, 0.0]) - axis[:, :1] * axis
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    v = np.cross(u, axis)
+    u, v = across_axis(axis)
     turn = np.arange(sides) * 2 * np.pi / sides
     circle = np.cos(turn)[None, :, None] * u[:, None] + np.sin(turn)[None, :, None] * v[:, None]
     if outlines is not None:

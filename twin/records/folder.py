@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 
 from scenes.files import quote, read_regular
-from twin.errors import FrameError
-from twin.frames.images import read_image
+from twin.errors import ErrorsAs, FrameError
+from twin.frames.images import png, read_image
 from twin.frames.lerobot import RESTS
 from twin.records.record import About, Episode, RecordError, Records, RecordStep, digest, library
 from twin.store import contents, output, write_bytes, write_json
@@ -196,11 +196,9 @@ def read_sidecar(folder: Path, form: str = "") -> tuple[About, dict[str, Any]]:
         The folder has no description, or a damaged one, or one of another format than ``form`` or of another version.
     """
     stored = read_json(folder / SIDECAR)
-    try:
+    with ErrorsAs((KeyError, TypeError, ValueError, AttributeError), lambda error: RecordError(f"{folder / SIDECAR}: damaged; {AGAIN}")):
         about = About.of(stored["about"])
         found, version = str(stored["format"]), stored["version"]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise RecordError(f"{folder / SIDECAR}: damaged; {AGAIN}") from error
     if version != VERSION:
         raise RecordError(f"{folder / SIDECAR}: of version {version!r}, expected {VERSION}; read it with the program that wrote it")
     if form and found != form:
@@ -283,11 +281,6 @@ def whole_steps(path: Path, facts: dict[str, Any], steps: Callable[[], Iterator[
         yield step
     if count != facts["length"]:
         raise RecordError(f"{path}: damaged, {count} of {facts['length']} steps of {quote(facts['key'])} can be read; {AGAIN}")
-
-
-def png(image: ImageArray) -> bytes:
-    """A picture as PNG."""
-    return cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes()
 
 
 def image_of(data: bytes, gray: bool, name: str) -> ImageArray:

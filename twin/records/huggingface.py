@@ -62,9 +62,9 @@ class HuggingFaceWriter(PicturesWriter):
     def _find(self) -> list[dict[str, Any]]:
         self._begin()
         remove_parts(self.folder / DATA)
-        listed = _list_files(self.folder)
-        self._next = len(listed)
-        return [facts for _, facts in _facts_in(self.folder)]
+        found = _facts_in(self.folder)
+        self._next = int(found[-1][0]) + 1 if found else 0
+        return [facts for _, facts in found]
 
     def _write_step(self, episode: Episode, step: RecordStep, number: int, k: int) -> dict[str, Any]:
         """One row of the metadata. Every row has the same keys, as the reader requires."""
@@ -115,19 +115,14 @@ def _steps_of(folder: Path, about: About, index: int) -> Iterator[RecordStep]:
         raise RecordError(f"{folder}: damaged ({error}); {AGAIN}") from error
 
 
-def _list_files(folder: Path) -> list[Path]:
-    """Files that list the episodes, in their order.
+def _facts_in(folder: Path) -> list[tuple[str, dict[str, Any]]]:
+    """Folder and facts of each episode, in their order.
 
     Raises
     ------
     RecordError
-        One of them is missing.
+        One of the files that list the episodes is missing.
     """
     files = sorted((folder / EPISODES).glob("*.json"))
     require_numbered(files, "{:06d}.json".format)
-    return files
-
-
-def _facts_in(folder: Path) -> list[tuple[str, dict[str, Any]]]:
-    """Folder and facts of each episode."""
-    return [(path.stem, facts) for path in _list_files(folder) for facts in read_facts(path)]
+    return [(path.stem, facts) for path in files for facts in read_facts(path)]

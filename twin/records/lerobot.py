@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import cv2
 import numpy as np
 
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.frames import open_recording
 from twin.frames.lerobot import COUNTERS
 from twin.frames.videos import describe_pauses
@@ -380,9 +380,7 @@ def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Recor
     at = {key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}
     path, number = folder / DATA_PATH.format(**at), row["episode_index"]
     video = f"videos/{IMAGE}/from_timestamp" in row
-    pictures: Iterator[np.ndarray] = iter(())
-    if video:
-        pictures = _film_pictures(folder, row, about)
+    pictures = _film_pictures(folder, row, about) if video else iter(())
     try:
         file = parquet.ParquetFile(path, page_checksum_verification=True)
         leaf = next(k for k in range(len(file.schema)) if file.schema.column(k).path == "episode_index")
@@ -405,12 +403,10 @@ def _film_pictures(folder: Path, row: dict[str, Any], about: About) -> Iterator[
     at = {key: row[f"videos/{IMAGE}/{key}"] for key in ("chunk_index", "file_index")}
     rate_hz = int(read_json(folder / INFO)["fps"])
     first = round(row[f"videos/{IMAGE}/from_timestamp"] * rate_hz)
-    try:
+    with ErrorsAs(FrameError, lambda error: RecordError(f"{folder}: {error}")):
         for k, frame in enumerate(open_recording(folder / VIDEO_PATH.format(video_key=IMAGE, **at), None, Form.RAW)):
             if first <= k < first + row["length"]:
                 yield frame.image[..., 0] if about.gray and frame.image.ndim == 3 else frame.image
-    except FrameError as error:
-        raise RecordError(f"{folder}: {error}") from error
 
 
 def _episode_rows(folder: Path) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ are used: the six numbers of a pose are a ``TwistStamped`` in mm and deg. Types 
 import json
 from collections.abc import Iterator
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -187,23 +188,22 @@ def _steps_of(path: Path, about: About) -> Iterator[RecordStep]:
     reader, decoder = library("mcap.reader"), library("mcap_ros2.decoder").DecoderFactory()
     named = {CHANNELS[name].topic: name for name in about.numbers}
     topics = [IMAGE_TOPIC, *named]
-    image, at_ns, start_ns, count = None, 0, 0, -1
-    values: dict[str, np.ndarray] = {}
+    start_ns: int | None = None
     try:
         with path.open("rb") as file:
             bag = reader.make_reader(file, validate_crcs=True, decoder_factories=[decoder])
-            for _, channel, message, ros in bag.iter_decoded_messages(topics, log_time_order=False):
-                if message.sequence != count:
-                    if image is not None:
-                        yield RecordStep(image, (at_ns - start_ns) / NS_PER_S, {name: values[name] for name in about.numbers})
-                    start_ns = message.log_time if count < 0 else start_ns
-                    image, at_ns, count, values = None, message.log_time, message.sequence, {}
-                if channel.topic == IMAGE_TOPIC:
-                    image = image_of(bytes(ros.data), about.gray, str(path))
-                else:
-                    values[named[channel.topic]] = _numbers(named[channel.topic], ros, about)
-            if image is not None:
-                yield RecordStep(image, (at_ns - start_ns) / NS_PER_S, {name: values[name] for name in about.numbers})
+            decoded = bag.iter_decoded_messages(topics, log_time_order=False)
+            for _, messages in groupby(decoded, key=lambda each: each[2].sequence):
+                image, values, at_ns = None, dict[str, np.ndarray](), 0
+                for _, channel, message, ros in messages:
+                    at_ns = message.log_time
+                    if channel.topic == IMAGE_TOPIC:
+                        image = image_of(bytes(ros.data), about.gray, str(path))
+                    else:
+                        values[named[channel.topic]] = _numbers(named[channel.topic], ros, about)
+                start_ns = at_ns if start_ns is None else start_ns
+                if image is not None:
+                    yield RecordStep(image, (at_ns - start_ns) / NS_PER_S, {name: values[name] for name in about.numbers})
     except RecordError:
         raise
     except Exception as error:  # the libraries raise exceptions of any type for damaged files

@@ -20,13 +20,13 @@ from pydantic import BaseModel, ValidationError
 from scenes import load_experiment, load_sensor
 from scenes.base import Name, SpecError
 from scenes.files import quote, read_regular
-from twin.errors import FrameError, StoreError
+from twin.errors import ErrorsAs, FrameError, StoreError
 from twin.frames.forms import times
 from twin.frames.images import read_image, write_image
 from twin.frames.videos import describe_pauses
 from twin.records.record import CHANNELS, About, Episode, Records, RecordStep, digest, float32, seconds
 from twin.rig.mounting import Mounting
-from twin.store import contents, unwritten, write_json
+from twin.store import contents, write_json, writing
 from twin.types import Form, Frame
 
 ABOUT, STEPS, FRAMES, REST = "session.json", "steps.jsonl", "frames", "rest.png"
@@ -79,11 +79,9 @@ class SessionWriter:
             self._written = {frame.sequence: name}
         about_frame = {"file": name, "name": frame.name, "form": str(frame.form), "time_s": frame.time_s, "sequence": frame.sequence}
         line = {"step": self.count, "frame": about_frame, **{key: plain(value) for key, value in step.items()}}
-        try:
+        with writing(self.folder / STEPS):
             self._lines.write(json.dumps(line) + "\n")
             self._lines.flush()
-        except OSError as error:
-            raise unwritten(self.folder / STEPS, error) from error
         self.count += 1
 
     def keep_rest(self, frame: Frame) -> None:
@@ -98,10 +96,8 @@ class SessionWriter:
         StoreError
             A line that could not be written before can't be written now.
         """
-        try:
+        with writing(self.folder / STEPS):
             self._lines.close()
-        except OSError as error:
-            raise unwritten(self.folder / STEPS, error) from error
 
     def __enter__(self) -> Self:
         return self
@@ -138,10 +134,8 @@ def _steps_and_note(folder: Path) -> tuple[list[dict], str]:
     FrameError
         The file can't be read.
     """
-    try:
+    with ErrorsAs(OSError, lambda error: FrameError(f"{folder}: {STEPS} can't be read ({error.strerror}); give the folder of a session")):
         text = read_regular(folder / STEPS, LARGEST_BYTES).decode("utf-8", "replace")
-    except OSError as error:
-        raise FrameError(f"{folder}: {STEPS} can't be read ({error.strerror}); give the folder of a session") from error
     steps: list[dict] = []
     lines = text.split("\n")
     for line in lines[:-1]:
@@ -225,10 +219,8 @@ class Session:
         path = self.folder / name
         if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(self.folder)):
             raise FrameError(f"{self.folder}: {name} is a link to outside the session; put the picture itself there")
-        try:
+        with ErrorsAs(FrameError, lambda error: FrameError(f"{self.folder}: {error}")):
             return read_image(path)[0]
-        except FrameError as error:
-            raise FrameError(f"{self.folder}: {error}") from error
 
     def stills(self) -> list[str]:
         """Pauses between frames, frames that the camera took and nobody read, and steps that use a frame again, one line each."""

@@ -65,7 +65,7 @@ class SmoothSurface:
     """
 
     def __init__(self, spec: ObjectSpec) -> None:
-        self.field = build_field(spec.model_copy(update={"texture": None}))
+        self.field = build_field(spec.alter(texture=None))
         self.raised_mm = spec.texture.wire_diameter_mm if spec.texture else 0.0
 
     @cached_property

@@ -1,6 +1,6 @@
 """Storage of results: atomic writing of files, protected outputs, a cache, resumable work, and records of the code behind the results."""
 
-from twin.store.arrays import ArrayFile, Layers, layers_from, layers_to
+from twin.store.arrays import ArrayFile, Layers, layers_from, layers_to, silu, through_layers
 from twin.store.atomic import (
     lock_folder,
     remove_parts,
@@ -13,6 +13,7 @@ from twin.store.atomic import (
     write_result,
     write_text,
     write_with,
+    writing,
 )
 from twin.store.cache import cache_folder, cached_arrays
 from twin.store.fingerprint import code_of, fingerprint

@@ -5,7 +5,7 @@ See https://github.com/huggingface/safetensors. The format has no checksums, so 
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,6 +116,22 @@ class ArrayFile:
         except (SafetensorError, KeyError, IndexError, ValueError, TypeError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise self.error(f"{path}: damaged, or no {self.thing} ({reason}); {self._remedy}") from error
+
+
+def through_layers(
+    layers: Layers, x: FloatArray, activation: Callable[[FloatArray], FloatArray], product: Callable[..., FloatArray] = np.matmul
+) -> FloatArray:
+    """Output (B, o) of a network for inputs (B, i), with ``activation`` between its layers; ``product`` multiplies two matrices."""
+    for number, (weights, offset) in enumerate(layers):
+        x = product(x, weights.T) + offset
+        if number < len(layers) - 1:
+            x = activation(x)
+    return x
+
+
+def silu(x: FloatArray) -> FloatArray:
+    """The activation x times the logistic function of x."""
+    return x / (1 + np.exp(-x))
 
 
 def layers_to(layers: Layers, name: str = "layers") -> dict[str, np.ndarray]:

@@ -21,7 +21,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from twin.errors import StoreError
+from twin.errors import ErrorsAs, StoreError
 
 PART = ".part"
 """End of the name of a temporary file. The name begins with a dot."""
@@ -127,11 +127,9 @@ def replace_folder(part: Path, path: Path) -> Path:
     StoreError
         The folder cannot be moved.
     """
-    try:
+    with writing(path):
         shutil.rmtree(path, ignore_errors=True)
         os.replace(part, path)
-    except OSError as error:
-        raise unwritten(path, error) from error
     return path
 
 
@@ -143,17 +141,22 @@ def remove_parts(folder: Path) -> None:
     StoreError
         A file or folder cannot be removed.
     """
-    try:
+    with writing(folder):
         for part in folder.glob(f".*{PART}"):
             shutil.rmtree(part) if part.is_dir() else part.unlink()
-    except OSError as error:
-        raise unwritten(folder, error) from error
 
 
 def unwritten(path: Path, error: OSError) -> StoreError:
     """The error for a path that can't be written. It names the path, the reason and the remedy."""
     remedy = _REMEDIES.get(error.errno or 0, _ANY_REMEDY)
     return StoreError(f"{path}: can't be written ({error.strerror or error}); {remedy}")
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Context that converts an error of the operating system to the ``StoreError`` of ``unwritten``."""
+    with ErrorsAs(OSError, lambda error: unwritten(path, error)):
+        yield
 
 
 @contextmanager
@@ -172,14 +175,12 @@ def lock_folder(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
         Another run has reserved the folder, or it cannot be written to.
     """
     until_s = time.monotonic() + wait_s
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         while (place := _lock(folder)) is None:
             if time.monotonic() >= until_s:
                 raise StoreError(f"{folder}: another run is at work there; wait until it has ended, or give another `out`")
             time.sleep(LOOK_S)
-    except OSError as error:
-        raise unwritten(folder, error) from error
     try:
         yield
     finally:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from twin.errors import StoreError
-from twin.store.atomic import unwritten, write_json, write_npz
+from twin.store.atomic import write_json, write_npz, writing
 from twin.store.fingerprint import Maker, code_of, fingerprint
 from twin.store.made import inputs_digest, made_by
 
@@ -153,8 +153,6 @@ def require_same_code(folder: Path, *by: Maker, begun: bool) -> None:
 
 def _ready(folder: Path) -> Path:
     """The folder, made if missing."""
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritten(folder, error) from error
     return folder

@@ -111,7 +111,3 @@ class StudioCamera:
         if self.spec.recording is None:
             raise FrameError(f"{self.spec.name} has no processed frames; show raw frames")
         return in_form(raw, Form.PROCESSED, self.spec.recording)
-
-    def crop(self, image: ImageArray, form: Form) -> ImageArray:
-        """The dome's part of a frame, for the page."""
-        return dome_part(self.spec, image, form)

@@ -11,7 +11,7 @@ from twin.estimate import Estimate, readable_labels
 from twin.pins.labelling.reference import Reference
 from twin.studio.camera import dome_part
 from twin.studio.page import LineChart, StudioPage
-from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, paragraph
+from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, paragraph, pins_found
 from twin.types import Frame, ImageArray, Observation
 
 CHARTED = 3
@@ -27,17 +27,18 @@ class LiveFrame:
     lines: tuple[str, ...]
 
 
-def frame_pictures(sensor: SensorSpec, reference: Reference, frame: Frame, seen: Observation) -> tuple[ImageArray, ImageArray]:
-    """The dome's part of a frame with pins and graph, and its Voronoi cells by their change of area; (h, w, 3) uint8 RGB each."""
-    pictures = camera_picture(frame, seen, reference.pins_px, OverlayChoices.GRAPH), cell_picture(frame, seen, reference.area_px2)
+def frame_pictures(
+    sensor: SensorSpec, reference: Reference, frame: Frame, seen: Observation, drawn: OverlayChoices = OverlayChoices.GRAPH
+) -> tuple[ImageArray, ImageArray]:
+    """The dome's part of a frame with its overlay, and its Voronoi cells by their change of area; (h, w, 3) uint8 RGB each."""
+    pictures = camera_picture(frame, seen, reference.pins_px, drawn), cell_picture(frame, seen, reference.area_px2)
     camera, cells = (dome_part(sensor, picture, frame.form) for picture in pictures)
     return camera, cells
 
 
 def frame_numbers(live: LiveFrame, seen: Observation) -> list[str]:
     """HTML of the estimate, the number of found pins, and the lines."""
-    found = f"pins found: {seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}")
-    return [estimate_table(live.estimate, {}), *(paragraph(line, "note") for line in (found, *live.lines))]
+    return [estimate_table(live.estimate, {}), *(paragraph(line, "note") for line in (f"pins found: {pins_found(seen)}", *live.lines))]
 
 
 def chart_values(estimate: Estimate) -> dict[str, float]:

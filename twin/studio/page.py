@@ -284,11 +284,7 @@ class StudioPage:
         self._modes = {mode.title: mode for mode in modes}
         if self._choice is not None:
             self._choice.options = tuple(self._modes)
-
-            @self._choice.on_update
-            def _(event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
-                self.choose(event.target.value)
-
+            self._choice.on_update(lambda event: self.choose(event.target.value))
         self.choose(modes[0].title)
 
     def add_mode_choice(self, titles: Sequence[str]) -> None:

@@ -48,6 +48,11 @@ def cell_picture(frame: Frame, seen: Observation, rest_px2: FloatArray) -> Image
     return np.asarray(voronoi_map(frame.image.shape[:2], seen, rest_px2), np.uint8)
 
 
+def pins_found(seen: Observation) -> str:
+    """How many pins were found, and why the result is not valid, if it is not."""
+    return f"{seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}")
+
+
 def estimate_table(estimate: Estimate | None, truth: Mapping[str, float], *, missing: str = "no model") -> str:
     """HTML of the estimate with its 90 % interval and the true value. A true value outside the interval is marked."""
     if estimate is None:

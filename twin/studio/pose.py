@@ -97,15 +97,11 @@ def unit_of(name: str) -> str:
 
 def bend_mm(way: list[FloatArray]) -> float:
     """Largest distance of the poses (4, 4) of a path from the straight motion between its ends, at ``STRAIGHT_POINTS_MM``."""
-    start, stop = (points @ T[:3, :3].T + T[:3, 3] for points, T in ((STRAIGHT_POINTS_MM, way[0]), (STRAIGHT_POINTS_MM, way[-1])))
-    along = stop - start
+    points = np.array([STRAIGHT_POINTS_MM @ T[:3, :3].T + T[:3, 3] for T in way])
+    off, along = points[1:-1] - points[0], points[-1] - points[0]
     length2 = np.maximum((along**2).sum(axis=1, keepdims=True), 1e-12)
-    worst = 0.0
-    for T in way[1:-1]:
-        off = STRAIGHT_POINTS_MM @ T[:3, :3].T + T[:3, 3] - start
-        share = np.clip((off * along).sum(axis=1, keepdims=True) / length2, 0, 1)
-        worst = max(worst, float(np.linalg.norm(off - share * along, axis=1).max()))
-    return worst
+    share = np.clip((off * along).sum(axis=2, keepdims=True) / length2, 0, 1)
+    return float(np.linalg.norm(off - share * along, axis=2).max(initial=0.0))
 
 
 def motion_mm(places_mm: FloatArray, start: FloatArray, stop: FloatArray) -> float:

@@ -16,6 +16,7 @@ from scenes.object import ObjectSpec
 from scenes.sensor import PinsSpec, SensorSpec
 from twin.geometry.mesh import SensorMesh
 from twin.objects import build_field
+from twin.optics.surfaces import lathe
 from twin.report.skin3d import object_surface
 from twin.types import ContactState, FloatArray, IntArray, PinState
 
@@ -140,24 +141,10 @@ def matrix(wxyz: FloatArray, position: FloatArray) -> FloatArray:
 def pin_shape(pins: PinsSpec) -> TriangleMesh:
     """A pin that points along -z, with the centre of its cap at the origin; stem and cap are tubes."""
     half, length = pins.cap_height_mm / 2, pins.length_mm + pins.cap_height_mm / 2
-    around = np.arange(SIDES) * 2 * np.pi / SIDES
-    circle = np.stack([np.cos(around), np.sin(around)], axis=1)
-    rings = [
-        (pins.diameter_mm / 2, length),
-        (pins.diameter_mm / 2, half),
-        (pins.cap_diameter_mm / 2, half),
-        (pins.cap_diameter_mm / 2, -half),
-    ]
-    corners = np.concatenate([np.column_stack([radius * circle, np.full(SIDES, z)]) for radius, z in rings] + [[[0.0, 0.0, -half]]])
-    place = np.arange(SIDES)
-    ahead = (place + 1) % SIDES
-    faces = []
-    for ring in range(len(rings) - 1):
-        a, b = ring * SIDES, (ring + 1) * SIDES
-        faces += [np.stack([a + place, b + place, b + ahead], axis=1), np.stack([a + place, b + ahead, a + ahead], axis=1)]
-    last = (len(rings) - 1) * SIDES
-    faces.append(np.stack([last + place, np.full(SIDES, len(corners) - 1), last + ahead], axis=1))
-    return TriangleMesh(corners, np.concatenate(faces))
+    stem, cap = pins.diameter_mm / 2, pins.cap_diameter_mm / 2
+    profile = np.array([[stem, -length], [stem, -half], [cap, -half], [cap, half], [0, half]])
+    body = lathe(profile, np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), SIDES)
+    return TriangleMesh(body.vertices_mm, body.faces)
 
 
 class PinScene:

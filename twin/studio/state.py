@@ -3,17 +3,18 @@
 import csv
 import io
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
+import numpy as np
 from pydantic import ValidationError
 
 from scenes import load_object, load_sensor
 from scenes.base import NonNegative, Section
 from scenes.files import read_regular
-from twin.errors import TwinError
-from twin.store import text_file, unwritten, write_json
+from twin.errors import ErrorsAs, TwinError
+from twin.store import text_file, write_json, writing
 from twin.studio.pictures import OverlayChoices
 from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.scene import PinColour
@@ -87,10 +88,8 @@ class StudioState(Section):
     @classmethod
     def load(cls, path: Path) -> "StudioState":
         """Read a state's file; raises as ``read``."""
-        try:
+        with ErrorsAs(OSError, lambda error: TwinError(f"{path}: can't be read ({error.strerror}); give a file that 'Save state' wrote")):
             return cls.read(read_regular(path, MOST_BYTES), str(path))
-        except OSError as error:
-            raise TwinError(f"{path}: can't be read ({error.strerror}); give a file that 'Save state' wrote") from error
 
     def link(self, page: str = "") -> str:
         """The state as a link to a page of the studio, which then shows it. Without ``page`` it is the link's query alone."""
@@ -110,11 +109,9 @@ class StudioState(Section):
         """
         remedy = "copy the link from the page's folder 'Save'"
         name = f"link {link[:MOST_SHOWN]}{'...' if len(link) > MOST_SHOWN else ''}".replace("\n", " ")
-        try:
+        with ErrorsAs(ValueError, lambda error: TwinError(f"{name}: not a link to a state of the studio ({error}); {remedy}")):
             given = dict(parse_qsl(urlsplit(link).query, keep_blank_values=True, strict_parsing=True, max_num_fields=50))
             numbers = {key: float(given.pop(key)) for key in (*NAMES, "friction") if key in given}
-        except ValueError as error:
-            raise TwinError(f"{name}: not a link to a state of the studio ({error}); {remedy}") from error
         friction = {key: numbers.pop(key) for key in ("friction",) if key in numbers}
         pose = numbers or {"depth_mm": FIRST_DEPTH_MM}
         return cls.read(json.dumps({**given, **friction, "pose": pose}).encode(), name, remedy)
@@ -187,24 +184,12 @@ def read_trajectory(content: bytes, name: str) -> Way:
     return [(at - times[0], pose) for at, pose in zip(times, poses, strict=True)]
 
 
-def tap_and_shear(pose: ObjectPose, *, depth_mm: float = 3.0, shear_mm: float = 3.0) -> Way:
-    """A tap from 2 mm above the tip down to a depth, a shear along x and back, and the lift. Tilts and twist are not changed."""
-    knots = [
-        (0.0, -2.0, 0.0),
-        (1.5, depth_mm, 0.0),
-        (3.0, depth_mm, shear_mm),
-        (5.0, depth_mm, -shear_mm),
-        (6.5, depth_mm, 0.0),
-        (8.0, -2.0, 0.0),
-    ]
-    way: Way = []
-    for (t0, d0, x0), (t1, d1, x1) in zip(knots, knots[1:], strict=False):
-        steps = round((t1 - t0) / 0.1)
-        for k in range(steps):
-            s = k / steps
-            turned = asdict(pose) | {"x_mm": x0 + s * (x1 - x0), "y_mm": 0.0, "depth_mm": d0 + s * (d1 - d0)}
-            way.append((t0 + s * (t1 - t0), ObjectPose(**turned)))
-    return [*way, (knots[-1][0], ObjectPose(**(asdict(pose) | {"x_mm": 0.0, "y_mm": 0.0, "depth_mm": knots[-1][1]})))]
+def tap_and_shear(pose: ObjectPose) -> Way:
+    """A tap from 2 mm above the tip down to 3 mm, a shear along x by 3 mm and back, and the lift. Tilts and twist are not changed."""
+    knots_s, depths_mm, shears_mm = (0.0, 1.5, 3.0, 5.0, 6.5, 8.0), (-2.0, 3.0, 3.0, 3.0, 3.0, -2.0), (0.0, 0.0, 3.0, -3.0, 0.0, 0.0)
+    times_s = np.linspace(0.0, 8.0, 81)
+    moves = zip(times_s.tolist(), *(np.interp(times_s, knots_s, values).tolist() for values in (depths_mm, shears_mm)), strict=True)
+    return [(at_s, replace(pose, x_mm=shear, y_mm=0.0, depth_mm=depth)) for at_s, depth, shear in moves]
 
 
 def next_path(folder: Path, stem: str, suffix: str) -> Path:
@@ -215,10 +200,8 @@ def next_path(folder: Path, stem: str, suffix: str) -> Path:
     TwinError
         The folder can't be made.
     """
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritten(folder, error) from error
     number = 1
     while (path := folder / f"{stem}-{number}{suffix}").exists():
         number += 1

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
+from scenes.base import SpecError
 from twin.errors import TwinError
 from twin.optics.preview import Shading
 from twin.studio.contact import ContactAnswer, Light, MovingContact
@@ -25,7 +26,7 @@ LOOK_S = 0.02
 
 def describe_error(error: Exception) -> str:
     """An error as text for the page. A fault of this program is also logged with its traceback, and the thread continues."""
-    if isinstance(error, TwinError):
+    if isinstance(error, TwinError | SpecError):
         return str(error)
     LOG.error("a fault of this program", exc_info=error)
     return f"a fault of this program ({error!r}); what is shown may be an earlier state"

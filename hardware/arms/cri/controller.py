@@ -64,7 +64,11 @@ class RobotController(Closing):
         (s).
     tolerance : float or None
         With a tolerance (mm and deg) a move ends as soon as the arm is that near. Otherwise it ends when the arm is at rest there.
+    elbow, commanded_elbow : None
+        Arms of four and six axes have no elbow.
     """
+
+    elbow = commanded_elbow = None
 
     def __init__(self, arm: str | Arm) -> None:
         self.arm = open_arm(arm) if isinstance(arm, str) else arm
@@ -150,14 +154,6 @@ class RobotController(Closing):
     def blend_radius(self, blend_radius: float) -> None:
         if blend_radius:
             warnings.warn(f"{self.arm.name}: moves are not blended; blend_radius stays 0", stacklevel=2)
-
-    @property
-    def elbow(self) -> None:
-        """Arms of four and six axes have none."""
-
-    @property
-    def commanded_elbow(self) -> None:
-        """Arms of four and six axes have none."""
 
     @property
     def pose(self) -> np.ndarray:

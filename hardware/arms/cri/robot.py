@@ -56,9 +56,15 @@ class SyncRobot(Closing):
     """An arm with a tool and a work frame; poses are 6-tuples in mm and deg.
 
     As in ``cri``, the flange moves to ``coord_frame * pose * tcp``: ``tcp`` is the flange's pose in the frame of the tool's tip.
+
+    Attributes
+    ----------
+    elbow, target_elbow : None
+        Arms of four and six axes have no elbow.
     """
 
     EULER_AXES = EULER_AXES
+    elbow = target_elbow = None
 
     def __init__(self, controller: RobotController) -> None:
         self.controller = controller
@@ -126,14 +132,6 @@ class SyncRobot(Closing):
         """Joints that were commanded last (J,), deg; None before the first move."""
         return self.controller.commanded_joint_angles
 
-    @property
-    def elbow(self) -> None:
-        """Arms of four and six axes have none."""
-
-    @property
-    def target_elbow(self) -> None:
-        """Arms of four and six axes have none."""
-
     def move_joints(self, joint_angles: Numbers) -> None:
         if not FEWEST_JOINTS <= len(joint_angles) <= MOST_JOINTS:
             raise InvalidJointAngles(f"{len(joint_angles)} joint angles; expected as many as the arm has joints")
@@ -194,18 +192,14 @@ class AsyncRobot(SyncRobot):
         AsyncNotBusy
             No move was started.
         """
-        if self._worker is None:
-            raise AsyncNotBusy("no move was begun; call async_move_linear or its like first")
-        self._worker.join()
+        self._require_move().join()
         self._worker, error = None, self._error
         if error is not None:
             raise error
 
     def async_done(self) -> bool:
         """Whether the move has ended; ``AsyncNotBusy`` if none was started."""
-        if self._worker is None:
-            raise AsyncNotBusy("no move was begun; call async_move_linear or its like first")
-        return not self._worker.is_alive()
+        return not self._require_move().is_alive()
 
     def close(self) -> None:
         """Stop the present move, and disconnect."""
@@ -213,6 +207,11 @@ class AsyncRobot(SyncRobot):
             self.controller.arm.stop()
             self._worker.join()
         super().close()
+
+    def _require_move(self) -> Thread:
+        if self._worker is None:
+            raise AsyncNotBusy("no move was begun; call async_move_linear or its like first")
+        return self._worker
 
     def _begin(self, move: Callable[[], None]) -> None:
         if self._worker is not None:

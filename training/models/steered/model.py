@@ -19,8 +19,7 @@ from torch import nn
 from training.data.label_code import LabelCode
 from training.data.pins import PinTable
 from training.errors import TrainingError
-from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Weights, refuse_sizes
-from training.models.recipes import Recipe
+from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Recipe, Weights, refuse_sizes
 from training.models.steered.field import Waves, waves_of
 from twin.pins.labelling.reference import Reference
 

@@ -2,31 +2,48 @@
 
 It needs a few hundred labelled frames and trains in minutes. ``vgnn`` estimates depth and angles of a surface. ``touch`` also distinguishes
 light contacts, in which all pins move little, and uses the caps' brightness if there are pictures.
+
+Its features are the information in a frame's pins as a few numbers:
+
+- modes: amplitudes of the principal components of all displacements, in rest spacings;
+- relative modes: the same for the displacements divided by their size plus a small number. They show place and kind of a light contact,
+  which is small among the modes of deep contacts;
+- light: amplitudes of the principal components of the caps' brightness. A cap brightens as it moves towards the LEDs, and the whole
+  picture darkens as the LEDs warm up.
+
+Mode k is scaled to the standard deviation sqrt(s_k / s_0), with s_k the singular values: small modes carry finer detail.
+
+The network is the sum of a multi-layer perceptron and a linear map. Outside the range of its training data, a network's own error scale has
+no meaning. Therefore the distance by which a feature exceeds its largest value in training is added to the error scale, in standard
+deviations of the label.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
 import torch
+from torch import nn
 
 from training.data.dataset import Dataset
 from training.data.label_code import LabelCode
 from training.data.pins import PinTable
 from training.errors import TrainingError
-from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Prepared, Weights, refuse_sizes
-from training.models.recipes import Recipe
-from training.models.touch.features import Bases
-from training.models.touch.network import TouchNetwork
-from training.models.vgnn.registration import Registration, align, fit_registration
+from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Prepared, Recipe, Weights, refuse_sizes
+from training.models.vgnn.registration import Registration, align, count_modes, fit_registration
 from twin.pins.labelling.reference import Reference
 
+SMALL = 0.15
+"""Size, in rest spacings times the root of the number of coordinates, below which displacements are noise rather than a contact."""
+MOST_LOST = 0.1
+"""Largest share of the training frames in which a used pin may be lost."""
+LEAST_BEYOND = 1e-6
+"""Distance that counts as zero."""
 SIZES = {"modes": 40, "light_modes": 20, "width": 256, "depth": 3}
 """Numbers of modes of displacements (and of relative modes) and of modes of light; width and depth of the network."""
 GAIN = 3.0
 """Factor on all features. With it, the network learns fastest from their small modes."""
-
-
 HEADROOM = 1.2
 """Size of a feature, relative to its largest size in training, above which intervals grow."""
 LEAST_FEATURE = 1e-3
@@ -41,6 +58,109 @@ BRIGHTER = 0.05
 """Common change of the light of all caps (logarithm of levels) above which no contact causes it. Contacts cause 0.023 (rms)."""
 LIGHT_DECIMALS = 4
 """Decimals of the caps' light (logarithms of levels) that are compared between frames."""
+
+
+@dataclass(frozen=True)
+class Bases:
+    """Means and directions of the three kinds of modes, fitted to training frames.
+
+    Attributes
+    ----------
+    moved_mean, relative_mean : (2 N,) float
+    moved, relative : (2 N, m) float
+    light_mean : (N,) float
+    light : (N, l) float
+    small : (1,) float
+        Norm of the displacements that is added before the division, rest spacings.
+    seen : (N,) float
+        1 for pins that were found in most training frames, 0 for the others. These are left out, because their places are mostly guesses.
+    """
+
+    moved_mean: np.ndarray
+    moved: np.ndarray
+    relative_mean: np.ndarray
+    relative: np.ndarray
+    light_mean: np.ndarray
+    light: np.ndarray
+    small: np.ndarray
+    seen: np.ndarray
+
+    def __call__(self, moved: np.ndarray, light: np.ndarray) -> np.ndarray:
+        """Features (M, D) of displacements (M, 2 N), rest spacings, and levels (M, N)."""
+        moved, light = moved * np.repeat(self.seen, 2), light * self.seen
+        return np.concatenate(
+            [
+                (moved - self.moved_mean) @ self.moved,
+                (self.relative_of(moved) - self.relative_mean) @ self.relative,
+                (light - self.light_mean) @ self.light,
+            ],
+            axis=1,
+        )
+
+    def relative_of(self, moved: np.ndarray) -> np.ndarray:
+        """Displacements (M, 2 N) divided by their norm plus ``small``."""
+        return moved / (np.linalg.norm(moved, axis=1, keepdims=True) + self.small)
+
+    @classmethod
+    def learn_bases(cls, moved: np.ndarray, light: np.ndarray, lost: np.ndarray, *, modes: int, light_modes: int) -> "Bases":
+        """Learn the bases from displacements (m, 2 N), levels (m, N) and lost pins (m, N) of training frames."""
+        seen = (lost.mean(axis=0) <= MOST_LOST).astype(float)
+        if not seen.any():
+            seen[:] = 1.0
+        moved, light = moved * np.repeat(seen, 2), light * seen
+        small = np.array([SMALL * np.sqrt(moved.shape[1])])
+        relative = moved / (np.linalg.norm(moved, axis=1, keepdims=True) + small)
+        means = [values.mean(axis=0) for values in (moved, relative, light)]
+        directions = [
+            _directions(values - mean, count)
+            for values, mean, count in zip((moved, relative, light), means, (modes, modes, light_modes), strict=True)
+        ]
+        return cls(means[0], directions[0], means[1], directions[1], means[2], directions[2], small, seen)
+
+
+def _directions(centred: np.ndarray, count: int) -> np.ndarray:
+    """Directions (D, count) of the largest modes of centred rows (m, D), scaled as in the module's docstring; missing modes are 0."""
+    _, sizes, rows = np.linalg.svd(centred, full_matrices=False)
+    found = np.zeros((centred.shape[1], count))
+    if sizes.size and sizes[0] > 0:
+        keep = count_modes(sizes, count)
+        found[:, :keep] = rows[:keep].T * np.sqrt(len(centred) / (sizes[:keep] * sizes[0]))
+    return found
+
+
+class TouchNetwork(nn.Module):
+    """Labels and their error scales from features (B, D).
+
+    Parameters
+    ----------
+    features : int
+        Number D of features.
+    outputs : int
+        Number K of labels.
+    width, depth : int
+        Units of a hidden layer, and number of them.
+    """
+
+    limit: torch.Tensor  # (D,) largest size of each feature in training
+
+    def __init__(self, features: int, outputs: int, *, width: int, depth: int) -> None:
+        super().__init__()
+        self.outputs = outputs
+        self.register_buffer("limit", torch.full((features,), torch.inf))
+        self.linear = nn.Linear(features, outputs)
+        nn.init.zeros_(self.linear.weight)
+        self.hidden = nn.ModuleList([nn.Linear(features if k == 0 else width, width) for k in range(depth)])
+        self.head = nn.Linear(width, 2 * outputs)
+
+    def forward(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        """``mean`` (B, K) and ``log_scale`` (B, K), standardised."""
+        h = x
+        for layer in self.hidden:
+            h = nn.functional.silu(layer(h))
+        out = self.head(h)
+        beyond = (x.abs() / self.limit - 1).amax(dim=1, keepdim=True).clamp(min=LEAST_BEYOND)
+        scale = torch.logaddexp(out[:, self.outputs :], beyond.log())
+        return {"mean": out[:, : self.outputs] + self.linear(x), "log_scale": scale}
 
 
 def _scale(features: np.ndarray) -> ArrayInputs:

@@ -88,13 +88,8 @@ def teach(
     moved, known = real.pins.nodes_px - real.pins.reference.pins_px, [labels[row] for row in few]
     told = named_labels(twin.estimate(moved[few], known, moved[unlabelled], moved[unlabelled]), real.targets.names)
     rows = np.sort(np.concatenate([few, unlabelled]))
-    train_on_real(
-        replace(real, targets=_with_estimated(real.targets, few, unlabelled, told)).rows(rows),
-        out,
-        seed=seed,
-        epochs=epochs,
-        progress=progress,
-    )
+    taught = replace(real, targets=_with_estimated(real.targets, few, unlabelled, told)).rows(rows)
+    train_on_real(taught, out, seed=seed, epochs=epochs, progress=progress)
     judged, found = twin.left_out(moved[few], known)
     part = real.rows(few[judged])
     if not len(part):

@@ -20,8 +20,7 @@ from training.estimate.estimator import PoseEstimator
 from training.models import model_named, recipe_of, variant_named
 from training.models.part import Inputs
 from training.runs.config import RunConfig
-from training.runs.loop import Loop, TrainingRows, epoch_step
-from training.runs.networks import parameter_count
+from training.runs.loop import Loop, TrainingRows, epoch_step, parameter_count
 from training.runs.run import is_finished, train_run
 from training.runs.run_files import CHECKPOINT, TENSORS, read_config
 from training.studies.judging import measure_errors, rows_to_evaluate

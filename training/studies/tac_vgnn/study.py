@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from scipy.linalg import block_diag
 
 from scenes import load_object
 from scenes.sensor import SensorSpec
@@ -20,9 +21,10 @@ from training.data.dataset import Dataset, load_dataset
 from training.data.pins import PinTable
 from training.data.targets import ANGLE, DEPTH
 from training.models import model_named
-from training.runs.networks import choose_device
+from training.runs.loop import choose_device
 from training.studies.tac_vgnn.models import SHOWN, PlannedRun, error_columns, measure_training, plan_run, table_row, train_all
 from training.studies.tac_vgnn.page import curves_figure, efficiency_figure, write_page
+from training.surrogate.symmetry import about_z
 from twin.errors import OptionError, TwinError
 from twin.estimate import readable_labels
 from twin.mechanics.path import ContactPath, ContactPose, plan_path
@@ -159,7 +161,8 @@ def twin_contacts(spec: SensorSpec, form: Form, *, progress: Step | None = None)
         obj = load_object(stimulus)
         for depth in DEPTHS_MM:
             poses = plan_path(spec.geometry, build_field(obj), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
-            state = [state for _, state in simulator.solver.path(obj, ContactPath(_rotation_about_z(turn_deg) @ poses))][-1]
+            turn = block_diag(about_z(np.radians(turn_deg)), 1.0)
+            state = [state for _, state in simulator.solver.path(obj, ContactPath(turn @ poses))][-1]
             seen = pipeline(simulator.render(state, form=form).frame)
             if not seen.valid or seen.graph is None:
                 raise TwinError(f"{spec.name}, {name}, {depth:g} mm: {seen.reason}")
@@ -190,13 +193,6 @@ def recorded_contacts(data: Dataset) -> list[AreaChange]:
         rest = data.pins.reference.area_px2
         found.append(AreaChange("centre, recorded", float(depth[k]), graph, rest, str(data.pins.image_name[k])))
     return found
-
-
-def _rotation_about_z(turn_deg: float) -> np.ndarray:
-    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-    T = np.eye(4)
-    T[:2, :2] = [[c, -s], [s, c]]
-    return T
 
 
 def contacts_figure(contacts: list[AreaChange]) -> Figure:

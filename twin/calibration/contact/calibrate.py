@@ -156,7 +156,7 @@ def calibrate_to_file(
         measured = measure_frames(frames, sensor, labels + min(labels, MOST_HELD_OUT), seed, experiment=experiment, form=form)
         order = np.random.default_rng(seed).permutation(len(measured))  # the frames come in the order of the recording's table
         fitted, held = _part(measured, np.sort(order[:labels])), _part(measured, np.sort(order[labels:]))
-        spec = sensor.model_copy(update={"rig": rig_of(sensor, obj.name)})
+        spec = sensor.alter(rig=rig_of(sensor, obj.name))
         setup = CalibrationSetup(spec, experiment, obj, measured.form, across, folder / "contacts", workers, parameters)
         fit = fit_contact(setup, fitted, progress=step)
         error = held_out_px(setup, fit, held, progress=step) if len(held) else None

@@ -275,8 +275,8 @@ def mean_squared(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def at_rest(sensor: SensorSpec, form: Form, pins_px: np.ndarray) -> SensorSpec:
     """The sensor with these places (N, 2) of its pins at rest in frames of a form."""
-    blob = blob_spec(sensor.pipeline, form).model_copy(update={"rest_px": tuple(map(tuple, pins_px.round(3).tolist()))})
-    return sensor.model_copy(update={"pipeline": sensor.pipeline.model_copy(update={str(form): blob})})
+    blob = blob_spec(sensor.pipeline, form).alter(rest_px=tuple(map(tuple, pins_px.round(3).tolist())))
+    return sensor.alter(pipeline={str(form): blob})
 
 
 def _shares(weights: Weights) -> np.ndarray:

@@ -142,14 +142,14 @@ class ForceSetup:
 
     def with_rig(self, **changes: Any) -> "ForceSetup":
         """The setup with other values of the rig."""
-        rig = rig_of(self.sensor, self.obj.name).model_copy(update=changes)
-        return replace(self, sensor=self.sensor.model_copy(update={"rig": rig}))
+        rig = rig_of(self.sensor, self.obj.name).alter(**changes)
+        return replace(self, sensor=self.sensor.alter(rig=rig))
 
     def sensor_of(self, values: np.ndarray) -> SensorSpec:
         """The sensor with other values (P + 4,)."""
         cell = {"offset_n": tuple(values[-4:-1].round(4).tolist()), "turn_deg": round(float(values[-1]), 2)}
         sensor = with_quantities(self.sensor, self.experiment, values[:-4], rig_of(self.sensor).turn_sign, self.parameters)
-        return replace(self, sensor=sensor).with_rig(force_sensor=self.reads.model_copy(update=cell)).sensor
+        return replace(self, sensor=sensor).with_rig(force_sensor=self.reads.alter(**cell)).sensor
 
     def forces(self, values: Sequence[np.ndarray], labels: Sequence[ArmLabel], step: Step = unheard) -> np.ndarray:
         """(V, M, 7) for V vectors of values and M labels; a contact that fails is NaN.
@@ -398,7 +398,7 @@ def compare_table(
     sensor = setup.sensor_of(value)
     if labels:  # the stiffness is known as well as the mean ratio of measured to simulated normal forces
         factor = compare_forces((measured - offset_n)[chosen, 2], (simulated - offset_n)[chosen, 2], sensor).factor
-        sensor = sensor.model_copy(update={"skin": sensor.skin.model_copy(update={"stiffness_factor": factor})})
+        sensor = sensor.alter(skin={"stiffness_factor": factor})
     result = ForceComparison(sensor, summary, rows, [])
     return replace(result, written=[_write_page(folder, result)])
 

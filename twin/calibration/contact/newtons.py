@@ -15,7 +15,6 @@ from scipy.stats import t as student
 
 from scenes.body import ASSUMED_FACTOR
 from scenes.experiment import ExperimentSpec
-from scenes.rig import ForceSensorSpec
 from scenes.sensor import SensorSpec
 from twin.frames import Recording
 from twin.frames.tables import numbers
@@ -55,17 +54,13 @@ class Newtons:
 
     def of(self, sensor: SensorSpec) -> SensorSpec:
         """The sensor with this stiffness. The rig's compliances are scaled so that the pins move as before."""
-        skin = sensor.skin.model_copy(
-            update={"young_modulus_mpa": self.scale * sensor.skin.young_modulus_mpa, "stiffness_factor": self.factor}
+        skin = sensor.skin.alter(young_modulus_mpa=self.scale * sensor.skin.young_modulus_mpa, stiffness_factor=self.factor)
+        gel = sensor.gel.alter(young_modulus_mpa=self.scale * sensor.gel.young_modulus_mpa)
+        rig = sensor.rig and sensor.rig.alter(
+            compliance_mm_per_n=sensor.rig.compliance_mm_per_n / self.scale,
+            turn_compliance_deg_per_n=sensor.rig.turn_compliance_deg_per_n / self.scale,
         )
-        gel = sensor.gel.model_copy(update={"young_modulus_mpa": self.scale * sensor.gel.young_modulus_mpa})
-        rig = sensor.rig and sensor.rig.model_copy(
-            update={
-                "compliance_mm_per_n": sensor.rig.compliance_mm_per_n / self.scale,
-                "turn_compliance_deg_per_n": sensor.rig.turn_compliance_deg_per_n / self.scale,
-            }
-        )
-        return sensor.model_copy(update={"skin": skin, "gel": gel, "rig": rig})
+        return sensor.alter(skin=skin, gel=gel, rig=rig)
 
 
 def assume_stiffness(sensor: SensorSpec, why: str) -> Newtons:
@@ -102,17 +97,9 @@ def compare_forces(measured_n: ArrayLike, simulated_n: ArrayLike, sensor: Sensor
 
 def pressed_n(recording: Recording, sensor: SensorSpec, experiment: ExperimentSpec) -> np.ndarray:
     """Measured forces (M,) along the approach, N, of a recording's frames; NaN for a frame without a measured force."""
-    reads = None if sensor.rig is None else sensor.rig.force_sensor
-    if reads is None:
-        name = next((name for name in ALONG if name in recording.labels), "")
-        return numbers(recording.labels[name]) if name else np.full(len(recording), np.nan)
-    return _project_forces(recording, reads, experiment.axis)
-
-
-def _project_forces(recording: Recording, reads: ForceSensorSpec, axis: int) -> np.ndarray:
-    """Forces (M,) along an axis of the rig, computed from the readings of its force sensor."""
-    name = reads.columns[axis]
-    if name not in recording.labels:
+    reads, axis = None if sensor.rig is None else sensor.rig.force_sensor, experiment.axis
+    name = next((name for name in (reads.columns[axis : axis + 1] if reads else ALONG) if name in recording.labels), None)
+    if name is None:
         return np.full(len(recording), np.nan)
-    found: np.ndarray = (numbers(recording.labels[name]) - reads.offset_n[axis]) / reads.gain[axis]
-    return found
+    found = numbers(recording.labels[name])
+    return found if reads is None else (found - reads.offset_n[axis]) / reads.gain[axis]

@@ -105,7 +105,7 @@ def with_quantities(
     """
     for parameter, value in zip(parameters, values, strict=True):
         if parameter.name == SIZE:
-            sensor = of_radius(sensor.model_copy(update={"rig": rig_of(sensor)}), parameter.number(value))
+            sensor = of_radius(sensor.alter(rig=rig_of(sensor)), parameter.number(value))
     plain = sensor.model_dump(mode="json") | {"rig": rig_of(sensor).model_dump(mode="json")}
     plain["rig"]["turn_sign"] = int(turn_sign)
     for parameter, value in zip(parameters, values, strict=True):

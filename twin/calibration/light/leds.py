@@ -222,7 +222,7 @@ def _reflection_misfit(spec: SensorSpec, seen: _Reflections, values: np.ndarray)
     for n, k in enumerate(seen.leds):
         azimuth_deg = np.degrees(seen.azimuth_rad[n] + values[4 + n])
         one = shape | {"azimuth_deg": (azimuth_deg,), "balance": (leds.balance[k],) if leds.balance else ()}
-        light = reflections(spec.view, leds.model_copy(update=one), spec.housing, seen.rays[n]).mean(axis=(2, 3))
+        light = reflections(spec.view, leds.alter(**one), spec.housing, seen.rays[n]).mean(axis=(2, 3))
         light = blurred(light + seen.background[n], spec.response.blur_sigma_px)
         misses.append(level_misfit(light, seen.levels[n], spec.response)[seen.used[n]].ravel())
     return np.concatenate(misses)

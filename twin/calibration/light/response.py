@@ -76,10 +76,8 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     """
     bounds = BOUNDS | (CHROMA | FRINGES | SHIFTS if spec.camera.channels == "color" else {})
     names = list(bounds)
-    pick = np.zeros_like(inside)
-    pick[::EVERY, ::EVERY] = True
     frames, light = frames[:MOST_FRAMES], [hazed(np.asarray(x, np.float32), spec.gel) for x in light[:MOST_FRAMES]]
-    useful = [inside & pick & (gray_levels(f.image) < SATURATED) for f in frames]
+    useful = _compared_pixels(frames, inside)
     real = np.concatenate([f.image[u].astype(float).ravel() for f, u in zip(frames, useful, strict=True)])
     images = [f.image for f in frames]
     stream = {"stream": stream_of(images), "chroma_columns": chroma_columns(images)}
@@ -124,10 +122,8 @@ def fit_haze(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], i
     inside : (H, W) bool
         The disc.
     """
-    pick = np.zeros_like(inside)
-    pick[::EVERY, ::EVERY] = True
     chosen = list(zip(frames, light, strict=True))[:MOST_FRAMES]
-    useful = [inside & pick & (gray_levels(f.image) < SATURATED) for f, _ in chosen]
+    useful = _compared_pixels(frames[:MOST_FRAMES], inside)
 
     def misfit(haze: float) -> float:
         shown = with_changes(spec, gel={"haze": haze}, response={"jpeg_quality": 0}).capture
@@ -137,6 +133,13 @@ def fit_haze(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], i
     found = minimize_scalar(misfit, bounds=(0.0, MOST_HAZE), method="bounded", options={"xatol": HAZE_STEP, "maxiter": MOST_TRIES})
     haze = round(float(found.x), 5)
     return with_changes(spec, gel={"haze": haze}) if misfit(haze) < misfit(spec.gel.haze) else spec
+
+
+def _compared_pixels(frames: list[Aligned], inside: np.ndarray) -> list[np.ndarray]:
+    """The compared pixels of each frame, (H, W) bool: one in ``EVERY`` each way that is in the disc and not saturated."""
+    pick = np.zeros_like(inside)
+    pick[::EVERY, ::EVERY] = True
+    return [inside & pick & (gray_levels(frame.image) < SATURATED) for frame in frames]
 
 
 def chroma_columns(images: list[np.ndarray]) -> int:

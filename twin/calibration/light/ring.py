@@ -165,7 +165,7 @@ def fit_ring(spec: SensorSpec, still: Still) -> SensorSpec:
     low, high = np.log(np.array(list(BOUNDS.values())).T)
 
     def residual(values: np.ndarray) -> np.ndarray:
-        trial = spec.model_copy(update={"housing": spec.housing.model_copy(update=_housing_values(spec.housing, values))})
+        trial = spec.alter(housing=_housing_values(spec.housing, values))
         light = seen.inside.copy()
         light[seen.wall] = housing_light(trial.leds, trial.housing, seen.at_mm[seen.wall])
         return level_misfit(hazed(light, seen.haze) * seen.loss, seen.levels, spec.response)[seen.compared].ravel()
@@ -200,7 +200,7 @@ def _thin_out(spec: SensorSpec, still: Still) -> _Wall:
         levels=still.image[few],
         inside=to_light(still.image, spec.response)[few].astype(np.float32),
         loss=vignetted(np.ones((*still.gray.shape, 1), np.float32), spec.camera)[few],
-        haze=spec.gel.model_copy(update={"haze_sigma_px": spec.gel.haze_sigma_px / EVERY}),
+        haze=spec.gel.alter(haze_sigma_px=spec.gel.haze_sigma_px / EVERY),
     )
 
 

@@ -14,7 +14,7 @@ from twin.calibration.light.ring import fit_disc_edge, fit_ring
 from twin.calibration.light.specks import fit_specks
 from twin.calibration.light.still import Still, median_still
 from twin.errors import FrameError
-from twin.progress import Step, unheard
+from twin.progress import Step, report_each, unheard
 
 # Share of pixels at exactly 0 or 255 above which frames count as thresholded. Raw frames are saturated only on the ring.
 MOST_BINARY = 0.6
@@ -53,9 +53,8 @@ def fit_surroundings(spec: SensorSpec, images: np.ndarray, pins_px: np.ndarray, 
         return fit_specks(found, still, images, pins_px)
 
     stages: tuple[Callable[[SensorSpec, Still], SensorSpec], ...] = (fit_disc_edge, turn_leds, fit_reflections, fit_ring, specks)
-    for done, stage in enumerate(stages):
+    for stage in report_each(stages, progress):
         spec = stage(spec, still)
-        progress(done + 1, len(stages))
     return spec
 
 

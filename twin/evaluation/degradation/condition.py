@@ -5,7 +5,7 @@ called, so that nothing changes, bit for bit.
 """
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -94,7 +94,7 @@ class OnSection(Generic[S]):
     change: SectionChange[S]
 
     def __call__(self, spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
-        return spec.model_copy(update={self.section: self.change(getattr(spec, self.section), value, rng)})
+        return spec.alter(**{self.section: self.change(getattr(spec, self.section), value, rng)})
 
 
 @dataclass(frozen=True)
@@ -150,6 +150,15 @@ class Condition:
     def rng(self, draw: int = 0) -> np.random.Generator:
         """The condition's own random numbers. They are the same at every severity, so that a degradation grows at the same place."""
         return np.random.default_rng([zlib.crc32(self.name.encode()), draw])
+
+
+def in_family(family: str, *, image_level: bool = False) -> Callable[..., Condition]:
+    """A function that makes conditions of one family. Its arguments are those of ``Condition`` without the family."""
+
+    def make(name: str, title: str, parameter: str, unit: str, severe: float, nominal: float = 0.0, **effects: Any) -> Condition:
+        return Condition(name, title, family, parameter, unit, severe, nominal, **{"image_level": image_level} | effects)
+
+    return make
 
 
 @dataclass(frozen=True)
@@ -223,11 +232,6 @@ class DegradedCase:
         for change, value, _ in self._acting("setting", severity):
             detector = change(detector, value)
         return detector
-
-
-def alter(spec: SensorSpec, **sections: Mapping[str, Any]) -> SensorSpec:
-    """A copy of a specification with values changed section by section. It is not validated, because all values are computed in range."""
-    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
 
 
 def choose_share(count: int, share: float, rng: np.random.Generator) -> np.ndarray:

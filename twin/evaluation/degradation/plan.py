@@ -9,7 +9,7 @@ from pydantic import Field
 
 from scenes.base import Section, SpecError
 from scenes.load import read_section
-from twin.errors import TwinError
+from twin.errors import ErrorsAs, TwinError
 from twin.evaluation.degradation.condition import Condition, DegradedCase
 from twin.evaluation.degradation.conditions import CONDITIONS, condition
 from twin.evaluation.degradation.sweep import SEVERITIES
@@ -98,7 +98,5 @@ def load_plan(path: Path) -> SweepPlan:
     TwinError
         The file can't be read, or a key or name is unknown.
     """
-    try:
+    with ErrorsAs(SpecError, lambda error: TwinError(f"{error}; 'twin robustness --help' shows such a file")):
         return read_section(path, SweepPlan)
-    except SpecError as error:
-        raise TwinError(f"{error}; 'twin robustness --help' shows such a file") from error

@@ -14,9 +14,9 @@ from scenes.sensor import SensorSpec
 from twin.camera.capture import expose
 from twin.camera.truth import CapTruth, cap_truth
 from twin.errors import ContactError, TwinError
-from twin.evaluation.degradation.condition import DegradedCase, PictureView, alter
+from twin.evaluation.degradation.condition import DegradedCase, PictureView
 from twin.evaluation.pictures.aligned import to_light
-from twin.geometry.pins import rest_pins
+from twin.geometry.pins import PinRest, rest_pins
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview, Shading
@@ -32,15 +32,6 @@ class ObjectContact:
     name: str
     object_name: str
     pose: ContactPose
-
-
-@dataclass(frozen=True)
-class ContactPins:
-    """Pins of a contact: feet, axes and caps, (N, 3) each, mm, sensor frame."""
-
-    base_mm: np.ndarray
-    axis: np.ndarray
-    caps_mm: np.ndarray
 
 
 CONTACTS = (
@@ -115,7 +106,7 @@ class RenderedSource:
         view = PictureView.of(spec, np.zeros((spec.pins.count, 2)))
         geometry = _with_light_of(self.spec, spec)
         shots = []
-        lit = spec.model_copy(update={"response": self.spec.response})
+        lit = spec.alter(response=self.spec.response)
         for film in _films(lit, geometry, geometry if case.solves else self.spec, self.contacts):
             view = replace(view, caps_px=film.truth.caps_px)
             light = case.on_light(film.light, severity, view, film.draw)
@@ -155,7 +146,7 @@ class RealSource:
 
     def render(self, case: DegradedCase, severity: float) -> list[DegradedFrame]:
         """The frames degraded by a case, which must be `image_level`."""
-        neutral = alter(self.spec, **NEUTRAL)
+        neutral = self.spec.alter(**NEUTRAL)
         spec = case.on_spec(neutral, severity)
         in_light = severity > 0 and self.form == Form.RAW and any(c.spec is not None or c.light is not None for c in case.conditions)
         view = PictureView.of(neutral, self.caps_px[0])
@@ -202,7 +193,7 @@ def degraded_state(
     for case, severity in cases:
         degraded = case.on_spec(degraded, severity)
     geometry = _with_light_of(spec, degraded)
-    lit = degraded.model_copy(update={"response": spec.response})
+    lit = degraded.alter(response=spec.response)
     truth = cap_truth(geometry, rest_pins(spec.geometry), state, Form.RAW)
     view = replace(PictureView.of(degraded, truth.caps_px), caps_px=truth.caps_px)
     light = Preview(lit, shading=shading).render(state)
@@ -214,7 +205,7 @@ def degraded_state(
     return replace(_degrade("contact", image, Form.RAW, cases, view, truth.visible), touched=touched)
 
 
-def pins_under(spec: SensorSpec, contact: ObjectContact) -> ContactPins:
+def pins_under(spec: SensorSpec, contact: ObjectContact) -> PinRest:
     """The pins in a contact, from the cache if it was solved before.
 
     Raises
@@ -223,8 +214,7 @@ def pins_under(spec: SensorSpec, contact: ObjectContact) -> ContactPins:
         The contact can't be solved.
     """
     if contact.pose.indent_mm <= 0:
-        rest = rest_pins(spec.geometry)
-        return ContactPins(rest.base_mm, rest.axis, rest.caps_mm)
+        return rest_pins(spec.geometry)
 
     def solve() -> dict[str, np.ndarray]:
         state = SkinSolver(spec).press(load_object(contact.object_name), contact.pose)
@@ -233,7 +223,7 @@ def pins_under(spec: SensorSpec, contact: ObjectContact) -> ContactPins:
     optical = {"refractive_index", "absorption_per_mm", "haze", "haze_sigma_px"}
     key = {part: getattr(spec, part).model_dump(mode="json", exclude=optical) for part in ("skin", "gel", "lens", "pins")}
     key |= {"object": load_object(contact.object_name).model_dump(mode="json"), "pose": vars(contact.pose)}
-    return ContactPins(**cached_arrays("pins-under-contact", key, solve))
+    return PinRest(**cached_arrays("pins-under-contact", key, solve))
 
 
 def _degrade(
@@ -250,8 +240,8 @@ def _degrade(
 def _with_light_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
     """``spec`` with the values of ``base`` that do not affect the pins' places. Under most conditions the result equals ``base``."""
     gel = {name: getattr(base.gel, name) for name in ("haze", "haze_sigma_px", "absorption_per_mm")}
-    alike = alter(spec, gel=gel, camera={"vignetting": base.camera.vignetting})
-    return alike.model_copy(update={name: getattr(base, name) for name in ("leds", "housing", "appearance", "response")})
+    alike = spec.alter(gel=gel, camera={"vignetting": base.camera.vignetting})
+    return alike.alter(**{name: getattr(base, name) for name in ("leds", "housing", "appearance", "response")})
 
 
 @dataclass(frozen=True)
@@ -283,7 +273,7 @@ def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contac
 
 
 @lru_cache(maxsize=32)
-def _press(spec: SensorSpec, mechanics: SensorSpec, contact: ObjectContact) -> tuple[ContactPins, CapTruth]:
+def _press(spec: SensorSpec, mechanics: SensorSpec, contact: ObjectContact) -> tuple[PinRest, CapTruth]:
     """Pins in a contact of the sensor ``mechanics``, and their places in the picture of ``spec``'s camera."""
     state = pins_under(mechanics, contact)
     return state, cap_truth(spec, rest_pins(spec.geometry), state, Form.RAW)

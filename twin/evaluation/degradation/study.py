@@ -5,18 +5,17 @@ The true places of the pins in real frames are unknown. The places on which seve
 
 import json
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError, OptionError, TwinError
+from twin.errors import ErrorsAs, FrameError, OptionError, TwinError
 from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.envelope import Envelope, evaluate_sweep
 from twin.evaluation.degradation.report import write_report
-from twin.evaluation.degradation.shots import CONTACTS, RealSource, RenderedSource
-from twin.evaluation.degradation.sweep import Models, SweepSettings
+from twin.evaluation.degradation.shots import RealSource, RenderedSource
+from twin.evaluation.degradation.sweep import SweepSettings
 from twin.frames import evenly_read, open_recording
 from twin.pins import METHODS, DetectorSpec, load_detector, make_detector, shipped_detector, tune, write_detector
 from twin.pins.detectors.detector_spec import OWN
@@ -34,50 +33,36 @@ LEAST_AGREEING = 2
 
 
 def rendered_study(
-    spec: SensorSpec,
-    pipelines: list[str],
-    cases: tuple[DegradedCase, ...],
-    severities: tuple[float, ...],
-    out: Path,
-    *,
-    jobs: int = 1,
-    models: Models | None = None,
-    model_digests: dict[str, str] | None = None,
-    progress: Progress = silent,
+    settings: SweepSettings, pipelines: list[str], out: Path, *, jobs: int = 1, progress: Progress = silent
 ) -> tuple[list[Envelope], list[Path]]:
-    """A study on rendered frames. Models are as in `Plan`, other options and results as in `study`."""
-    source, bar = RenderedSource(spec, CONTACTS), partial(stage, progress)
-    with bar("contacts, undegraded"):
-        frames = [shot.frame for shot in source.render(cases[0], 0.0)]
-    with bar("tuning") as step:
-        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
-    plan = SweepSettings(source, detectors, cases, severities, models, model_digests or {})
-    return study(plan, "rendered", out, jobs=jobs, progress=progress)
+    """A study on the rendered frames of ``settings``, whose detectors are those of ``pipelines``. Results are as of `study`."""
+    with stage(progress, "contacts, undegraded"):
+        frames = [shot.frame for shot in settings.source.render(settings.cases[0], 0.0)]
+    with stage(progress, "tuning") as step:
+        detectors = choose_pipelines(pipelines, settings.source.spec, frames, out / "pipelines", step)
+    return study(replace(settings, detectors=detectors), "rendered", out, jobs=jobs, progress=progress)
 
 
 def real_study(
-    spec: SensorSpec,
+    settings: SweepSettings,
+    pipelines: list[str],
     path: Path,
     limit: int,
-    pipelines: list[str],
-    cases: tuple[DegradedCase, ...],
-    severities: tuple[float, ...],
     out: Path,
     *,
     beside: bool = True,
     jobs: int = 1,
-    models: Models | None = None,
-    model_digests: dict[str, str] | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Envelope], list[Path]]:
-    """A study on a folder of real frames, with image-level conditions only.
+    """A study on at most ``limit`` real frames of a folder, with the image-level conditions of ``settings`` only.
 
-    Models are as in `Plan`, other options and results as in `study`. With ``beside`` and raw frames, rendered frames are also swept, and
-    the envelopes of both are compared.
+    Results are as of `study`. With ``beside`` and raw frames, the rendered frames of ``settings`` are also swept, and the envelopes of both
+    are compared.
     """
+    spec, cases = settings.source.spec, settings.cases
     recording = open_recording(path, spec)
-    frames, bar = evenly_read(recording, limit), partial(stage, progress)
-    with bar("tuning") as step:
+    frames = evenly_read(recording, limit)
+    with stage(progress, "tuning") as step:
         detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
         judges = choose_pipelines(["twin", "adaptive"], spec, frames, out / "pipelines", step)
     built_in = [each for each in detectors if each.method != OWN]  # what is evaluated must not say what is true
@@ -88,9 +73,9 @@ def real_study(
         raise TwinError("none of the conditions can be applied to frames that are already there; without `frames` they are rendered")
     if left := [c.name for c in cases if c not in usable]:
         notes.append(f"left out, because they cannot be applied to frames that are already there: {', '.join(left)}")
-    rendered = RenderedSource(spec, CONTACTS) if beside and recording.form == Form.RAW else None
     source = replace(source, rest_frame=recording.reference)
-    plan = SweepSettings(source, detectors, usable, severities, models, model_digests or {})
+    plan = replace(settings, source=source, detectors=detectors, cases=usable)
+    rendered = settings.source if beside and recording.form == Form.RAW else None
     return study(plan, path.name, out, jobs=jobs, notes=notes, rendered=rendered, progress=progress)
 
 
@@ -102,13 +87,13 @@ def study(
     progress: Progress = silent,
     jobs: int = 1,
     notes: list[str] | None = None,
-    rendered: RenderedSource | None = None,
+    rendered: RenderedSource | RealSource | None = None,
 ) -> tuple[list[Envelope], list[Path]]:
     """Sweep, evaluate and write. Returns the envelopes and the written files, the page first.
 
     Parameters
     ----------
-    plan : Plan
+    plan : SweepSettings
     source : str
         Name of the frames for the page.
     out : Path
@@ -190,17 +175,15 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
                 folder.mkdir(parents=True, exist_ok=True)
                 tuned = tune(frames, spec, method).detector
                 write_detector(kept, tuned, f"Tuned on undegraded frames.\nmade_by = {json.dumps(item.made_by)}")
-            chosen.append(load_detector(kept).model_copy(update={"name": method}))
+            chosen.append(load_detector(kept).alter(name=method))
         progress(k + 1, len(names))
     return tuple(chosen)
 
 
 def _check_detector(detector: DetectorSpec, frame: Frame) -> DetectorSpec:
     """A detector whose function works on an undegraded frame. On degraded frames its failure is a result."""
-    try:
+    with ErrorsAs(FrameError, lambda error: OptionError(f"`pipeline` {detector.finder}, on the undegraded frame {frame.name}: {error}")):
         own_places(detector, frame)
-    except FrameError as error:
-        raise OptionError(f"`pipeline` {detector.finder}, on the undegraded frame {frame.name}: {error}") from error
     return detector
 
 

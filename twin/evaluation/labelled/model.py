@@ -20,7 +20,7 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.pins import Pipeline
 from twin.pins.batch import UNMEASURED, recording_reference
-from twin.progress import Step, unheard
+from twin.progress import Step, report_each, unheard
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel, read_arm_labels
@@ -82,18 +82,17 @@ def measure_frames(
     pipeline = Pipeline(spec, recording.form, reference)
     chosen = np.random.default_rng(seed).permutation(len(recording))[:count]
     kept, pins = [], []
-    for done, row in enumerate(np.sort(chosen)):
+    for row in report_each(np.sort(chosen).tolist(), progress):
         try:
-            seen = pipeline(recording.read(int(row)))
+            seen = pipeline(recording.read(row))
             if seen.valid:
-                kept.append(int(row))
+                kept.append(row)
                 pins.append(seen.pins_px)
             reason = seen.reason
         except FrameError as error:
             reason = str(error)
         if reason:
             problems.append(f"{recording.names[row]}: left out: {reason}")
-        progress(done + 1, len(chosen))
     if not kept:
         raise FrameError(f"{folder}: no frame with pins among {len(chosen)}; {problems[-1] if problems else 'is it the right `sensor`?'}")
     names, told = [recording.names[row] for row in kept], [labels[row] for row in kept]

@@ -10,19 +10,10 @@ from scenes.sensor import Polarity, SensorSpec
 from twin.camera.capture import expose
 from twin.camera.projection import Disc, project
 from twin.evaluation.labelled.compare import pin_errors
+from twin.evaluation.pictures import poses
 from twin.evaluation.pictures.fixed import cap_patches, fixed_share
 from twin.evaluation.pictures.frames import RealFrame
 from twin.evaluation.pictures.images import ImageFigures, compare_images
-from twin.evaluation.pictures.poses import (
-    EXPERIMENT,
-    PlateTaps,
-    TapBank,
-    bank_labels,
-    contacts_of,
-    fit_rig,
-    halves,
-    labels_of_rows,
-)
 from twin.evaluation.pictures.statistics import FrameStatistics, Statistics, compare_statistics, measure_frame
 from twin.frames.forms import gray_levels
 from twin.geometry.mesh import SensorMesh
@@ -30,7 +21,7 @@ from twin.mechanics.skin_fit import FittedPins, SkinFit
 from twin.mechanics.solver import SkinSolver
 from twin.optics.render import Renderer
 from twin.pins.pipeline import Pipeline
-from twin.progress import Bar, Step
+from twin.progress import Bar, Step, report_each
 from twin.rig.kinematics import rig_of
 from twin.types import ContactState, Form, Quality
 
@@ -85,10 +76,9 @@ class PoseAligned:
 def pin_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: Quality, progress: Step) -> list[Pair]:
     """Fit the skin to each frame's pins, render and capture it. This tests camera and light, but not the mechanics."""
     fit, shoot, pairs = SkinFit(spec), _Shooter(spec, disc, quality), []
-    for number, real in enumerate(frames):
+    for number, real in enumerate(report_each(frames, progress)):
         pins = fit(real.pins_px)
         pairs.append(shoot(real, pins, float(np.nanmedian(pins.remainder_px)), seed=number))
-        progress(number + 1, len(frames))
     return pairs
 
 
@@ -100,34 +90,32 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
     FrameError
         The frames have no labels, or are too few.
     """
-    experiment, apex_mm = load_experiment(EXPERIMENT), spec.skin.apex_mm
-    labels, fitted = labels_of_rows([real.label for real in frames], experiment), halves(len(frames))
+    experiment, apex_mm = load_experiment(poses.EXPERIMENT), spec.skin.apex_mm
+    labels, fitted = poses.labels_of_rows([real.label for real in frames], experiment), poses.halves(len(frames))
     learnt = [label for label, used in zip(labels, fitted, strict=True) if used]
     solver, start = SkinSolver(spec), rig_of(spec)
-    taps = PlateTaps(solver, experiment)
+    taps = poses.PlateTaps(solver, experiment)
     with bar("simulate taps to fit the arm's rig") as progress:
-        spread = bank_labels(start, experiment, labels, apex_mm)
-        bank = TapBank(contacts_of(start, experiment, spread, apex_mm), taps.pins_px(start, spread, progress))
+        spread = poses.bank_labels(start, experiment, labels, apex_mm)
+        bank = poses.TapBank(poses.contacts_of(start, experiment, spread, apex_mm), taps.pins_px(start, spread, progress))
     with bar("fit the arm's rig") as progress:
         seen_px = np.stack([real.pins_px for real in frames])[fitted]
-        rig = fit_rig(bank, start, experiment, learnt, seen_px, apex_mm, simulate=lambda tried: taps.pins_px(tried, learnt, progress))
+        rig = poses.fit_rig(bank, start, experiment, learnt, seen_px, apex_mm, simulate=lambda tried: taps.pins_px(tried, learnt, progress))
     contact, shoot, pairs = taps.contact(rig), _Shooter(spec, disc, quality, mesh=solver.mesh), []
     with bar("press and render from the labels") as progress:
-        for number, (real, label) in enumerate(zip(frames, labels, strict=True)):
+        for number, (real, label) in enumerate(report_each(list(zip(frames, labels, strict=True)), progress)):
             state = contact.end(label)
             error_px = pin_errors(project(spec.view, state.caps_mm), real.pins_px)
             pairs.append(shoot(real, state, float(error_px), seed=number))
-            progress(number + 1, len(frames))
-    return PoseAligned(rig, fitted, contacts_of(rig, experiment, labels, apex_mm), pairs)
+    return PoseAligned(rig, fitted, poses.contacts_of(rig, experiment, labels, apex_mm), pairs)
 
 
 def statistics(pairs: list[Pair], disc: Disc, polarity: Polarity, *, progress: Step) -> Statistics:
     """Compare real frames with pin-aligned renders: caps, skin, noise, spectrum, spots."""
     sets: tuple[list[FrameStatistics], list[FrameStatistics]] = ([], [])
-    for number, pair in enumerate(pairs):
+    for pair in report_each(pairs, progress):
         for measured, image in zip(sets, (pair.real.frame.image, pair.image), strict=True):
             measured.append(measure_frame(gray_levels(image), pair.real.pins_px, disc, polarity=polarity))
-        progress(number + 1, len(pairs))
     return compare_statistics(*sets)
 
 

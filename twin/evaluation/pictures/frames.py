@@ -12,7 +12,7 @@ from twin.frames import open_recording, spread_indices
 from twin.frames.forms import gray_levels
 from twin.frames.recording import BadFrame
 from twin.pins.pipeline import Pipeline
-from twin.progress import Step, unheard
+from twin.progress import Step, report_each, unheard
 from twin.types import Form, Frame, Observation
 
 # A frame counts as dark if this percentile of the disc's gray levels is at most this level.
@@ -96,7 +96,7 @@ def read_real(
     chosen = left[spread_indices(len(left), len(left) if limit is None else limit)].tolist()
     frames: list[RealFrame] = []
     refused: list[BadFrame] = []
-    for done, index in enumerate(chosen):
+    for index in report_each(chosen, progress):
         name = recording.names[index]
         try:
             frame = recording.read(index)
@@ -106,7 +106,6 @@ def read_real(
         else:
             numbers = {key: float(c[index]) for key, c in recording.labels.items() if c.dtype.kind == "f"}
             frames.append(RealFrame(frame, observation.pins_px, numbers))
-        progress(done + 1, len(chosen))
     if not frames:
         first = refused[0]
         raise FrameError(f"{path}: none of {len(chosen)} frames are valid; the first, {first['image_name']}: {first['reason']}")

@@ -184,7 +184,7 @@ def fit_rig(
         return least_squares(residuals, np.zeros(PARAMETERS))
 
     tries = [
-        start.model_copy(update={"turn_sign": sign, "image_turn_deg": start.image_turn_deg + turn})
+        start.alter(turn_sign=sign, image_turn_deg=start.image_turn_deg + turn)
         for turn, sign in product(TURNS_DEG, (start.turn_sign, -start.turn_sign))
     ]
     found = [solve(rig, pins_px) for rig in tries]
@@ -200,15 +200,13 @@ def _with_parameters(rig: RigSpec, experiment: ExperimentSpec, x: np.ndarray) ->
     """The rig with its fitted parameters changed by ``x`` (PARAMETERS,), each in a unit in which the change is of order 1."""
     offsets = np.array(rig.turn_offset_deg)
     offsets[np.array(tilts_of(experiment)) - 3] += 10 * x[5:]
-    return rig.model_copy(
-        update={
-            "contact_offset_mm": rig.contact_offset_mm + float(x[0]),
-            "tcp_to_dome_mm": rig.tcp_to_dome_mm + 10 * float(x[1]),
-            "tcp_lateral_mm": rig.tcp_lateral_mm + float(x[2]),
-            "tcp_binormal_mm": rig.tcp_binormal_mm + float(x[3]),
-            "image_turn_deg": (rig.image_turn_deg + 90 * float(x[4])) % 360,
-            "turn_offset_deg": tuple(offsets.tolist()),
-        }
+    return rig.alter(
+        contact_offset_mm=rig.contact_offset_mm + float(x[0]),
+        tcp_to_dome_mm=rig.tcp_to_dome_mm + 10 * float(x[1]),
+        tcp_lateral_mm=rig.tcp_lateral_mm + float(x[2]),
+        tcp_binormal_mm=rig.tcp_binormal_mm + float(x[3]),
+        image_turn_deg=(rig.image_turn_deg + 90 * float(x[4])) % 360,
+        turn_offset_deg=tuple(offsets.tolist()),
     )
 
 

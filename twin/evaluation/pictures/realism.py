@@ -9,18 +9,9 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.camera.projection import lens_disc
+from twin.evaluation.pictures import report
 from twin.evaluation.pictures.compare import fixed_residual, pin_aligned, pose_aligned, statistics
 from twin.evaluation.pictures.frames import FEW_LOST, read_real
-from twin.evaluation.pictures.report import (
-    image_summary,
-    pose_summary,
-    statistics_summary,
-    write_metrics,
-    write_page,
-    write_pictures,
-    write_plots,
-    write_tables,
-)
 from twin.optics.relief import without as plain_of
 from twin.progress import Progress, Step, silent, stage
 from twin.types import Quality
@@ -115,15 +106,15 @@ def run_realism(
         "without": sorted(without),
         "refused": real.refused,
         "disc": {"center_px": disc.center_px.tolist(), "radius_px": disc.radius_px},
-        "pin_aligned": image_summary(pairs),
+        "pin_aligned": report.image_summary(pairs),
         "fixed_residual": fixed_residual(spec, pairs),
-        "statistics": statistics_summary(found),
+        "statistics": report.statistics_summary(found),
         "two_sample": {name: {"accuracy": told.accuracy, "low": told.low, "high": told.high} for name, told in outcome.items()},
-        "pose_aligned": poses and pose_summary(poses),
+        "pose_aligned": poses and report.pose_summary(poses),
     }
     pictures = out / "pictures"
-    rows = write_pictures(pictures, pairs, "pins")
-    pose_rows = write_pictures(pictures, poses.pairs, "pose") if poses else []
-    page = write_page(out / "index.html", spec, metrics, write_plots(pictures, found), rows, pose_rows, found)
-    written = [page, write_metrics(out / "metrics.json", metrics), *write_tables(out, pairs, found, poses)]
+    rows = report.write_pictures(pictures, pairs, "pins")
+    pose_rows = report.write_pictures(pictures, poses.pairs, "pose") if poses else []
+    page = report.write_page(out / "index.html", spec, metrics, report.write_plots(pictures, found), rows, pose_rows, found)
+    written = [page, report.write_metrics(out / "metrics.json", metrics), *report.write_tables(out, pairs, found, poses)]
     return metrics, written

@@ -53,7 +53,7 @@ def _ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> Floa
     widest = WIDEST_FISHEYE if camera.projection == "fisheye" else WIDEST_FIELD
     edge = min(FIELD_MARGIN * valid_radius(camera), widest)
     tangent = np.tan(np.linspace(0, np.arctan(edge), 6001))
-    image = distort(camera.model_copy(update={"p1": 0.0, "p2": 0.0}), np.stack([tangent, np.zeros_like(tangent)], axis=-1))[:, 0]
+    image = distort(camera.alter(p1=0.0, p2=0.0), np.stack([tangent, np.zeros_like(tangent)], axis=-1))[:, 0]
     seen_radius = np.linalg.norm(seen, axis=-1, keepdims=True)
     beyond = np.maximum(1.0, seen_radius / image[-1])
     inside = seen / beyond

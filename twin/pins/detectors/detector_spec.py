@@ -11,7 +11,7 @@ from scenes.base import Fraction, Name, Positive, Section, SpecError
 from scenes.load import read_section
 from scenes.sensor import BlobSpec, CameraSpec, Polarity, RecordingSpec, SensorSpec
 from twin.camera.projection import project
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.frames.forms import blob_spec, known_sizes
 from twin.geometry.pins import rest_pins
 from twin.store import write_result
@@ -192,10 +192,8 @@ def load_detector(path: Path) -> DetectorSpec:
     FrameError
         The file does not hold such parameters; the message names the key and the remedy.
     """
-    try:
+    with ErrorsAs(SpecError, lambda error: FrameError(f"{error}; give a file written by 'twin tune', or one of {', '.join(METHODS)}")):
         return read_section(path, DetectorSpec)
-    except SpecError as error:
-        raise FrameError(f"{error}; give a file written by 'twin tune', or one of {', '.join(METHODS)}") from error
 
 
 def write_detector(path: Path, detector: DetectorSpec, comment: str = "") -> None:

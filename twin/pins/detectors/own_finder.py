@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError, OptionError
+from twin.errors import ErrorsAs, FrameError, OptionError
 from twin.pins.detectors.detector_spec import OWN, DetectorSpec, shipped_detector
 from twin.types import Form, Frame
 
@@ -65,10 +65,8 @@ def own_places(detector: DetectorSpec, frame: Frame) -> np.ndarray:
     """
     path, name = _parts(detector.finder)
     function = _function(path, name, detector.finder_digest)
-    try:
+    with ErrorsAs(Exception, lambda error: FrameError(f"{name} failed: {type(error).__name__}: {error}")):
         returned = function(frame.image.copy())
-    except Exception as error:
-        raise FrameError(f"{name} failed: {type(error).__name__}: {error}") from error
     try:
         px = np.asarray(returned, float)
     except (TypeError, ValueError):
@@ -89,10 +87,8 @@ def _parts(text: str) -> tuple[Path, str]:
 
 def _digest(path: Path) -> str:
     """Of the file's content."""
-    try:
+    with ErrorsAs(OSError, lambda error: OptionError(f"{path} can't be read ({error.strerror}); give FILE.py:FUNCTION")):
         return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-    except OSError as error:
-        raise OptionError(f"{path} can't be read ({error.strerror}); give FILE.py:FUNCTION") from error
 
 
 @cache

@@ -16,7 +16,7 @@ from twin.pins import Pipeline, nominal_reference
 from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
 from twin.studio.page import LineChart, StudioPage
-from twin.studio.pictures import badge, number_table
+from twin.studio.pictures import badge, number_table, pins_found
 from twin.studio.scene import PinColour, PinScene, TriangleMesh, colours
 from twin.types import FloatArray, Form, Frame, PinState
 
@@ -106,7 +106,7 @@ class EpisodeMode(PageMode):
             "reward": f"{step.reward:+.3f}",
             "object": step.obj.name,
             "force x, y, z": "  ".join(f"{value:+.2f}" for value in step.force_n + 0.0) + " N",
-            "pins found": f"{seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}"),
+            "pins found": pins_found(seen),
         }
         way_mm = np.linalg.norm(step.pins.caps_mm - self._rest.caps_mm, axis=1)
 

@@ -4,9 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import viser
 
-from scenes.base import SpecError
 from scenes.pins import PinsSpec, layout_from
 from scenes.sensor import SensorSpec
 from twin.calibration.new_sensor import NewSensor, new_sensor
@@ -87,7 +85,7 @@ class NewMode(PageMode):
             self._number = gui.add_slider("frame shown", 0, 1, 1, 0, disabled=True)
             page.button("Use this sensor", self.use)
         correct.on_click(page.guard(lambda: self.correct(+1 if correct.value == LARGER else -1)))
-        self._number.on_update(self._follow_slider)
+        self._number.on_update(page.guard(lambda: self._looking.give(int(self._number.value))))
 
     def show(self) -> None:
         """Show the newest proposal."""
@@ -128,7 +126,7 @@ class NewMode(PageMode):
             Nothing has been proposed yet.
         """
         written = str(self._proposal().written[0])
-        self._twin.open(self._twin.state.model_copy(update={"sensor": written, "form": "raw", "pose": {}}))
+        self._twin.open(self._twin.state.alter(sensor=written, form="raw", pose={}))
         self._page.choose(self._twin.title)
 
     def _proposal(self) -> NewSensor:
@@ -136,26 +134,16 @@ class NewMode(PageMode):
             raise TwinError("nothing has been proposed yet; press 'Propose a specification' first")
         return self._made
 
-    def _follow_slider(self, event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
-        if event.client is not None:  # otherwise this program moved the slider
-            self._looking.give(int(event.target.value))
-
     def _make(self, wish: Wish) -> None:
         def report(stage: str, done: float, total: float, note: str = "") -> None:
             share = f", {100 * done / total:.0f} %" if total else ""
             self._page.say(f"processing the frames: {stage}{share}")
 
         no_contact = Path(wish.no_contact) if wish.no_contact else None
-        try:
-            layout = layout_from(wish.layout) if wish.layout else None
-            out = next_path(self._out, "my-sensor", ".toml")
-            made = new_sensor(Path(wish.frames), out, layout=layout, no_contact=no_contact, progress=report)
-        except SpecError as error:
-            raise TwinError(str(error)) from error
+        layout = layout_from(wish.layout) if wish.layout else None
+        out = next_path(self._out, "my-sensor", ".toml")
+        made = new_sensor(Path(wish.frames), out, layout=layout, no_contact=no_contact, progress=report)
         recording = open_recording(frames_at(Path(wish.frames), None, no_contact), made.sensor)
-        self._take(made, recording)
-
-    def _take(self, made: NewSensor, recording: Recording) -> None:
         self._made, self._recording = made, recording
         self._pipeline = Pipeline(made.sensor, recording.form)
         self._number.max, self._number.disabled = max(1, len(recording) - 1), False

@@ -14,6 +14,7 @@ from twin.pins.batch import recording_reference
 from twin.pins.pipeline import Pipeline
 from twin.rig.contact import RigContact
 from twin.rig.labels import ArmLabel, poses_and_moves, read_arm_labels
+from twin.studio.camera import dome_part
 from twin.studio.contact import MovingContact, experiment_of
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
@@ -148,7 +149,7 @@ class RecordingView:
 
     def crop(self, image: np.ndarray) -> np.ndarray:
         """The dome's part of a processed picture."""
-        return self.contact.camera.crop(image, self.recording.form)
+        return dome_part(self.contact.setup.sensor, image, self.recording.form)
 
 
 def _label_values(label: ArmLabel) -> dict[str, float]:

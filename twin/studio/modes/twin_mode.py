@@ -18,9 +18,10 @@ from twin.frames.images import write_image
 from twin.pins import nominal_reference
 from twin.report.table import force_interval
 from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
+from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
 from twin.studio.page import LineChart, StudioPage, put, value_of
-from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
+from twin.studio.pictures import OverlayChoices, badge, estimate_table, number_table, paragraph, pins_found
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of
 from twin.studio.scene import FULL_SCALE, PinColour, Scene
 from twin.studio.state import StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
@@ -153,14 +154,12 @@ class TwinMode(PageMode):
     @property
     def state(self) -> StudioState:
         """The whole state."""
-        return self._state.model_copy(
-            update={
-                "friction": self.contact.setup.friction,
-                "pose": asdict(self._wish),
-                "form": str(self.contact.setup.form),
-                "colour": str(self._shown),
-                "drawn": str(self._drawn),
-            }
+        return self._state.alter(
+            friction=self.contact.setup.friction,
+            pose=asdict(self._wish),
+            form=str(self.contact.setup.form),
+            colour=str(self._shown),
+            drawn=str(self._drawn),
         )
 
     # wishes
@@ -198,8 +197,8 @@ class TwinMode(PageMode):
 
     def _follow_drag(self, T: np.ndarray, ended: bool) -> None:
         self.ask(ObjectPose.of(T, self.contact.setup.sensor.skin.apex_mm))
-        if ended and self.worker.newest is not None:
-            self._publisher.give(self.worker.newest)
+        if ended:
+            self.show()
 
     # controls
 
@@ -217,7 +216,7 @@ class TwinMode(PageMode):
                     getattr(self._wish, name),
                     hint=f"{low:g} to {high:g}: {why}",
                 )
-                slider.on_update(self._slider_callback(name))
+                slider.on_update(guarded(partial(self._move_to_slider, name)))
             with gui.add_folder("Contact"):
                 sensors, objects = (tuple(sorted({*names(), chosen})) for names, chosen in (
                     (list_sensors, self._state.sensor), (list_objects, self._state.object)))  # fmt: skip
@@ -263,12 +262,8 @@ class TwinMode(PageMode):
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
         gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(self.tap_and_shear))
 
-    def _slider_callback(self, name: str) -> Callable[[viser.GuiEvent[viser.GuiSliderHandle[float]]], None]:
-        def moved(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
-            if event.client is not None:  # otherwise this program moved the slider
-                self.ask(replace(self._wish, **{name: float(event.target.value)}))
-
-        return moved
+    def _move_to_slider(self, name: str) -> None:
+        self.ask(replace(self._wish, **{name: float(self._sliders[name].value)}))
 
     def _own_friction(self) -> float:
         setup = self.contact.setup
@@ -292,8 +287,7 @@ class TwinMode(PageMode):
     def _change_look(self) -> None:
         self._shown = value_of(self._colour, PinColour, str(self._shown))
         self._drawn = value_of(self._drawing, OverlayChoices, str(self._drawn))
-        if self.worker.newest is not None:
-            self._publisher.give(self.worker.newest)
+        self.show()
 
     def _change_friction(self) -> None:
         friction = float(self._friction.value)
@@ -315,7 +309,7 @@ class TwinMode(PageMode):
             put(self._object, self._state.object, send=True)
             raise
         put(self._object, name, send=True)
-        self._state = self._state.model_copy(update={"object": name})
+        self._state = self._state.alter(object=name)
 
         def change() -> None:
             self.contact.change(obj=obj)
@@ -330,7 +324,7 @@ class TwinMode(PageMode):
         chosen = self._sensor.value
         with self._rebuilding:
             try:
-                self.open(self.state.model_copy(update={"sensor": chosen, "form": str(Form.RAW)}))
+                self.open(self.state.alter(sensor=chosen, form=str(Form.RAW)))
             except (TwinError, SpecError):
                 put(self._sensor, self._state.sensor, send=True)
                 raise
@@ -374,10 +368,7 @@ class TwinMode(PageMode):
         """Show the state of a link, unless the page shows it already."""
         if link.partition("?")[2] == self.state.link().partition("?")[2]:
             return
-        try:
-            self.open(StudioState.of_link(link))
-        except SpecError as error:
-            raise TwinError(str(error)) from error
+        self.open(StudioState.of_link(link))
 
     # answers
 
@@ -412,9 +403,7 @@ class TwinMode(PageMode):
     def _show_answer(self, answer: ContactAnswer) -> None:
         contact = self.contact
         if self._active:
-            camera = camera_picture(answer.frame, answer.seen, self._rest.pins_px, self._drawn)
-            cells = cell_picture(answer.frame, answer.seen, self._rest.area_px2)
-            camera, cells = (contact.camera.crop(picture, answer.frame.form) for picture in (camera, cells))
+            camera, cells = frame_pictures(contact.setup.sensor, self._rest, answer.frame, answer.seen, self._drawn)
             if self._film is not None:
                 self._film.add(np.hstack([camera, cells]))
         numbers = self._numbers(answer)
@@ -458,7 +447,7 @@ class TwinMode(PageMode):
             "torque about z": f"{torque:+.1f} N mm",
             "indentation": f"{answer.indent_mm:+.2f} mm",
             "contact area, slipping": f"{state.area_mm2:.0f} mm2, {100 * state.slip_share:.0f} %",
-            "pins found": f"{seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}"),
+            "pins found": pins_found(seen),
         }
         full, unit = FULL_SCALE[self._shown]
         return [

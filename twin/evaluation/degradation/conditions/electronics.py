@@ -5,22 +5,22 @@ import numpy as np
 
 from scenes.sensor import ResponseSpec
 from twin.camera.capture import compressed
-from twin.evaluation.degradation.condition import Condition, OnSection, PictureView, choose_share
+from twin.evaluation.degradation.condition import OnSection, PictureView, choose_share, in_family
 
 
 def darker(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
     """Less exposure."""
-    return response.model_copy(update={"exposure": response.exposure * 2.0**-value})
+    return response.alter(exposure=response.exposure * 2.0**-value)
 
 
 def brighter(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
     """More exposure."""
-    return response.model_copy(update={"exposure": response.exposure * 2.0**value})
+    return response.alter(exposure=response.exposure * 2.0**value)
 
 
 def noisier(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
     """More read and shot noise."""
-    return response.model_copy(update={"read_noise": float(np.hypot(response.read_noise, value))})
+    return response.alter(read_noise=float(np.hypot(response.read_noise, value)))
 
 
 def jpeg(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
@@ -55,40 +55,14 @@ def posterised(image: np.ndarray, value: float, view: PictureView, rng: np.rando
     return np.clip(np.floor(image / step) * step, 0, 255).astype(np.uint8)
 
 
+_condition = in_family("electronics", image_level=True)
 CONDITIONS = (
-    Condition(
-        "exposure-low",
-        "exposure or gain too low",
-        "electronics",
-        "light lost",
-        "stops",
-        9.0,
-        spec=OnSection("response", darker),
-        image_level=True,
-    ),
-    Condition(
-        "exposure-high",
-        "exposure or gain too high",
-        "electronics",
-        "light gained",
-        "stops",
-        9.0,
-        spec=OnSection("response", brighter),
-        image_level=True,
-    ),
-    Condition(
-        "noise",
-        "sensor noise",
-        "electronics",
-        "sd of the light, in saturations",
-        "",
-        0.4,
-        spec=OnSection("response", noisier),
-        image_level=True,
-    ),
-    Condition("jpeg", "JPEG compression", "electronics", "100 less the quality", "", 99.0, frame=jpeg, image_level=True),
-    Condition("resolution", "low resolution", "electronics", "pixels merged, each way", "px", 9.0, 1.0, frame=coarser, image_level=True),
-    Condition("rows-dropped", "dropped rows", "electronics", "share of the rows", "", 0.9, frame=rows_lost, image_level=True),
-    Condition("hot-pixels", "hot pixels", "electronics", "share of the pixels", "", 0.1, frame=hot, image_level=True),
-    Condition("posterised", "posterised levels", "electronics", "bits lost", "bit", 7.5, frame=posterised, image_level=True),
+    _condition("exposure-low", "exposure or gain too low", "light lost", "stops", 9.0, spec=OnSection("response", darker)),
+    _condition("exposure-high", "exposure or gain too high", "light gained", "stops", 9.0, spec=OnSection("response", brighter)),
+    _condition("noise", "sensor noise", "sd of the light, in saturations", "", 0.4, spec=OnSection("response", noisier)),
+    _condition("jpeg", "JPEG compression", "100 less the quality", "", 99.0, frame=jpeg),
+    _condition("resolution", "low resolution", "pixels merged, each way", "px", 9.0, 1.0, frame=coarser),
+    _condition("rows-dropped", "dropped rows", "share of the rows", "", 0.9, frame=rows_lost),
+    _condition("hot-pixels", "hot pixels", "share of the pixels", "", 0.1, frame=hot),
+    _condition("posterised", "posterised levels", "bits lost", "bit", 7.5, frame=posterised),
 )

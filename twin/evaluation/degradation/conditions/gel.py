@@ -4,7 +4,7 @@ import numpy as np
 
 from scenes.body import GelSpec
 from scenes.sensor import SensorSpec, SpeckSpec
-from twin.evaluation.degradation.condition import Condition, OnSection, alter
+from twin.evaluation.degradation.condition import OnSection, in_family
 
 # Smallest and largest radius of a bubble, mm. Chosen.
 BUBBLE_RADIUS_MM = (0.15, 0.6)
@@ -35,37 +35,31 @@ def bubbles(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorS
         SpeckSpec(x_mm=r * np.cos(t), y_mm=r * np.sin(t), radius_mm=size, opacity=BUBBLE_OPACITY * p, light=light * p)
         for t, r, size, p in zip(turn.tolist(), rho_mm.tolist(), radius_mm.tolist(), part.tolist(), strict=True)
     ]
-    return alter(spec, appearance={"specks": (*spec.appearance.specks, *new)})
+    return spec.alter(appearance={"specks": (*spec.appearance.specks, *new)})
 
 
 def hazy(gel: GelSpec, value: float, rng: np.random.Generator) -> GelSpec:
     """Gel that scatters more light."""
-    return gel.model_copy(update={"haze": gel.haze + value * (MOST_HAZE - gel.haze)})
+    return gel.alter(haze=gel.haze + value * (MOST_HAZE - gel.haze))
 
 
 def yellowed(gel: GelSpec, value: float, rng: np.random.Generator) -> GelSpec:
     """Gel that absorbs blue."""
     old = gel.absorption_per_mm
-    return gel.model_copy(update={"absorption_per_mm": tuple(a + value * share for a, share in zip(old, YELLOW, strict=True))})
+    return gel.alter(absorption_per_mm=tuple(a + value * share for a, share in zip(old, YELLOW, strict=True)))
 
 
 def softened(gel: GelSpec, value: float, rng: np.random.Generator) -> GelSpec:
     """Gel that has lost stiffness."""
-    return gel.model_copy(update={"young_modulus_mpa": gel.young_modulus_mpa * (1 - value)})
+    return gel.alter(young_modulus_mpa=gel.young_modulus_mpa * (1 - value))
 
 
+_condition = in_family("gel")
 CONDITIONS = (
-    Condition("gel-bubbles", "bubbles in the gel", "gel", "bubbles", "", 200.0, spec=bubbles),
-    Condition("gel-haze", "hazy gel", "gel", "share of the light scattered forward", "", 1.0, spec=OnSection("gel", hazy)),
-    Condition("gel-yellow", "yellowed gel", "gel", "absorption of blue", "1/mm", 0.6, spec=OnSection("gel", yellowed)),
-    Condition(
-        "gel-soft",
-        "gel softened by temperature",
-        "gel",
-        "share of its stiffness lost",
-        "",
-        0.9,
-        spec=OnSection("gel", softened),
-        solves=True,
+    _condition("gel-bubbles", "bubbles in the gel", "bubbles", "", 200.0, spec=bubbles),
+    _condition("gel-haze", "hazy gel", "share of the light scattered forward", "", 1.0, spec=OnSection("gel", hazy)),
+    _condition("gel-yellow", "yellowed gel", "absorption of blue", "1/mm", 0.6, spec=OnSection("gel", yellowed)),
+    _condition(
+        "gel-soft", "gel softened by temperature", "share of its stiffness lost", "", 0.9, spec=OnSection("gel", softened), solves=True
     ),
 )

@@ -3,7 +3,7 @@
 import numpy as np
 
 from scenes.sensor import LedRingSpec
-from twin.evaluation.degradation.condition import Condition, OnSection, PictureView, over_channels
+from twin.evaluation.degradation.condition import OnSection, PictureView, in_family, over_channels
 
 # Light in the middle of a glare, in saturations. It is large, so that the camera is saturated far beyond the glare's half width.
 GLARE = 3.0
@@ -13,7 +13,7 @@ GLARE_AT = (0.35, -0.25)
 
 def dimmed(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
     """All LEDs weaker."""
-    return leds.model_copy(update={"power": leds.power * (1 - value)})
+    return leds.alter(power=leds.power * (1 - value))
 
 
 def dead(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
@@ -21,13 +21,13 @@ def dead(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSp
     balance = np.array(leds.balance or (1.0,) * len(leds.azimuth_deg))
     lit = np.setdiff1d(np.arange(len(balance)), leds.off)
     balance[lit] *= np.clip(1 - (value * len(lit) - np.arange(len(lit))), 0, 1)
-    return leds.model_copy(update={"balance": tuple(balance.tolist())})
+    return leds.alter(balance=tuple(balance.tolist()))
 
 
 def reddened(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
     """LEDs that have changed their colour."""
     red, green, blue = leds.color
-    return leds.model_copy(update={"color": (red, green * (1 - value), blue * (1 - value))})
+    return leds.alter(color=(red, green * (1 - value), blue * (1 - value)))
 
 
 def room_light(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
@@ -45,21 +45,13 @@ def glare(light: np.ndarray, value: float, view: PictureView, rng: np.random.Gen
     return light + over_channels(GLARE * view.saturation * np.exp(-np.log(GLARE) * away2**2), light)
 
 
+_condition = in_family("light")
 CONDITIONS = (
-    Condition("leds-dim", "LEDs grown dim", "light", "share of the LEDs' light lost", "", 0.995, spec=OnSection("leds", dimmed)),
-    Condition("leds-dead", "LEDs dead, one after the other", "light", "share of the LEDs", "", 1.0, spec=OnSection("leds", dead)),
-    Condition(
-        "leds-red", "LED colour shifted to red", "light", "share of green and blue lost", "", 0.995, spec=OnSection("leds", reddened)
+    _condition("leds-dim", "LEDs grown dim", "share of the LEDs' light lost", "", 0.995, spec=OnSection("leds", dimmed)),
+    _condition("leds-dead", "LEDs dead, one after the other", "share of the LEDs", "", 1.0, spec=OnSection("leds", dead)),
+    _condition("leds-red", "LED colour shifted to red", "share of green and blue lost", "", 0.995, spec=OnSection("leds", reddened)),
+    _condition(
+        "room-light", "room light leaking in", "light at the bright side, in saturations", "", 1.5, light=room_light, image_level=True
     ),
-    Condition(
-        "room-light",
-        "room light leaking in",
-        "light",
-        "light at the bright side, in saturations",
-        "",
-        1.5,
-        light=room_light,
-        image_level=True,
-    ),
-    Condition("glare", "saturated glare", "light", "diameter at the caps", "mm", 16.0, light=glare, image_level=True),
+    _condition("glare", "saturated glare", "diameter at the caps", "mm", 16.0, light=glare, image_level=True),
 )

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from twin.evaluation.degradation.condition import Condition, PictureView, over_channels
+from twin.evaluation.degradation.condition import PictureView, in_family, over_channels
 
 # Number of sub-pixels of a pixel along each axis, over which the kernel of a blur is averaged.
 SUBPIXELS = 8
@@ -98,19 +98,18 @@ def scratched(light: np.ndarray, value: float, view: PictureView, rng: np.random
     return light + over_channels(added, light)
 
 
+_condition = in_family("optics", image_level=True)
 CONDITIONS = (
-    Condition("defocus", "camera out of focus", "optics", "circle of confusion at the caps", "mm", 4.0, light=defocus, image_level=True),
-    Condition(
+    _condition("defocus", "camera out of focus", "circle of confusion at the caps", "mm", 4.0, light=defocus),
+    _condition(
         "focus-rolled",
         "focus rolled off to one side",
-        "optics",
         "circle of confusion at the far rim",
         "mm",
         6.0,
         light=rolled_focus,
-        image_level=True,
     ),
-    Condition("motion-blur", "motion blur", "optics", "path of the picture during the exposure", "mm", 5.0, light=motion, image_level=True),
-    Condition("lens-dirt", "dirt on the lens", "optics", "share of the disc under smudges", "", 0.9, light=dirt, image_level=True),
-    Condition("lens-scratches", "scratched lens", "optics", "scratches", "", 120.0, light=scratched, image_level=True),
+    _condition("motion-blur", "motion blur", "path of the picture during the exposure", "mm", 5.0, light=motion),
+    _condition("lens-dirt", "dirt on the lens", "share of the disc under smudges", "", 0.9, light=dirt),
+    _condition("lens-scratches", "scratched lens", "scratches", "", 120.0, light=scratched),
 )

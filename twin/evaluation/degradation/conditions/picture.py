@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from twin.evaluation.degradation.condition import Condition, PictureView
+from twin.evaluation.degradation.condition import PictureView, in_family
 from twin.evaluation.degradation.conditions.placement import mapped, warped
 
 FARTHEST_PX = 64.0
@@ -55,16 +55,10 @@ def mirrored_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarr
     return np.column_stack([view.size_px[0] - 1 - px[:, 0], px[:, 1]])
 
 
+_condition = in_family("picture", image_level=True)
 CONDITIONS = (
-    Condition(
-        "picture-rolled", "rolled picture", "picture", "columns", "px", FARTHEST_PX, frame=rolled, moves=rolled_points, image_level=True
-    ),
-    Condition(
-        "picture-torn", "torn picture", "picture", "columns of the lower half", "px", FARTHEST_PX, frame=torn, moves=torn_points,
-        image_level=True,
-    ),
-    Condition("picture-turned", "turned picture", "picture", "angle", "deg", 180.0, frame=turned, moves=turned_points, image_level=True),
-    Condition(
-        "picture-mirrored", "mirrored picture", "picture", "mirrored", "", 1.0, frame=mirrored, moves=mirrored_points, image_level=True
-    ),
-)  # fmt: skip
+    _condition("picture-rolled", "rolled picture", "columns", "px", FARTHEST_PX, frame=rolled, moves=rolled_points),
+    _condition("picture-torn", "torn picture", "columns of the lower half", "px", FARTHEST_PX, frame=torn, moves=torn_points),
+    _condition("picture-turned", "turned picture", "angle", "deg", 180.0, frame=turned, moves=turned_points),
+    _condition("picture-mirrored", "mirrored picture", "mirrored", "", 1.0, frame=mirrored, moves=mirrored_points),
+)

@@ -5,7 +5,7 @@ import numpy as np
 
 from scenes.sensor import CameraSpec, SensorSpec
 from twin.camera.projection import lens_disc
-from twin.evaluation.degradation.condition import Condition, OnSection, PictureView, alter
+from twin.evaluation.degradation.condition import OnSection, PictureView, in_family
 
 # Direction of a shift in the picture: unit vector at 30 deg from x towards y.
 AWAY = (np.cos(np.radians(30.0)), np.sin(np.radians(30.0)))
@@ -14,28 +14,28 @@ AWAY = (np.cos(np.radians(30.0)), np.sin(np.radians(30.0)))
 def shifted(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     """The chip is displaced from the lens' axis."""
     by = value * PictureView.of(spec, np.zeros((0, 2))).px_per_mm
-    return alter(spec, camera={"cx_px": spec.camera.cx_px + AWAY[0] * by, "cy_px": spec.camera.cy_px + AWAY[1] * by})
+    return spec.alter(camera={"cx_px": spec.camera.cx_px + AWAY[0] * by, "cy_px": spec.camera.cy_px + AWAY[1] * by})
 
 
 def tilted(camera: CameraSpec, value: float, rng: np.random.Generator) -> CameraSpec:
     """A camera that is rotated about x."""
-    return camera.model_copy(update={"tilt_x_deg": camera.tilt_x_deg + value})
+    return camera.alter(tilt_x_deg=camera.tilt_x_deg + value)
 
 
 def zoomed(camera: CameraSpec, value: float, rng: np.random.Generator) -> CameraSpec:
     """Another focal length."""
-    return camera.model_copy(update={"fx_px": camera.fx_px * (1 + value), "fy_px": camera.fy_px * (1 + value)})
+    return camera.alter(fx_px=camera.fx_px * (1 + value), fy_px=camera.fy_px * (1 + value))
 
 
 def distorted(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     """Another lens, with a barrel distortion that moves the disc's rim inwards by a share of its radius."""
     rim = lens_disc(spec.view, spec.housing).radius_px / spec.camera.fx_px
-    return alter(spec, camera={"k1": spec.camera.k1 - value / rim**2})
+    return spec.alter(camera={"k1": spec.camera.k1 - value / rim**2})
 
 
 def vignetted(camera: CameraSpec, value: float, rng: np.random.Generator) -> CameraSpec:
     """Darker corners."""
-    return camera.model_copy(update={"vignetting": camera.vignetting + value * (1 - camera.vignetting)})
+    return camera.alter(vignetting=camera.vignetting + value * (1 - camera.vignetting))
 
 
 def roll(degrees: float, view: PictureView) -> np.ndarray:
@@ -80,18 +80,24 @@ def sheared_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarra
     return mapped(px, skew(0.5 * value * view.px_per_mm / view.radius_px, view))
 
 
+_condition = in_family("camera")
 CONDITIONS = (
-    Condition("camera-shifted", "camera shifted", "camera", "shift at the caps", "mm", 16.0, spec=shifted),
-    Condition("camera-rolled", "camera rotated", "camera", "angle", "deg", 60.0, light=rolled, moves=rolled_points, image_level=True),
-    Condition("camera-tilted", "camera tilted", "camera", "angle", "deg", 24.0, spec=OnSection("camera", tilted)),
-    Condition("camera-zoomed", "camera zoomed in", "camera", "growth of the picture", "", 0.4, spec=OnSection("camera", zoomed)),
-    Condition("camera-distorted", "another camera's distortion", "camera", "rim drawn in, of its radius", "", 0.3, spec=distorted),
-    Condition(
-        "vignetting", "vignetting", "camera", "share of light lost at the corners", "", 1.0, spec=OnSection("camera", vignetted),
+    _condition("camera-shifted", "camera shifted", "shift at the caps", "mm", 16.0, spec=shifted),
+    _condition("camera-rolled", "camera rotated", "angle", "deg", 60.0, light=rolled, moves=rolled_points, image_level=True),
+    _condition("camera-tilted", "camera tilted", "angle", "deg", 24.0, spec=OnSection("camera", tilted)),
+    _condition("camera-zoomed", "camera zoomed in", "growth of the picture", "", 0.4, spec=OnSection("camera", zoomed)),
+    _condition("camera-distorted", "another camera's distortion", "rim drawn in, of its radius", "", 0.3, spec=distorted),
+    _condition(
+        "vignetting", "vignetting", "share of light lost at the corners", "", 1.0, spec=OnSection("camera", vignetted), image_level=True
+    ),
+    _condition(
+        "rolling-shutter",
+        "rolling shutter in motion",
+        "motion over the disc's height",
+        "mm",
+        24.0,
+        light=sheared,
+        moves=sheared_points,
         image_level=True,
     ),
-    Condition(
-        "rolling-shutter", "rolling shutter in motion", "camera", "motion over the disc's height", "mm", 24.0, light=sheared,
-        moves=sheared_points, image_level=True,
-    ),
-)  # fmt: skip
+)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from twin.evaluation.degradation.condition import Condition, PictureView
+from twin.evaluation.degradation.condition import PictureView, in_family
 from twin.pins import DetectorSpec
 
 
@@ -40,18 +40,9 @@ def too_lax(detector: DetectorSpec, value: float) -> DetectorSpec:
     return detector.stricter(-value)
 
 
+_condition = in_family("settings", image_level=True)
 CONDITIONS = (
-    Condition(
-        "wrong-crop",
-        "wrong crop",
-        "settings",
-        "displacement, of the disc's radius",
-        "",
-        0.9,
-        frame=wrong_crop,
-        moves=displaced,
-        image_level=True,
-    ),
-    Condition("threshold-strict", "threshold too strict", "settings", "gray levels", "", 120.0, setting=too_strict, image_level=True),
-    Condition("threshold-lax", "threshold too lax", "settings", "gray levels", "", 60.0, setting=too_lax, image_level=True),
+    _condition("wrong-crop", "wrong crop", "displacement, of the disc's radius", "", 0.9, frame=wrong_crop, moves=displaced),
+    _condition("threshold-strict", "threshold too strict", "gray levels", "", 120.0, setting=too_strict),
+    _condition("threshold-lax", "threshold too lax", "gray levels", "", 60.0, setting=too_lax),
 )

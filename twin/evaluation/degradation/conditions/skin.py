@@ -6,7 +6,7 @@ import numpy as np
 from scenes.base import Rgb
 from scenes.body import SkinSpec
 from scenes.sensor import AppearanceSpec, SensorSpec
-from twin.evaluation.degradation.condition import Condition, OnSection, PictureView, alter, choose_share, over_channels
+from twin.evaluation.degradation.condition import OnSection, PictureView, choose_share, in_family, over_channels
 from twin.geometry.pins import rest_pins
 from twin.optics.surfaces import cap_albedo
 
@@ -39,7 +39,7 @@ def missing(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorS
     look = spec.appearance
     gone = sum(look.skin_albedo) / max(sum(look.cap_albedo), GONE) if look.dark_caps else GONE
     levels = np.where(choose_share(spec.pins.count, value, rng), gone, cap_levels(look, spec.pins.count))
-    return alter(spec, appearance={"cap_levels": tuple(levels.tolist())})
+    return spec.alter(appearance={"cap_levels": tuple(levels.tolist())})
 
 
 def those_missing(value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
@@ -57,14 +57,14 @@ def broken(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSp
         new[:, k] = BROKEN[k] * np.cos(order * turn)
         new[:, k + 1] = BROKEN[k] * np.sin(order * turn)
     shapes = np.where(choose_share(spec.pins.count, value, rng)[:, None], new, old)
-    return alter(spec, appearance={"cap_shapes": tuple(map(tuple, shapes.tolist()))})
+    return spec.alter(appearance={"cap_shapes": tuple(map(tuple, shapes.tolist()))})
 
 
 def faded(appearance: AppearanceSpec, value: float, rng: np.random.Generator) -> AppearanceSpec:
     """Caps that have darkened; dark caps have become as bright as the skin."""
     if appearance.dark_caps:
-        return appearance.model_copy(update={"cap_albedo": _towards(appearance.cap_albedo, appearance.skin_albedo, value)})
-    return appearance.model_copy(update={"cap_albedo": tuple(a * (1 - value) for a in appearance.cap_albedo)})
+        return appearance.alter(cap_albedo=_towards(appearance.cap_albedo, appearance.skin_albedo, value))
+    return appearance.alter(cap_albedo=tuple(a * (1 - value) for a in appearance.cap_albedo))
 
 
 def _towards(albedo: Rgb, other: Rgb, value: float) -> tuple[float, ...]:
@@ -75,15 +75,13 @@ def _towards(albedo: Rgb, other: Rgb, value: float) -> tuple[float, ...]:
 def uneven(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     """Caps of different brightness."""
     levels = cap_levels(spec.appearance, spec.pins.count) * np.exp(-value * np.abs(rng.standard_normal(spec.pins.count)))
-    return alter(spec, appearance={"cap_levels": tuple(levels.tolist())})
+    return spec.alter(appearance={"cap_levels": tuple(levels.tolist())})
 
 
 def pale(appearance: AppearanceSpec, value: float, rng: np.random.Generator) -> AppearanceSpec:
     """A skin that has lost its black; a bright skin has become as dark as the caps."""
-    if appearance.dark_caps:
-        return appearance.model_copy(update={"skin_albedo": _towards(appearance.skin_albedo, appearance.cap_albedo, value)})
-    old = appearance.skin_albedo
-    return appearance.model_copy(update={"skin_albedo": tuple(a + value * (1 - a) for a in old)})
+    end = appearance.cap_albedo if appearance.dark_caps else (1.0, 1.0, 1.0)
+    return appearance.alter(skin_albedo=_towards(appearance.skin_albedo, end, value))
 
 
 def translucent(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
@@ -110,7 +108,7 @@ def those_torn_off(value: float, view: PictureView, rng: np.random.Generator) ->
 def swollen(skin: SkinSpec, value: float, rng: np.random.Generator) -> SkinSpec:
     """Skin swollen by oil: thicker and larger."""
     grown = {name: getattr(skin, name) * (1 + value) for name in (*skin.size_keys, "thickness_mm")}
-    return skin.model_copy(update=grown)
+    return skin.alter(**grown)
 
 
 def cap_cover(shape: tuple[int, ...], view: PictureView) -> np.ndarray:
@@ -122,13 +120,14 @@ def cap_cover(shape: tuple[int, ...], view: PictureView) -> np.ndarray:
     return cover / np.float32(255)
 
 
+_condition = in_family("skin")
 CONDITIONS = (
-    Condition("caps-missing", "caps come off", "skin", "share of the caps", "", 0.6, spec=missing, hides=those_missing),
-    Condition("caps-broken", "broken caps", "skin", "share of the caps", "", 1.0, spec=broken),
-    Condition("caps-faded", "faded caps", "skin", "share of their reflectance lost", "", 0.995, spec=OnSection("appearance", faded)),
-    Condition("caps-uneven", "unevenly soiled caps", "skin", "sd of the logarithm of their reflectance", "", 4.0, spec=uneven),
-    Condition("skin-pale", "skin worn pale", "skin", "reflectance gained", "", 0.6, spec=OnSection("appearance", pale)),
-    Condition("skin-translucent", "translucent skin", "skin", "room light through it, in saturations", "", 0.8, light=translucent),
-    Condition("skin-torn", "torn skin", "skin", "diameter of the hole", "mm", 22.0, light=torn, hides=those_torn_off),
-    Condition("skin-swollen", "skin swollen by oil", "skin", "growth", "", 0.2, spec=OnSection("skin", swollen), solves=True),
+    _condition("caps-missing", "caps come off", "share of the caps", "", 0.6, spec=missing, hides=those_missing),
+    _condition("caps-broken", "broken caps", "share of the caps", "", 1.0, spec=broken),
+    _condition("caps-faded", "faded caps", "share of their reflectance lost", "", 0.995, spec=OnSection("appearance", faded)),
+    _condition("caps-uneven", "unevenly soiled caps", "sd of the logarithm of their reflectance", "", 4.0, spec=uneven),
+    _condition("skin-pale", "skin worn pale", "reflectance gained", "", 0.6, spec=OnSection("appearance", pale)),
+    _condition("skin-translucent", "translucent skin", "room light through it, in saturations", "", 0.8, light=translucent),
+    _condition("skin-torn", "torn skin", "diameter of the hole", "mm", 22.0, light=torn, hides=those_torn_off),
+    _condition("skin-swollen", "skin swollen by oil", "growth", "", 0.2, spec=OnSection("skin", swollen), solves=True),
 )

@@ -1,7 +1,8 @@
 """``python tests/weights/domains.py FOLDER [NAME...]``: learn the domains of the shipped weights again, after a change of the domain.
 
 They come from the training fifths of the recordings (``TACTIP_REAL``) and from simulated contacts with sixteen objects, which are generated
-into FOLDER, or taken up from it (about two hours on two cores). Names: mg400-331, mg400-127, ur5-331, ur5-tacpad, edge, plate.
+into FOLDER, or taken up from it (about two hours on two cores), and from those that ``train.py`` made there. Names: mg400-331, mg400-127,
+ur5-331, ur5-tacpad, edge, plate.
 """
 
 import os
@@ -61,7 +62,7 @@ def simulated(sensor: str, folder: Path, *, raw: bool) -> list[Path]:
                 )
                 generate(out, config, count)
             found.append(out)
-    return found
+    return found + [out for name in ([] if raw else LEARNT) if ((out := folder / f"{sensor}-{name}") / "targets.csv").is_file()]
 
 
 def moved(data: Dataset, rows: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
 """``python tests/weights/domains.py FOLDER [NAME...]``: learn the domains of the shipped weights again, after a change of the domain.
 
 They come from the training fifths of the recordings (``TACTIP_REAL``) and from simulated contacts with sixteen objects, which are generated
-into FOLDER, or taken up from it (about two hours on two cores), and from those that ``train.py`` made there. Names: mg400-331, mg400-127,
-ur5-331, ur5-tacpad, edge, plate.
+into FOLDER, or taken up from it (about two hours on two cores). Names: mg400-331, mg400-127, ur5-331, ur5-tacpad,
+edge, plate.
 """
 
 import os
@@ -27,7 +27,9 @@ REAL = Path(os.environ.get("TACTIP_REAL", "../shared/real"))
 LEARNT = ["plane", "sphere", "ball-10", "ball-40", "ball-80", "round-bar", "square-rod", "triangle-rod", "hexagon-rod"]
 MORE = ["cylinder", "edge", "can", "mesh-can", "square", "prism", "tin-box"]
 ACROSS, NOISE_PX = 12, 0.1
-CONTACTS = ((LEARNT, 24, 71), (MORE, 5, 1071))
+AROUND = {"prism": 24.0, "square": 41.0}
+"""Largest distance, mm, of contacts from the middle of a face of these objects: past its edges."""
+CONTACTS = ((LEARNT, 24, 71), (MORE, 5, 1071), (AROUND, 40, 2071))
 """Objects, contacts with each of them, and the seed."""
 RECORDINGS = {
     "mg400-331": ("tac-vgnn-331",),
@@ -45,14 +47,18 @@ def simulated(sensor: str, folder: Path, *, raw: bool) -> list[Path]:
     if raw:
         spec = spec.model_copy(update={"recording": None, "pipeline": spec.pipeline.model_copy(update={"processed": None})})
     for objects, count, seed in ((["plane"], 24, 71),) if raw else CONTACTS:
+        experiment = load_experiment("surface-3d" if raw else "objects-2d")
         for name in objects:
+            if objects is AROUND:
+                pose = experiment.pose.model_copy(update={"pose_1": (-AROUND[name], AROUND[name])})
+                experiment = experiment.model_copy(update={"pose": pose})
             out = folder / f"{sensor}-{name}-{seed}{'-raw' if raw else ''}"
             if not (out / "targets.csv").is_file():
                 out.mkdir(parents=True, exist_ok=True)
                 config = GenerationConfig(
                     sensor=spec,
                     object=load_object(name),
-                    experiment=load_experiment("surface-3d" if raw else "objects-2d"),
+                    experiment=experiment,
                     randomisation=load_randomisation("contact"),
                     friction=rig_of(spec).friction,
                     seed=seed,
@@ -62,7 +68,7 @@ def simulated(sensor: str, folder: Path, *, raw: bool) -> list[Path]:
                 )
                 generate(out, config, count)
             found.append(out)
-    return found + [out for name in ([] if raw else LEARNT) if ((out := folder / f"{sensor}-{name}") / "targets.csv").is_file()]
+    return found
 
 
 def moved(data: Dataset, rows: np.ndarray) -> np.ndarray:

@@ -42,9 +42,9 @@ BARS_MM = (40, 100)
 CONTACTS, ACROSS, SEED, EPOCHS, LABELLED = 100, 16, 171, 40, 40
 UNITS = 40
 """Contacts with units of other skin and gel."""
-DRAWS, NOISE_PX = 4, 0.15
-"""Draws of the discrepancy for each simulated contact, and noise of their pins, px. Real frames have none: with noise, rendered frames look
-like real ones, and their depths come out as the real unit's."""
+DRAWS, REAL_COPIES, NOISE_PX = 4, 4, 0.1
+"""Draws of the discrepancy for each simulated contact, copies of each real frame, and noise of the pins of every copy but the first, px:
+the networks learn no row by heart."""
 TARGETS = ("pose_2", "pose_6")
 RIDGE = 0.01
 """Penalty of a change of the weights of the expected errors, in standard deviations of their inputs."""
@@ -175,7 +175,7 @@ def make(name: str, folder: Path) -> None:
     splits = [split_rows(len(each), 0, each.group) for each in sets]
     copies = [a.rows(mine).with_copies([each.rows(mine).pins for each in b]) for a, b, (mine, _) in zip(sets, drawn, splits, strict=True)]
     seen = real.rows(train)
-    data = join_datasets([seen.with_copies([]), *copies])
+    data = join_datasets([seen.with_copies([with_noise(seen, k).pins for k in range(1, REAL_COPIES)]), *copies])
     firsts = [each[0] for each in drawn]
     clean, drawn = (join_datasets([each.rows(out) for each, (_, out) in zip(of, splits, strict=True)]) for of in (sets, firsts))
     contacts = np.unique(clean.group)  # a quasi-random sequence: every second one would be another half of the poses

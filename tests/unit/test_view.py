@@ -129,16 +129,17 @@ def test_weights_refuse_a_displaced_picture_of_their_unit(name, change, words):
 
 @pytest.mark.parametrize("name", WEIGHTS)
 @pytest.mark.parametrize("change", [{"turn_deg": 4.0}, {"scale": (1.04, 1.04)}, {"shift_px": (8.0, -5.0)}], ids=str)
-def test_a_small_displacement_of_the_picture_is_corrected(name, change):
+def test_a_small_displacement_of_the_picture_is_corrected(name, change, real_dir):
     """Both frames are displaced alike. Without the correction 4 deg change the angle by up to a degree."""
     model, known = model_of(name), known_of(name)
-    pressed = known + (model.domain.mean * model.pipeline.reference.spacing_px.mean()).reshape(-1, 2)
+    recording = open_recording(real_dir / name.replace("mg400", "tac-vgnn"), model.sensor, None)
+    pressed = model.at_known_rest().pipeline(recording.read(len(recording) // 2)).graph.nodes_px
     both = np.concatenate([known, pressed])
     straight = model.at_rest(drawn(model, known))(drawn(model, pressed))
     seen = carried(both, **change)
     made = model.at_rest(drawn(model, seen[: len(known)]))(drawn(model, seen[len(known) :]))
     assert straight.valid and made.valid
-    assert np.all(np.abs(made.value - straight.value) < 0.25 * (straight.high - straight.low))
+    assert np.all(np.abs(made.value - straight.value) < 0.4 * (straight.high - straight.low))
 
 
 def test_displacements_from_rest_are_turned_scaled_and_stretched_as_their_view():

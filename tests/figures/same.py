@@ -59,7 +59,7 @@ class Sample:
 
 
 PICTURES, PINS, LEARNT = ("render", "robustness"), ("pins", "audit"), ("training", "intervals", "kinds")
-TWINS = ("sim_to_real", "objects", "forces", "slip", "labels", "studio", "data", "servo")
+TWINS = ("sim_to_real", "objects", "forces", "load_cell", "slip", "labels", "studio", "data", "servo")
 SAMPLES = {
     **{
         f"contacts {sensor}": Sample(
@@ -92,7 +92,7 @@ SAMPLES = {
             + ("--out", "OUT"),
         ),
     ),
-    "rollout": Sample(("environments", "policies"), (("-c", ROLLOUT, "OUT"),)),
+    "rollout": Sample(("environments", "policies", "baselines"), (("-c", ROLLOUT, "OUT"),)),
 }
 FRAMES = 40
 """Frames of a recording that a sample takes."""

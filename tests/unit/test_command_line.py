@@ -16,6 +16,7 @@ import typer
 from command import run_twin
 from typer.testing import CliRunner
 
+import twin
 from hardware.errors import DeviceNotConnectedError
 from scenes import load_experiment, load_object, load_randomisation, load_sensor
 from scenes.base import SpecError
@@ -400,3 +401,20 @@ def test_a_missing_device_is_one_line_though_it_is_also_an_error_of_the_system(m
 def test_an_option_of_two_numbers_says_so_where_one_is_missing():
     told = CliRunner().invoke(command_line(), ["render", "--sensor", "ur5-331", "--object", "edge", "--tilt-deg", "5", "--indent-mm", "3"])
     assert told.exit_code == 2 and "it needs 2 numbers" in " ".join(told.output.split()), told.output
+
+
+def test_no_command_overwrites_an_option_before_it_hands_all_of_them_on():
+    """Commands hand their options on as ``locals()``: an option that is assigned to would arrive as something else.
+
+    ``frames`` may: the path becomes the frames that are there.
+    """
+    found, checked = [], 0
+    for path in sorted((Path(twin.__file__).parent / "cli").glob("*.py")):
+        for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(function, ast.FunctionDef) or "locals()" not in ast.unparse(function):
+                continue
+            checked += 1
+            options = {one.arg for one in (*function.args.args, *function.args.kwonlyargs)}
+            stored = {node.id for node in ast.walk(function) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+            found += [f"{path.name}: {function.name}: {name}" for name in sorted((options & stored) - {"frames"})]
+    assert checked > 20 and not found, found

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes import load_experiment, load_object, load_randomisation, load_sensor
+from scenes import ObjectSpec, SensorSpec, load_experiment, load_object, load_randomisation, load_sensor
+from scenes.experiment import ExperimentSpec
 from training.data.dataset import Dataset, load_dataset, split_rows
 from training.data.simulated import config_of
 from training.estimate.contact_estimator import ContactEstimator, contacts_folder
@@ -41,33 +42,40 @@ RECORDINGS = {
 }
 
 
+def simulate(
+    out: Path, sensor: SensorSpec, obj: ObjectSpec, experiment: ExperimentSpec, randomisation: str, *, count: int, seed: int, across: int
+) -> Path:
+    """Simulated contacts of pins alone, made if they are missing."""
+    if not (out / "targets.csv").is_file():
+        out.mkdir(parents=True, exist_ok=True)
+        config = GenerationConfig(
+            sensor=sensor,
+            object=obj,
+            experiment=experiment,
+            randomisation=load_randomisation(randomisation),
+            friction=rig_of(sensor).friction,
+            seed=seed,
+            images="none",
+            states="all",
+            across=across,
+        )
+        generate(out, config, count)
+    return out
+
+
 def simulated(sensor: str, folder: Path, *, raw: bool) -> list[Path]:
     """Folders of the simulated contacts of a sensor, made if they are missing; of frames of the camera if ``raw``."""
     spec, found = load_sensor(sensor), []
     if raw:
         spec = spec.model_copy(update={"recording": None, "pipeline": spec.pipeline.model_copy(update={"processed": None})})
     for objects, count, seed in ((["plane"], 24, 71),) if raw else CONTACTS:
-        experiment = load_experiment("surface-3d" if raw else "objects-2d")
         for name in objects:
+            experiment = load_experiment("surface-3d" if raw else "objects-2d")
             if objects is AROUND:
                 pose = experiment.pose.model_copy(update={"pose_1": (-AROUND[name], AROUND[name])})
                 experiment = experiment.model_copy(update={"pose": pose})
             out = folder / f"{sensor}-{name}-{seed}{'-raw' if raw else ''}"
-            if not (out / "targets.csv").is_file():
-                out.mkdir(parents=True, exist_ok=True)
-                config = GenerationConfig(
-                    sensor=spec,
-                    object=load_object(name),
-                    experiment=experiment,
-                    randomisation=load_randomisation("contact"),
-                    friction=rig_of(spec).friction,
-                    seed=seed,
-                    images="none",
-                    states="all",
-                    across=ACROSS,
-                )
-                generate(out, config, count)
-            found.append(out)
+            found.append(simulate(out, spec, load_object(name), experiment, "contact", count=count, seed=seed, across=ACROSS))
     return found
 
 

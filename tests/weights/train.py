@@ -14,15 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from domains import LEARNT, REAL
+from domains import LEARNT, REAL, simulate
 
-from scenes import load_experiment, load_object, load_randomisation, load_sensor
+from scenes import load_experiment, load_object, load_sensor
 from scenes.object import CylinderShape, ObjectSpec
 from training.data.dataset import Dataset, join_datasets, load_dataset, split_rows
 from training.data.label_code import label_error
 from training.data.pins import voronoi_areas
 from training.estimate.estimator import PoseEstimator
-from training.generation import GenerationConfig, generate
 from training.models import recipe_of
 from training.runs.assemble import conformal_quantile
 from training.runs.config import RunConfig
@@ -33,7 +32,6 @@ from training.studies.judging import intervals_on, measure_errors
 from training.studies.sim_to_real.discrepancy import Discrepancy, measure_residuals
 from training.studies.sim_to_real.steps import arm_labels, choose_frames, measured_of, widen_intervals, with_missing
 from twin.calibration.contact.simulate import CalibrationSetup
-from twin.rig.kinematics import rig_of
 from twin.store import output, overwriting, write_json
 
 RECORDINGS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
@@ -65,29 +63,10 @@ def objects() -> list[ObjectSpec]:
     return [*(load_object(name) for name in LEARNT), *bars]
 
 
-def simulate(sensor, folder: Path) -> list[Dataset]:
-    """The simulated contacts."""
-    names = {each.name: each for each in objects()}
-    return [contacts_in(folder / f"{sensor.name}-{name}", sensor, each, "objects-2d", "moves") for name, each in names.items()]
-
-
 def contacts_in(out: Path, sensor, obj: ObjectSpec, experiment: str, randomisation: str, count: int = CONTACTS) -> Dataset:
     """Simulated contacts with an object, made if they are missing."""
-    if not (out / "targets.csv").is_file():
-        out.mkdir(parents=True, exist_ok=True)
-        config = GenerationConfig(
-            sensor=sensor,
-            object=obj,
-            experiment=load_experiment(experiment, wide=randomisation == "moves"),
-            randomisation=load_randomisation(randomisation),
-            friction=rig_of(sensor).friction,
-            seed=SEED,
-            images="none",
-            states="all",
-            across=ACROSS,
-        )
-        generate(out, config, count)
-    return load_dataset(out, sensor, TARGETS)
+    plan = load_experiment(experiment, wide=randomisation == "moves")
+    return load_dataset(simulate(out, sensor, obj, plan, randomisation, count=count, seed=SEED, across=ACROSS), sensor, TARGETS)
 
 
 def with_noise(data: Dataset, seed: int) -> Dataset:
@@ -170,7 +149,7 @@ def make(name: str, folder: Path) -> None:
     sensor, run = load_sensor(name), folder / f"{name}-run"
     real = load_dataset(REAL / RECORDINGS[name], sensor, TARGETS).in_order()
     train, test = split_rows(len(real), 0)
-    sets = simulate(sensor, folder)
+    sets = [contacts_in(folder / f"{name}-{each.name}", sensor, each, "objects-2d", "moves") for each in objects()]
     drawn = with_discrepancy(sensor, folder, sets, real)
     splits = [split_rows(len(each), 0, each.group) for each in sets]
     copies = [a.rows(mine).with_copies([each.rows(mine).pins for each in b]) for a, b, (mine, _) in zip(sets, drawn, splits, strict=True)]

@@ -234,8 +234,8 @@ class ContactEstimator:
         return list(dict.fromkeys(line for part in self.parts.values() for line in part.caveats))
 
     def with_history(self) -> "ContactEstimator":
-        """As for ``PoseEstimator``."""
-        return self._with({name: part.with_history() for name, part in self.parts.items()})
+        """The models for consecutive frames. They name pins as in the frame before; slip is not estimated."""
+        return self._with({name: part.keep_names() for name, part in self.parts.items()})
 
     def at_known_rest(self) -> "ContactEstimator":
         """As for ``PoseEstimator``."""

@@ -146,7 +146,7 @@ class PoseEstimator:
         self.domain: Domain | None = None
         self._tracker: SlipTracker | None = None
         self._consecutive = False
-        self._other_unit = False
+        self._wider: tuple[float, ...] = ()  # factors of the intervals on another unit, if this is one
         self._undecided = ""
 
     @classmethod
@@ -229,13 +229,18 @@ class PoseEstimator:
         moves over the skin (deg, sensor frame, from x towards y). A frame without an estimate ends the contact: the next frame belongs to
         a new contact.
         """
-        found = copy(self)
-        found.pipeline, found._consecutive = self.pipeline.with_history(), True
-        found._trained = replace(self._trained, pipeline=found.pipeline)
+        found = self.keep_names()
         if self.slip is not None:
             found._tracker = SlipTracker(self.slip)
             if self._tracker is None:
                 found.names, found.units = (*self.names, *SLIP_NAMES), (*self.units, *SLIP_UNITS)
+        return found
+
+    def keep_names(self) -> "PoseEstimator":
+        """The model for consecutive frames, which names pins as in the frame before, without any other use of earlier frames."""
+        found = copy(self)
+        found.pipeline, found._consecutive = self.pipeline.with_history(), True
+        found._trained = replace(self._trained, pipeline=found.pipeline)
         return found
 
     @property
@@ -305,8 +310,11 @@ class PoseEstimator:
         found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
         touched = TouchAnswer(reference) if measured else self._trained.touched
         found._trained = replace(self._trained, pipeline=found.pipeline, touched=touched)
-        found._other_unit = not self.rest.same_unit(reference)
-        return found.with_history() if self._consecutive else found
+        factors = tuple(self.config.get("other_unit_widens", ()))
+        found._wider = () if not factors or self.rest.same_unit(reference) else factors
+        if not self._consecutive:
+            return found
+        return found.keep_names() if self._tracker is None else found.with_history()
 
     def noting(self, undecided: str) -> "PoseEstimator":
         """The same model; its ``caveats`` say what is ``undecided`` about the camera's view."""
@@ -356,8 +364,7 @@ class PoseEstimator:
     def _widening(self) -> Widening:
         alone = self.pipeline.reference is self._trained.reference
         unmeasured = self.part.unmeasured_widens if isinstance(self.part, PinModel) and alone else 1.0
-        factors = tuple(self.config.get("other_unit_widens", ())) if self._other_unit else ()
-        return Widening(self.sensor, self.domain, self.config["columns"], self.config["units"], unmeasured, factors)
+        return Widening(self.sensor, self.domain, self.config["columns"], self.config["units"], unmeasured, self._wider)
 
     def contact_maps(self, frame: Frame) -> tuple[PoseEstimate, ContactMaps | None]:
         """The estimate of one frame, with the pressure and shear over the skin; no maps if the estimate is not valid.

@@ -163,7 +163,7 @@ class Pipeline:
         graph = None
         if not reason:
             net = self._net_of(nodes_px)
-            graph = make_graph(self.graph, nodes_px, outmost=self.reference.outmost, net=net or self.reference.net)
+            graph = make_graph(self.graph, nodes_px, outmost=self.reference.outmost, net=net)
             self._before = (nodes_px, net) if self._follows and paired.all() else None
         ms["graph"], now = _since(now)
         ms["total"], _ = _since(started)
@@ -180,7 +180,10 @@ class Pipeline:
         return found
 
     def _net_of(self, nodes_px: np.ndarray) -> Net | None:
-        """The net of the pins' Delaunay triangles, from that of the frame before, or from that at rest; None if neither leads to it."""
+        """The net of the pins' Delaunay triangles, from that of the frame before, or from that at rest; None if neither leads to it, or if
+        the graph needs none."""
+        if self.graph == "knn":
+            return None
         before = self._before[1] if self._before else None
         known = None if before is None else before.move(nodes_px)
         return known if known is not None or self.reference.net is None else self.reference.net.move(nodes_px)
@@ -209,7 +212,7 @@ class Pipeline:
         blobs = self._detect(frame, self.mask, blob)
         ms["detect"], now = _since(started)
         followed = None if before is None else follow(self.reference, before[0], blobs.px, blobs.area_px2)
-        if followed is not None and not self._near_edge(followed.predicted_px).any():
+        if followed is not None and not self._near_edge(followed.predicted_px):
             ms["match"], _ = _since(now)
             return blobs, followed
         found = match(self.reference, blobs.px, blobs.area_px2, second_look=False)
@@ -265,7 +268,7 @@ class Pipeline:
         """If the whole view is displaced so far that the mask may cut pins off, detect again with a displaced mask."""
         paired = found.blob >= 0
         rim = self.reference.outmost[paired[self.reference.outmost]]
-        if not len(rim) or not self._near_edge(found.predicted_px).any():
+        if not len(rim) or not self._near_edge(found.predicted_px):
             return blobs, found
         shift = median_px(blobs.px[found.blob[rim]] - self.reference.pins_px[rim])
         if np.linalg.norm(shift) < REMASK_PX:
@@ -275,11 +278,10 @@ class Pipeline:
         again = match(self.reference, displaced.px, displaced.area_px2, second_look=False)
         return (displaced, again) if again.score > found.score else (blobs, found)
 
-    def _near_edge(self, px: np.ndarray) -> np.ndarray:
-        """Pins (N,) bool whose caps the mask may cut off, at places (N, 2)."""
+    def _near_edge(self, px: np.ndarray) -> bool:
+        """Whether the mask may cut off the cap of one of the pins at places (N, 2)."""
         away = np.linalg.norm(px - self.blob_spec.mask_center_px, axis=1)
-        near: np.ndarray = away > self.blob_spec.mask_radius_px - MASK_MARGIN * self.reference.spacing_px
-        return near
+        return bool((away > self.blob_spec.mask_radius_px - MASK_MARGIN * self.reference.spacing_px).any())
 
     def _with_split_caps(self, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
         """Split caps that touch. Each split improves the predictions for the next."""

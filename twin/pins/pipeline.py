@@ -19,7 +19,7 @@ from twin.pins.finding.blobs import Blobs, Mask, circular_mask, despeckle, find_
 from twin.pins.flips import Net
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.labelling.identify import SHOWN, score_layout
-from twin.pins.labelling.matching import Match, complete, confirm, follow, look_again, match, proven, rematch
+from twin.pins.labelling.matching import Match, complete, confirm, find_again, follow, look_again, match, proven, rematch
 from twin.pins.labelling.reference import Reference, folded_fraction, make_reference, mean_radius, median_px, nominal_reference
 from twin.pins.labelling.rest import require_even
 from twin.pins.labelling.split import split_chains, split_merged
@@ -59,8 +59,8 @@ EXTRA_COST = 0.05
 hundreds of such blobs."""
 REMASK_PX = 2.0
 """Least displacement of the whole view, px, with which the mask is displaced, if a pin is close to the mask's edge."""
-MASK_MARGIN = 0.5
-"""Distance from the mask's edge, in spacings, below which a pin may be cut off."""
+MASK_MARGIN, MASK_MARGIN_PX = 0.5, 2.0
+"""Distance from the mask's edge below which a lost pin may be cut off, in spacings, and below which a found pin's cap is, px."""
 PLAUSIBLE = 0.5
 """Least share of labelled pins for a labelling to be improved by further steps."""
 NEAREST, DARKER, BRIGHT, LEAST_ABOVE = 6, 35, 75, 0.15
@@ -212,7 +212,7 @@ class Pipeline:
         blobs = self._detect(frame, self.mask, blob)
         ms["detect"], now = _since(started)
         followed = None if before is None else follow(self.reference, before[0], blobs.px, blobs.area_px2)
-        if followed is not None and not self._near_edge(followed.predicted_px):
+        if followed is not None and not self._cut_by_mask(blobs, followed):
             ms["match"], _ = _since(now)
             return blobs, followed
         found = match(self.reference, blobs.px, blobs.area_px2, second_look=False)
@@ -268,20 +268,22 @@ class Pipeline:
         """If the whole view is displaced so far that the mask may cut pins off, detect again with a displaced mask."""
         paired = found.blob >= 0
         rim = self.reference.outmost[paired[self.reference.outmost]]
-        if not len(rim) or not self._near_edge(found.predicted_px):
+        if not len(rim) or not self._cut_by_mask(blobs, found):
             return blobs, found
         shift = median_px(blobs.px[found.blob[rim]] - self.reference.pins_px[rim])
         if np.linalg.norm(shift) < REMASK_PX:
             return blobs, found
         center = np.asarray(self.blob_spec.mask_center_px) + shift
         displaced = self._detect(frame, circular_mask(self.size_px, tuple(center), self.blob_spec.mask_radius_px), blob)
-        again = match(self.reference, displaced.px, displaced.area_px2, second_look=False)
+        again = find_again(self.reference, displaced.px, displaced.area_px2, found, blobs.px)
         return (displaced, again) if again.score > found.score else (blobs, found)
 
-    def _near_edge(self, px: np.ndarray) -> bool:
-        """Whether the mask may cut off the cap of one of the pins at places (N, 2)."""
-        away = np.linalg.norm(px - self.blob_spec.mask_center_px, axis=1)
-        return bool((away > self.blob_spec.mask_radius_px - MASK_MARGIN * self.reference.spacing_px).any())
+    def _cut_by_mask(self, blobs: Blobs, found: Match) -> bool:
+        """Whether the mask may cut off a pin's cap: that of a found pin, as a disc of its area, or the place of a lost one."""
+        paired = found.blob >= 0
+        px = np.where(paired[:, None], blobs.px[found.blob], found.predicted_px)
+        radius = np.where(paired, np.sqrt(blobs.area_px2[found.blob] / np.pi) + MASK_MARGIN_PX, MASK_MARGIN * self.reference.spacing_px)
+        return bool((np.linalg.norm(px - self.blob_spec.mask_center_px, axis=1) > self.blob_spec.mask_radius_px - radius).any())
 
     def _with_split_caps(self, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
         """Split caps that touch. Each split improves the predictions for the next."""

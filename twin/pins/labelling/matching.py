@@ -194,16 +194,24 @@ def follow(reference: Reference, before_px: np.ndarray, px: np.ndarray, area_px2
     return Match(blob, px[blob], float(len(blob)))
 
 
+def find_again(reference: Reference, px: np.ndarray, area_px2: np.ndarray, before: Match, before_px: np.ndarray) -> Match:
+    """A labelling ``before`` of blobs at places (M, 2) for the blobs (K, 2) that another look at the same frame shows: it grows onward."""
+    layout, blobs = _layout(reference), _put_in_cells(reference, px, area_px2)
+    names = _carry_names(layout, np.where(before.blob[:, None] >= 0, before_px[before.blob], np.nan), blobs)
+    return replace(_refine(layout, blobs, _grow(layout, blobs, names)), lead=before.lead)
+
+
 @compiled()
 def _carry_names(layout: LayoutArrays, before_px: np.ndarray, blobs: FrameBlobs) -> np.ndarray:
-    """Blob (N,) next to each pin's place in the frame before, -1 from the first pin on that has none of its own."""
+    """Blob (N,) next to each pin's place (N, 2) before, NaN where it was lost; -1 for a pin that has none of its own."""
     found, taken, none = np.full(len(before_px), -1), np.zeros(len(blobs.px), np.bool_), np.zeros(len(blobs.px), np.bool_)
     for i in range(len(before_px)):
+        if np.isnan(before_px[i, 0]):
+            continue
         reach = FOLLOW_GATE * layout.spacing[i]
         k, _ = nearest_free(before_px[i, 0], before_px[i, 1], reach, blobs.px, none, blobs.buckets, blobs.cell)
-        if k < 0 or taken[k]:
-            break
-        found[i], taken[k] = k, True
+        if k >= 0 and not taken[k]:
+            found[i], taken[k] = k, True
     return found
 
 

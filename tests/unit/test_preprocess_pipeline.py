@@ -247,6 +247,18 @@ def test_a_view_displaced_out_of_its_mask_is_followed(pipeline):
     assert observation.found == len(truth) and errors_px(observation, truth).max() < 1.0
 
 
+def test_another_look_with_a_displaced_mask_keeps_the_names_and_searches_no_second_time(pipeline, monkeypatch):
+    searches = []
+    monkeypatch.setattr("twin.pins.pipeline.match", lambda *args, **options: searches.append(1) or match(*args, **options))
+    rest, blob = pipeline.reference.pins_px, pipeline.blob_spec
+    room = blob.mask_radius_px - (rest - blob.mask_center_px)[:, 0].max()
+    for displaced in (room - 4.0, room - 1.0, room + 2.0):
+        searches.clear()
+        observation = pipeline(draw(pipeline, rest + (displaced, 0.0)))
+        assert observation.found == len(rest) and errors_px(observation, rest + (displaced, 0.0)).max() < 1.0
+        assert searches == [1]
+
+
 def test_rings_turned_on_by_a_pin_score_less_than_the_truth():
     rest = nominal_reference(load_sensor("mg400-331"), Form.PROCESSED)
     true = np.arange(len(rest.pins_px))

@@ -22,7 +22,7 @@ from twin.errors import FrameError, StoreError
 from twin.frames import evenly_read, natural_key, open_recording, read_image
 from twin.frames.forms import blob_spec, frame_size, from_raw, is_two_level
 from twin.frames.images import write_image
-from twin.frames.videos import is_cut
+from twin.frames.videos import _Shown, is_cut
 from twin.pins import Pipeline, nominal_reference
 from twin.pins.batch import overlay_name, preprocess_recording
 from twin.records import open_writer
@@ -298,7 +298,7 @@ def test_a_video_cut_within_its_first_frame_is_refused(video, spec, monkeypatch)
         video.write_bytes(data[:at])
         with pytest.raises(FrameError, match="tap.avi: (no frame can be decoded|cut within its first frame)"):
             open_recording(video, spec)
-    made_up = [(0, 0.0, np.zeros((480, 640, 3), np.uint8), "")]
+    made_up = [_Shown(0.0, np.zeros((480, 640, 3), np.uint8), "")]
     monkeypatch.setattr("twin.frames.videos._read_frames", lambda *_: iter(made_up))
     with pytest.raises(FrameError, match="tap.avi: cut within its first frame"):  # where the decoder made it up
         open_recording(video, spec)

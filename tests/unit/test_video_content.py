@@ -105,8 +105,8 @@ def test_the_flags_of_a_lerobot_data_set_are_said_and_not_applied(tmp_path):
     assert alike(next(iter(open_recording(tmp_path / "pictures"))).image, scene(0))
 
 
-def test_frames_that_the_decoder_would_scale_are_left_out_and_counted(tmp_path, capfd):
-    whole, half = video(tmp_path / "a.ts", "mpg2"), video(tmp_path / "b.ts", "mpg2", (32, 24))
+def test_frames_of_another_size_are_left_out_and_counted(tmp_path, capfd):
+    whole, half = video(tmp_path / "a.ts", "mpg2"), write_video(tmp_path / "b.ts", "mpg2", [scene(k, (32, 24)) for k in range(COUNT // 2)])
     both = tmp_path / "both.ts"
     both.write_bytes(whole.read_bytes() + half.read_bytes())
     capfd.readouterr()
@@ -114,8 +114,8 @@ def test_frames_that_the_decoder_would_scale_are_left_out_and_counted(tmp_path, 
     frames = list(found)
     assert found.size_px == (WIDTH, HEIGHT) and all(alike(frame.image, scene(k)) for k, frame in enumerate(frames))
     left_out = len(found) - len(frames)
-    assert len(frames) >= COUNT - 1, "the decoder loses the last frame of a size, and one of the others counts as doubtful"
-    assert left_out >= COUNT - 1 and len(found.failed) == left_out
+    assert len(frames) >= COUNT - 1 and left_out >= COUNT // 2 - 1, "the decoder loses the last frame of a size"
+    assert len(found.failed) == left_out
     assert any(f"{left_out} of {len(found)} frames are left out: another size (32x24)" in problem for problem in found.problems)
     assert sum(note.startswith("skipped") for note in found.notes()) == 1, "frames with the same fault are one line"
     assert capfd.readouterr().err == ""
@@ -170,16 +170,11 @@ def av1_video(path):
     return path
 
 
-def test_av1_is_read(tmp_path, monkeypatch):
-    path = av1_video(tmp_path / "a.mp4")
-    assert not cv2.VideoCapture(str(path)).read()[0], "OpenCV itself decodes AV1: twin.frames.av1 is not needed any more"
-    found = open_recording(path)
+def test_av1_is_read(tmp_path):
+    found = open_recording(av1_video(tmp_path / "a.mp4"))
     frames = list(found)
     assert len(frames) == COUNT and not found.problems and all(alike(frame.image, scene(k)) for k, frame in enumerate(frames))
     assert frames[3].time_s == pytest.approx(0.12, abs=1e-6)
-    monkeypatch.setattr("PIL.features.check", lambda name: False)
-    with pytest.raises(FrameError, match="its codec is AV01 .*Pillow reads no AVIF.*ffmpeg"):
-        open_recording(path)
 
 
 @pytest.mark.parametrize(("name", "codec"), [("a.mp4", "xyz1"), ("a.avi", "xyz1"), ("a.mkv", "V_XYZ12")])

@@ -1,46 +1,39 @@
 """Reads videos frame by frame, counts their frames, and finds out which frames are valid.
 
 Motion JPEG is read picture by picture, so that a damaged frame is noticed and left out. Of other codecs those frames are left out of which
-the decoder reports damage, with those that are predicted from them, and those that the decoder would scale to the first frame's size.
-Pixels are taken as they are stored: a flag that says how a player should turn the picture is stated, and not applied.
+the decoder reports damage, with those that are predicted from them. Pixels are taken as they are stored: a flag that says how a player
+should turn the picture is stated, and not applied.
 """
 
-import itertools
 import re
-import struct
-import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
-import cv2
+import av
 import numpy as np
+from av.container import InputContainer
+from av.logging import Capture
+from av.video.stream import VideoStream
 
 from scenes.files import quote, require_regular
 from twin.errors import ErrorsAs, FrameError
-from twin.frames.av1 import decode_av1
 from twin.frames.forms import times
-from twin.frames.images import NOT_TURNED, overheard, picture_of
+from twin.frames.images import NOT_TURNED, picture_of
 
-MOTION_JPEG, AV1 = b"MJPG", b"AV01"
-"""Four-letter codes of the codec whose frames are JPEG pictures, and of one that OpenCV can't decode."""
-AS_STORED = -1.0
-"""Value of OpenCV's format setting that gives a video's frames without decoding them."""
-MS_PER_S = 1e3
-COMPLAINT = re.compile(
-    r"(?:\[[^\]]*\] )?(.*(?:error|damage|corrupt|conceal|invalid|truncat|missing|mismatch|premature|not reached).*)", re.IGNORECASE
-)
-"""A decoder's message about a damaged frame, behind the name of the decoder."""
+MOTION_JPEG = "mjpeg"
+"""FFmpeg's name of the codec whose frames are JPEG pictures."""
+COMPLAINT = re.compile(r".*(?:error|damage|corrupt|conceal|invalid|truncat|missing|mismatch|premature|not reached).*", re.IGNORECASE)
+"""A decoder's message about a damaged frame."""
 CODEC = re.compile(rb"stsd.{12}(\w{4})|vids(\w{4})|(V_[\w/]{3,20})", re.DOTALL)
 """Name of the codec in an MP4, AVI or Matroska file, which states it even if nothing here can open it."""
 LOOKED_BYTES = 16_000_000
 """Bytes of a video that are searched for this name at a time."""
-DELAY = 4
-"""Most frames by which a decoder's message usually comes before the frame that it is about."""
-HEAD_BYTES, MOST_HEADS = 48, 300
-"""Bytes of a key frame that hold its size, and the most different ones of a video from which a size is read."""
+USUAL_FPS = 25.0
+"""Frames a second of a video that states no times."""
 MOST_SAID = 3
 """Most reasons against frames that are stated, the most frequent ones."""
 PAUSE = 3.0
@@ -72,10 +65,10 @@ class Video:
 
     def frames(self) -> Iterator[tuple[int, float, np.ndarray | str]]:
         """Index, time (s) and picture of each frame, in order. A frame that can't be used gives the reason, a text, instead."""
-        for index, time_s, image, said in _read_frames(self.path):
+        for index, shown in enumerate(_read_frames(self.path)):
             if index >= self.count:
                 return
-            yield index, time_s, self.faults.get(index) or (said if image is None else image)
+            yield index, shown.time_s, self.faults.get(index) or (shown.said if shown.image is None else shown.image)
 
 
 def open_video(path: Path) -> Video:
@@ -88,43 +81,43 @@ def open_video(path: Path) -> Video:
     """
     with ErrorsAs(OSError, lambda error: FrameError(f"{path}: can't be read ({error.strerror}); give a video")):
         require_regular(path)
-    stored = _read_properties(path)
     times_s: list[float] = []
     said: dict[int, str] = {}
     sizes: dict[int, tuple[int, ...]] = {}
     firsts: dict[tuple[int, ...], np.ndarray] = {}
-    repeated, before = 0, None
-    for index, time_s, image, note in _read_frames(path):
-        times_s.append(time_s)
-        said |= {index: note} if note else {}
-        if image is not None:
-            sizes[index] = image.shape[1::-1]
+    repeated, before, turned = 0, None, 0
+    for index, shown in enumerate(_read_frames(path)):
+        times_s.append(shown.time_s)
+        said |= {index: shown.said} if shown.said else {}
+        if (image := shown.image) is not None:
+            sizes[index], turned = image.shape[1::-1], shown.turned_deg
             firsts.setdefault(sizes[index], image)
             repeated += before is not None and np.array_equal(before, image)
             before = image
     count = len(times_s)
     if not sizes:
-        raise FrameError(f"{path}: no frame can be decoded{_remedy(path, stored.codec, said.get(0, ''))}")
-    problems = [NOT_TURNED.format(f"{stored.turned} deg")] if stored.turned else []
+        raise FrameError(f"{path}: no frame can be decoded{_remedy(path, said.get(0, ''))}")
+    with _open(path) as opened:
+        promised, lasts_s, as_pictures = _describe(*opened) if opened else (0, 0.0, False)
+    problems = [NOT_TURNED.format(f"{turned} deg")] if turned else []
     odd = [note for index, note in said.items() if index in sizes]
-    if stored.codec == MOTION_JPEG and 2 * len(odd) > count:  # so its camera stores them
+    if as_pictures and 2 * len(odd) > count:  # so its camera stores them
         problems.append(f"{odd[0]} ({len(odd)} such frames)")
         said = {index: note for index, note in said.items() if index not in sizes}
     # The number that a header states can be an estimate from the duration, which a pause makes too large.
     step_s = np.median(np.diff(times_s)) if count > 1 else 0.0
-    if (stored.promised > count and times_s[-1] + 1.5 * step_s < stored.lasts_s) or is_cut(path):
+    if (promised > count and times_s[-1] + 1.5 * step_s < lasts_s) or is_cut(path):
         # The decoder fills the missing part of a truncated frame with a guess, without a message.
-        decoded = f"{count} of {max(stored.promised, count)} frames can be decoded"
+        decoded = f"{count} of {max(promised, count)} frames can be decoded"
         problems.append(f"cut, {decoded}; the last of them may lack a part and is left out")
         count -= 1
     if min(sizes) >= count:
         raise FrameError(f"{path}: cut within its first frame; copy it again, or record it again")
-    faults = said if stored.codec == MOTION_JPEG else stored.faults(said, np.array(times_s), sizes[min(sizes)])
-    usable = Counter(size for index, size in sizes.items() if index not in faults and index < count).most_common()
+    usable = Counter(size for index, size in sizes.items() if index not in said and index < count).most_common()
     if not usable:
-        raise FrameError(f"{path}: no usable frame ({next(iter(faults.values()))}); record it again")
+        raise FrameError(f"{path}: no usable frame ({next(iter(said.values()))}); record it again")
     others = {index: size for index, size in sizes.items() if size != usable[0][0]}
-    faults = {index: f"another size ({times(size)}) than the others" for index, size in others.items()} | faults
+    faults = {index: f"another size ({times(size)}) than the others" for index, size in others.items()} | said
     faults = {index: fault for index, fault in faults.items() if index < count}
     problems += [f"{n} of {count} frames are left out: {fault}" for fault, n in Counter(faults.values()).most_common(MOST_SAID)]
     problems += [f"{repeated} of {count} frames repeat the one before them"] if repeated else []
@@ -168,44 +161,9 @@ def is_cut(path: Path) -> bool:
         return start > size
 
 
-@dataclass
-class _Stored:
-    """What a video's file holds without decoding it.
-
-    Codec, number of frames and duration that its header states, angle of its flag (deg), number of packets, and of its key frames number,
-    time (s) and size (() if unknown).
-    """
-
-    codec: bytes = b""
-    promised: int = 0
-    lasts_s: float = 0.0
-    turned: int = 0
-    count: int = 0
-    keys: list[int] = field(default_factory=list)
-    key_times_s: list[float] = field(default_factory=list)
-    sizes: list[tuple[int, ...]] = field(default_factory=list)
-
-    def faults(self, damaged: dict[int, str], times_s: np.ndarray, size: tuple[int, ...]) -> dict[int, str]:
-        """Reasons against decoded frames: damage, up to the next key frame, and a size that the decoder has scaled to the first frame's."""
-        found: dict[int, str] = {}
-        frame, last = np.arange(len(times_s)), len(times_s) - 1
-        by_time = self.count != len(times_s) and bool((np.diff(self.key_times_s) > 0).all())
-        keys, places = (self.key_times_s, times_s) if by_time else (self.keys, frame)
-        part = np.searchsorted(keys, places, side="right") - 1
-        for index, said in damaged.items():
-            after = (frame >= index) & (part <= part[min(index + DELAY, last)])
-            found |= dict.fromkeys(np.flatnonzero(after).tolist(), f"{said}, or predicted from such a frame")
-        slack = 0 if by_time else abs(self.count - len(times_s))  # frames whose packet is not known for sure
-        soonest = part[np.minimum(frame + slack, last)]
-        for k, of_key in enumerate(self.sizes):
-            if of_key and of_key != size:
-                said = f"another size ({times(of_key)}), which the decoder scales to {times(size)}"
-                found |= dict.fromkeys(np.flatnonzero((part <= k) & (soonest >= k)).tolist(), said)
-        return found
-
-
-def _remedy(path: Path, codec: bytes, said: str) -> str:
+def _remedy(path: Path, said: str) -> str:
     """Why no frame of a video can be decoded, and what helps."""
+    codec = b""
     with path.open("rb") as file:
         while not codec and (part := file.read(LOOKED_BYTES)):
             named = CODEC.search(part)
@@ -217,80 +175,85 @@ def _remedy(path: Path, codec: bytes, said: str) -> str:
 
 
 @contextmanager
-def _capture(path: Path) -> Iterator[tuple[cv2.VideoCapture, bytes]]:
-    """An open video and its codec. One thread decodes it, so that messages belong to the frame that is read; nothing is turned."""
-    with overheard():
-        capture = cv2.VideoCapture(str(path), cv2.CAP_ANY, [cv2.CAP_PROP_N_THREADS, 1])
-        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    code = int(capture.get(cv2.CAP_PROP_FOURCC)) if capture.isOpened() else 0
-    try:
-        yield capture, (code & 0xFFFFFFFF).to_bytes(4, "little").strip(b"\0")
-    finally:
-        capture.release()
-
-
-def _read_properties(path: Path) -> _Stored:
-    with _capture(path) as (capture, codec):
-        if not capture.isOpened():
-            return _Stored()
-        promised, fps = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), capture.get(cv2.CAP_PROP_FPS)
-        found = _Stored(codec, promised, promised / fps if fps > 0 else 0.0, round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360)
-        known: dict[bytes, tuple[int, ...]] = {}
-        more = codec != MOTION_JPEG and capture.set(cv2.CAP_PROP_FORMAT, AS_STORED)
-        while more:
-            with overheard():
-                more, data = capture.read()
-            if more and capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME):
-                packet = data.tobytes()
-                head = packet[:HEAD_BYTES]
-                if head not in known and len(known) < MOST_HEADS:
-                    known[head] = _size_in(packet, codec)
-                found.keys.append(found.count)
-                found.key_times_s.append(capture.get(cv2.CAP_PROP_POS_MSEC) / MS_PER_S)
-                found.sizes.append(known.get(head, ()))
-            found.count += more
-        return found
-
-
-def _size_in(packet: bytes, codec: bytes) -> tuple[int, ...]:
-    """Width and height of a key frame by its own data, which are put into a file without stated size; () if they do not hold it."""
-    head = struct.pack("<4s2H4s2H4I", b"DKIF", 0, 32, codec, 0, 0, 30, 1, 1, 0) + struct.pack("<IQ", len(packet), 0)
-    for content in (head + packet, packet):  # an IVF file, and the data alone for codecs that IVF does not have
-        with tempfile.NamedTemporaryFile(suffix=".ivf") as file:
-            file.write(content)
-            file.flush()
-            with _capture(Path(file.name)) as (capture, _):
-                size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        if min(size) > 0:
-            return size
-    return ()
-
-
-def _read_frames(path: Path) -> Iterator[tuple[int, float, np.ndarray | None, str]]:
-    """Index, time (s), picture (RGB) and irregularities of each frame; None and the reason for a frame that can't be used."""
-    with _capture(path) as (capture, codec):
-        if codec == AV1:
-            yield from decode_av1(path)
+def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream] | None]:
+    """A file and its video, decoded by one thread, so that messages belong to the packet that is decoded; None if it holds none."""
+    with ExitStack() as opened:
+        try:
+            container = opened.enter_context(av.open(f"file:{path}"))
+            video = container.streams.video[0] if container.streams.video else None
+        except av.FFmpegError:
+            video = None
+        if video is None or video.codec_context is None:
+            yield None
             return
-        pictures = codec == MOTION_JPEG and capture.set(cv2.CAP_PROP_FORMAT, AS_STORED)
-        for index in itertools.count():
-            with overheard() as said:
-                good, image = capture.read()
-            if not good:
-                return
-            time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / MS_PER_S
-            if pictures:
-                yield index, time_s, *_picture(image)
-            else:
-                complaint = COMPLAINT.search(said[0])
-                rgb = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-                yield index, time_s, rgb, f"damaged ({complaint[1]})" if complaint else ""
+        video.codec_context.thread_count = 1
+        yield container, video
 
 
-def _picture(stored: np.ndarray) -> tuple[np.ndarray | None, str]:
-    """A frame (H, W) or (H, W, 3), RGB, from its bytes (1, n), and its irregularities; None and the reason if it can't be used."""
+def _describe(container: InputContainer, video: VideoStream) -> tuple[int, float, bool]:
+    """Number of frames and duration (s) that a file states, 0 if it does not, and whether its frames are JPEG pictures."""
+    lasts_s = (container.duration or 0) / av.time_base
+    promised = video.frames or round(lasts_s * float(video.average_rate or 0))
+    return promised, lasts_s, video.codec_context.name == MOTION_JPEG
+
+
+class _Shown(NamedTuple):
+    """A frame's time (s), picture (RGB), irregularities, and angle of its flag (deg). One that can't be used has the reason alone."""
+
+    time_s: float
+    image: np.ndarray | None
+    said: str
+    turned_deg: int = 0
+
+
+def _read_frames(path: Path) -> Iterator[_Shown]:
+    """Each frame of a video, in order."""
+    with _open(path) as opened:
+        if opened is None:
+            return
+        container, video = opened
+        start, tick_s, step_s = video.start_time or 0, float(video.time_base or 0), 1 / float(video.average_rate or USUAL_FPS)
+        as_pictures, harm, count = _describe(*opened)[2], "", 0
+        harms: dict[int | None, str] = {}  # by the time of the frame that a packet holds
+        for packet in _packets(container, video):
+            shown: list[_Shown] = []
+            if as_pictures and packet.size:
+                shown = [_Shown(tick_s * ((packet.pts or 0) - start), *_picture(bytes(packet)))]
+            elif not as_pictures:
+                frames, said = _decode(packet)
+                harm = f"damaged ({said}), or predicted from such a frame" if said else "" if packet.is_keyframe else harm
+                harms[packet.pts] = harm
+                for frame in frames:
+                    time_s = (count + len(shown)) * step_s if frame.pts is None else tick_s * (frame.pts - start)
+                    rgb = frame.to_ndarray(format="rgb24", interpolation="BICUBIC")
+                    shown.append(_Shown(time_s, rgb, harms.pop(frame.pts, harm), round(-frame.rotation) % 360))
+            yield from shown
+            count += len(shown)
+
+
+def _packets(container: InputContainer, video: VideoStream) -> Iterator[av.Packet]:
+    """The packets of a video, up to where its file can't be read any more; the last one is empty."""
+    with suppress(av.FFmpegError):
+        yield from container.demux(video)
+
+
+def _decode(packet: av.Packet) -> tuple[list[av.VideoFrame], str]:
+    """The frames that a packet completes, and what the decoder reports against them, "" if nothing."""
+    av.logging.set_level(av.logging.ERROR)
     try:
-        image, note = picture_of(stored.tobytes())
+        with Capture() as said:
+            frames = packet.decode()
+    except av.FFmpegError as error:
+        return [], error.strerror or str(error)
+    finally:
+        av.logging.set_level(None)
+    complaint = COMPLAINT.search("\n".join(text.strip() for _, _, text in said))
+    return frames, complaint[0] if complaint else ""
+
+
+def _picture(stored: bytes) -> tuple[np.ndarray | None, str]:
+    """A frame (H, W) or (H, W, 3), RGB, from its bytes, and its irregularities; None and the reason if it can't be used."""
+    try:
+        return picture_of(stored)
     except FrameError as error:
         return None, str(error)
-    return image, note

@@ -12,7 +12,7 @@
 specifications  load_sensor load_object load_experiment
 simulation      Simulator ContactPose
 frames, pins    Frame Form Pipeline Observation node_features preprocess tune
-your sensor     new_sensor check calibrate_optics calibrate_contact
+your sensor     record new_sensor check calibrate_optics calibrate_contact
 how true it is  validate realism robustness audit
 models          make_dataset train evaluate predict load_model
 policies        register_environments BaselinesVecEnv demonstrate learn
@@ -65,6 +65,7 @@ _PLACES = {
     "predict": "twin.cli.learning",
     "preprocess": "twin.cli.frames",
     "realism": "twin.cli.calibration",
+    "record": "twin.cli.calibration",
     "register_environments": "training.environments:register_all",
     "robustness": "twin.cli.calibration",
     "run_policy": "twin.cli.live",

@@ -7,6 +7,7 @@ from typing import Literal
 from hardware.arms.open_arm import open_arm as open_arm
 from hardware.cameras.choose import open_camera as open_camera
 from hardware.collect.collect import Collected as Collected
+from hardware.collect.record import RecordedFrames as RecordedFrames
 from hardware.live.examining import Examination as Examination
 from hardware.safety.decide import load_limits as load_limits
 from hardware.safety.safe_arm import SafeArm as SafeArm
@@ -276,6 +277,16 @@ def realism(
     force: bool = ...,
     progress: Progress | bool | None = ...,
 ) -> Realism: ...
+
+def record(
+    *,
+    camera: str | Path,
+    out: Path | str,
+    count: int = ...,
+    port: int = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> RecordedFrames: ...
 
 def robustness(
     *,

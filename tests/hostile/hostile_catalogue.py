@@ -475,6 +475,7 @@ EVERY = (
     *(
         "randomisations",
         "realism",
+        "record",
         "render",
         "robustness",
         "sensors",

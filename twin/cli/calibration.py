@@ -1,5 +1,6 @@
 """Commands that compare the twin with a real sensor, and fit it to one.
 
+- ``twin record``: frames of a new sensor, with a camera, while a person presses it.
 - ``twin new``: a specification of a sensor of which only frames are known.
 - ``twin calibrate``: a specification fitted to frames of a real sensor.
 - ``twin validate``: the twin's pins compared with those of labelled real frames.
@@ -21,6 +22,7 @@ from twin.progress import Progress
 from twin.types import FINE, Quality
 
 if TYPE_CHECKING:
+    from hardware.collect.record import RecordedFrames
     from training.studies.degradation import DegradationResult
     from training.studies.label_audit import LabelAudit
     from training.studies.realism import Realism
@@ -39,6 +41,38 @@ Columns = Annotated[
 def columns_in(pairs: list[str] | None) -> dict[str, str]:
     """A table's columns by their keys."""
     return dict(pair.partition("=")[::2] for pair in pairs or ())
+
+
+@app.command("record")
+def record(
+    camera: Annotated[str, typer.Option(metavar="C", help="0, /dev/videoN, http://...")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="new folder for the frames")],
+    count: Annotated[int, typer.Option(min=1, help="frames in contact")] = 40,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port of the page with the picture; 0: a free one")] = 0,
+    *,
+    progress: Progress,
+) -> "RecordedFrames":
+    """Record frames of a new sensor with a camera, as input of 'twin new'.
+
+    First keep the sensor free of contact, then press it at different places, lightly and firmly, and hold it still each time. A page on
+    this machine shows the camera's picture and what to do next. A frame is kept if the picture is still, shows a new contact, and is
+    neither blurred, too bright nor too dark; otherwise the page and the command say what to change. No sensor is needed: 'twin new' finds
+    out which it is.
+
+    \b
+    Writes:
+      init_0.png    the frame without contact
+      images/       the frames in contact
+
+    \b
+    Example:
+      twin record --camera 0 --out recordings/mine
+      twin new recordings/mine --out mine.toml
+    """
+    from hardware.cameras.choose import open_camera
+    from hardware.collect.record import record_frames
+
+    return record_frames(open_camera(camera), out, count=count, port=port, progress=progress)
 
 
 @app.command("new")
@@ -74,7 +108,7 @@ def new_sensor(
 
     With --label-table TABLE it also fits the contact, as 'twin calibrate contact' does; with --optics also light and colours, as 'twin
     calibrate optics' does (raw frames). --table TABLE only gives the names of the frames and their order. With --camera a live camera
-    replaces the folder, and the command asks you to press.
+    replaces the folder, and the command asks you to press, as 'twin record' does.
 
     \b
     Writes:
@@ -99,7 +133,7 @@ def new_sensor(
       twin new --camera /dev/video0 --out mine.toml
     """
     from hardware.cameras.choose import open_camera
-    from hardware.collect.gather import gather_frames
+    from hardware.collect.record import record_frames
     from scenes import load_experiment
     from scenes.pins import layout_from
     from twin.calibration.go_on import whole_sensor
@@ -107,7 +141,7 @@ def new_sensor(
     if (frames is None) == (not camera):
         raise OptionError("give either a folder of frames or `camera`")
     if frames is None:
-        frames = gather_frames(open_camera(camera), out.with_name(f"{out.stem}-frames"))
+        frames = record_frames(open_camera(camera), out.with_name(f"{out.stem}-frames"), progress=progress).folder
     made_of = {"experiment": load_if_named(load_experiment, experiment), "layout": load_if_named(layout_from, layout)}
     return call(whole_sensor, locals(), **made_of)
 

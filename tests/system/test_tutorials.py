@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from command import run_twin
-from generators.notebooks import DOCS, Block, blocks, run_pages, tutorials
+from generators.notebooks import DOCS, Block, blocks, cells, require_commands_done, run_pages, tutorials
 
 from training.models import MODELS
 
@@ -58,6 +58,22 @@ def test_every_tutorial_has_code_that_runs():
     for path in tutorials():
         languages = [block.language for block in blocks(path.read_text(encoding="utf-8"))]
         assert "python" in languages, path.name
+
+
+def test_a_notebook_holds_the_pages_code_as_one_kernel_runs_it():
+    pytest.importorskip("nbformat")
+    for path in tutorials():
+        text = path.read_text(encoding="utf-8")
+        found = [cell["source"] for cell in cells(text) if cell["cell_type"] == "code"]
+        assert len(found) == sum(block.language in ("python", "bash") for block in blocks(text))
+        for code in found:
+            assert code.startswith("!twin ") or ast.parse(code), path.name
+            assert "%%" not in code and all(line.startswith("!twin ") for line in code.splitlines() if code.startswith("!"))
+    page = "# T\n\nWrite:\n\n```toml\n# a.toml\nx = 1\n```\n\n```bash\ntwin new a \\\n    --out b\n```\n"
+    assert [cell["source"] for cell in cells(page)] == ["# T\n\nWrite:", "%%writefile a.toml\n# a.toml\nx = 1", "!twin new a --out b"]
+    require_commands_done("T", {"source": "", "outputs": [{"text": "wrote a"}, {"data": {}}]})
+    with pytest.raises(RuntimeError, match="T: !twin x"):
+        require_commands_done("T", {"source": "!twin x", "outputs": [{"text": "twin: error: no such command"}]})
 
 
 def test_the_five_scripts_are_short_and_need_one_import():

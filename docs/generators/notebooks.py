@@ -52,7 +52,7 @@ def tutorials() -> list[Path]:
 
 def run_pages() -> list[Path]:
     """Every page whose code is run."""
-    return [*tutorials(), *(path for path in sorted((DOCS / "how-to").glob("*.md")) if path.stem != "index")]
+    return [*tutorials(), DOCS / "gallery.md", *(path for path in sorted((DOCS / "how-to").glob("*.md")) if path.stem != "index")]
 
 
 def blocks(text: str) -> list[Block]:

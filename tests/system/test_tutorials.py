@@ -76,6 +76,15 @@ def test_a_notebook_holds_the_pages_code_as_one_kernel_runs_it():
         require_commands_done("T", {"source": "!twin x", "outputs": [{"text": "twin: error: no such command"}]})
 
 
+def test_every_picture_of_the_gallery_has_its_ten_lines():
+    text = (DOCS / "gallery.md").read_text(encoding="utf-8")
+    shown, made = re.findall(r"\(pictures/gallery/(\w+)\.jpg\)", text), re.findall(r'savefig\("(\w+)\.png"\)', text)
+    assert shown == made and len(made) == 12 == len(set(made)) == len(blocks(text))
+    assert {path.stem for path in (DOCS / "pictures" / "gallery").glob("*.jpg")} == set(made)
+    for block in blocks(text):
+        assert len([line for line in block.code.splitlines() if line and not line.startswith("import")]) <= 10
+
+
 def test_the_five_scripts_are_short_and_need_one_import():
     """The last block of Python of each section is the script; what stands before it makes its files."""
     sections = (TUTORIALS / "five-scripts.md").read_text(encoding="utf-8").split("\n## ")[1:]

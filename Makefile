@@ -21,6 +21,7 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 	@echo "installing Python packages into $(VENV) (3 to 7 GB, a few minutes the first time; docs/install.md says how to have the smaller)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c requirements.lock -e '.[dev]'
 	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib >/dev/null 2>&1 || true # on all cores, where pip uses one; some libraries ship files for other Pythons
+	@$(BIN)/twin doctor --prepare >/dev/null 2>&1 || true # compiles ahead, half a minute
 	@touch $@
 
 # out/demo is the program's own folder: a demo of an earlier version there is replaced. In another folder only own files are.
@@ -59,9 +60,9 @@ gallery: setup   ## the pictures of the gallery, from the code of its page
 tables: setup    ## make the documents' tables from figures.json
 	@$(SCRIPT) -m figures --tables
 
-docs: setup      ## the documentation, from this code, in out/docs; a warning is an error
+docs: setup      ## the documentation, from this code, in out/docs; a warning is an error; NOTEBOOKS=written runs no notebook
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,docs]'
-	@$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
+	@NOTEBOOKS=$(NOTEBOOKS) $(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
 	@echo "wrote out/docs/index.html"
 
 lint: setup      ## style

@@ -86,8 +86,10 @@ def cells(text: str) -> list[dict[str, Any]]:
     return found + ([nbformat.v4.new_markdown_cell(prose)] if (prose := text[place:].strip()) else [])
 
 
-def write_all(source: Path, out: Path) -> list[Path]:
-    """Write a notebook of each tutorial below ``out``, run by its own kernel in a fresh folder; its folder has the pages' names.
+def write_all(source: Path, out: Path, *, run: bool = True) -> list[Path]:
+    """Write a notebook of each tutorial below ``out``; its folder has the pages' names.
+
+    With ``run`` its own kernel runs each in a fresh folder.
 
     Raises
     ------
@@ -105,8 +107,9 @@ def write_all(source: Path, out: Path) -> list[Path]:
             continue
         notebook = nbformat.v4.new_notebook(cells=cells(page.read_text(encoding="utf-8")))
         notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
-        with tempfile.TemporaryDirectory() as folder:
-            NotebookClient(notebook, timeout=MOST_CELL_S, resources={"metadata": {"path": folder}}).execute()
+        if run:
+            with tempfile.TemporaryDirectory() as folder:
+                NotebookClient(notebook, timeout=MOST_CELL_S, resources={"metadata": {"path": folder}}).execute()
         for cell in notebook.cells:
             require_commands_done(page.name, cell)
         written.append(out / FOLDER / f"{page.stem}.ipynb")

@@ -1,5 +1,6 @@
 """What Sphinx does for this documentation beyond its extensions: generated pages, notebooks beside tutorials, formulas as MathML."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ def _name_notebook(app: Sphinx, name: str, source: list[str]) -> None:
 
 def _write_notebooks(app: Sphinx, error: Exception | None) -> None:
     if error is None and app.builder.format == "html":
-        notebooks.write_all(Path(app.srcdir), Path(app.outdir))
+        notebooks.write_all(Path(app.srcdir), Path(app.outdir), run=os.environ.get("NOTEBOOKS") != "written")
 
 
 def _inline_formula(translator: Any, node: nodes.math) -> None:

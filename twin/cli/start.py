@@ -79,18 +79,27 @@ def randomisations() -> None:
 
 
 @app.command("doctor", exit_code=lambda machine: 0 if machine.can_render else 1)
-def doctor() -> "Machine":
+def doctor(
+    prepare: Annotated[bool, typer.Option("--prepare", help="first compile what commands need at their first use")] = False,
+    *,
+    progress: Progress,
+) -> "Machine":
     """Check this machine, and list what is missing, with the remedy.
 
     It checks packages, Mitsuba's variants (with the one that is used, and why), LLVM, GPU, offscreen 3D, cameras and serial ports. The
-    exit code is 1 if this machine cannot render.
+    exit code is 1 if this machine cannot render. The first command compiles for about half a minute; with --prepare that is done now.
 
     \b
     Example:
       twin doctor
+      twin doctor --prepare
     """
     from hardware.live.doctor import examine_machine
 
+    if prepare:
+        from hardware.live.prepare import compile_ahead
+
+        compile_ahead(progress=progress)
     return examine_machine()
 
 

@@ -87,7 +87,7 @@ def doctor(
     """Check this machine, and list what is missing, with the remedy.
 
     It checks packages, Mitsuba's variants (with the one that is used, and why), LLVM, GPU, offscreen 3D, cameras and serial ports. The
-    exit code is 1 if this machine cannot render. The first command compiles for about half a minute; with --prepare that is done now.
+    exit code is 1 if this machine cannot render. The first command compiles for about half a minute; --prepare does that ahead.
 
     \b
     Example:

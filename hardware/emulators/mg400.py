@@ -84,6 +84,8 @@ class Mg400Emulator(Emulator):
     firmware : str
         Below 1.5.6 it replies with bare echoes, and not at all on the motion port. From 1.6 on it has SetUser and SetTool. From 1.7 on it
         refuses ``GetPose`` with keywords.
+    lenient : bool
+        Behave as firmware 1.5.5, whatever ``firmware`` is, but echo on the motion port too.
     joints_deg : (4,) float
         Joints at the start.
     time_scale : float
@@ -102,17 +104,18 @@ class Mg400Emulator(Emulator):
         port_offset: int | None = 0,
         faults: tuple[str, ...] = (),
         firmware: str = NEW_FIRMWARE,
+        lenient: bool = False,
         joints_deg: Sequence[float] = START_JOINTS_DEG,
         time_scale: float = 1.0,
     ) -> None:
         with ErrorsAs(ValueError, lambda error: TwinError(str(error))):
-            version = parse_firmware(firmware)
+            version = parse_firmware(OLD_FIRMWARE if lenient else firmware)
         require_ports(port_offset or 0)
         self.host, self._port_offset = host, port_offset
         self.faults = Faults(FAULTS, faults)
         self.arm = Mg400Controller(self.faults, joints_deg=joints_deg, time_scale=time_scale)
         self._commands = Mg400Commands(self.arm, version)
-        self._bare = version < FIRST_NUMBERED_REPLIES
+        self._bare, self._lenient = version < FIRST_NUMBERED_REPLIES, lenient
         self.ports: dict[int, int] = {}
         self._sockets: list[socket.socket] = []  # bound
         self._listeners: dict[socket.socket, int] = {}  # the bound sockets that listen, with the arm's own port
@@ -268,7 +271,7 @@ class Mg400Emulator(Emulator):
             return
         if not self._bare:
             client.sendall(reply.encode())
-        elif port == DASHBOARD_PORT:
+        elif port == DASHBOARD_PORT or self._lenient:
             client.sendall(f"{request.text};".encode())
 
     def _execute(self, port: int, request: Request) -> str:

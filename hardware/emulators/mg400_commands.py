@@ -36,6 +36,14 @@ LAPS = Parameter(integer=True, low=1, high=999)
 CENTRE_MM = Parameter(low=-500.0, high=500.0)
 # Time that the queue waits, ms.
 WAIT_MS = Parameter(integer=True, low=1, high=3_600_000)
+# Signs and number of a hand's orientation. This arm has one orientation.
+ORIENTATION = Parameter(integer=True, low=-1, high=1)
+# Number of a joint.
+JOINT = Parameter(integer=True, low=1, high=4)
+# Numbers of Modbus slaves, of their registers, and of the values in one request. Slave 0 is the controller itself.
+SLAVE, ADDRESS, VALUES = (Parameter(integer=True, low=low, high=high) for low, high in ((0, 4), (0, 65535), (1, 16)))
+# Registers that a value of a type takes.
+REGISTERS = {"U32": 2, "F32": 2, "F64": 4}
 # Names of the directions of a jog.
 AXES = {f"{axis}{sign}" for axis in ("j1", "j2", "j3", "j4", "x", "y", "z", "r") for sign in "+-"}
 # Number of servos. GetErrorID replies with the controller's alarms, followed by those of each servo.
@@ -56,6 +64,7 @@ class Mg400Commands:
 
     def __init__(self, controller: Mg400Controller, firmware: tuple[int, ...]) -> None:
         self.arm, self.firmware = controller, firmware
+        self._slaves: dict[int, dict[tuple[str, int], float]] = {0: {}}  # what each Modbus slave holds, by table and address
         arm = controller
         self.dashboard: dict[str, Command] = {
             "enablerobot": self._enable,
@@ -85,6 +94,14 @@ class Mg400Commands:
             "startdrag": self._plain(lambda: arm.drag(True)),
             "stopdrag": self._plain(lambda: arm.drag(False)),
             **dict.fromkeys(arm.percent, self._percentage),
+            "loadswitch": lambda request: self._only_check(request, BIT),
+            "setarmorientation": lambda request: self._only_check(request, ORIENTATION, counts=(1, 4)),
+            "brakecontrol": self._brake,
+            "runscript": self._run_script,
+            **dict.fromkeys(("stopscript", "pausescript", "continuescript"), self._plain(lambda: None)),  # no project runs
+            "modbuscreate": self._create_slave,
+            "modbusclose": self._close_slave,
+            **dict.fromkeys(("getcoils", "getinbits", "getinregs", "getholdregs", "setcoils", "setholdregs"), self._registers),
         }
         if firmware >= (1, 5, 9):
             self.dashboard["wait"] = self._wait
@@ -121,9 +138,48 @@ class Mg400Commands:
         else:
             self.arm.percent[request.name] = percent
 
-    def _only_check(self, request: Request, parameter: Parameter, reply: str = "") -> str:
-        read_numbers(request, (parameter,), (1,))
+    def _only_check(self, request: Request, parameter: Parameter, reply: str = "", counts: tuple[int, ...] = (1,)) -> str:
+        read_numbers(request, (parameter,) * counts[-1], counts)
         return reply
+
+    def _brake(self, request: Request) -> None:
+        """The brakes of an enabled arm are not switched. An emulated arm does not sink, so a brake has no effect."""
+        read_numbers(request, (JOINT, BIT), (2,))
+        if self.arm.enabled:
+            raise RefusedError(ErrorId.FAILED)
+
+    def _run_script(self, request: Request) -> None:
+        """There is no project on this controller."""
+        raise RefusedError(ErrorId.FAILED if len(request.values) == 1 else ErrorId.PARAMETER_COUNT)
+
+    def _create_slave(self, request: Request) -> str:
+        """``ModbusCreate(ip,port,slave[,isRTU])``. Every address has a slave, which holds what is written to it."""
+        if len(request.values) not in (3, 4):
+            raise RefusedError(ErrorId.PARAMETER_COUNT)
+        free = [index for index in range(int(SLAVE.high) + 1) if index not in self._slaves]
+        if not free:
+            raise RefusedError(ErrorId.FAILED)
+        self._slaves[free[0]] = {}
+        return str(free[0])
+
+    def _close_slave(self, request: Request) -> None:
+        if self._slaves.pop(int(read_numbers(request, (SLAVE,), (1,))[0]), None) is None:
+            raise RefusedError(ErrorId.FAILED)
+
+    def _registers(self, request: Request) -> str:
+        """``GetHoldRegs(index,address,count[,type])``, ``SetHoldRegs(index,address,count,{values}[,type])``, and those of other tables."""
+        writes, table = request.name[0] == "s", request.name[3:]
+        if len(request.values) - writes not in (3, 4):
+            raise RefusedError(ErrorId.PARAMETER_COUNT)
+        index, address, count = map(int, read_numbers(replace(request, values=request.values[:3]), (SLAVE, ADDRESS, VALUES), (3,)))
+        if index not in self._slaves:
+            raise RefusedError(ErrorId.FAILED)
+        width = REGISTERS.get(request.values[-1].strip("{}'\"").upper(), 1)
+        places = [(table, address + width * n) for n in range(count)]
+        if writes:
+            self._slaves[index] |= dict(zip(places, read_table(request.values[3], (count,), 4, most=np.inf), strict=True))
+            return ""
+        return ",".join(f"{self._slaves[index].get(place, 0.0):.15g}" for place in places)
 
     def _select(self, request: Request) -> None:
         (index,) = read_numbers(request, (INDEX,), (1,))

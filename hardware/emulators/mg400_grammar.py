@@ -97,8 +97,8 @@ def read_numbers(request: Request, parameters: tuple[Parameter, ...], counts: tu
     return [_number(text, parameter, n) for n, (text, parameter) in enumerate(zip(request.values, parameters, strict=False), start=1)]
 
 
-def read_table(text: str, counts: tuple[int, ...], n: int) -> list[float]:
-    """Numbers of the n-th parameter, ``{x,y,z,r}`` or ``(x,y,z,r)``.
+def read_table(text: str, counts: tuple[int, ...], n: int, most: float = FARTHEST) -> list[float]:
+    """Numbers of the n-th parameter, ``{x,y,z,r}`` or ``(x,y,z,r)``. A number whose size is above ``most`` counts as that size.
 
     Raises
     ------
@@ -106,10 +106,10 @@ def read_table(text: str, counts: tuple[int, ...], n: int) -> list[float]:
         The values are not numbers (-3000n), or are not finite or have the wrong count (-4000n).
     """
     with ErrorsAs(ValueError, lambda error: RefusedError(ErrorId.PARAMETER_TYPE - n)):
-        numbers = [float(part) for part in text.strip("{}() ").split(",")]
+        numbers = [float(part) for part in text.strip("{}() '\"").split(",")]
     if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
         raise RefusedError(ErrorId.PARAMETER_RANGE - n)
-    return [_at_most(number, FARTHEST) for number in numbers]
+    return [_at_most(number, most) for number in numbers]
 
 
 def keyword_number(request: Request, key: str, parameter: Parameter, default: float) -> float:

@@ -7,7 +7,6 @@ before that, the old file is unchanged, and the temporary file stays until ``rem
 """
 
 import errno
-import fcntl
 import io
 import json
 import os
@@ -23,10 +22,17 @@ import numpy as np
 
 from twin.errors import ErrorsAs, StoreError
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 PART = ".part"
 """End of the name of a temporary file. The name begins with a dot."""
 LOCK = ".lock"
 """Name of the file that is locked where the file system (NFS) can't lock a folder itself. Earlier versions left one in each folder."""
+TAKEN = ".taken"
+"""Name of the file that is in a reserved folder on Windows, where a folder can't be locked."""
 LOOK_S = 0.05
 """Interval, s, at which a run that waits for another one looks again."""
 
@@ -184,12 +190,20 @@ def lock_folder(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     try:
         yield
     finally:
-        fcntl.flock(place, fcntl.LOCK_UN)  # forked processes have the descriptor too, and may live longer
+        if fcntl is None:
+            with suppress(OSError):
+                (folder / TAKEN).unlink()
+        else:
+            fcntl.flock(place, fcntl.LOCK_UN)  # forked processes have the descriptor too, and may live longer
         os.close(place)
 
 
 def _lock(folder: Path) -> int | None:
     """Descriptor of a locked folder, or if the file system locks no folders, of a file in it. None if another run has locked it."""
+    if fcntl is None:
+        with suppress(FileExistsError):  # Windows removes the file when its process ends, whatever the cause
+            return os.open(folder / TAKEN, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_TEMPORARY", 0))
+        return None
     for path, flags in ((folder, os.O_RDONLY), (folder / LOCK, os.O_RDWR | os.O_CREAT)):
         place = os.open(path, flags)
         try:

@@ -27,7 +27,18 @@ DrJit: TypeAlias = Any
 OLDEST_LLVM = 16
 """Oldest usable major version of LLVM: versions 14 and 15 abort the process at the first kernel."""
 BACKENDS = ("cuda", "llvm", "scalar")
-REMEDY = "install LLVM 16 or newer (Debian, Ubuntu: apt-get install libllvm19), or point DRJIT_LIBLLVM_PATH to its library"
+REMEDY = (
+    "install LLVM 16 or newer (Debian, Ubuntu: apt-get install libllvm19; macOS: brew install llvm; Windows: winget install LLVM.LLVM), "
+    "or point DRJIT_LIBLLVM_PATH to its library"
+)
+_ROOTS = {  # folders in which each system has LLVM, and the patterns of its library below them and below Python's own folder
+    "linux": (
+        ("/usr/lib", "/usr/lib64", "/usr/local/lib"),
+        ("libLLVM*.so*", "*-linux-gnu/libLLVM*.so*", "llvm*/lib/libLLVM*.so*", "lib/libLLVM*.so*"),
+    ),
+    "darwin": (("/opt/homebrew/opt", "/usr/local/opt", "/opt/local/libexec"), ("llvm*/lib/libLLVM*.dylib", "lib/libLLVM*.dylib")),
+    "win32": (("$PROGRAMFILES",), ("LLVM/bin/LLVM-C.dll", "Library/bin/LLVM-C.dll", "LLVM-C.dll")),
+}
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _VARIANT_VARIABLE = "TACTIP_VARIANT"
 
@@ -273,22 +284,15 @@ def _newest_first(paths: Sequence[Path]) -> list[Path]:
 
 def _usual_places() -> list[Path]:
     found = []
-    if sys.platform.startswith("linux"):
-        for tool in ("/sbin/ldconfig", "/usr/sbin/ldconfig"):
-            if Path(tool).exists():
-                listing = subprocess.run([tool, "-p"], capture_output=True, text=True).stdout
-                found += [Path(p) for p in re.findall(r"=> (\S*libLLVM[^\s]*)", listing)]
-                break
-        roots = ["/usr/lib", "/usr/lib64", "/usr/local/lib"]
-        patterns = ["libLLVM*.so*", "*-linux-gnu/libLLVM*.so*", "llvm*/lib/libLLVM*.so*"]
-    elif sys.platform == "darwin":
-        roots, patterns = ["/opt/homebrew/opt", "/usr/local/opt", "/opt/local/libexec"], ["llvm*/lib/libLLVM*.dylib"]
-    else:
-        roots, patterns = [os.environ.get("PROGRAMFILES", "C:/Program Files")], ["LLVM/bin/LLVM-C.dll"]
-    roots.append(str(Path(sys.prefix) / "lib"))
-    for root in roots:
+    for tool in ("/sbin/ldconfig", "/usr/sbin/ldconfig"):
+        if sys.platform.startswith("linux") and Path(tool).exists():
+            listing = subprocess.run([tool, "-p"], capture_output=True, text=True, errors="replace").stdout
+            found += [Path(p) for p in re.findall(r"=> (\S*libLLVM[^\s]*)", listing)]
+            break
+    roots, patterns = _ROOTS.get(sys.platform, _ROOTS["linux"])
+    for root in (*roots, sys.prefix, *(os.environ.get("PATH", "").split(os.pathsep) if sys.platform == "win32" else ())):
         for pattern in patterns:
-            found += sorted(Path(root).glob(pattern))
+            found += sorted(Path(os.path.expandvars(root or ".")).glob(pattern))
     return [p for p in found if p.exists()]
 
 

@@ -27,7 +27,7 @@ from hardware.arms.mg400_wire import (
 from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range
 from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame
-from hardware.emulators.mg400_grammar import RefusedError, Request, take_request
+from hardware.emulators.mg400_grammar import RefusedError, Request, refuse_if, take_request
 from hardware.errors import cannot_listen
 from twin.errors import ErrorsAs, TwinError
 
@@ -275,15 +275,12 @@ class Mg400Emulator(Emulator):
             client.sendall(f"{request.text};".encode())
 
     def _execute(self, port: int, request: Request) -> str:
-        if "no-tcp-mode" in self.faults:
-            raise RefusedError(ErrorId.FAILED)
+        refuse_if("no-tcp-mode" in self.faults)
         with self._lock:
             alone = MOTION_PORT not in self._clients.values()
-        if alone and ("needs-motion-client" in self.faults or "motion-port-closed" in self.faults):
-            raise RefusedError(ErrorId.NO_SUCH_COMMAND)
+        refuse_if(alone and ("needs-motion-client" in self.faults or "motion-port-closed" in self.faults), ErrorId.NO_SUCH_COMMAND)
         commands = self._commands.dashboard if port == DASHBOARD_PORT else self._commands.motion
-        if request.name not in commands:
-            raise RefusedError(ErrorId.NO_SUCH_COMMAND)
+        refuse_if(request.name not in commands, ErrorId.NO_SUCH_COMMAND)
         with self.arm.lock:
             return commands[request.name](request) or ""
 
@@ -312,34 +309,34 @@ def feedback_packet(arm: Mg400Controller) -> np.ndarray:
     speed = (seen - _tool_in_user_frame(arm, before, user, tool)) / DIFFERENCE_S
     half_turn = np.radians(seen[3]) / 2
     packet = np.zeros((), PACKET)
-    for names, value in (
-        (("length",), PACKET_BYTES),
-        (("test_value",), TEST_VALUE),
-        (("digital_out",), arm.digital_out),
-        (("mode",), int(mode)),
-        (("unix_ms",), int(time.time() * 1000)),
-        (("speed_scaling",), arm.percent["speedfactor"]),
-        (("q_target", "q_actual"), [*joints, 0, 0]),
-        (("qd_target", "qd_actual"), [*((joints - before) / DIFFERENCE_S), 0, 0]),
-        (("tool_target", "tool_actual"), [*seen, 0, 0]),
-        (("tcp_speed_target", "tcp_speed_actual"), [*speed, 0, 0]),
-        (("user_index",), arm.user),
-        (("tool_index",), arm.tool),
-        (("queue_runs",), arm.queue_runs),
-        (("paused",), arm.paused),
-        (("enabled",), arm.enabled),
-        (("drag",), mode == Mode.BACKDRIVE),
-        (("running",), mode == Mode.RUNNING),
-        (("error",), bool(arm.alarms)),
-        (("jog",), mode == Mode.JOG),
-        (("robot_type",), ROBOT_TYPE_MG400),
-        (("load",), arm.load),
-        (("user",), [user.x, user.y, user.z, user.r, 0, 0]),
-        (("tool",), [tool.x, tool.y, tool.z, tool.r, 0, 0]),
-        (("target_quaternion", "actual_quaternion"), [np.cos(half_turn), 0, 0, np.sin(half_turn)]),
-    ):
-        for name in names:
-            packet[name] = value
+    fields: dict[str, object] = {
+        "length": PACKET_BYTES,
+        "test_value": TEST_VALUE,
+        "digital_out": arm.digital_out,
+        "mode": int(mode),
+        "unix_ms": int(time.time() * 1000),
+        "speed_scaling": arm.percent["speedfactor"],
+        **dict.fromkeys(("q_target", "q_actual"), [*joints, 0, 0]),
+        **dict.fromkeys(("qd_target", "qd_actual"), [*((joints - before) / DIFFERENCE_S), 0, 0]),
+        **dict.fromkeys(("tool_target", "tool_actual"), [*seen, 0, 0]),
+        **dict.fromkeys(("tcp_speed_target", "tcp_speed_actual"), [*speed, 0, 0]),
+        "user_index": arm.user,
+        "tool_index": arm.tool,
+        "queue_runs": arm.queue_runs,
+        "paused": arm.paused,
+        "enabled": arm.enabled,
+        "drag": mode == Mode.BACKDRIVE,
+        "running": mode == Mode.RUNNING,
+        "error": bool(arm.alarms),
+        "jog": mode == Mode.JOG,
+        "robot_type": ROBOT_TYPE_MG400,
+        "load": arm.load,
+        "user": [user.x, user.y, user.z, user.r, 0, 0],
+        "tool": [tool.x, tool.y, tool.z, tool.r, 0, 0],
+        **dict.fromkeys(("target_quaternion", "actual_quaternion"), [np.cos(half_turn), 0, 0, np.sin(half_turn)]),
+    }
+    for name, value in fields.items():
+        packet[name] = value
     return packet
 
 

@@ -237,7 +237,7 @@ import sys, time, types
 sys.modules.setdefault("tkinter", types.SimpleNamespace(Text=None, END=None))
 import numpy as np
 from cri.robot import AsyncRobot, SyncRobot
-from cri.dobot.mg400_controller import MG400Controller
+from cri.controller import MG400Controller
 with AsyncRobot(SyncRobot(MG400Controller(ip=sys.argv[1]))) as robot:
     def at(*place):
         time.sleep(0.5)  # until its own reader has the newest feedback

@@ -14,7 +14,6 @@ from functools import partial
 from multiprocessing import Pipe, connection
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
@@ -117,11 +116,11 @@ class Tracer:
         if self._process is None:
             # ``multiprocessing`` is not used, because it would run the user's own program again in the new process
             number = self._there.fileno()
-            inherited: dict[str, Any] = {"pass_fds": [number]}
+            passed = () if sys.platform == "win32" else (number,)
             if sys.platform == "win32":
                 os.set_handle_inheritable(number, True)
-                inherited = {"close_fds": False}
-            self._process = subprocess.Popen([sys.executable, "-c", f"from {__name__} import serve; serve({number})"], **inherited)
+            command = [sys.executable, "-c", f"from {__name__} import serve; serve({number})"]
+            self._process = subprocess.Popen(command, pass_fds=passed, close_fds=bool(passed))
             self._there.close()
             self._here.send(self._spec)
             threading.Thread(target=self._receive, name="studio-tracer", daemon=True).start()

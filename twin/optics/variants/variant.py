@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias, TypedDict
@@ -31,14 +32,10 @@ REMEDY = (
     "install LLVM 16 or newer (Debian, Ubuntu: apt-get install libllvm19; macOS: brew install llvm; Windows: winget install LLVM.LLVM), "
     "or point DRJIT_LIBLLVM_PATH to its library"
 )
-_ROOTS = {  # folders in which each system has LLVM, and the patterns of its library below them and below Python's own folder
-    "linux": (
-        ("/usr/lib", "/usr/lib64", "/usr/local/lib"),
-        ("libLLVM*.so*", "*-linux-gnu/libLLVM*.so*", "llvm*/lib/libLLVM*.so*", "lib/libLLVM*.so*"),
-    ),
-    "darwin": (("/opt/homebrew/opt", "/usr/local/opt", "/opt/local/libexec"), ("llvm*/lib/libLLVM*.dylib", "lib/libLLVM*.dylib")),
-    "win32": (("$PROGRAMFILES",), ("LLVM/bin/LLVM-C.dll", "Library/bin/LLVM-C.dll", "LLVM-C.dll")),
-}
+# Folders of LLVM on Linux, macOS and Windows, beside Python's own; the folders of its library below them; and the library's names.
+_ROOTS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt", "/usr/local/opt", "/opt/local/libexec", "$PROGRAMFILES")
+_BELOW = ("", "lib/", "*-linux-gnu/", "llvm*/lib/", "LLVM/bin/", "Library/bin/")
+_LIBRARIES = ("libLLVM*.so*", "libLLVM*.dylib", "LLVM-C.dll")
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _VARIANT_VARIABLE = "TACTIP_VARIANT"
 
@@ -285,14 +282,12 @@ def _newest_first(paths: Sequence[Path]) -> list[Path]:
 def _usual_places() -> list[Path]:
     found = []
     for tool in ("/sbin/ldconfig", "/usr/sbin/ldconfig"):
-        if sys.platform.startswith("linux") and Path(tool).exists():
+        if Path(tool).exists():
             listing = subprocess.run([tool, "-p"], capture_output=True, text=True, errors="replace").stdout
             found += [Path(p) for p in re.findall(r"=> (\S*libLLVM[^\s]*)", listing)]
             break
-    roots, patterns = _ROOTS.get(sys.platform, _ROOTS["linux"])
-    for root in (*roots, sys.prefix, *(os.environ.get("PATH", "").split(os.pathsep) if sys.platform == "win32" else ())):
-        for pattern in patterns:
-            found += sorted(Path(os.path.expandvars(root or ".")).glob(pattern))
+    for root, below, library in product((*_ROOTS, sys.prefix), _BELOW, _LIBRARIES):
+        found += sorted(Path(os.path.expandvars(root)).glob(below + library))
     return [p for p in found if p.exists()]
 
 

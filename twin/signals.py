@@ -42,7 +42,8 @@ def signals_as_ctrl_c() -> Iterator[None]:
     def interrupt(number: int, _: object) -> None:
         raise KeyboardInterrupt(number)
 
-    handled = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
+    ending = (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM))  # Windows has no SIGHUP
+    handled = ending if threading.current_thread() is threading.main_thread() else ()
     before = {ended: signal.getsignal(ended) for ended in handled}
     for ended, handler in before.items():
         if handler is not signal.SIG_IGN:

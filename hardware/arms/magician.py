@@ -2,7 +2,6 @@
 
 import contextlib
 import struct
-import termios
 import time
 from dataclasses import replace
 from threading import RLock
@@ -16,7 +15,7 @@ from hardware.arms.awake import awake_s
 from hardware.arms.dobot_alarms import explain
 from hardware.arms.kinematics import MAGICIAN, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
-from hardware.arms.supervisor import Supervisor
+from hardware.arms.supervisor import Supervisor, supervise_connection
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from twin.errors import ErrorsAs
 
@@ -27,7 +26,11 @@ TRIES = 4
 # Longest time of homing, in s.
 HOME_TIMEOUT_S = 60.0
 # Errors that pyserial raises when a port vanishes.
-PORT_ERRORS = (serial.SerialException, OSError, termios.error, TypeError, ValueError)
+PORT_ERRORS: tuple[type[Exception], ...] = (serial.SerialException, OSError, TypeError, ValueError)
+with contextlib.suppress(ImportError):  # Windows has no such module
+    from termios import error as terminal_error
+
+    PORT_ERRORS += (terminal_error,)
 # Bytes of the replies to commands that read.
 REPLY_BYTES = {Id.GET_POSE: 32, Id.ALARMS: 16, Id.QUEUE_INDEX: 8}
 # Messages that stop the arm and empty its queue if this program dies.
@@ -77,7 +80,7 @@ class Magician(LinkageArm):
             attached = [port.device for port in list_ports.comports() if port.vid in USB_VENDORS]
             raise DeviceNotConnectedError(
                 f"{self.name}: can't open the port ({error}); Magicians attached: {', '.join(attached) or 'none'}. Plug in the USB cable "
-                "and switch the arm on; the user must be in the group 'dialout', and no other program may hold the port; "
+                "and switch the arm on; on Linux the user must be in the group 'dialout'; and no other program may hold the port; "
                 "without an arm: 'twin emulate magician'"
             ) from error
         try:
@@ -100,7 +103,7 @@ class Magician(LinkageArm):
         self._forget_queue()
         self._request(Id.QUEUE_START, ctrl=WRITE)
         if self._supervised and self._supervisor is None:
-            self._supervisor = Supervisor(self._port().fileno(), LAST_WORDS)
+            self._supervisor = supervise_connection(self._port().fileno, LAST_WORDS)
         self._enabled = True
 
     def disable(self) -> None:

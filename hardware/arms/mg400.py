@@ -12,7 +12,7 @@ from hardware.arms import kinematics as arms
 from hardware.arms.arm import POLL_S, ArmState, LinkageArm
 from hardware.arms.dobot_alarms import explain
 from hardware.arms.kinematics import LinkageKinematics, require_possible
-from hardware.arms.mg400_link import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback
+from hardware.arms.mg400_link import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback, NoReplyError
 from hardware.arms.mg400_wire import (
     DASHBOARD_PORT,
     DEFAULT_HOSTS,
@@ -36,6 +36,8 @@ ENABLE_TIMEOUT_S = 5.0
 MOTION_REPLY_S = 1.0
 # The same for a stop, an emergency stop and a disable. After this time the next method is tried, because the arm may still move.
 STOP_REPLY_S = 0.5
+# Wait, s, in which echoes of moves are read that nobody needs, so that they do not fill the connection.
+DRAIN_S = 0.001
 # Longest time, s, until feedback shows that a stop or a disable was executed: more than two periods of the slower of the two used ports.
 SHOWS_S = 0.5
 # Longest time, s, until feedback shows the alarm that caused the refusal of a move.
@@ -86,8 +88,7 @@ class MG400(LinkageArm):
         Used to check targets before they are sent, so that the arm does not raise an alarm.
     lenient : bool
         For controllers and emulators that are only similar: feedback counts whatever its test value is, a motion is detected from the
-        joints,
-        and ``Sync`` is not used.
+        joints, ``Sync`` is not used, and moves need no reply.
     supervised : bool
         Whether a further process stops and disables the arm if this program dies while the arm is enabled.
     """
@@ -108,7 +109,7 @@ class MG400(LinkageArm):
         self._feedback = Feedback(self.name, host, ports.feedback, lenient=lenient)
         self._lenient = lenient
         self._in_use = False  # true from connect to disconnect, even if the connection is lost in between
-        self._bare = False  # old firmware: echoes on the dashboard, nothing on the motion port
+        self._bare = False  # whether moves have no reply: old firmware, which only echoes on the dashboard, and some emulators
         self._alarm_text: str | None = None
         self._speed: tuple[float, float] | None = None  # mm/s and deg/s; None after speeds were set in percent
         self._sent: np.ndarray | None = None  # end of the queue while the arm may still move there
@@ -128,8 +129,7 @@ class MG400(LinkageArm):
             self._dashboard.open()
             self._motion.open()
             self._feedback.open()
-            self._bare = self._dashboard.request("RobotMode()").error_id is None
-            self._ask("RobotMode()")
+            self._bare = self._ask("GetErrorID()").error_id is None  # the query that emulators know, too
             self._in_use = True
         except BaseException:
             self._close()
@@ -301,9 +301,16 @@ class MG400(LinkageArm):
         self._under_way = True
         if self._bare:
             self._motion.send(text)
+            self._motion.poll("", wait_s=DRAIN_S)
             return
         self._late_replies = True
-        reply = self._motion.request(text, timeout_s=MOTION_REPLY_S, look=lambda: self._feedback.newest(SILENCE_S))
+        try:
+            reply = self._motion.request(text, timeout_s=MOTION_REPLY_S, look=lambda: self._feedback.newest(SILENCE_S))
+        except NoReplyError:
+            if not self._lenient:
+                raise
+            self._bare, self._late_replies = True, False
+            return
         self._late_replies = False
         if reply.error_id == ErrorId.FAILED and self._shows(lambda packet: int(packet["mode"]) == Mode.ERROR, within_s=ALARM_S):
             raise DeviceError(f"{self.name}: {self._alarm()}")  # the alarm appeared only now

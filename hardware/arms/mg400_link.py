@@ -11,7 +11,7 @@ import numpy as np
 from hardware.arms.arm import FEEDBACK_AGE_S
 from hardware.arms.awake import awake_s
 from hardware.arms.mg400_wire import PACKET_BYTES, Reply, describe_bytes, newest_packet, take_reply, why_no_packet
-from hardware.arms.supervisor import Supervisor
+from hardware.arms.supervisor import Supervisor, supervise_connection
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 # Longest wait for a connection, in s.
@@ -30,6 +30,10 @@ MOTION_DEG = 1e-4
 STALL_CHECK_S = 0.01
 # Largest number of bytes in one read: more than half a second of feedback.
 BACKLOG_BYTES = 64 * PACKET_BYTES
+
+
+class NoReplyError(DeviceError):
+    """No reply came in time."""
 
 
 class CommandPort:
@@ -71,7 +75,7 @@ class CommandPort:
             self._last_words = last_words
             if self._supervisor is not None:
                 self._supervisor.end()
-            self._supervisor = Supervisor(self._socket.fileno(), last_words) if self._socket is not None and last_words else None
+            self._supervisor = supervise_connection(self._socket.fileno, last_words) if self._socket is not None and last_words else None
 
     def close(self) -> None:
         with self._lock:
@@ -90,7 +94,7 @@ class CommandPort:
         ------
         DeviceNotConnectedError
             The connection is lost.
-        DeviceError
+        NoReplyError
             No reply came in time.
         """
         with self._lock:
@@ -103,7 +107,7 @@ class CommandPort:
             came = self._buffer
         host, port = self._address
         instead = f", {describe_bytes(came.encode('ascii', errors='replace'))} came instead: is this an MG400?" if came else ""
-        raise DeviceError(
+        raise NoReplyError(
             f"{self._name}: no reply to {text} from {host}:{port} within {timeout_s:g} s{instead}; check the arm, then connect again"
         )
 

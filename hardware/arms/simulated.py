@@ -157,8 +157,5 @@ class SimulatedArm(BaseArm):
 
     def _newest_feedback_s(self, now_s: float) -> float:
         """Time of the newest feedback: now, unless the fault SILENT is on."""
-        if SimulatedFault.SILENT not in self.faults:
-            self._silent_since = None
-        elif self._silent_since is None:
-            self._silent_since = now_s
-        return now_s if self._silent_since is None else self._silent_since
+        self._silent_since = (self._silent_since or now_s) if SimulatedFault.SILENT in self.faults else None
+        return self._silent_since or now_s

@@ -10,11 +10,17 @@ import select
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 
 # Interval, s, at which it checks that the program lives, and time, s, that an arm has for each message.
 CHECK_S, MESSAGE_S = 0.05, 0.15
 # Longest wait, s, for its end.
 END_S = 2.0
+
+
+def supervise_connection(fileno: Callable[[], int], messages: tuple[bytes, ...]) -> "Supervisor | None":
+    """Start a supervisor of the connection with this descriptor; None on Windows, where processes inherit no descriptors."""
+    return Supervisor(fileno(), messages) if hasattr(os, "fork") else None
 
 
 class Supervisor:

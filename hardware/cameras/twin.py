@@ -130,8 +130,14 @@ class TwinCamera(LiveSource):
         pass
 
     def _take(self, wanted: Callable[[Frame], bool], timeout_s: float, missing: str) -> Frame:
+        def is_wanted(frame: Frame) -> bool:
+            good = wanted(frame)
+            if not good:
+                self._asked.set()  # its state of the arm is older than the request
+            return good
+
         self._asked.set()
-        return super()._take(wanted, timeout_s, missing)
+        return super()._take(is_wanted, timeout_s, missing)
 
     def _grab(self) -> DevicePicture:
         world, preview = self._require_open()

@@ -1,5 +1,6 @@
-"""A USB camera through OpenCV and Video4Linux."""
+"""A USB camera through OpenCV: on Linux through Video4Linux, elsewhere through what the system has."""
 
+import sys
 import time
 
 import cv2
@@ -39,7 +40,7 @@ class UvcCamera(LiveSource):
 
     def _open(self) -> None:
         with overheard():
-            device = cv2.VideoCapture(self._node, cv2.CAP_V4L2)
+            device = cv2.VideoCapture(self._node, cv2.CAP_V4L2 if sys.platform == "linux" else cv2.CAP_ANY)
         if not device.isOpened():
             raise DeviceError(f"{self.name}: can't be opened; 'twin doctor' lists the cameras; check whether another program uses it")
         size = (self._spec.camera.width_px, self._spec.camera.height_px) if self._spec else (WIDTH_PX, HEIGHT_PX)
@@ -83,6 +84,8 @@ def apply_settings(device: cv2.VideoCapture, width_px: int, height_px: int) -> f
         cv2.CAP_PROP_AUTO_WB: 0,
         cv2.CAP_PROP_AUTOFOCUS: 0,
     }
+    if sys.platform != "linux":  # these numbers have other meanings there
+        del wanted[cv2.CAP_PROP_AUTO_EXPOSURE], wanted[cv2.CAP_PROP_EXPOSURE]
     for key, value in wanted.items():  # set() does not report failures
         device.set(key, value)
     fps = device.get(cv2.CAP_PROP_FPS)

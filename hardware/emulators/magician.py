@@ -3,12 +3,9 @@
 import contextlib
 import logging
 import os
-import pty
 import random
 import select
-import termios
 import time
-import tty
 from collections.abc import Sequence
 from pathlib import Path
 from threading import Event, Lock, Thread
@@ -18,10 +15,11 @@ import numpy as np
 from hardware.arms.magician_wire import Message, take_message
 from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range
 from hardware.emulators.magician_controller import START_JOINTS_DEG, EmulatedController
-from twin.errors import TwinError
+from twin.errors import ErrorsAs, TwinError
 
 LOG = logging.getLogger(__name__)
 SPLIT_AT = 4
+NO_TERMINALS = "this system has no pseudo-terminals; emulate an MG400, or emulate the Magician on Linux, macOS or in WSL"
 FAULTS = {
     "noise": Fault("this many random bytes come before each reply", 5.0, Range(1, 1000, whole=True)),
     "split-frames": Fault("replies come in two pieces, this many seconds apart", 0.02, SECONDS),
@@ -83,8 +81,11 @@ class MagicianEmulator(Emulator):
         Raises
         ------
         TwinError
-            The link can't be made.
+            The link can't be made, or the system has no pseudo-terminals.
         """
+        with ErrorsAs(ImportError, lambda error: TwinError(NO_TERMINALS)):
+            import pty
+            import tty
         self._ends = pty.openpty()
         tty.setraw(self._ends[1])
         self.device = os.ttyname(self._ends[1])
@@ -117,6 +118,8 @@ class MagicianEmulator(Emulator):
                 self._link.unlink()
 
     def _serve(self) -> None:
+        import termios
+
         buffer = b""
         while not self._ended.is_set():
             with self._lock:

@@ -67,6 +67,8 @@ SIZES: dict[int, tuple[int, ...]] = {
     Id.ARC: (32,),
     Id.WAIT: (4,),
 }
+# The same for all commands with a known number of bytes. Those of ``SIZES`` can't be read.
+WRITTEN = SIZES | {id: (len(stored),) for id, stored in PARAMETERS.items()} | {id: (bytes_n,) for id, (bytes_n, _) in NOT_ATTACHED.items()}
 # Floating-point numbers at the beginning of a command's parameters. All must be finite.
 NUMBERS: dict[int, struct.Struct] = {
     id: struct.Struct(form.rstrip("B"))
@@ -176,13 +178,9 @@ class EmulatedController:
 
     @staticmethod
     def _has_its_form(message: Message, *, writes: bool) -> bool:
-        if message.id in SIZES:
-            return writes and len(message.params) in SIZES[message.id]
-        if message.id in PARAMETERS:
-            return not writes or len(message.params) == len(PARAMETERS[message.id])
-        if message.id in NOT_ATTACHED:
-            return not writes or len(message.params) == NOT_ATTACHED[message.id][0]
-        return not writes or message.id in set(Id)
+        if not writes:
+            return message.id not in SIZES
+        return len(message.params) in WRITTEN[message.id] if message.id in WRITTEN else message.id in set(Id)
 
     @staticmethod
     def _has_allowed_numbers(message: Message) -> bool:

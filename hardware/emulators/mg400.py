@@ -27,7 +27,7 @@ from hardware.arms.mg400_wire import (
 from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range
 from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame
-from hardware.emulators.mg400_grammar import RefusedError, Request, take_request
+from hardware.emulators.mg400_grammar import RefusedError, Request, refuse_if, take_request
 from hardware.errors import cannot_listen
 from twin.errors import ErrorsAs, TwinError
 
@@ -84,6 +84,8 @@ class Mg400Emulator(Emulator):
     firmware : str
         Below 1.5.6 it replies with bare echoes, and not at all on the motion port. From 1.6 on it has SetUser and SetTool. From 1.7 on it
         refuses ``GetPose`` with keywords.
+    lenient : bool
+        Behave as firmware 1.5.5, whatever ``firmware`` is, but echo on the motion port too.
     joints_deg : (4,) float
         Joints at the start.
     time_scale : float
@@ -102,17 +104,18 @@ class Mg400Emulator(Emulator):
         port_offset: int | None = 0,
         faults: tuple[str, ...] = (),
         firmware: str = NEW_FIRMWARE,
+        lenient: bool = False,
         joints_deg: Sequence[float] = START_JOINTS_DEG,
         time_scale: float = 1.0,
     ) -> None:
         with ErrorsAs(ValueError, lambda error: TwinError(str(error))):
-            version = parse_firmware(firmware)
+            version = parse_firmware(OLD_FIRMWARE if lenient else firmware)
         require_ports(port_offset or 0)
         self.host, self._port_offset = host, port_offset
         self.faults = Faults(FAULTS, faults)
         self.arm = Mg400Controller(self.faults, joints_deg=joints_deg, time_scale=time_scale)
         self._commands = Mg400Commands(self.arm, version)
-        self._bare = version < FIRST_NUMBERED_REPLIES
+        self._bare, self._lenient = version < FIRST_NUMBERED_REPLIES, lenient
         self.ports: dict[int, int] = {}
         self._sockets: list[socket.socket] = []  # bound
         self._listeners: dict[socket.socket, int] = {}  # the bound sockets that listen, with the arm's own port
@@ -268,19 +271,16 @@ class Mg400Emulator(Emulator):
             return
         if not self._bare:
             client.sendall(reply.encode())
-        elif port == DASHBOARD_PORT:
+        elif port == DASHBOARD_PORT or self._lenient:
             client.sendall(f"{request.text};".encode())
 
     def _execute(self, port: int, request: Request) -> str:
-        if "no-tcp-mode" in self.faults:
-            raise RefusedError(ErrorId.FAILED)
+        refuse_if("no-tcp-mode" in self.faults)
         with self._lock:
             alone = MOTION_PORT not in self._clients.values()
-        if alone and ("needs-motion-client" in self.faults or "motion-port-closed" in self.faults):
-            raise RefusedError(ErrorId.NO_SUCH_COMMAND)
+        refuse_if(alone and ("needs-motion-client" in self.faults or "motion-port-closed" in self.faults), ErrorId.NO_SUCH_COMMAND)
         commands = self._commands.dashboard if port == DASHBOARD_PORT else self._commands.motion
-        if request.name not in commands:
-            raise RefusedError(ErrorId.NO_SUCH_COMMAND)
+        refuse_if(request.name not in commands, ErrorId.NO_SUCH_COMMAND)
         with self.arm.lock:
             return commands[request.name](request) or ""
 
@@ -309,34 +309,34 @@ def feedback_packet(arm: Mg400Controller) -> np.ndarray:
     speed = (seen - _tool_in_user_frame(arm, before, user, tool)) / DIFFERENCE_S
     half_turn = np.radians(seen[3]) / 2
     packet = np.zeros((), PACKET)
-    for names, value in (
-        (("length",), PACKET_BYTES),
-        (("test_value",), TEST_VALUE),
-        (("digital_out",), arm.digital_out),
-        (("mode",), int(mode)),
-        (("unix_ms",), int(time.time() * 1000)),
-        (("speed_scaling",), arm.percent["speedfactor"]),
-        (("q_target", "q_actual"), [*joints, 0, 0]),
-        (("qd_target", "qd_actual"), [*((joints - before) / DIFFERENCE_S), 0, 0]),
-        (("tool_target", "tool_actual"), [*seen, 0, 0]),
-        (("tcp_speed_target", "tcp_speed_actual"), [*speed, 0, 0]),
-        (("user_index",), arm.user),
-        (("tool_index",), arm.tool),
-        (("queue_runs",), arm.queue_runs),
-        (("paused",), arm.paused),
-        (("enabled",), arm.enabled),
-        (("drag",), mode == Mode.BACKDRIVE),
-        (("running",), mode == Mode.RUNNING),
-        (("error",), bool(arm.alarms)),
-        (("jog",), mode == Mode.JOG),
-        (("robot_type",), ROBOT_TYPE_MG400),
-        (("load",), arm.load),
-        (("user",), [user.x, user.y, user.z, user.r, 0, 0]),
-        (("tool",), [tool.x, tool.y, tool.z, tool.r, 0, 0]),
-        (("target_quaternion", "actual_quaternion"), [np.cos(half_turn), 0, 0, np.sin(half_turn)]),
-    ):
-        for name in names:
-            packet[name] = value
+    fields: dict[str, object] = {
+        "length": PACKET_BYTES,
+        "test_value": TEST_VALUE,
+        "digital_out": arm.digital_out,
+        "mode": int(mode),
+        "unix_ms": int(time.time() * 1000),
+        "speed_scaling": arm.percent["speedfactor"],
+        **dict.fromkeys(("q_target", "q_actual"), [*joints, 0, 0]),
+        **dict.fromkeys(("qd_target", "qd_actual"), [*((joints - before) / DIFFERENCE_S), 0, 0]),
+        **dict.fromkeys(("tool_target", "tool_actual"), [*seen, 0, 0]),
+        **dict.fromkeys(("tcp_speed_target", "tcp_speed_actual"), [*speed, 0, 0]),
+        "user_index": arm.user,
+        "tool_index": arm.tool,
+        "queue_runs": arm.queue_runs,
+        "paused": arm.paused,
+        "enabled": arm.enabled,
+        "drag": mode == Mode.BACKDRIVE,
+        "running": mode == Mode.RUNNING,
+        "error": bool(arm.alarms),
+        "jog": mode == Mode.JOG,
+        "robot_type": ROBOT_TYPE_MG400,
+        "load": arm.load,
+        "user": [user.x, user.y, user.z, user.r, 0, 0],
+        "tool": [tool.x, tool.y, tool.z, tool.r, 0, 0],
+        **dict.fromkeys(("target_quaternion", "actual_quaternion"), [np.cos(half_turn), 0, 0, np.sin(half_turn)]),
+    }
+    for name, value in fields.items():
+        packet[name] = value
     return packet
 
 

@@ -10,10 +10,8 @@ import numpy as np
 from hardware.arms.mg400_wire import ErrorId
 from hardware.arms.motion import Speeds, circle
 from hardware.emulators.mg400_controller import Mg400Controller, Order, PlanarFrame
-from hardware.emulators.mg400_grammar import FARTHEST, Parameter, RefusedError, Request, keyword_number, read_numbers, read_table
+from hardware.emulators.mg400_grammar import NUMBER, Parameter, RefusedError, Request, keyword_number, read_numbers, read_table, refuse_if
 
-# A coordinate or an angle of any size.
-NUMBER = Parameter(most=FARTHEST)
 # A speed or an acceleration, percent.
 PERCENT = Parameter(integer=True, low=1, high=100)
 # Ratio of continuous-path blending, percent.
@@ -36,6 +34,16 @@ LAPS = Parameter(integer=True, low=1, high=999)
 CENTRE_MM = Parameter(low=-500.0, high=500.0)
 # Time that the queue waits, ms.
 WAIT_MS = Parameter(integer=True, low=1, high=3_600_000)
+# Parameters of commands that have no effect here.
+CHECKED = {"arch": INDEX, "limz": NUMBER, "loadswitch": BIT, "di": INPUT, "tooldi": TOOL_PORT} | {
+    name: Parameter(integer=True, low=low, high=high) for name, low, high in (("setcollisionlevel", 0, 5), ("setarmorientation", -1, 1))
+}
+# Number of a joint.
+JOINT = Parameter(integer=True, low=1, high=4)
+# Numbers of Modbus slaves, of their registers, and of the values in one request. Slave 0 is the controller itself.
+SLAVE, ADDRESS, VALUES = (Parameter(integer=True, low=low, high=high) for low, high in ((0, 4), (0, 65535), (1, 16)))
+# Registers that a value of a type takes.
+REGISTERS = {"U32": 2, "F32": 2, "F64": 4}
 # Names of the directions of a jog.
 AXES = {f"{axis}{sign}" for axis in ("j1", "j2", "j3", "j4", "x", "y", "z", "r") for sign in "+-"}
 # Number of servos. GetErrorID replies with the controller's alarms, followed by those of each servo.
@@ -56,6 +64,7 @@ class Mg400Commands:
 
     def __init__(self, controller: Mg400Controller, firmware: tuple[int, ...]) -> None:
         self.arm, self.firmware = controller, firmware
+        self._slaves: dict[int, dict[tuple[str, int], float]] = {0: {}}  # what each Modbus slave holds, by table and address
         arm = controller
         self.dashboard: dict[str, Command] = {
             "enablerobot": self._enable,
@@ -69,22 +78,23 @@ class Mg400Commands:
             "getangle": self._plain(lambda: _text(self._joints())),
             "getpose": self._get_pose,
             "geterrorid": self._plain(self._error_ids),
-            "setcollisionlevel": lambda request: self._only_check(request, Parameter(integer=True, low=0, high=5)),
             "user": self._select,
             "tool": self._select,
             "positivesolution": self._forward,
             "inversesolution": self._inverse,
-            **dict.fromkeys(("do", "doexecute"), self._output),
-            "dogroup": self._outputs,
+            **dict.fromkeys(("do", "doexecute", "dogroup"), self._output),
             **dict.fromkeys(("tooldo", "tooldoexecute"), self._tool_output),
-            "di": lambda request: self._only_check(request, INPUT, "0"),  # nothing is attached, so no input has a signal
-            "tooldi": lambda request: self._only_check(request, TOOL_PORT, "0"),
             **dict.fromkeys(("setpayload", "payload"), self._payload),
-            "arch": lambda request: self._only_check(request, INDEX),
-            "limz": lambda request: self._only_check(request, NUMBER),
+            **dict.fromkeys(CHECKED, self._only_check),
             "startdrag": self._plain(lambda: arm.drag(True)),
             "stopdrag": self._plain(lambda: arm.drag(False)),
             **dict.fromkeys(arm.percent, self._percentage),
+            "brakecontrol": self._brake,
+            "runscript": self._run_script,
+            **dict.fromkeys(("stopscript", "pausescript", "continuescript"), self._plain(lambda: None)),  # no project runs
+            "modbuscreate": self._create_slave,
+            "modbusclose": self._close_slave,
+            **dict.fromkeys(("getcoils", "getinbits", "getinregs", "getholdregs", "setcoils", "setholdregs"), self._registers),
         }
         if firmware >= (1, 5, 9):
             self.dashboard["wait"] = self._wait
@@ -121,9 +131,44 @@ class Mg400Commands:
         else:
             self.arm.percent[request.name] = percent
 
-    def _only_check(self, request: Request, parameter: Parameter, reply: str = "") -> str:
-        read_numbers(request, (parameter,), (1,))
-        return reply
+    def _only_check(self, request: Request) -> str:
+        counts = (1, 4) if request.name == "setarmorientation" else (1,)
+        read_numbers(request, (CHECKED[request.name],) * counts[-1], counts)
+        return "0" if request.name in ("di", "tooldi") else ""  # nothing is attached, so no input has a signal
+
+    def _brake(self, request: Request) -> None:
+        """The brakes of an enabled arm are not switched. An emulated arm does not sink, so a brake has no effect."""
+        read_numbers(request, (JOINT, BIT), (2,))
+        refuse_if(self.arm.enabled)
+
+    def _run_script(self, request: Request) -> None:
+        """There is no project on this controller."""
+        raise RefusedError(ErrorId.FAILED if len(request.values) == 1 else ErrorId.PARAMETER_COUNT)
+
+    def _create_slave(self, request: Request) -> str:
+        """``ModbusCreate(ip,port,slave[,isRTU])``. Every address has a slave, which holds what is written to it."""
+        refuse_if(len(request.values) not in (3, 4), ErrorId.PARAMETER_COUNT)
+        free = [index for index in range(int(SLAVE.high) + 1) if index not in self._slaves]
+        refuse_if(not free)
+        self._slaves[free[0]] = {}
+        return str(free[0])
+
+    def _close_slave(self, request: Request) -> None:
+        (index,) = read_numbers(request, (SLAVE,), (1,))
+        refuse_if(self._slaves.pop(int(index), None) is None)
+
+    def _registers(self, request: Request) -> str:
+        """``GetHoldRegs(index,address,count[,type])``, ``SetHoldRegs(index,address,count,{values}[,type])``, and those of other tables."""
+        writes, table = request.name[0] == "s", request.name[3:]
+        refuse_if(len(request.values) - writes not in (3, 4), ErrorId.PARAMETER_COUNT)
+        index, address, count = map(int, read_numbers(replace(request, values=request.values[:3]), (SLAVE, ADDRESS, VALUES), (3,)))
+        refuse_if(index not in self._slaves)
+        width = REGISTERS.get(request.values[-1].strip("{}'\"").upper(), 1)
+        places = [(table, address + width * n) for n in range(count)]
+        if writes:
+            self._slaves[index] |= dict(zip(places, read_table(request.values[3], (count,), 4, most=np.inf), strict=True))
+            return ""
+        return ",".join(f"{self._slaves[index].get(place, 0.0):.15g}" for place in places)
 
     def _select(self, request: Request) -> None:
         (index,) = read_numbers(request, (INDEX,), (1,))
@@ -142,25 +187,16 @@ class Mg400Commands:
         return PlanarFrame(x, y, z, values[3] if len(values) == 4 else values[5])
 
     def _define(self, request: Request) -> None:
-        if len(request.values) not in (2, 5, 7):
-            raise RefusedError(ErrorId.PARAMETER_COUNT)
+        refuse_if(len(request.values) not in (2, 5, 7), ErrorId.PARAMETER_COUNT)
         frame = self._frame_of(request, 1)
-        self._frames_named(request)[self._whole(request, 0, INDEX)] = frame
+        self._frames_named(request)[request.whole(0, INDEX)] = frame
 
     def _calculate(self, request: Request) -> str:
         """A frame after an offset along the base's axes (1) or along its own (0)."""
-        if len(request.values) not in (3, 6, 8):
-            raise RefusedError(ErrorId.PARAMETER_COUNT)
-        frame, offset = self._frame(self._frames_named(request), self._whole(request, 0, INDEX)), self._frame_of(request, 2)
-        along_base = self._whole(request, 1, BIT)
+        refuse_if(len(request.values) not in (3, 6, 8), ErrorId.PARAMETER_COUNT)
+        frame, offset = self._frame(self._frames_named(request), request.whole(0, INDEX)), self._frame_of(request, 2)
+        along_base = request.whole(1, BIT)
         return _text(np.add(astuple(frame), astuple(offset)) if along_base else astuple(frame @ offset))
-
-    @staticmethod
-    def _whole(request: Request, n: int, parameter: Parameter) -> int:
-        """The whole number at a position of the parameters."""
-        ahead = (NUMBER,) * n
-        values = Request(request.name, (*["0"] * n, request.values[n]), {}, request.text)
-        return int(read_numbers(values, (*ahead, parameter), (n + 1,))[n])
 
     def _payload(self, request: Request) -> None:
         kg = read_numbers(request, (LOAD_KG, NUMBER), (1, 2))[0]
@@ -171,17 +207,13 @@ class Mg400Commands:
         self.arm.order(Order(np.zeros(6), True, self.arm.speeds(100.0, 100.0), wait_s=(times_ms[0] if times_ms else 0.0) / 1000.0))
 
     def _output(self, request: Request) -> None:
-        index, level = (int(value) for value in read_numbers(request, (OUTPUT, BIT), (2,)))
-        if request.name == "do" and self.arm.busy():  # it waits in the queue
-            self.arm.order(Order(np.zeros(6), True, self.arm.speeds(100.0, 100.0), outputs=((0.0, index, level),), wait_s=0.0))
-        else:
-            self.arm.set_output(index, level)
-
-    def _outputs(self, request: Request) -> None:
-        if not request.values or len(request.values) % 2:
-            raise RefusedError(ErrorId.PARAMETER_COUNT)
+        """``DO(index,level)``, which waits in the queue, ``DOExecute(index,level)`` and ``DOGroup(index,level,index,level,...)``."""
         count = len(request.values)
+        refuse_if(count != 2 and (request.name != "dogroup" or not count or count % 2), ErrorId.PARAMETER_COUNT)
         values = [int(value) for value in read_numbers(request, (OUTPUT, BIT) * (count // 2), (count,))]
+        if request.name == "do" and self.arm.busy():
+            self.arm.order(Order(np.zeros(6), True, self.arm.speeds(100.0, 100.0), outputs=((0.0, values[0], values[1]),), wait_s=0.0))
+            return
         for index, level in zip(values[::2], values[1::2], strict=True):
             self.arm.set_output(index, level)
 
@@ -200,25 +232,23 @@ class Mg400Commands:
 
     def _get_pose(self, request: Request) -> str:
         read_numbers(request, (), (0,))
-        if request.keywords and self.firmware >= (1, 7):
-            raise RefusedError(ErrorId.PARAMETER_TYPE - 1)
+        refuse_if(request.keywords and self.firmware >= (1, 7), ErrorId.PARAMETER_TYPE - 1)
         pose = self._tool_in_user_frame(PlanarFrame.of_pose(self.arm.track.pose(self.arm.update())), *self._frames(request))
         return _text([*pose, 0.0, 0.0] if "six-value-pose" in self.arm.faults else pose)
 
     def _forward(self, request: Request) -> str:
         *joints, user, tool = read_numbers(request, (NUMBER,) * 4 + (INDEX,) * 2, (6,))
-        if self.arm.kinematics.violation(np.array(joints)):
-            raise RefusedError(ErrorId.FAILED)
+        refuse_if(self.arm.kinematics.violation(np.array(joints)))
         flange = PlanarFrame.of_pose(self.arm.kinematics.forward(np.array(joints)))
         return _text(self._tool_in_user_frame(flange, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
 
     def _inverse(self, request: Request) -> str:
-        if len(request.values) not in (6, 7, 8):  # two optional parameters select the solution near given joints; here there is only one
-            raise RefusedError(ErrorId.PARAMETER_COUNT)
+        refuse_if(
+            len(request.values) not in (6, 7, 8), ErrorId.PARAMETER_COUNT
+        )  # two optional parameters select the solution near given joints; here there is only one
         *pose, user, tool = read_numbers(Request(request.name, request.values[:6], {}, request.text), (NUMBER,) * 4 + (INDEX,) * 2, (6,))
         joints = self.arm.joints_at(self._flange(pose, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
-        if self.arm.kinematics.violation(joints):
-            raise RefusedError(ErrorId.FAILED)
+        refuse_if(self.arm.kinematics.violation(joints))
         return _text(joints)
 
     def _to_pose(self, request: Request) -> None:
@@ -235,8 +265,7 @@ class Mg400Commands:
         if not request.name.endswith("io"):
             return request, ()
         groups = tuple(value for value in request.values if value[0] in "{(")
-        if not groups:
-            raise RefusedError(ErrorId.PARAMETER_COUNT)
+        refuse_if(not groups, ErrorId.PARAMETER_COUNT)
         return replace(request, values=request.values[: len(request.values) - len(groups)]), groups
 
     @staticmethod
@@ -244,8 +273,10 @@ class Mg400Commands:
         """Share of the path at which an output is set, its index and its level."""
         mode, distance, index, level = read_table(text, (4,), n)
         share = distance / 100.0 if mode == 0 else distance / max(length_mm, 1e-9)
-        if mode not in (0, 1) or not -1.0 <= share <= 1.0 or not OUTPUT.low <= index <= OUTPUT.high or level not in (0, 1):
-            raise RefusedError(ErrorId.PARAMETER_RANGE - n)
+        refuse_if(
+            mode not in (0, 1) or not -1.0 <= share <= 1.0 or not OUTPUT.low <= index <= OUTPUT.high or level not in (0, 1),
+            ErrorId.PARAMETER_RANGE - n,
+        )
         return share if share >= 0 else 1.0 + share, int(index), int(level)
 
     def _arc(self, request: Request) -> None:
@@ -255,7 +286,7 @@ class Mg400Commands:
     def _circle(self, request: Request) -> None:
         """``Circle(count,{X1,Y1,Z1,R1},{X2,Y2,Z2,R2})``, or in the form of the vendor's client: eight numbers and the count."""
         if len(request.values) == 3:
-            laps = self._whole(request, 0, LAPS)
+            laps = request.whole(0, LAPS)
             numbers = read_table(request.values[1], (4,), 2) + read_table(request.values[2], (4,), 3)
         else:
             *numbers, count = read_numbers(request, (NUMBER,) * 8 + (LAPS,), (9,))
@@ -267,8 +298,7 @@ class Mg400Commands:
         via, end = (self._flange(part, *self._frames(request)).pose for part in (numbers[:4], numbers[4:]))
         start = self.arm.last_target().pose
         poses = circle(start, via, end, whole=laps > 0)
-        if len(poses) == 2:
-            raise RefusedError(ErrorId.FAILED)
+        refuse_if(len(poses) == 2)
         speeds = replace(self._speeds(request, "l"), linear_mm_s2=np.inf, angular_deg_s2=np.inf)  # no stop between the lines
         for pose in poses * max(laps, 1):
             self.arm.order(Order(pose, True, speeds))
@@ -303,12 +333,10 @@ class Mg400Commands:
     def _jog(self, request: Request) -> None:
         if not request.values:
             self.arm.reset()
-            return
-        axis = request.values[0].lower().replace(" ", "")
-        if axis not in AXES:  # according to the vendor's document, any other text stops a jog
+        elif (axis := request.values[0].lower().replace(" ", "")) not in AXES:  # the vendor's document: any other text stops a jog
             self.arm.stop_jog()
-            return
-        self.arm.jog(axis, user=self._frames(request)[0])
+        else:
+            self.arm.jog(axis, user=self._frames(request)[0])
 
     def _speeds(self, request: Request, kind: str) -> Speeds:
         speed = keyword_number(request, f"speed{kind}", PERCENT, self.arm.percent[f"speed{kind}"])
@@ -323,8 +351,7 @@ class Mg400Commands:
 
     @staticmethod
     def _frame(frames: dict, index: float) -> PlanarFrame:
-        if int(index) not in frames:
-            raise RefusedError(ErrorId.FAILED)
+        refuse_if(int(index) not in frames)
         return frames[int(index)]
 
     @staticmethod

@@ -11,7 +11,7 @@ from hardware.arms.kinematics import MG400, OutOfReachError, Violation
 from hardware.arms.mg400_wire import MAX_JOINT_DEG_S, MAX_LINEAR_MM_S, ErrorId, Mode
 from hardware.arms.motion import MotionTrack, Piece, Speeds, check_line
 from hardware.emulators.faults import Faults
-from hardware.emulators.mg400_grammar import RefusedError
+from hardware.emulators.mg400_grammar import RefusedError, refuse_if
 from twin.errors import ErrorsAs
 
 # Largest accelerations. They are chosen for the emulator, because those of a real arm are not known.
@@ -153,8 +153,7 @@ class Mg400Controller:
 
     def enable(self) -> None:
         with self.lock:
-            if self.alarms:
-                raise RefusedError(ErrorId.FAILED)
+            refuse_if(self.alarms)
             self.enabled = True
 
     def disable(self) -> None:
@@ -182,8 +181,7 @@ class Mg400Controller:
     def drag(self, begin: bool) -> None:
         """Begin or end the mode in which a person moves the arm by hand. It is possible only while the arm is enabled and without error."""
         with self.lock:
-            if self.alarms or not self.enabled:
-                raise RefusedError(ErrorId.FAILED)
+            refuse_if(self.alarms or not self.enabled)
             self.reset()
             self.dragged = begin
 
@@ -219,8 +217,7 @@ class Mg400Controller:
     def resume(self) -> None:
         """``Continue``: execute the held commands."""
         with self.lock:
-            if self.alarms or not self.enabled:
-                raise RefusedError(ErrorId.FAILED)
+            refuse_if(self.alarms or not self.enabled)
             self.paused = False
             held, self._held = self._held, []
             for order in held:
@@ -236,8 +233,7 @@ class Mg400Controller:
         """
         with self.lock:
             self.update()
-            if self.alarms or self.dragged or not self.enabled:
-                raise RefusedError(ErrorId.FAILED)
+            refuse_if(self.alarms or self.dragged or not self.enabled)
             if "ignore-moves" in self.faults:
                 return
             if self.paused or self._held:
@@ -275,8 +271,7 @@ class Mg400Controller:
         sign = {"+": 1.0, "-": -1.0}[axis[-1]]
         with self.lock:
             self.update()
-            if self.alarms or not self.enabled:
-                raise RefusedError(ErrorId.FAILED)
+            refuse_if(self.alarms or not self.enabled)
             self.reset()
             joints = self.track.joints_deg(time.monotonic())
             linear = not axis.startswith("j")

@@ -25,6 +25,10 @@ class Request:
     keywords: dict
     text: str
 
+    def whole(self, n: int, parameter: "Parameter") -> int:
+        """The whole number at a position of the values, from 0; raises as ``read_numbers``."""
+        return int(_number(self.values[n], parameter, n + 1))
+
 
 class RefusedError(Exception):
     """A request is refused with an error id."""
@@ -32,6 +36,12 @@ class RefusedError(Exception):
     def __init__(self, error_id: int) -> None:
         super().__init__(f"refused: {error_id}")
         self.error_id = int(error_id)
+
+
+def refuse_if(wrong: object, error_id: int = ErrorId.FAILED) -> None:
+    """Raise ``RefusedError`` if something is wrong."""
+    if wrong:
+        raise RefusedError(error_id)
 
 
 def take_request(buffer: str) -> tuple[Request | None, str]:
@@ -84,6 +94,10 @@ class Parameter:
     most: float = float("inf")
 
 
+# A coordinate or an angle of any size.
+NUMBER = Parameter(most=FARTHEST)
+
+
 def read_numbers(request: Request, parameters: tuple[Parameter, ...], counts: tuple[int, ...]) -> list[float]:
     """The request's values as numbers.
 
@@ -92,13 +106,12 @@ def read_numbers(request: Request, parameters: tuple[Parameter, ...], counts: tu
     RefusedError
         The number of values is wrong (-20000), or the type (-3000n) or the range (-4000n) of the n-th value.
     """
-    if len(request.values) not in counts:
-        raise RefusedError(ErrorId.PARAMETER_COUNT)
+    refuse_if(len(request.values) not in counts, ErrorId.PARAMETER_COUNT)
     return [_number(text, parameter, n) for n, (text, parameter) in enumerate(zip(request.values, parameters, strict=False), start=1)]
 
 
-def read_table(text: str, counts: tuple[int, ...], n: int) -> list[float]:
-    """Numbers of the n-th parameter, ``{x,y,z,r}`` or ``(x,y,z,r)``.
+def read_table(text: str, counts: tuple[int, ...], n: int, most: float = FARTHEST) -> list[float]:
+    """Numbers of the n-th parameter, ``{x,y,z,r}`` or ``(x,y,z,r)``. A number whose size is above ``most`` counts as that size.
 
     Raises
     ------
@@ -106,10 +119,9 @@ def read_table(text: str, counts: tuple[int, ...], n: int) -> list[float]:
         The values are not numbers (-3000n), or are not finite or have the wrong count (-4000n).
     """
     with ErrorsAs(ValueError, lambda error: RefusedError(ErrorId.PARAMETER_TYPE - n)):
-        numbers = [float(part) for part in text.strip("{}() ").split(",")]
-    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
-        raise RefusedError(ErrorId.PARAMETER_RANGE - n)
-    return [_at_most(number, FARTHEST) for number in numbers]
+        numbers = [float(part) for part in text.strip("{}() '\"").split(",")]
+    refuse_if(len(numbers) not in counts or not all(map(math.isfinite, numbers)), ErrorId.PARAMETER_RANGE - n)
+    return [_at_most(number, most) for number in numbers]
 
 
 def keyword_number(request: Request, key: str, parameter: Parameter, default: float) -> float:
@@ -122,8 +134,9 @@ def keyword_number(request: Request, key: str, parameter: Parameter, default: fl
 def _number(text: str, parameter: Parameter, n: int) -> float:
     with ErrorsAs(ValueError, lambda error: RefusedError(ErrorId.PARAMETER_TYPE - n)):
         number = int(text) if parameter.integer else float(text)
-    if not (parameter.low <= number <= parameter.high and math.isfinite(number)):  # a whole number may be too large for isfinite
-        raise RefusedError(ErrorId.PARAMETER_RANGE - n)
+    refuse_if(
+        not (parameter.low <= number <= parameter.high and math.isfinite(number)), ErrorId.PARAMETER_RANGE - n
+    )  # a whole number may be too large for isfinite
     return _at_most(number, parameter.most)
 
 

@@ -1,6 +1,7 @@
 """Runs an emulator until it is ended."""
 
 import signal
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -8,11 +9,11 @@ from typing import Any
 
 from hardware.emulators.faults import Fault
 from hardware.emulators.magician import MagicianEmulator
-from hardware.emulators.mg400 import OLD_FIRMWARE, Mg400Emulator
+from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
 
 SLOWEST, FASTEST = 1e-3, 1e3  # limits of the time scale: beyond them a move takes hours, or no time at all
-CHECK_S = 0.5  # interval, s, at which a failure of the emulator is checked
+CHECK_S = 0.1  # interval, s, at which signals and a failure of the emulator are checked
 
 
 def run_until_signal(
@@ -31,29 +32,18 @@ def run_until_signal(
     failure : callable
         Returns the error with which the device ended, or None while it runs. The error is raised.
     """
-    ends = {signal.SIGTERM, signal.SIGINT}
     told: list[bool] = []
-    handlers = {end: signal.signal(end, lambda *_: told.append(True)) for end in ends}  # threads of libraries may get the signals, too
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # signals are waited for, so that nothing is interrupted halfway
+    handlers = {end: signal.signal(end, lambda *_: told.append(True)) for end in (signal.SIGTERM, signal.SIGINT)}
     try:
         with device:
             print(f"ready {ready()}", flush=True)  # at once, because a program may wait for it on a pipe
-            while not told and not _comes(ends):
+            while not told:
                 if (error := failure()) is not None:
                     raise error
+                time.sleep(CHECK_S)
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for end, handler in handlers.items():
             signal.signal(end, handler)
-
-
-def _comes(ends: set[signal.Signals]) -> bool:
-    """Whether one of these signals comes within ``CHECK_S``.
-
-    A process that was stopped and continues gets an answer from ``sigtimedwait`` although no signal came: it holds no number of a signal.
-    """
-    found = signal.sigtimedwait(ends, CHECK_S)
-    return found is not None and found.si_signo in ends
 
 
 def emulate_mg400(
@@ -70,11 +60,10 @@ def emulate_mg400(
     Parameters
     ----------
     lenient : bool
-        Behave as firmware 1.5.5, whatever ``firmware`` is: bare echoes, no reply to moves.
+        See ``Mg400Emulator``.
     """
     _require_time_scale(time_scale)
-    version = OLD_FIRMWARE if lenient else firmware
-    arm = Mg400Emulator(host=host, port_offset=port_offset, faults=faults, firmware=version, time_scale=time_scale)
+    arm = Mg400Emulator(host=host, port_offset=port_offset, faults=faults, firmware=firmware, lenient=lenient, time_scale=time_scale)
     run_until_signal(arm, lambda: f"mg400 {host} {' '.join(str(port) for port in arm.ports.values())}")
 
 

@@ -25,8 +25,8 @@ PACKAGES = ("mitsuba", "drjit", "pyvista", "vtk", "trimesh", "torch", "scikit-im
 OWN = ("scenes", "twin", "training", "hardware")
 # Kinds of devices, each with the remedy if none is found.
 DEVICES = {
-    "camera": "plug in the sensor's USB camera; in a container pass --device /dev/video0",
-    "serial": "plug in the arm's USB cable; the user must be in the group 'dialout'",
+    "camera": "plug in the sensor's USB camera; in a container pass --device /dev/video0; on Windows and macOS try '--camera 0'",
+    "serial": "plug in the arm's USB cable; on Linux the user must be in the group 'dialout'",
 }
 
 

@@ -7,6 +7,7 @@ import threading
 import time
 import urllib.request
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -430,6 +431,16 @@ def test_a_twin_that_draws_on_demand_draws_no_more_frames_than_are_read():
         second = camera.read_after(asked_s, timeout_s=60.0)
         time.sleep(0.5)
         assert first.time_s < asked_s < second.time_s and camera.arrived <= 3
+
+
+def test_a_twin_on_demand_draws_again_until_the_arms_state_is_as_new_as_requested():
+    """An arm on a network reports its pose every few milliseconds, so its newest state is older than the request for a frame."""
+    arm, camera = twin_camera(on_demand=True)
+    camera._arm = lambda: replace(state := arm.state(), time_s=state.time_s - 0.1)
+    with camera:
+        camera.read(timeout_s=60.0)
+        asked_s = time.monotonic()
+        assert camera.read_after(asked_s, timeout_s=60.0).time_s > asked_s
 
 
 def test_check_says_what_to_do_about_a_camera_that_gives_nothing(monkeypatch):

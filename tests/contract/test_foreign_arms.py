@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from arms import mg400_of
 
-from hardware.arms.mg400 import MG400, Mg400Ports
+from hardware.arms.mg400 import MG400, MOTION_REPLY_S, Mg400Ports
 from hardware.arms.mg400_wire import TEST_VALUE, newest_packet
 from hardware.arms.open_arm import open_arm
 from hardware.emulators.mg400 import Mg400Emulator, feedback_packet
-from hardware.errors import DeviceError, DeviceNotConnectedError
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 
 @contextmanager
@@ -139,6 +139,63 @@ def test_an_arm_that_is_only_alike_is_used_with_the_lenient_mode():
             arm.move_joints(np.array([5.0, 20, 40, 0]))
             arm.disable()
             assert not arm.state().enabled
+
+
+class Mock(Alike):
+    """As HarvestX/MG400_Mock: a few commands, no reply to moves, and a dashboard that hangs up on other commands."""
+
+    KNOWN = ("enablerobot", "disablerobot", "clearerror", "resetrobot", "geterrorid", "speedfactor", "user", "tool", "speedj", "speedl")
+
+    def _answer(self, client, port, request):
+        if port == 30003:
+            self._execute(port, request)
+        elif request.name in self.KNOWN:
+            super()._answer(client, port, request)
+        else:
+            client.shutdown(socket.SHUT_RDWR)
+
+
+def test_the_public_mock_works_in_the_lenient_mode_and_the_error_says_so():
+    with Mock(port_offset=None, time_scale=4.0) as emulator:
+        with pytest.raises(DeviceNotConnectedError, match="mg400-lenient"):
+            mg400_of(emulator).connect()
+        with mg400_of(emulator, lenient=True) as arm:
+            arm.clear_error()
+            arm.enable()
+            arm.set_speed(100.0, 90.0)
+            for y in (30.0, -30.0, 0.0):
+                target = np.array([300.0, y, -10, 0, 0, 30])
+                arm.move_linear(target)
+                assert np.allclose(emulator.pose(), target, atol=0.05)
+            begun_s = time.monotonic()
+            for y in range(10):  # only the first move waits for a reply
+                arm.move_linear(np.array([300.0, y, -10, 0, 0, 30]), wait=False)
+            assert time.monotonic() - begun_s < MOTION_REPLY_S
+            arm.stop()
+            arm.disable()
+            assert not arm.state().enabled
+
+
+def test_a_silent_arm_stops_the_lenient_mode_too():
+    with Mg400Emulator(port_offset=None, faults=("no-move-reply",)) as emulator, mg400_of(emulator, lenient=True) as arm:
+        arm.enable()
+        emulator.faults.add("frozen=0")
+        with pytest.raises(StaleDataError, match="no feedback"):
+            arm.move_linear(np.array([300.0, 0, 0, 0, 0, 10]))
+
+
+def test_echoes_of_moves_that_nobody_reads_do_not_stop_the_lenient_emulator():
+    """The connection has room for a few thousand of them; here it has less."""
+    with Mg400Emulator(port_offset=None, lenient=True, time_scale=50.0) as emulator, mg400_of(emulator) as arm:
+        arm._motion._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        for client, port in emulator._clients.items():
+            if port == 30003:
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2048)
+        arm.enable()
+        for n in range(1000):
+            arm.move_linear(np.array([300.0, n % 2, 0, 0, 0, 10]), wait=False)
+        arm.move_linear(np.array([300.0, 5.0, 0, 0, 0, 10]), timeout_s=30.0)
+        assert np.allclose(emulator.pose()[:2], [300.0, 5.0], atol=0.05)
 
 
 def test_the_lenient_mode_by_its_name():

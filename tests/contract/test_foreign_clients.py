@@ -14,7 +14,7 @@ from free_ports import free_offset
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 
-PACKAGES = ("pydobot", "pydobotplus")
+PACKAGES = ("pydobot", "pydobotplus", "common-robot-interface", "transforms3d")
 INSTALL_TIMEOUT_S = 120
 
 
@@ -97,7 +97,7 @@ def test_an_alarm_as_the_vendors_client_deals_with_it():
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory):
-    """The published clients of the Magician, installed apart; skips where they can't be."""
+    """The published clients of both arms, installed apart; skips where they can't be."""
     folder = tmp_path_factory.mktemp("clients")
     command = [sys.executable, "-m", "pip", "install", "-q", "--target", str(folder), *PACKAGES]
     try:
@@ -231,8 +231,42 @@ print("done")
 """
 
 
+# The sensor group's own client of the MG400. Its log window is not used.
+CRI = """
+import sys, time, types
+sys.modules.setdefault("tkinter", types.SimpleNamespace(Text=None, END=None))
+import numpy as np
+from cri.robot import AsyncRobot, SyncRobot
+from cri.controller import MG400Controller
+with AsyncRobot(SyncRobot(MG400Controller(ip=sys.argv[1]))) as robot:
+    def at(*place):
+        time.sleep(0.5)  # until its own reader has the newest feedback
+        assert np.allclose(np.take(robot.pose, [0, 1, 2, 5]), place, atol=0.01), (robot.pose, place)
+    robot.coord_frame = (300, 0, 0, 0, 0, 0)
+    robot.linear_speed, robot.angular_speed, robot.speed = 100, 100, 50
+    robot.move_linear((0, 0, 0, 0, 0, 0))
+    at(0, 0, 0, 0)
+    assert robot.speed == 50
+    robot.move_joints((10, 20, 40, 0))
+    time.sleep(0.5)
+    assert np.allclose(robot.joint_angles, (10, 20, 40, 0))
+    robot.async_move_linear((10, 20, -10, 0, 0, 30))
+    robot.async_result()
+    at(10, 20, -10, 30)
+print("done")
+"""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("script", [PYDOBOT, PYDOBOTPLUS], ids=PACKAGES)
+def test_the_groups_own_client_drives_the_emulated_mg400(packages):
+    with Mg400Emulator(host="127.0.0.29", time_scale=4.0):
+        environment = {**os.environ, "PYTHONPATH": str(packages)}
+        done = subprocess.run([sys.executable, "-c", CRI, "127.0.0.29"], env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip().endswith("done"), done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", [PYDOBOT, PYDOBOTPLUS], ids=PACKAGES[:2])
 def test_published_clients_drive_the_emulated_magician(packages, script):
     with MagicianEmulator(time_scale=4.0) as emulator:
         environment = {**os.environ, "PYTHONPATH": str(packages)}
@@ -301,6 +335,17 @@ def test_twin_emulate_lists_its_faults(device):
     command = [sys.executable, "-c", "from twin.cli import main; main()", "emulate", device, "--fault", "help"]
     listed = subprocess.check_output(command, text=True)
     assert "slow=0.1" in listed and "ignore-moves" in listed
+
+
+def test_a_client_that_waits_for_replies_does_not_hang_on_the_lenient_emulator():
+    """As the vendor's client: a reply to each move, and one to ``Sync`` when the moves are done."""
+    with Mg400Emulator(port_offset=None, lenient=True, time_scale=4.0) as emulator:
+        client = PlainClient(emulator, 30004)
+        assert client.ask(client.dashboard, "EnableRobot()") == "EnableRobot();"
+        for text in ("MovL(280,40,-20,30)", "Sync()"):
+            assert client.ask(client.motion, text) == f"{text};"
+        assert emulator.pose()[1] == pytest.approx(40.0, abs=0.1)
+        client.close()
 
 
 def test_numbers_that_are_none_are_out_of_range():

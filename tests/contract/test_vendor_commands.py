@@ -64,6 +64,15 @@ ACCEPTED = [
     ("d", "SetUser(0,{1,2,3,4})"),
     ("d", "SetUser(1,10,10,10,0)"),
     ("d", "SetTool(1,{10,10,10,0,0,5})"),
+    ("d", "LoadSwitch(1)"),
+    ("d", "SetArmOrientation(1)"),
+    ("d", "SetArmOrientation(1,1,-1,1)"),
+    ("d", "StopScript()"),
+    ("d", "PauseScript()"),
+    ("d", "ContinueScript()"),
+    ("d", "SetHoldRegs(0,3095,2,{1,2},U16)"),
+    ("d", "SetHoldRegs(0,3095,1,7)"),
+    ("d", "SetCoils(0,0,3,'{1,0,1}')"),
     ("m", "Arc(320,20,0,0,340,0,0,0)"),
     ("m", "Arc(320.0,20.0,0.0,0.0,340.0,0.0,0.0,0.0,SpeedL=50,AccL=50)"),
     ("m", "Circle(2,{320,20,0,0},{340,0,0,0})"),
@@ -85,6 +94,18 @@ REFUSED = [
     ("d", "ToolDO(1)", -20000),
     ("d", "DOGroup(1)", -20000),
     ("d", "wait(0)", -40001),
+    ("d", "LoadSwitch(2)", -40001),
+    ("d", "SetArmOrientation(1,1)", -20000),
+    ("d", "BrakeControl(1,1)", -1),  # the arm is enabled
+    ("d", "RunScript(demo)", -1),
+    ("d", "RunScript()", -20000),
+    ("d", "ModbusCreate(127.0.0.1,502)", -20000),
+    ("d", "ModbusClose(1)", -1),
+    ("d", "GetHoldRegs(1,3095,1)", -1),
+    ("d", "GetHoldRegs(5,3095,1)", -40001),
+    ("d", "GetInRegs(0,3095,17)", -40003),
+    ("d", "SetCoils(0,0,2,{1})", -40004),
+    ("d", "SetCoils(0,0,2)", -20000),
     ("d", "SetPayload(0.9)", -40001),
     ("d", "Arch(10)", -40001),
     ("m", "Arc(320,0,0,0,340,0,0,0)", -1),
@@ -108,6 +129,24 @@ def test_refused_with_the_documents_number(ask, port, text, error_id):
 
 def test_inputs_have_no_signal(ask):
     assert ask("d", "DI(1)") == "0,{0}" and ask("d", "ToolDI(2)") == "0,{0}"
+
+
+def test_brakes_are_those_of_a_disabled_arm(ask):
+    ask("d", "DisableRobot()")
+    assert ask("d", "BrakeControl(2,1)") == "0,{}"
+
+
+def test_slaves_hold_what_is_written_to_them(ask):
+    assert [ask("d", "ModbusCreate(192.168.1.8,502,1,0)") for _ in range(4)] == ["0,{1}", "0,{2}", "0,{3}", "0,{4}"]
+    assert ask("d", "ModbusCreate(192.168.1.8,502,1)") == "-1,{}"
+    assert ask("d", "SetHoldRegs(2,3095,2,{4000000000,1.5},F32)") == "0,{}"
+    assert ask("d", "GetHoldRegs(2,3095,2,F32)") == "0,{4000000000,1.5}"
+    assert ask("d", "GetHoldRegs(2,3097,1)") == "0,{1.5}"  # the first value takes two registers
+    assert ask("d", "GetInRegs(2,3095,1,{U16})") == "0,{0}" and ask("d", "GetHoldRegs(1,3095,2,F32)") == "0,{0,0}"
+    assert ask("d", "SetCoils(2,7,3,{1,0,1})") == "0,{}" and ask("d", "GetCoils(2,7,3)") == "0,{1,0,1}"
+    assert ask("d", "GetInBits(2,7,1)") == "0,{0}"
+    assert ask("d", "ModbusClose(2)") == "0,{}" and ask("d", "GetCoils(2,7,3)") == "-1,{}"
+    assert ask("d", "ModbusCreate(192.168.1.8,502,1)") == "0,{2}" and ask("d", "GetCoils(2,7,3)") == "0,{0,0,0}"
 
 
 def test_frames_are_calculated_along_the_base_or_along_themselves(ask):

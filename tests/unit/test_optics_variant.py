@@ -114,6 +114,23 @@ def test_newest_library_is_tried_first_and_old_ones_without_a_probe(tmp_path, mo
     assert found.library is None and len(found.candidates) == 3 and "abort" in found.candidates[2].reason
 
 
+@pytest.mark.parametrize(
+    "library",
+    [
+        "prefix/lib/libLLVM.so.19.1",
+        "prefix/lib/libLLVM.dylib",
+        "prefix/Library/bin/LLVM-C.dll",
+        "programs/LLVM/bin/LLVM-C.dll",
+    ],
+)
+def test_the_library_is_found_under_each_systems_name(library, tmp_path, monkeypatch):
+    (tmp_path / library).parent.mkdir(parents=True)
+    (tmp_path / library).touch()
+    monkeypatch.setattr(variant.sys, "prefix", str(tmp_path / "prefix"))
+    monkeypatch.setenv("PROGRAMFILES", str(tmp_path / "programs"))
+    assert tmp_path / library in variant._usual_places()
+
+
 def test_verdicts_are_remembered_until_the_library_changes(tmp_path, monkeypatch):
     library, runs = tmp_path / "libLLVM.so.19.1", []
     library.touch()

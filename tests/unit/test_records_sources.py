@@ -30,7 +30,7 @@ def shifted(k):
 
 
 def session(folder, steps=3, about=None):
-    told = {"sensor": "mg400-127", "arm": "mg400:x", "object": "can", "servo": load_servo("surface").model_dump()}
+    told = {"sensor": "mg400-127", "arm": "mg400-lenient:10.0.0.7:29999", "object": "can", "servo": load_servo("surface").model_dump()}
     with SessionWriter(folder, told if about is None else about) as writer:
         writer.keep_rest(Frame(shifted(0)[1], Form.PROCESSED))
         for k in range(steps):
@@ -57,7 +57,7 @@ def test_a_session_is_one_episode_of_the_arms_poses_and_the_models_estimates(tmp
     records = open_records(session(tmp_path / "s"))
     (episode,) = records.episodes
     steps = list(episode.steps())
-    assert (records.about.frame, records.about.robot, records.about.estimates) == ("base", "mg400:x", ("pose_2", "pose_6"))
+    assert (records.about.frame, records.about.robot, records.about.estimates) == ("base", "mg400", ("pose_2", "pose_6"))
     assert episode.task == "follow the can" and episode.length == 3 and episode.started_s > 1.5e9
     assert [step.time_s for step in steps] == [0.0, 0.1, 0.2] and records.rate_hz() == 10
     np.testing.assert_array_equal(steps[2].values["pose"], np.arange(6) + 2)
@@ -65,6 +65,20 @@ def test_a_session_is_one_episode_of_the_arms_poses_and_the_models_estimates(tmp
     np.testing.assert_array_equal(steps[2].values["estimate"], [2, np.nan])
     mounting = Mounting.of(SENSOR, load_experiment(load_servo("surface").experiment))
     np.testing.assert_allclose(episode.T_tool_sensor, mounting.T_tool_sensor)
+
+
+def test_steps_that_use_a_frame_again_have_their_own_times_and_the_record_no_address(tmp_path):
+    """A data set with one time for two steps has two actions at one moment; a published one must not name a host."""
+    with SessionWriter(tmp_path / "s", {"sensor": "mg400-127", "arm": "mg400:10.0.0.7"}) as writer:
+        for number, decided_s in ((1, 50.25), (1, 50.3), (1, 50.35), (2, 50.4), (2, 50.45)):
+            frame = Frame(shifted(number)[1], Form.PROCESSED, "", 50.0 + 0.15 * number, number)
+            writer.append(frame, {"exposed_pose": np.arange(6), "sent": np.arange(6), "time_s": decided_s})
+    for to in ("lerobot", "recording"):
+        convert([tmp_path / "s"], tmp_path / to, to)
+        (episode,) = open_records(tmp_path / to).episodes
+        assert [step.time_s for step in episode.steps()] == pytest.approx([0.0, 0.05, 0.1, 0.15, 0.2])
+        assert "10.0.0.7" not in "".join(path.read_text() for path in (tmp_path / to).rglob("*.json"))
+    assert json.loads((tmp_path / "lerobot/meta/info.json").read_text())["robot_type"] == "mg400"
 
 
 def test_pins_are_found_in_the_pictures(tmp_path):

@@ -35,7 +35,9 @@ Steps = Annotated[int | None, typer.Option("--steps", min=1, help="number of ste
 Record = Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")]
 NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")]
 KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stands exactly at --servo: measure errors against it")]
-ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS, magician:PORT")]
+ArmOption = Annotated[
+    str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT")
+]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, without motion")]
 Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, or a TOML file"), Formerly("limits")]
 AtRest = Annotated[
@@ -291,8 +293,10 @@ def mg400(
     host: Annotated[str, typer.Option(help="address to listen on")] = "127.0.0.1",
     port_offset: Annotated[int, typer.Option(help="added to 29999 and 30003 to 30006")] = 0,
     fault: FaultOption = None,
-    firmware: Annotated[str, typer.Option(help="emulated version; below 1.5.6 replies are bare echoes")] = "1.7.0",
-    lenient: Annotated[bool, typer.Option("--lenient", help="like firmware 1.5.5: bare echoes, no reply to moves")] = False,
+    firmware: Annotated[str, typer.Option(help="emulated version; below 1.5.6 replies are bare echoes, and moves get none")] = "1.7.0",
+    lenient: Annotated[
+        bool, typer.Option("--lenient", help="like firmware 1.5.5, but with echoes of moves too, for clients that wait for them")
+    ] = False,
     time_scale: TimeScale = 1.0,
 ) -> None:
     """Emulate a Dobot MG400 on its network ports.

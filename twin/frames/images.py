@@ -246,8 +246,8 @@ def overheard() -> Iterator[list[str]]:
 
 
 def _own_stderr() -> int | None:
-    """A second descriptor of the process's stderr; None if it has none."""
+    """A second descriptor of the process's stderr; None if it has none, or if pipes always block (Python 3.11 on Windows)."""
     try:
-        return os.dup(STDERR)
+        return os.dup(STDERR) if hasattr(os, "set_blocking") else None
     except OSError:
         return None

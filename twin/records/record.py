@@ -108,7 +108,7 @@ class About:
     frame : str
         Frame of poses and actions: ``base`` (of the arm) or ``work`` (of the experiment).
     robot : str
-        Description of the arm; "" if unknown.
+        Kind of the arm, or a specification such as ``mg400:192.168.1.6``, of which only the kind is kept; "" if unknown.
     names : dict of str to tuple of str
         Names of the numbers of channels that are not the usual ones: of goals, and of actions that are no poses.
     """
@@ -122,6 +122,9 @@ class About:
     frame: str = "work"
     robot: str = ""
     names: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "robot", self.robot.partition(":")[0].removesuffix("-lenient"))
 
     def axes(self, channel: str) -> tuple[str, ...]:
         """Names of the numbers of a channel. Pins have ``pin_0_x, pin_0_y, pin_1_x, ...``."""
@@ -174,7 +177,7 @@ class RecordStep:
     ----------
     image : (H, W) or (H, W, 3) uint8
     time_s : float
-        Time of the exposure, s, from the episode's first exposure.
+        Time of the exposure, s, from the episode's first exposure. A step that uses the frame of the step before it is later.
     values : dict of str to array of float32
         The numbers of each channel; shapes as ``About.shape``.
     """

@@ -121,6 +121,7 @@ class _StepLine(BaseModel):
 
     step: int
     frame: _FrameLine
+    time_s: float = 0.0
     value: list[float | None] = []
 
 
@@ -181,7 +182,8 @@ class Session:
         self.steps, note = _steps_and_note(self.folder)
         if not self.steps:
             raise FrameError(f"{folder}: {note or 'the session ended before its first step'}; nothing to replay, record it again")
-        self._lines = [self._check_step(number, step).frame for number, step in enumerate(self.steps, 1)]
+        checked = [self._check_step(number, step) for number, step in enumerate(self.steps, 1)]
+        self._lines, self._decided_s = [line.frame for line in checked], [line.time_s for line in checked]
         loose = {path.name for path in (self.folder / FRAMES).glob("*.png")} - {line.file for line in self._lines}
         loose_note = f"{len(loose)} pictures in {FRAMES}/ have no step in {STEPS}: the session was interrupted" if loose else ""
         self.notes = [each for each in (note, loose_note) if each]
@@ -250,6 +252,13 @@ class Session:
         line = self._lines[index]
         return Frame(self._picture(f"{FRAMES}/{line.file}"), line.form, line.name, line.time_s, line.sequence)
 
+    def step_s(self, index: int) -> float:
+        """Time of a step: the exposure of its frame, and the time that passed since the first step that used this frame."""
+        first = index
+        while first and self._lines[first - 1].sequence == self._lines[index].sequence:
+            first -= 1
+        return self._lines[index].time_s + self._decided_s[index] - self._decided_s[first]
+
 
 def session_records(folder: Path) -> Records:
     """A session as a record of one episode.
@@ -303,7 +312,7 @@ def _steps_of(session: Session, about: About, first_s: float) -> Iterator[Record
                 f"{session.folder}: {line['frame']['file']}: expected {expected} as the first frame, got {got}; record it again"
             )
         values = {name: float32(line.get(key, []), about.numbers[name]) for name, key in keys.items()}
-        yield RecordStep(frame.image, seconds(frame.time_s - first_s), values)
+        yield RecordStep(frame.image, seconds(session.step_s(index) - first_s), values)
 
 
 def _started_s(session: Session) -> float:

@@ -145,7 +145,7 @@ def object_surface(
 def _run_child(folder: str, path: str) -> str:
     command = [sys.executable, "-m", "twin.report.skin3d", folder, path]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=CHILD_TIMEOUT_S)
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=CHILD_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         return f"the 3D picture took more than {CHILD_TIMEOUT_S} s"
     if done.returncode == 0 and Path(path).is_file():

@@ -7,12 +7,13 @@ before that, the old file is unchanged, and the temporary file stays until ``rem
 """
 
 import errno
-import fcntl
+import hashlib
 import io
 import json
 import os
 import secrets
 import shutil
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -22,6 +23,11 @@ from typing import BinaryIO
 import numpy as np
 
 from twin.errors import ErrorsAs, StoreError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 PART = ".part"
 """End of the name of a temporary file. The name begins with a dot."""
@@ -184,12 +190,19 @@ def lock_folder(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     try:
         yield
     finally:
-        fcntl.flock(place, fcntl.LOCK_UN)  # forked processes have the descriptor too, and may live longer
+        if fcntl is None:
+            _reservation(folder).unlink(missing_ok=True)
+        else:
+            fcntl.flock(place, fcntl.LOCK_UN)  # forked processes have the descriptor too, and may live longer
         os.close(place)
 
 
 def _lock(folder: Path) -> int | None:
     """Descriptor of a locked folder, or if the file system locks no folders, of a file in it. None if another run has locked it."""
+    if fcntl is None:
+        with suppress(FileExistsError):  # Windows removes the file when its process ends, whatever the cause
+            return os.open(_reservation(folder), os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_TEMPORARY", 0))
+        return None
     for path, flags in ((folder, os.O_RDONLY), (folder / LOCK, os.O_RDWR | os.O_CREAT)):
         place = os.open(path, flags)
         try:
@@ -201,3 +214,9 @@ def _lock(folder: Path) -> int | None:
         if isinstance(failure, BlockingIOError):
             return None
     raise failure
+
+
+def _reservation(folder: Path) -> Path:
+    """The file that exists while a folder is reserved on Windows, where a folder can't be locked. It is not in the folder."""
+    place = os.path.normcase(os.path.realpath(folder))
+    return Path(tempfile.gettempdir()) / f"tactip-twin-{hashlib.sha256(os.fsencode(place)).hexdigest()}"

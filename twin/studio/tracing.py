@@ -1,5 +1,6 @@
 """Path tracing in a separate process. The page and the moving object never wait for it, and continue if it fails."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import Pipe
+from multiprocessing import Pipe, connection
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -115,7 +116,11 @@ class Tracer:
         if self._process is None:
             # ``multiprocessing`` is not used, because it would run the user's own program again in the new process
             number = self._there.fileno()
-            self._process = subprocess.Popen([sys.executable, "-c", f"from {__name__} import serve; serve({number})"], pass_fds=[number])
+            passed = () if sys.platform == "win32" else (number,)
+            if sys.platform == "win32":
+                os.set_handle_inheritable(number, True)
+            command = [sys.executable, "-c", f"from {__name__} import serve; serve({number})"]
+            self._process = subprocess.Popen(command, pass_fds=passed, close_fds=bool(passed))
             self._there.close()
             self._here.send(self._spec)
             threading.Thread(target=self._receive, name="studio-tracer", daemon=True).start()
@@ -188,7 +193,7 @@ class Tracer:
 def serve(number: int) -> None:
     """Run the process: receive the sensor and then jobs through a file descriptor, and send outcomes, until that is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in the terminal ends the studio, which then ends this process
-    there = Connection(number)
+    there = getattr(connection, "PipeConnection", Connection)(number)  # Windows has a class of its own for pipes
     try:
         spec: SensorSpec = there.recv()
         for shading in _catch_render_errors(lambda: iter([dome_shading(spec)]), tracing=True):

@@ -30,6 +30,8 @@ from twin.progress import Progress, silent, stage
 INITIAL_ROWS = 500
 # Bytes of a MiB.
 MIB = 2.0**20
+# File of the Linux kernel with this process's memory.
+STATM = Path("/proc/self/statm")
 # Time between two measurements of the process's memory, s.
 WATCH_S = 0.01
 # Columns of the page's table of models that hold no errors, in the order of the table.
@@ -157,16 +159,18 @@ def ordering(rows: list[dict[str, Any]], key: str) -> list[tuple[str, float, flo
 
 
 class PeakMemory:
-    """Context that measures the peak memory, in MiB above that at its start: of the GPU, or of the process's resident set on a CPU."""
+    """Context that measures the peak memory, in MiB above that at its start: of the GPU, or of the process's resident set on a CPU.
+
+    The resident set is known on Linux only. Elsewhere the peak is NaN.
+    """
 
     def __init__(self, device: str = "cpu") -> None:
-        self.device, self.peak = device, 0.0
+        self.device, self.peak = device, 0.0 if device == "cuda" or STATM.exists() else float("nan")
 
     def __enter__(self) -> "PeakMemory":
         gc.collect()
         # Freed memory that was not given back to the system would be reused, and the resident set would not grow.
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if trim:
+        if STATM.exists() and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):
             trim(0)
         if self.device == "cuda":
             torch.cuda.reset_peak_memory_stats()
@@ -189,7 +193,7 @@ class PeakMemory:
     def _now(self) -> float:
         if self.device == "cuda":
             return torch.cuda.memory_allocated() / MIB
-        return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * 4096 / MIB
+        return int(STATM.read_text(encoding="utf-8").split()[1]) * 4096 / MIB if STATM.exists() else float("nan")
 
 
 def measure_training(model: str, pins: PinTable, inputs: Inputs, batch: int, *, device: str = "cpu") -> dict[str, Any]:

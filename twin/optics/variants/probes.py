@@ -113,7 +113,7 @@ def _run(backend: str, library: Path) -> ProbeResult:
             env["DRJIT_LIBLLVM_PATH"] = str(library)
         command = [sys.executable, "-c", _NO_CORE_DUMP + _PROBE.format(backend=backend)]
         try:
-            done = subprocess.run(command, env=env, cwd=home, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S)
+            done = subprocess.run(command, env=env, cwd=home, capture_output=True, text=True, errors="replace", timeout=PROBE_TIMEOUT_S)
         except (subprocess.TimeoutExpired, OSError) as error:
             return ProbeResult(False, "", f"the probe did not finish: {error.__class__.__name__}")
     for line in done.stdout.splitlines():

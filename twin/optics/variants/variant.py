@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias, TypedDict
@@ -27,7 +28,14 @@ DrJit: TypeAlias = Any
 OLDEST_LLVM = 16
 """Oldest usable major version of LLVM: versions 14 and 15 abort the process at the first kernel."""
 BACKENDS = ("cuda", "llvm", "scalar")
-REMEDY = "install LLVM 16 or newer (Debian, Ubuntu: apt-get install libllvm19), or point DRJIT_LIBLLVM_PATH to its library"
+REMEDY = (
+    "install LLVM 16 or newer (Debian, Ubuntu: apt-get install libllvm19; macOS: brew install llvm; Windows: winget install LLVM.LLVM), "
+    "or point DRJIT_LIBLLVM_PATH to its library"
+)
+# Folders of LLVM on Linux, macOS and Windows, beside Python's own; the folders of its library below them; and the library's names.
+_ROOTS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt", "/usr/local/opt", "/opt/local/libexec", "$PROGRAMFILES")
+_BELOW = ("", "lib/", "*-linux-gnu/", "llvm*/lib/", "LLVM/bin/", "Library/bin/")
+_LIBRARIES = ("libLLVM*.so*", "libLLVM*.dylib", "LLVM-C.dll")
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _VARIANT_VARIABLE = "TACTIP_VARIANT"
 
@@ -273,22 +281,13 @@ def _newest_first(paths: Sequence[Path]) -> list[Path]:
 
 def _usual_places() -> list[Path]:
     found = []
-    if sys.platform.startswith("linux"):
-        for tool in ("/sbin/ldconfig", "/usr/sbin/ldconfig"):
-            if Path(tool).exists():
-                listing = subprocess.run([tool, "-p"], capture_output=True, text=True).stdout
-                found += [Path(p) for p in re.findall(r"=> (\S*libLLVM[^\s]*)", listing)]
-                break
-        roots = ["/usr/lib", "/usr/lib64", "/usr/local/lib"]
-        patterns = ["libLLVM*.so*", "*-linux-gnu/libLLVM*.so*", "llvm*/lib/libLLVM*.so*"]
-    elif sys.platform == "darwin":
-        roots, patterns = ["/opt/homebrew/opt", "/usr/local/opt", "/opt/local/libexec"], ["llvm*/lib/libLLVM*.dylib"]
-    else:
-        roots, patterns = [os.environ.get("PROGRAMFILES", "C:/Program Files")], ["LLVM/bin/LLVM-C.dll"]
-    roots.append(str(Path(sys.prefix) / "lib"))
-    for root in roots:
-        for pattern in patterns:
-            found += sorted(Path(root).glob(pattern))
+    for tool in ("/sbin/ldconfig", "/usr/sbin/ldconfig"):
+        if Path(tool).exists():
+            listing = subprocess.run([tool, "-p"], capture_output=True, text=True, errors="replace").stdout
+            found += [Path(p) for p in re.findall(r"=> (\S*libLLVM[^\s]*)", listing)]
+            break
+    for root, below, library in product((*_ROOTS, sys.prefix), _BELOW, _LIBRARIES):
+        found += sorted(Path(os.path.expandvars(root)).glob(below + library))
     return [p for p in found if p.exists()]
 
 

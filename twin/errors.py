@@ -76,11 +76,11 @@ class ErrorsAs(Generic[E]):
 
 
 EXTRAS = {
+    "cyclonedds": "ros2",
     "dask": "cluster",
     "distributed": "cluster",
     "gymnasium": "gym",
     "mcap": "records",
-    "mcap_ros2": "records",
     "mujoco": "mujoco",
     "pyarrow": "records",
     "rerun": "rerun",

@@ -8,10 +8,12 @@ from which a model measures the pins' displacements.
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 
@@ -27,11 +29,12 @@ from hardware.rig.geometry import PlacedObject, matrix_of
 from hardware.safety.decide import Action, decide, load_limits
 from hardware.safety.eyes import NEAR_MM
 from hardware.safety.safe_arm import RETREAT_SHARES, SafeArm
+from hardware.workcell.ros2 import publishing
 from scenes import ObjectSpec, PlacementSpec, SensorSpec
 from scenes.experiment import ExperimentSpec
 from scenes.plugins import offered, others
 from twin.errors import ErrorsAs, FrameError, RenderError
-from twin.estimate import SensorModel
+from twin.estimate import Estimate, SensorModel
 from twin.frames import open_recording
 from twin.optics.preview import Preview
 from twin.optics.render import traced_shading
@@ -103,6 +106,13 @@ class Rig:
             No frame comes. The message names the camera.
         """
         return await_frame(self.source)
+
+    def publishing(
+        self, name: str | None, pipeline: Pipeline, *, estimates: bool = True
+    ) -> AbstractContextManager[Callable[[Frame, Estimate], None]]:
+        """As ``hardware.workcell.ros2.publishing``, for a connected rig."""
+        where: dict[str, Any] = {"arm": self.arm.state, "T_tool_sensor": self.mounting.T_tool_sensor}
+        return publishing(name, self.source, pipeline, estimates=estimates, **where)
 
     def __enter__(self) -> "Rig":
         self.arm.connect()

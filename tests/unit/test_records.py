@@ -279,7 +279,7 @@ def test_a_missing_library_names_its_remedy(tmp_path):
     def missing(name):
         raise ModuleNotFoundError(name, name=name)
 
-    for to, library in (("lerobot", "pyarrow"), ("mcap", "mcap_ros2")):
+    for to, library in (("lerobot", "pyarrow"), ("mcap", "mcap")):
         with patch.object(record, "import_module", missing), pytest.raises(ExtraError, match=f"{library}.*tactip-twin\\[records\\]"):
             written(tmp_path / to, to)
         assert not (tmp_path / to).exists()

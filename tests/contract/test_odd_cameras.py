@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 from odd_cameras import CATALOGUE, odd_camera
+from rtsp_camera import rtsp_camera
 
 from hardware.cameras import reader
 from hardware.cameras.choose import open_camera
@@ -80,3 +81,11 @@ def test_an_address_that_is_none_is_refused_without_its_secret(text):
     with pytest.raises(DeviceError) as refused:
         open_camera(text).connect()
     assert not SECRETS.search(str(refused.value)) and "cret" not in str(refused.value)
+
+
+def test_rtsp(capfd):
+    with rtsp_camera() as url, open_camera(url) as camera:
+        frames = [camera.read(timeout_s=WAIT_S) for _ in range(5)]
+        assert all(frame.image.shape == (48, 64, 3) and frame.image.std() > 15 for frame in frames)
+        assert camera.read_after(time.monotonic(), timeout_s=WAIT_S).image.size
+    assert not SECRETS.search(camera.name + "".join(capfd.readouterr()))

@@ -6,7 +6,6 @@ import re
 import socket
 import time
 import urllib.request
-from typing import Any
 from urllib.error import HTTPError, URLError
 from urllib.parse import unquote, urlsplit
 
@@ -75,15 +74,11 @@ class MjpegCamera(LiveSource):
         if not usable:
             raise DeviceError(f"{self.name}: not the address of a stream; expected http://host:port/path")
         self._plain = parts._replace(netloc=parts.netloc.rpartition("@")[2], fragment="").geturl()
-        self._open_url = _opener(self._plain, parts.username, parts.password, self._keep_socket)
+        self._open_url = _opener(self._plain, parts.username, parts.password)
         self._answer: http.client.HTTPResponse | None = None
         self._parts: Parts | None = None  # None for a single picture
-        self._socket: socket.socket | None = None
         self._last: int | None = None
         self._before: bytes | None = None
-
-    def _keep_socket(self, opened: socket.socket) -> None:
-        self._socket = opened
 
     def _open(self) -> None:
         self._last = self._before = None
@@ -113,12 +108,11 @@ class MjpegCamera(LiveSource):
     def _close(self) -> None:
         if self._answer is not None:
             self._answer.close()
-        self._answer = self._parts = self._socket = None
+        self._answer = self._parts = None
 
     def _interrupt(self) -> None:
-        if self._socket is not None:
-            with contextlib.suppress(OSError):
-                self._socket.shutdown(socket.SHUT_RDWR)
+        with contextlib.suppress(OSError, AttributeError):  # the connection's socket belongs to the answer, or it is closed already
+            self._answer.fp.raw._sock.shutdown(socket.SHUT_RDWR)  # type: ignore[union-attr]
 
     def _grab(self) -> DevicePicture:
         begun_s = time.monotonic()
@@ -165,41 +159,13 @@ class MjpegCamera(LiveSource):
         raise ReadFailed("the camera was closed")
 
 
-def _opener(url: str, user: str | None, password: str | None, keep: Any) -> urllib.request.OpenerDirector:
-    """What opens addresses: without proxies, with redirections and logins, and ``keep`` gets each connection's socket."""
-
-    def opens(base: type[http.client.HTTPConnection]) -> type[http.client.HTTPConnection]:
-        class Connection(base):  # type: ignore[misc, valid-type]
-            def connect(self) -> None:
-                super().connect()
-                keep(self.sock)
-
-        return Connection
-
-    class Http(urllib.request.HTTPHandler):
-        def http_open(self, request: urllib.request.Request) -> http.client.HTTPResponse:
-            return self.do_open(opens(http.client.HTTPConnection), request)
-
-    class Https(urllib.request.HTTPSHandler):
-        def https_open(self, request: urllib.request.Request) -> http.client.HTTPResponse:
-            return self.do_open(opens(http.client.HTTPSConnection), request)
-
+def _opener(url: str, user: str | None, password: str | None) -> urllib.request.OpenerDirector:
+    """What opens addresses: without proxies, with redirections, and with the login for this one."""
     logins = urllib.request.HTTPPasswordMgrWithDefaultRealm()
     if user:
         logins.add_password(None, url, unquote(user), unquote(password or ""))
-    made = urllib.request.OpenerDirector()
-    for handler in (
-        Http(),
-        Https(),
-        urllib.request.UnknownHandler(),
-        urllib.request.HTTPErrorProcessor(),
-        urllib.request.HTTPDefaultErrorHandler(),
-        urllib.request.HTTPRedirectHandler(),
-        urllib.request.HTTPBasicAuthHandler(logins),
-        urllib.request.HTTPDigestAuthHandler(logins),
-    ):
-        made.add_handler(handler)
-    return made
+    basic, digest = urllib.request.HTTPBasicAuthHandler(logins), urllib.request.HTTPDigestAuthHandler(logins)
+    return urllib.request.build_opener(urllib.request.ProxyHandler({}), basic, digest)
 
 
 def stamped_s(headers: dict[str, str]) -> float:

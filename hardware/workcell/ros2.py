@@ -130,7 +130,7 @@ class Ros2Publisher:
         participant = self._participant = Participant()
         for sensor, topics in ((True, SENSOR_TOPICS), (False, TOPICS)):
             for topic, kind in topics.items():
-                self._writers[topic] = participant.writer(self.full(topic), kind, sensor=sensor)
+                self._writers[topic] = participant.writer(topic if topic[0] == "/" else f"/{self._name}/{topic}", kind, sensor=sensor)
         if self._static is not None:
             kept, now_ns = participant.writer(ros.TF_STATIC_TOPIC, TOPICS[ros.TF_TOPIC], kept=True), time.time_ns()
             place = ros.transform(self._static, ros.header_of(now_ns, self.tool_frame), self.sensor_frame)
@@ -150,10 +150,6 @@ class Ros2Publisher:
         self._thread.join(CLOSE_S)
         self._writers.clear()
         self._participant = None
-
-    def full(self, topic: str) -> str:
-        """A topic with its namespace."""
-        return topic if topic.startswith("/") else f"/{self._name}/{topic}"
 
     def offer(self, frame: Frame, estimate: Estimate | None = None) -> None:
         """Publish a frame, and its estimate if there is one. This returns at once."""
@@ -215,8 +211,7 @@ class Ros2Publisher:
             self._publish_pins(at_ns, frame, None)
 
     def _publish_pins(self, at_ns: int, frame: Frame, estimate: Estimate | None) -> None:
-        topics = ("pins", "points", "markers")
-        if not any(self._writers[topic].heard for topic in topics):
+        if not any(self._writers[topic].heard for topic in ("pins", "points", "markers")):
             return
         seen = pins_in(frame, estimate, self._pipeline)
         pins_px = seen.pins_px if seen.valid else np.full_like(self._pipeline.reference.pins_px, np.nan)
@@ -264,7 +259,10 @@ class Ros2Publisher:
 
     def _publish_status(self, at_ns: int, estimate: Estimate | None, seen: Observation | None) -> None:
         def make() -> dict[str, Any]:
-            status = [self._camera_status()]
+            wrong = self._source.fault or self._source.blind()
+            notes = {f"note {n}": note for n, note in enumerate(self._source.notes(), 1)}
+            camera = {"dropped": self._source.dropped} | notes
+            status = [self._status("camera", ERROR if wrong else OK, wrong or "fresh frames", camera)]
             if seen is not None:
                 level, message = (OK, "found") if seen.valid else (WARN, seen.reason)
                 status.append(self._status("pins", level, message, {"found": seen.found, "expected": seen.expected}))
@@ -276,11 +274,6 @@ class Ros2Publisher:
             return {"header": ros.header_of(at_ns, ""), "status": status}
 
         self._send(ros.DIAGNOSTICS_TOPIC, at_ns, make)
-
-    def _camera_status(self) -> dict[str, Any]:
-        wrong = self._source.fault or self._source.blind()
-        notes = {f"note {n}": note for n, note in enumerate(self._source.notes(), 1)}
-        return self._status("camera", ERROR if wrong else OK, wrong or "fresh frames", {"dropped": self._source.dropped} | notes)
 
     def _status(self, part: str, level: int, message: str, values: dict[str, Any]) -> dict[str, Any]:
         pairs = [{"key": key, "value": str(value)} for key, value in values.items()]
@@ -309,10 +302,9 @@ def _places_m(pipeline: Pipeline, form: Form, pins_px: np.ndarray) -> np.ndarray
 def _cloud(header: dict[str, Any], points: np.ndarray) -> dict[str, Any]:
     """Points (N, 7) as a point cloud."""
     fields = [{"name": name, "offset": 4 * k, "datatype": _FLOAT32, "count": 1} for k, name in enumerate(_POINT)]
-    size, data = 4 * len(_POINT), points.astype("<f4").tobytes()
-    whole = bool(np.isfinite(points).all())
-    shape = {"height": 1, "width": len(points), "point_step": size, "row_step": len(data)}
-    return {"header": header, "fields": fields, "data": data, "is_dense": whole} | shape
+    data = points.astype("<f4").tobytes()
+    shape = {"height": 1, "width": len(points), "point_step": 4 * len(_POINT), "row_step": len(data)}
+    return {"header": header, "fields": fields, "data": data, "is_dense": bool(np.isfinite(points).all())} | shape
 
 
 def _contact_pose(header: dict[str, Any], names: tuple[str, ...], numbers: np.ndarray) -> dict[str, Any]:
@@ -323,7 +315,6 @@ def _contact_pose(header: dict[str, Any], names: tuple[str, ...], numbers: np.nd
             k = _POSE[name]
             pose[k], unit = value, 1 / ros.MM_PER_M if k < 3 else np.radians(1.0)
             variance[k] = ((high - low) * unit / SD_90) ** 2
-    T = ros.pose_matrix(pose)
-    turn = ros.transform(T, header, "")["transforms"][0]["transform"]
-    place = {"position": turn["translation"], "orientation": turn["rotation"]}
-    return {"header": header, "pose": {"pose": place, "covariance": np.diag(variance).ravel()}}
+    place = ros.transform(ros.pose_matrix(pose), header, "")["transforms"][0]["transform"]
+    found = {"position": place["translation"], "orientation": place["rotation"]}
+    return {"header": header, "pose": {"pose": found, "covariance": np.diag(variance).ravel()}}

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from twin.errors import library
 from twin.records import ros2_messages as ros
 from twin.records.folder import AGAIN, VERSION, FolderWriter, image_of, png, read_sidecar, require_numbered, whole_steps
-from twin.records.record import CHANNELS, About, Episode, RecordError, Records, RecordStep, float32, library
+from twin.records.record import CHANNELS, About, Episode, RecordError, Records, RecordStep, float32
 from twin.store import write_with
 
 IMAGE_TOPIC, CONTACT_TOPIC, POSE_TOPIC = "/tactip/image/compressed", "/tactip/contact", "/tactip/pose"

@@ -26,7 +26,6 @@ from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, matrix_of, pose_of
 from hardware.workcell.build import Rig, build_rig, check_plan
 from hardware.workcell.mover import Mover
-from hardware.workcell.ros2 import namespace_of
 from scenes import ObjectSpec, SensorSpec, ServoSpec
 from scenes.experiment import LABELS, ExperimentSpec
 from scenes.files import quote
@@ -410,8 +409,6 @@ class CollectPlan:
     ros2: str | None = None
 
     def __post_init__(self) -> None:
-        if self.ros2 is not None:
-            namespace_of(self.ros2)
         if not 1 <= self.count <= MOST_CONTACTS:
             raise DeviceError(f"`count` {self.count}: a collection has 1 to {MOST_CONTACTS} contacts")
         if self.design not in DESIGNS:

@@ -20,7 +20,7 @@ from hardware.errors import DeviceError
 from hardware.live.rerun_view import RerunView
 from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import load_rest_frame
-from hardware.workcell.ros2 import namespace_of, publishing
+from hardware.workcell.ros2 import publishing
 from twin.errors import ErrorsAs, FrameError, OptionError, TwinError
 from twin.estimate import Estimate, Estimator, SensorModel, pins_in, readable_labels
 from twin.pins import Pipeline
@@ -273,8 +273,6 @@ class WatchPlan:
     ros2: str | None = None
 
     def __post_init__(self) -> None:
-        if self.ros2 is not None:
-            namespace_of(self.ros2)
         if self.also and self.record is None:
             raise OptionError("`also` needs `record`: it keeps the recorded session in a further format")
         if bool(self.camera) == (self.replay is not None):

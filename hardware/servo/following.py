@@ -22,7 +22,6 @@ from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
 from hardware.servo.timing import Timing
 from hardware.servo.trajectory import Measures, Trajectory, comparison_figure, measure, trajectory_figure, trajectory_of, write_csv
 from hardware.workcell.build import TWIN, Rig, build_rig, check_plan, load_rest_frame
-from hardware.workcell.ros2 import namespace_of
 from scenes import ObjectSpec, ServoSpec, load_experiment
 from scenes.files import quote
 from twin.errors import OptionError, StoreError, TwinError
@@ -150,8 +149,6 @@ class FollowPlan:
     ros2: str | None = None
 
     def __post_init__(self) -> None:
-        if self.ros2 is not None:
-            namespace_of(self.ros2)
         if self.also and not self.record:
             raise OptionError("`also` needs `record`: it keeps the recorded session in a further format")
         if self.stream_hz is not None and not SLOWEST_HZ <= self.stream_hz <= FASTEST_HZ:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from hardware.errors import DeviceError, leave
 from hardware.rig.approach import path_around
 from hardware.rig.geometry import PlacedObject, matrix_of
 from hardware.safety.decide import Action, decide, load_limits
-from hardware.safety.eyes import NEAR_MM
+from hardware.safety.eyes import NEAR_MM, ArmWatch
 from hardware.safety.safe_arm import RETREAT_SHARES, SafeArm
 from hardware.workcell.ros2 import publishing
 from scenes import ObjectSpec, PlacementSpec, SensorSpec
@@ -80,12 +79,15 @@ class Rig:
     placed : PlacedObject
     knows_truth : bool
         Whether the object's pose is exactly that of ``placed``. This is true in the twin.
+    watch : ArmWatch or None
+        What keeps the arm's newest states, once the arm has a mover.
     """
 
     source: FrameSource
     arm: Arm
     placed: PlacedObject
     knows_truth: bool
+    watch: ArmWatch | None = None
 
     @property
     def mounting(self) -> Mounting:
@@ -111,8 +113,8 @@ class Rig:
         self, name: str | None, pipeline: Pipeline, *, estimates: bool = True
     ) -> AbstractContextManager[Callable[[Frame, Estimate], None]]:
         """As ``hardware.workcell.ros2.publishing``, for a connected rig."""
-        where: dict[str, Any] = {"arm": self.arm.state, "T_tool_sensor": self.mounting.T_tool_sensor}
-        return publishing(name, self.source, pipeline, estimates=estimates, **where)
+        newest = lambda: self.watch and self.watch.newest  # noqa: E731  (no request, which could delay the arm's own)
+        return publishing(name, self.source, pipeline, estimates=estimates, arm=newest, T_tool_sensor=self.mounting.T_tool_sensor)
 
     def __enter__(self) -> "Rig":
         self.arm.connect()

@@ -28,7 +28,7 @@ from twin.frames.forms import recording_to_raw
 from twin.geometry.pins import rest_pins
 from twin.pins import Pipeline
 from twin.records import ros2_messages as ros
-from twin.types import Form, Frame, Observation
+from twin.types import Form, Frame
 
 LOG = logging.getLogger(__name__)
 JPEG_QUALITY = 90
@@ -52,6 +52,7 @@ _FORCES = ("Fx", "Fy", "Fz")
 _POINT = ("x", "y", "z", "u", "v", "du", "dv")
 _SPHERES, _LINES = 7, 5  # kinds of markers
 _FLOAT32 = 7  # kind of a number of a point
+_ARRAYS = ("pins", "estimate", "estimate_low", "estimate_high", "slip")
 SENSOR_TOPICS = {
     "image": "sensor_msgs/Image",
     "image/compressed": "sensor_msgs/CompressedImage",
@@ -60,15 +61,11 @@ SENSOR_TOPICS = {
 }
 """Topics in the profile for sensor data (best effort), and their messages."""
 TOPICS = {
-    "pins": "std_msgs/Float32MultiArray",
-    "estimate": "std_msgs/Float32MultiArray",
-    "estimate_low": "std_msgs/Float32MultiArray",
-    "estimate_high": "std_msgs/Float32MultiArray",
+    **dict.fromkeys(_ARRAYS, "std_msgs/Float32MultiArray"),
     "pose": "geometry_msgs/TwistStamped",
     "contact_pose": "geometry_msgs/PoseWithCovarianceStamped",
     "wrench": "geometry_msgs/WrenchStamped",
     "contact": "std_msgs/Int8",
-    "slip": "std_msgs/Float32MultiArray",
     ros.DIAGNOSTICS_TOPIC: "diagnostic_msgs/DiagnosticArray",
     ros.TF_TOPIC: "tf2_msgs/TFMessage",
 }
@@ -95,7 +92,7 @@ class Ros2Publisher:
     pipeline : Pipeline
         Finds the pins of frames whose estimates do not contain them. No other thread may use it.
     arm : callable, optional
-        Gives the arm's newest state for ``/tf``.
+        Gives the arm's newest known state for ``/tf``, without a request to the arm.
     T_tool_sensor : (4, 4) float, optional
         The sensor's pose on the tool, mm.
     estimates : bool
@@ -108,7 +105,7 @@ class Ros2Publisher:
         source: FrameSource,
         pipeline: Pipeline,
         *,
-        arm: Callable[[], ArmState] | None = None,
+        arm: Callable[[], ArmState | None] | None = None,
         T_tool_sensor: np.ndarray | None = None,
         estimates: bool = True,
     ) -> None:
@@ -120,6 +117,7 @@ class Ros2Publisher:
         self._frame: Frame | None = None
         self._estimated: tuple[Frame, Estimate] | None = None
         self._end, self._failed = False, False
+        self._state: ArmState | None = None  # that was published last
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
         self._foreign = (np.nan, 0)  # the last time of another clock, and when it came
         self._thread = threading.Thread(target=self._run, name="ROS 2", daemon=True)
@@ -176,7 +174,7 @@ class Ros2Publisher:
                 if done is not None:
                     self._publish_estimate(*done)
                 elif frame is None or not self._estimates:
-                    self._publish_status(time.time_ns(), None, None)
+                    self._publish_status(time.time_ns(), None, False)
             except Exception as error:  # whatever happens here, the loop that offers frames goes on
                 if not self._failed:
                     LOG.warning("ROS 2: %s; the program goes on, and publishing is tried again with each frame", error)
@@ -203,8 +201,9 @@ class Ros2Publisher:
         plain = {"header": header, "height": image.shape[0], "width": image.shape[1], "encoding": "mono8" if colours == 1 else "rgb8"}
         self._send("image/compressed", at_ns, lambda: {"header": header, "format": "jpeg", "data": jpeg_of(image, JPEG_QUALITY)})
         self._send("image", at_ns, lambda: plain | {"step": image.shape[1] * colours, "data": image.tobytes()})
-        if self._arm is not None:
-            state = self._arm()
+        state = None if self._arm is None else self._arm()
+        if state is not None and state is not self._state:  # tf2 warns of a stamp that comes twice
+            self._state = state
             based = ros.header_of(arm_ns := self._at_ns(state.time_s), "base")
             self._send(ros.TF_TOPIC, arm_ns, lambda: ros.transform(ros.pose_matrix(state.pose), based, self.tool_frame))
         if not self._estimates:
@@ -242,7 +241,7 @@ class Ros2Publisher:
         if valid:
             self._publish_valid(at_ns, names, numbers)
         self._publish_pins(at_ns, frame, estimate)
-        self._publish_status(at_ns, estimate, estimate.seen)
+        self._publish_status(at_ns, estimate, valid)
 
     def _publish_valid(self, at_ns: int, names: tuple[str, ...], numbers: np.ndarray) -> None:
         known = dict(zip(names, numbers[0].tolist(), strict=True))
@@ -257,20 +256,20 @@ class Ros2Publisher:
         if slip := [name for name in names if name.startswith("slip_")]:
             self._send("slip", at_ns, lambda: ros.number_array(np.array([known[name] for name in slip]), ",".join(slip)))
 
-    def _publish_status(self, at_ns: int, estimate: Estimate | None, seen: Observation | None) -> None:
+    def _publish_status(self, at_ns: int, estimate: Estimate | None, valid: bool) -> None:
         def make() -> dict[str, Any]:
             wrong = self._source.fault or self._source.blind()
             notes = {f"note {n}": note for n, note in enumerate(self._source.notes(), 1)}
             camera = {"dropped": self._source.dropped} | notes
             status = [self._status("camera", ERROR if wrong else OK, wrong or "fresh frames", camera)]
-            if seen is not None:
+            if estimate is not None and (seen := estimate.seen) is not None:
                 level, message = (OK, "found") if seen.valid else (WARN, seen.reason)
                 status.append(self._status("pins", level, message, {"found": seen.found, "expected": seen.expected}))
             if estimate is not None:
                 rows = zip(readable_labels(estimate.names), estimate.value, estimate.low, estimate.high, estimate.units, strict=True)
                 shown = {name: f"{value:.4g} [{low:.4g}, {high:.4g}] {unit}" for name, value, low, high, unit in rows}
-                level, message = (OK, "valid") if estimate.valid else (WARN, f"not valid: {estimate.reason}")
-                status.append(self._status("estimate", level, message, shown if estimate.valid else {}))
+                level, message = (OK, "valid") if valid else (WARN, f"not valid: {estimate.reason}")
+                status.append(self._status("estimate", level, message, shown if valid else {}))
             return {"header": ros.header_of(at_ns, ""), "status": status}
 
         self._send(ros.DIAGNOSTICS_TOPIC, at_ns, make)

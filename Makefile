@@ -40,6 +40,7 @@ bench: setup     ## speed, as ratios to named baselines in the same run
 	@$(SCRIPT) tests/bench/bench_mechanics.py
 	@$(SCRIPT) tests/bench/bench_environments.py
 	@$(SCRIPT) tests/bench/bench_render.py
+	@$(SCRIPT) tests/bench/bench_ros2.py
 
 validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, CalculiX, random contacts, Rerun (670 MB)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,rerun]'

@@ -10,6 +10,9 @@ from pathlib import Path
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
+# What tests say to other programs stays on this machine.
+os.environ.setdefault("ROS_LOCALHOST_ONLY", "1")
+
 # Python keeps what it compiles even where containers tell it not to: many tests start processes, and each would compile all modules again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False

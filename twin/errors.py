@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from types import MappingProxyType
+from importlib import import_module
+from types import MappingProxyType, ModuleType
 from typing import Generic, TypeVar
 
 E = TypeVar("E", bound=Exception)
@@ -76,11 +77,11 @@ class ErrorsAs(Generic[E]):
 
 
 EXTRAS = {
+    "cyclonedds": "ros2",
     "dask": "cluster",
     "distributed": "cluster",
     "gymnasium": "gym",
     "mcap": "records",
-    "mcap_ros2": "records",
     "mujoco": "mujoco",
     "pyarrow": "records",
     "rerun": "rerun",
@@ -102,6 +103,18 @@ def extras_named() -> Iterator[None]:
         if library not in EXTRAS:
             raise
         raise ExtraError(f"this needs {library}, which is not installed: pip install 'tactip-twin[{EXTRAS[library]}]'") from error
+
+
+def library(name: str) -> ModuleType:
+    """An optional library.
+
+    Raises
+    ------
+    ExtraError
+        It is not installed.
+    """
+    with extras_named():
+        return import_module(name)
 
 
 @cache

@@ -1,51 +1,40 @@
-"""JPEG pictures over HTTP (multipart/x-mixed-replace): the writing of such a stream, and a camera that reads it."""
+"""A camera that is read over HTTP: a stream of JPEGs or PNGs (multipart/x-mixed-replace), or the address of a single picture."""
 
 import contextlib
 import http.client
+import re
 import socket
 import time
-from io import BufferedIOBase
-from urllib.parse import urlsplit
+import urllib.request
+from urllib.error import HTTPError, URLError
+from urllib.parse import unquote, urlsplit
 
-import cv2
-import numpy as np
-
+from hardware.cameras import reader
+from hardware.cameras.coded import Parts, decode_picture, on_own_clock
 from hardware.cameras.reader import DevicePicture, LiveSource, ReadFailed, TornPicture
 from hardware.errors import DeviceError
+from scenes.files import quote
 from scenes.sensor import SensorSpec
-from twin.errors import ErrorsAs, FrameError
-from twin.frames.images import picture_of
+from twin.errors import ErrorsAs
 from twin.types import Form
 
-BOUNDARY = "frame"
-CONTENT_TYPE = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
-# Quality (0 to 100) of the JPEGs that are written.
-JPEG_QUALITY = 95
 # Time, s, without a byte after which a read has failed.
 SILENT_S = 2.0
-# Largest accepted picture, in bytes.
-LARGEST_PART = 32_000_000
+# Pause, s, after which the address of a single picture is asked again.
+POLL_S = 0.03
+# Bytes that are read at once.
+CHUNK = 65_536
 # Header of a part with the exposure in Unix seconds, in lower case, as mjpg-streamer sends it.
 TIME_HEADER = "x-timestamp"
-# Largest difference, s, between a time stamp and the present time. A time stamp with a larger difference is of another clock and not used.
-CLOCK_SLACK_S = 60.0
 # Bytes in the send buffer of a server's connection. The kernel doubles the number, and the client has its own buffer.
 HELD_BYTES = 16_384
-# First and last bytes of a JPEG.
-START, END = b"\xff\xd8", b"\xff\xd9"
-
-
-def jpeg_of(image: np.ndarray) -> bytes:
-    """A gray (H, W) or RGB (H, W, 3) picture as JPEG."""
-    _, coded = cv2.imencode(".jpg", image if image.ndim == 2 else image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return coded.tobytes()
-
-
-def write_part(out: BufferedIOBase, jpeg: bytes, headers: dict[str, object] | None = None) -> None:
-    """Write one picture of a stream; raises ``OSError`` if the client is gone."""
-    more = "".join(f"{name}: {value}\r\n" for name, value in (headers or {}).items())
-    head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n{more}\r\n"
-    out.write(head.encode("ascii") + jpeg + b"\r\n")
+# What to do about an answer, by its status.
+REMEDIES = {
+    401: "it wants a login: give http://NAME:PASSWORD@HOST/..., with % codes for special characters; if you did, it refuses this one",
+    403: "it refuses this user or this computer; allow it in the camera's settings",
+    404: "it has no such page; look up the path of the stream in the camera's manual",
+    503: "it is busy or not ready; end what else uses the camera, and try again",
+}
 
 
 def hold_little(connection: socket.socket) -> None:
@@ -53,21 +42,29 @@ def hold_little(connection: socket.socket) -> None:
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, HELD_BYTES)
 
 
+def without_secrets(address: str) -> str:
+    """An address without its login, and without the values of its query, any of which may be a password."""
+    plain = re.sub(r"^((?:\w+:)*//)?[^?]*@", lambda found: found[1] or "", address)
+    return re.sub(r"([?&;][^=&;]*=)[^&;]*", r"\1...", plain)
+
+
 class MjpegCamera(LiveSource):
-    """A stream of JPEG pictures.
+    """A camera that is read over HTTP.
 
     The time of exposure is a part's ``X-Timestamp`` (Unix seconds), or its arrival if there is none. Gaps in
-    ``X-Sequence`` are lost pictures.
+    ``X-Sequence`` are lost pictures. The address of a single picture is asked again and again; a picture that has not changed is not a new
+    one, and its time is that of the request.
 
     Parameters
     ----------
     url : str
+        It may contain a login (``http://NAME:PASSWORD@HOST/...``), for basic or digest authentication. It is never printed.
     spec : SensorSpec, optional
     form : Form
     """
 
     def __init__(self, url: str, spec: SensorSpec | None = None, form: Form = Form.RAW) -> None:
-        super().__init__(url, form)
+        super().__init__(without_secrets(url), form)
         self._spec = spec
         try:
             parts = urlsplit(url)
@@ -75,58 +72,63 @@ class MjpegCamera(LiveSource):
         except ValueError:  # the port is not a number
             usable = False
         if not usable:
-            raise DeviceError(f"{url}: not the address of a stream; expected http://host:port/path")
-        self._parts = parts
-        self._connection: http.client.HTTPConnection | None = None
-        self._stream: http.client.HTTPResponse | None = None
-        self._socket: socket.socket | None = None
+            raise DeviceError(f"{self.name}: not the address of a stream; expected http://host:port/path")
+        self._plain = parts._replace(netloc=parts.netloc.rpartition("@")[2], fragment="").geturl()
+        self._open_url = _opener(self._plain, parts.username, parts.password)
+        self._answer: http.client.HTTPResponse | None = None
+        self._parts: Parts | None = None  # None for a single picture
         self._last: int | None = None
+        self._before: bytes | None = None
 
     def _open(self) -> None:
-        self._last = None
+        self._last = self._before = None
         with ErrorsAs(OSError, lambda error: DeviceError(f"{self.name}: {error}; start the stream or check the address")):
             self._request()
 
     def _request(self) -> None:
-        """Request the stream; an ``OSError`` states the reason of a failure."""
-        protocol = http.client.HTTPSConnection if self._parts.scheme == "https" else http.client.HTTPConnection
-        connection = protocol(self._parts.hostname or "", self._parts.port, timeout=SILENT_S)
+        """Request the address; an ``OSError`` states the reason of a failure, ``DeviceError`` that this is no camera."""
         try:
-            connection.request("GET", (self._parts.path or "/") + (f"?{self._parts.query}" if self._parts.query else ""))
-            self._socket = connection.sock  # kept here, because the answer may take it over
-            answer = connection.getresponse()
-        except (OSError, http.client.HTTPException) as error:
-            connection.close()
-            raise OSError(f"no answer ({error})") from error
-        kind = answer.getheader("Content-Type", "")
-        if answer.status != 200 or "multipart" not in kind:
-            connection.close()
-            raise OSError(f"answers {answer.status} {kind or 'without a type'}, no multipart stream of JPEGs")
-        self._connection, self._stream = connection, answer
+            answer = self._open_url.open(self._plain, timeout=SILENT_S)
+        except HTTPError as error:
+            error.close()
+            why = REMEDIES.get(error.code, "look up the address of the stream in the camera's manual")
+            raise OSError(f"answers {error.code} {http.client.responses.get(error.code, '')}: {why}") from None
+        except (OSError, http.client.HTTPException, ValueError) as error:
+            reason = error.reason if isinstance(error, URLError) else error
+            raise OSError(f"no answer ({quote(without_secrets(str(reason) or type(error).__name__))})") from None
+        self._answer, kind = answer, answer.headers.get_content_maintype()
+        if kind == "multipart":
+            self._parts = Parts(lambda: answer.read1(CHUNK))
+        elif kind != "image":
+            self._close()
+            given = answer.headers.get("Content-Type", "nothing about its type")
+            page = "the page that shows the picture; give the address of the picture in it" if "html" in given else "no picture or stream"
+            raise OSError(f"answers {quote(given)}: {page}; a video (rtsp://..., or ffmpeg:http://...) is read as one")
 
     def _close(self) -> None:
-        for opened in (self._stream, self._connection):
-            if opened is not None:
-                opened.close()
-        self._connection = self._stream = self._socket = None
+        if self._answer is not None:
+            self._answer.close()
+        self._answer = self._parts = None
 
     def _interrupt(self) -> None:
-        if self._socket is not None:
-            with contextlib.suppress(OSError):
-                self._socket.shutdown(socket.SHUT_RDWR)
+        with contextlib.suppress(OSError, AttributeError):  # the connection's socket belongs to the answer, or it is closed already
+            self._answer.fp.raw._sock.shutdown(socket.SHUT_RDWR)  # type: ignore[union-attr]
 
     def _grab(self) -> DevicePicture:
-        if self._stream is None:
+        begun_s = time.monotonic()
+        if self._answer is None:
             self._again(self._request)
-        stream = self._stream
-        if stream is None:  # another thread closed it
+        answer, parts = self._answer, self._parts
+        if answer is None:  # another thread closed it
             raise ReadFailed("the stream was closed")
         try:
-            headers, data = next_part(stream)
-        except (OSError, EOFError, http.client.HTTPException) as error:
+            if parts is None:
+                return self._single(answer, begun_s)
+            headers, data = parts.next_part()
+        except (OSError, EOFError, http.client.HTTPException, ValueError) as error:
             self._close()  # so that it is opened again
             raise ReadFailed(str(error) or type(error).__name__) from error
-        image, note = decode_jpeg(data)
+        image, note = decode_picture(data)
         number = int(headers["x-sequence"]) if headers.get("x-sequence", "").isdecimal() else None
         lost = max(0, number - self._last - 1) if number is not None and self._last is not None else 0
         again = number is not None and number == self._last
@@ -134,44 +136,41 @@ class MjpegCamera(LiveSource):
             self._last = number
         return DevicePicture(image, stamped_s(headers), lost, note, again)
 
+    def _single(self, answer: http.client.HTTPResponse, begun_s: float) -> DevicePicture:
+        """The picture of an address of single pictures, once it has changed."""
+        until_s = begun_s + SILENT_S
+        while not self._end.is_set():
+            data = answer.read()
+            self._close()
+            if data != self._before:
+                try:
+                    image, note = decode_picture(data)
+                except TornPicture:
+                    self._end.wait(reader.FAILED_PAUSE_S)  # it may be about to be replaced
+                    raise
+                self._before = data
+                return DevicePicture(image, begun_s, 0, note)
+            if time.monotonic() > until_s:
+                raise ReadFailed(f"the picture at the address has not changed for {SILENT_S:g} s")
+            self._end.wait(POLL_S)
+            begun_s = time.monotonic()
+            self._request()
+            answer = self._answer or answer
+        raise ReadFailed("the camera was closed")
 
-def next_part(stream: BufferedIOBase) -> tuple[dict[str, str], bytes]:
-    """Headers (lower case) and body of the next part of a multipart stream; ``EOFError`` at its end."""
-    headers: dict[str, str] = {}
-    while True:  # skip lines up to the next part's boundary and headers
-        line = stream.readline(65536)
-        if not line:
-            raise EOFError("the stream ended")
-        name, colon, value = line.decode("latin-1").strip().partition(":")
-        if colon:
-            headers[name.lower()] = value.strip()
-        elif not name and headers:
-            break
-    length = int(headers.get("content-length", 0)) if headers.get("content-length", "0").isdecimal() else 0
-    if not 0 < length <= LARGEST_PART:
-        raise EOFError(f"a part without a usable Content-Length ({headers.get('content-length', 'none')})")
-    data = stream.read(length)
-    if len(data) < length:
-        raise EOFError(f"the stream ended within a picture ({len(data)} of {length} bytes)")
-    return headers, data
 
-
-def decode_jpeg(data: bytes) -> tuple[np.ndarray, str]:
-    """A JPEG as gray (H, W) or RGB (H, W, 3) uint8, and a note as of ``picture_of``.
-
-    An incomplete or damaged one raises ``TornPicture``, because decoders guess the rest.
-    """
-    if not data.startswith(START) or not data.rstrip(b"\0\r\n").endswith(END):
-        raise TornPicture(f"an incomplete JPEG ({len(data)} bytes, without its {'end' if data.startswith(START) else 'start'})")
-    with ErrorsAs(FrameError, lambda error: TornPicture(f"a damaged JPEG: {error}")):
-        return picture_of(data)
+def _opener(url: str, user: str | None, password: str | None) -> urllib.request.OpenerDirector:
+    """What opens addresses: without proxies, with redirections, and with the login for this one."""
+    logins = urllib.request.HTTPPasswordMgrWithDefaultRealm()
+    if user:
+        logins.add_password(None, url, unquote(user), unquote(password or ""))
+    basic, digest = urllib.request.HTTPBasicAuthHandler(logins), urllib.request.HTTPDigestAuthHandler(logins)
+    return urllib.request.build_opener(urllib.request.ProxyHandler({}), basic, digest)
 
 
 def stamped_s(headers: dict[str, str]) -> float:
     """Time of exposure on the monotonic clock, from a part's headers; the present time if the headers do not state it."""
-    now_s, unix_s = time.monotonic(), time.time()
     try:
-        age_s = unix_s - float(headers[TIME_HEADER])
+        return on_own_clock(float(headers[TIME_HEADER]))
     except (KeyError, ValueError):
-        return now_s
-    return now_s - max(age_s, 0.0) if abs(age_s) < CLOCK_SLACK_S else now_s
+        return time.monotonic()

@@ -111,6 +111,7 @@ class LiveSource(Connection):
     def __init__(self, name: str, form: Form) -> None:
         self.name, self.form = name, form_named(form)
         self.failed = 0  # total number of failed reads
+        self.on_frame: Callable[[Frame], None] | None = None  # called with each new frame, from the reader's thread
         self._new = threading.Condition()
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
@@ -151,6 +152,10 @@ class LiveSource(Connection):
         if outages_s:
             spent = f"{sum(outages_s):.1f} s in all, the longest {max(outages_s):.1f} s: no new picture came"
             found.append(f"{len(outages_s)} {'outage' if len(outages_s) == 1 else 'outages'} of the camera, {spent}")
+        if self.lost:
+            found.append(f"{self.lost} pictures were lost before they arrived: the camera's numbers have gaps")
+        if self.reopened:
+            found.append(f"the camera was opened again {self.reopened} {'time' if self.reopened == 1 else 'times'}")
         if torn:
             found.append(f"{len(torn)} pictures arrived incomplete or damaged and were left out; the last: {torn[-1]}")
         if self._repeated:
@@ -237,7 +242,7 @@ class LiveSource(Connection):
         self._outages_s: list[float] = []
         self._torn: list[str] = []
         self._notes: set[str] = set()
-        self._repeated = 0
+        self._repeated = self.lost = self.reopened = 0
 
     def _run(self) -> None:
         in_a_row = 0
@@ -264,14 +269,17 @@ class LiveSource(Connection):
                 with self._new:
                     self.fault = self._look_at(picture)
                     self._look_back(picture)
+                    self.lost += picture.lost
                     self.arrived += 1 + picture.lost
                     self.dropped += 1 + picture.lost
-                    if self._is_new(picture):
+                    if new := self._is_new(picture):
                         name = f"frame_{self.arrived:06d}.png"
                         self._frame = Frame(image, self.form, name, picture.time_s, self.arrived)
                         if not self.fault:
                             self._fresh_s = awake_s()
                     self._new.notify_all()
+                if new and (hear := self.on_frame) is not None and self._frame is not None:
+                    hear(self._frame)
 
     def _usual_s(self) -> float:
         """Usual time between two pictures."""
@@ -284,6 +292,7 @@ class LiveSource(Connection):
         except (DeviceError, OSError) as error:
             self._end.wait(FAILED_PAUSE_S)
             raise ReadFailed(str(error)) from error
+        self.reopened += 1
 
     def _give_up(self, error: Exception) -> None:
         with self._new:

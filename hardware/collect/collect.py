@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats.qmc import Sobol
 
 from hardware.arms.arm import ArmState
+from hardware.cameras.mjpeg import without_secrets
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, matrix_of, pose_of
 from hardware.workcell.build import Rig, build_rig, check_plan
@@ -387,6 +388,8 @@ class CollectPlan:
         Further formats in which each contact is kept as soon as it is made, each in a subfolder.
     dry_run : bool
         End after the check of the plan, before anything moves.
+    ros2 : str or None
+        Namespace in which frames, pins and the arm's pose are published as ROS 2 topics.
     """
 
     sensor: SensorSpec
@@ -403,6 +406,7 @@ class CollectPlan:
     plain_light: bool = False
     also: tuple[str, ...] = ()
     dry_run: bool = False
+    ros2: str | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= MOST_CONTACTS:
@@ -474,7 +478,8 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
                 if not plan.dry_run:
                     speed = plan.servo.linear_mm_s, plan.servo.angular_deg_s
                     options: dict[str, Any] = {"seed": plan.sampling_seed, "design": plan.design, "speed": speed}
-                    collect(rig, plan.experiment, collection, plan.count, **options, on_rest=require_rest, progress=report_contact)
+                    with rig.publishing(plan.ros2, Pipeline(plan.sensor, rig.source.form), estimates=False):
+                        collect(rig, plan.experiment, collection, plan.count, **options, on_rest=require_rest, progress=report_contact)
         kept.catch_up()
     return Collected(out, collection.count, before)
 
@@ -503,7 +508,7 @@ def _about(plan: CollectPlan, rig: Rig) -> dict[str, Any]:
     low, high = zip(*plan.experiment.ranges().values(), strict=True)
     return {
         "comments": f"collected: {plan.experiment.name}, {plan.sensor.name}, {plan.obj.name}",
-        "camera": plan.camera,
+        "camera": without_secrets(plan.camera),
         "arm": plan.arm,
         "sensor": plan.sensor.name,
         "form": str(rig.source.form),

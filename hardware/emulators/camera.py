@@ -7,7 +7,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 
-from hardware.cameras.mjpeg import CONTENT_TYPE, hold_little, jpeg_of, write_part
+from hardware.cameras.coded import CONTENT_TYPE, jpeg_of, write_part
+from hardware.cameras.mjpeg import hold_little
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.emulators.faults import EVERY_NTH, SECONDS, Emulator, Fault, Faults
 from hardware.errors import DeviceError, cannot_listen

@@ -1,4 +1,7 @@
-"""Lists what this machine has, what is missing, and the remedy: packages, renderer, 3D pictures, cameras, serial ports. Opens no device."""
+"""Lists what this machine has, what is missing, and the remedy: packages, renderer, 3D pictures, cameras, serial ports, ROS 2 topics.
+
+Opens no device.
+"""
 
 import importlib.metadata
 import importlib.util
@@ -9,16 +12,18 @@ from pathlib import Path
 
 from serial.tools import list_ports
 
+from hardware.cameras.ros2 import PICTURES
+from hardware.cameras.uvc import SYSFS_CAMERAS, port_of
+from hardware.errors import DeviceError
+from hardware.ros2.dds import Participant
 from scenes import list_experiments, list_objects, list_randomisations, list_sensors
 from scenes.plugins import plugin_lines
-from twin.errors import EXTRAS, RenderError
+from twin.errors import EXTRAS, ExtraError, RenderError
 from twin.optics.variants.variant import report
 from twin.report.skin3d import probe_offscreen
 from twin.store import cache_folder
 from twin.types import ReadableResult
 
-# Folder in which the Linux kernel lists its cameras.
-SYSFS_CAMERAS = Path("/sys/class/video4linux")
 # Packages whose versions are listed.
 PACKAGES = ("mitsuba", "drjit", "pyvista", "vtk", "trimesh", "torch", "scikit-image", "pyserial", "opencv-python-headless", "numba")
 # The program's own packages. They are checked, because another project may have a package of the same name.
@@ -27,6 +32,7 @@ OWN = ("scenes", "twin", "training", "hardware")
 DEVICES = {
     "camera": "plug in the sensor's USB camera; in a container pass --device /dev/video0; on Windows and macOS try '--camera 0'",
     "serial": "plug in the arm's USB cable; on Linux the user must be in the group 'dialout'",
+    "ROS 2": "pip install 'tactip-twin[ros2]', start what publishes pictures, and set ROS_DOMAIN_ID to its domain",
 }
 
 
@@ -43,13 +49,23 @@ def cameras(sysfs: Path = SYSFS_CAMERAS) -> list[Device]:
     found = []
     for entry in sorted(sysfs.glob("video*")):
         name = entry / "name"
-        found.append(Device(f"/dev/{entry.name}", name.read_text(encoding="utf-8").strip() if name.is_file() else "camera"))
+        described = name.read_text(encoding="utf-8").strip() if name.is_file() else "camera"
+        found.append(Device(f"/dev/{entry.name}", ", ".join(filter(None, [described, port_of(entry)]))))
     return found
 
 
 def serial_ports() -> list[Device]:
     """Serial ports (a Dobot Magician shows as a CP210x or CH340 USB adapter)."""
     return [Device(port.device, port.description or "serial port") for port in sorted(list_ports.comports())]
+
+
+def ros2_topics() -> list[Device]:
+    """Topics of the domain that somebody publishes, pictures as texts for ``camera``; none without the package ``cyclonedds``."""
+    try:
+        found = Participant().topics()
+    except (DeviceError, ExtraError):
+        return []
+    return [Device(f"ros2:{topic}" if kind in PICTURES else topic, kind) for topic, kind in found.items()]
 
 
 @dataclass(frozen=True, repr=False)
@@ -67,7 +83,7 @@ class Machine(ReadableResult):
     plain_pictures : str
         Reason why VTK draws no 3D pictures ("" if it does). Simpler pictures are then drawn.
     devices : dict of str to list of Device
-        Devices by kind: ``camera`` and ``serial``.
+        Devices by kind: ``camera``, ``serial`` and ``ROS 2`` (topics).
     places : dict of str to Path
         The folder from which each of the program's own packages is imported.
     kept : Path or None
@@ -120,11 +136,11 @@ class Machine(ReadableResult):
 
 
 def examine_machine() -> Machine:
-    """Look for packages, Mitsuba's variants, LLVM, a GPU, offscreen 3D, cameras and serial ports. Opens no device."""
+    """Look for packages, Mitsuba's variants, LLVM, a GPU, offscreen 3D, cameras, serial ports and ROS 2 topics. Opens no device."""
     rendering, can_render = _rendering()
     for names in (list_sensors, list_objects, list_experiments, list_randomisations):
         names()  # so that a clash of names is known
-    devices = dict(zip(DEVICES, (cameras(), serial_ports()), strict=True))
+    devices = dict(zip(DEVICES, (cameras(), serial_ports(), ros2_topics()), strict=True))
     versions = {name: _version(name) for name in PACKAGES}
     return Machine(versions, rendering, can_render, probe_offscreen(), devices, _places(), cache_folder(), plugin_lines())
 

@@ -20,6 +20,7 @@ from hardware.errors import DeviceError
 from hardware.live.rerun_view import RerunView
 from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import load_rest_frame
+from hardware.workcell.ros2 import publishing
 from twin.errors import ErrorsAs, FrameError, OptionError, TwinError
 from twin.estimate import Estimate, Estimator, SensorModel, pins_in, readable_labels
 from twin.pins import Pipeline
@@ -73,8 +74,12 @@ class LiveSession:
     _done: deque[float] = field(default_factory=lambda: deque(maxlen=RATE_SPAN))
     _begun_s: float = field(default_factory=time.monotonic)
 
-    def run(self, *, most: int | None = None, seconds: float | None = None, going: Callable[[], bool] = lambda: True) -> Timing:
+    def run(
+        self, *, most: int | None = None, seconds: float | None = None, rate_hz: float = np.inf, going: Callable[[], bool] = lambda: True
+    ) -> Timing:
         """Run until the recording ends, ``most`` frames were read, ``seconds`` have passed, or ``going()`` is false.
+
+        At most ``rate_hz`` frames are read in a second, each time the newest one of a camera.
 
         Raises
         ------
@@ -83,8 +88,10 @@ class LiveSession:
         FrameError
             A frame does not belong to the model's sensor.
         """
-        self._begun_s = time.monotonic()
+        self._begun_s = due_s = time.monotonic()
         while going() and (most is None or self.count < most) and (seconds is None or time.monotonic() - self._begun_s < seconds):
+            time.sleep(max(0.0, due_s - time.monotonic()))
+            due_s = max(due_s, time.monotonic()) + 1 / rate_hz
             try:
                 frame = self.source.read(timeout_s=FRAME_TIMEOUT_S)
             except EOFError:
@@ -239,6 +246,8 @@ class WatchPlan:
         A target of ``RerunView``. The frames are then shown there, whatever ``shown`` is.
     seconds, count : float or None, int or None
         Stop after this time in s, or after this number of frames.
+    rate : float or None
+        Largest number of frames per second that are used; None: all that the model keeps up with.
     at_rest : str
         The pins at rest: ``first`` (from the first frame), ``none`` (those that the model knows, or that follow from the contacts), or a
         file.
@@ -246,6 +255,8 @@ class WatchPlan:
         Port of the page; 0 for a free one.
     also : tuple of str
         Further formats in which the session is kept at its end, each in a subfolder of ``record``.
+    ros2 : str or None
+        Namespace in which frames and estimates are published as ROS 2 topics.
     """
 
     camera: str = ""
@@ -255,9 +266,11 @@ class WatchPlan:
     rerun: str | None = None
     seconds: float | None = None
     count: int | None = None
+    rate: float | None = None
     at_rest: str = NONE
     port: int = PORT
     also: tuple[str, ...] = ()
+    ros2: str | None = None
 
     def __post_init__(self) -> None:
         if self.also and self.record is None:
@@ -350,12 +363,14 @@ def watch(
     def keep(frame: Frame, estimate: Estimate) -> None:
         if plan.replay is not None:
             found.append(np.asarray(estimate.value, float))
+        publish(frame, estimate)
         if on_estimate is not None:
             on_estimate(frame, estimate)
 
     with ExitStack() as stack:
         stack.enter_context(source)
         model, rest = _at_rest(plan, model, source, rest)
+        publish = stack.enter_context(publishing(plan.ros2, source, model.pipeline))
         session, shower = LiveSession(source, model, on_estimate=keep), None
         pipeline = Pipeline(model.sensor, model.form, model.pipeline.reference)  # a separate one for the view's thread
         view = _view(plan, f"{model.sensor.name}, {source.name}", pipeline)
@@ -373,7 +388,7 @@ def watch(
                 session.record.keep_rest(rest)
         interrupted = False
         try:
-            session.run(most=plan.count, seconds=plan.seconds, going=lambda: shower is None or shower.open)
+            session.run(most=plan.count, seconds=plan.seconds, rate_hz=plan.rate or np.inf, going=lambda: shower is None or shower.open)
         except KeyboardInterrupt:
             interrupted = True
         same = (same_estimates(source.steps, found), len(found)) if isinstance(source, SessionSource) else None

@@ -78,6 +78,11 @@ class ArmWatch:
         """Keep a state."""
         self._states.append(state)
 
+    @property
+    def newest(self) -> ArmState | None:
+        """The newest kept state, without a request to the arm; None before the first one."""
+        return self._states[-1] if self._states else None
+
     def pose_at(self, time_s: float) -> np.ndarray:
         """Pose (6,) of the arm at a ``time.monotonic()``, interpolated between the kept states. Its turn about z is unwrapped."""
         states = sorted(self._states.copy(), key=lambda state: state.time_s)

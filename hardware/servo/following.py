@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hardware.arms.open_arm import kind_of, open_arm
+from hardware.cameras.mjpeg import without_secrets
 from hardware.errors import DeviceError, in_short
 from hardware.rig.geometry import PlacedObject, matrix_of, pose_of, shift_in_tool
 from hardware.rig.last_axis import LastAxis, poses_along, turns_back_mm
@@ -127,6 +128,8 @@ class FollowPlan:
         Further formats in which the session is kept at its end, each in a subfolder of it.
     dry_run : bool
         End after the check of the plan, before anything moves.
+    ros2 : str or None
+        Namespace in which frames, estimates and the arm's pose are published as ROS 2 topics.
     """
 
     obj: ObjectSpec
@@ -143,6 +146,7 @@ class FollowPlan:
     at_rest: str = FIRST
     also: tuple[str, ...] = ()
     dry_run: bool = False
+    ros2: str | None = None
 
     def __post_init__(self) -> None:
         if self.also and not self.record:
@@ -254,7 +258,8 @@ def follow(
         if session is not None and rest is not None:
             session.keep_rest(rest)
         take_rest = partial(_take_rest, session, model) if takes_rest else None
-        hooks = LoopHooks(law, take_rest, partial(_note_step, session, step, steps))
+        publish = stack.enter_context(rig.publishing(plan.ros2, model.pipeline))
+        hooks = LoopHooks(law, take_rest, partial(_note_step, session, step, steps), publish)
         period_s = 1.0 / (plan.stream_hz or STREAM_HZ)
         settings = LoopSettings(steps, plan.stream_hz is None, period_s, rig.frame_timeout_s, GIVE_UP_S)
         loop = ServoLoop(rig, plan.servo, model, settings, hooks)
@@ -307,7 +312,7 @@ def _rig_of(plan: FollowPlan, model: SensorModel) -> Rig:
 
 def _result_entries(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
     """The entries that are stored with the results."""
-    names = {"sensor": model.sensor.name, "object": plan.obj.name, "camera": plan.camera, "arm": plan.arm}
+    names = {"sensor": model.sensor.name, "object": plan.obj.name, "camera": without_secrets(plan.camera), "arm": plan.arm}
     return names | {"servo": plan.servo.model_dump()}
 
 

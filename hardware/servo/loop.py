@@ -238,6 +238,8 @@ class ServoLoop:
             return False
         view = self._view
         view.frame, view.estimate = frame, self.estimator(frame)
+        if self.hooks.on_estimate is not None:
+            self.hooks.on_estimate(frame, view.estimate)
         view.reading, view.doubt = self._reading(view.estimate)
         if not view.doubt:
             view.exposed_pose = self._watch.pose_at(frame.time_s) if self.source.is_live else state.pose

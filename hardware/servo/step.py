@@ -106,8 +106,11 @@ class LoopHooks:
         Gets a frame without contact, taken clear of the object, and returns the estimator to use from then on.
     on_step : callable, optional
         Called with each record, its frame and its estimate after the move was commanded.
+    on_estimate : callable, optional
+        Called with each used frame and its estimate, valid or not. It must return at once.
     """
 
     law: Callable[[np.ndarray, Estimate], np.ndarray] | None = None
     take_rest: Callable[[Frame], Estimator] | None = None
     on_step: Callable[[StepRecord, Frame, Estimate], object] | None = None
+    on_estimate: Callable[[Frame, Estimate], object] | None = None

@@ -8,6 +8,7 @@ from which a model measures the pins' displacements.
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -25,13 +26,14 @@ from hardware.errors import DeviceError, leave
 from hardware.rig.approach import path_around
 from hardware.rig.geometry import PlacedObject, matrix_of
 from hardware.safety.decide import Action, decide, load_limits
-from hardware.safety.eyes import NEAR_MM
+from hardware.safety.eyes import NEAR_MM, ArmWatch
 from hardware.safety.safe_arm import RETREAT_SHARES, SafeArm
+from hardware.workcell.ros2 import publishing
 from scenes import ObjectSpec, PlacementSpec, SensorSpec
 from scenes.experiment import ExperimentSpec
 from scenes.plugins import offered, others
 from twin.errors import ErrorsAs, FrameError, RenderError
-from twin.estimate import SensorModel
+from twin.estimate import Estimate, SensorModel
 from twin.frames import open_recording
 from twin.optics.preview import Preview
 from twin.optics.render import traced_shading
@@ -77,12 +79,15 @@ class Rig:
     placed : PlacedObject
     knows_truth : bool
         Whether the object's pose is exactly that of ``placed``. This is true in the twin.
+    watch : ArmWatch or None
+        What keeps the arm's newest states, once the arm has a mover.
     """
 
     source: FrameSource
     arm: Arm
     placed: PlacedObject
     knows_truth: bool
+    watch: ArmWatch | None = None
 
     @property
     def mounting(self) -> Mounting:
@@ -103,6 +108,13 @@ class Rig:
             No frame comes. The message names the camera.
         """
         return await_frame(self.source)
+
+    def publishing(
+        self, name: str | None, pipeline: Pipeline, *, estimates: bool = True
+    ) -> AbstractContextManager[Callable[[Frame, Estimate], None]]:
+        """As ``hardware.workcell.ros2.publishing``, for a connected rig."""
+        newest = lambda: self.watch and self.watch.newest  # noqa: E731  (no request, which could delay the arm's own)
+        return publishing(name, self.source, pipeline, estimates=estimates, arm=newest, T_tool_sensor=self.mounting.T_tool_sensor)
 
     def __enter__(self) -> "Rig":
         self.arm.connect()

@@ -56,7 +56,7 @@ class Mover:
     def __init__(self, rig: Rig, speed: tuple[float, float], *, clear_mm: float, patience_s: float) -> None:
         self.arm, self.source = rig.arm, rig.source
         self.notes: list[str] = []
-        self.watch = ArmWatch(rig.arm)
+        self.watch = rig.watch = ArmWatch(rig.arm)
         self.eyes = FreshFrames(rig.arm, rig.source, self.watch.pose_at, lambda pose: float(rig.placed.touch(pose).indent_mm))
         self.axis = LastAxis(getattr(rig.arm, "kinematics", None), rig.mounting.centre_mm)
         self._placed, self._speed, self._clear_mm, self._patience_s = rig.placed, speed, clear_mm, patience_s

@@ -20,11 +20,12 @@ from noisy_camera import NoisyCamera, number_of
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras import reader
 from hardware.cameras.choose import open_camera
-from hardware.cameras.mjpeg import CONTENT_TYPE, MjpegCamera, jpeg_of, next_part, write_part
+from hardware.cameras.coded import CONTENT_TYPE, Parts, jpeg_of, write_part
+from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import FIRST_PERIODS, MOST_FAILED_READS, ReadFailed
 from hardware.cameras.source import FrameSource
 from hardware.cameras.twin import TwinCamera
-from hardware.cameras.uvc import UvcCamera, apply_settings, exposed_s
+from hardware.cameras.uvc import UvcCamera, apply_settings, exposed_s, measure_settings, node_at
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError, StaleDataError
 from hardware.live.doctor import cameras
@@ -293,11 +294,23 @@ class TestStream:
             MjpegCamera("http://127.0.0.1:9/stream").connect()
         with pytest.raises(DeviceError, match="http"):
             MjpegCamera("rtsp://somewhere/stream")
+        with pytest.raises(DeviceError, match="rtsp://127.0.0.1:1/live: can't be opened; check the address, the login") as refused:
+            open_camera("rtsp://admin:s3cret@127.0.0.1:1/live").connect()
+        assert "s3cret" not in str(refused.value)
 
     @pytest.mark.parametrize("url", ["http://127.0.0.1:99999/x", "http://127.0.0.1:port/x", "http://[::1/x", "ftp://127.0.0.1/x"])
     def test_what_is_no_address_says_so(self, url):
         with pytest.raises(DeviceError, match="expected http"):
             MjpegCamera(url)
+
+    def test_ffmpeg_reads_what_it_opens(self, stream):
+        emulator, _ = stream
+        with open_camera(f"ffmpeg:{emulator.url}") as camera:
+            frame = camera.read_after(camera.read(timeout_s=WAIT_S).time_s, timeout_s=WAIT_S)
+            assert frame.image.shape[:2] == (48, 64)
+            emulator.faults.add("unplugged=0.5")
+            time.sleep(1.0)
+            assert camera.read_after(time.monotonic(), timeout_s=WAIT_S).image.size
 
     def test_opencv_opens_the_emulators_stream_too(self, stream):
         emulator, _ = stream
@@ -412,6 +425,51 @@ class TestUvc:
         assert device.log == order
         assert rate == 15.0 and device.values[cv2.CAP_PROP_FRAME_WIDTH] == 320
 
+    def test_a_setting_that_does_nothing_is_found_out_by_the_pictures(self):
+        """Each camera says yes to every setting; it ignores some of them."""
+
+        class Real(self.Device):
+            rng = np.random.default_rng(0)
+            pattern = np.kron(rng.integers(0, 2, (12, 16)), np.ones((4, 4)))
+
+            def __init__(self, obeys):
+                super().__init__()
+                self.obeys = obeys
+
+            def read(self):
+                light = self.values.get(cv2.CAP_PROP_EXPOSURE, 78.0) if "exposure" in self.obeys else 78.0
+                light *= 1 + self.values.get(cv2.CAP_PROP_GAIN, 0.0) / 10 if "gain" in self.obeys else 1.0
+                image = self.pattern * light + 20
+                if "focus" in self.obeys:
+                    image = cv2.GaussianBlur(image, (0, 0), 0.3 + abs(self.values.get(cv2.CAP_PROP_FOCUS, 0) - 120) / 40)
+                return True, np.clip(image + self.rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+
+        asked = {"exposure": 7.8, "gain": 8.0, "focus": 120.0}
+        for obeys in ((), ("exposure",), ("gain", "focus"), tuple(asked)):
+            device = Real(obeys)
+            ignored = [line.partition("=")[0].split()[-1] for line in measure_settings(device, asked)]
+            assert ignored == [name for name in asked if name not in obeys]
+            assert device.values[cv2.CAP_PROP_EXPOSURE] == 78.0 and device.values[cv2.CAP_PROP_FOCUS] == 120.0
+
+    @pytest.mark.parametrize("text", ["0?exposure=x", "0?shine=3", "0?exposure", "/dev/video0?gain=-1", "usb:1-1?focus=inf"])
+    def test_settings_that_are_none(self, text):
+        with pytest.raises(DeviceError, match="expected exposure, gain, focus and numbers"):
+            open_camera(text)
+
+    def test_equal_cameras_are_told_apart_by_their_ports(self, tmp_path):
+        """A tree as the kernel's: each camera has two nodes, and the first one gives the pictures."""
+        for number, port in enumerate(["1-1.2", "1-1.2", "1-1.4", "1-1.4"]):
+            device = tmp_path / "devices" / f"usb1/{port}/{port}:1.0"
+            device.mkdir(parents=True, exist_ok=True)
+            (tmp_path / "list" / f"video{number}").mkdir(parents=True)
+            (tmp_path / "list" / f"video{number}" / "device").symlink_to(device)
+            (tmp_path / "list" / f"video{number}" / "name").write_text("USB Camera\n")
+        found = tmp_path / "list"
+        assert node_at("usb:1-1.2", found) == "/dev/video0" and node_at("usb:1-1.4", found) == "/dev/video2"
+        with pytest.raises(DeviceError, match="no camera at this port; ports with cameras: usb:1-1.2, usb:1-1.4; plug it in"):
+            node_at("usb:2-1", found)
+        assert [device.description for device in cameras(found)][::2] == ["USB Camera, usb:1-1.2", "USB Camera, usb:1-1.4"]
+
     def test_the_kernels_time_is_taken_only_where_it_can_be(self):
         now_s = time.monotonic()
         assert exposed_s(1e3 * (now_s - 0.05)) == pytest.approx(now_s - 0.05)
@@ -485,10 +543,11 @@ def test_a_client_that_pauses_gets_few_old_pictures():
             stream = client.makefile("rb")
             while stream.readline().strip():
                 pass
-            next_part(stream)
+            parts = Parts(lambda: stream.read1(65536))
+            parts.next_part()
             time.sleep(0.6)  # 60 pictures
             resumed_s = time.time()
             old = 0
-            while float(next_part(stream)[0]["x-timestamp"]) < resumed_s:
+            while float(parts.next_part()[0]["x-timestamp"]) < resumed_s:
                 old += 1
             assert old < 30  # of 60; without a small buffer all of them come

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import random
 import re
 import signal
 import subprocess
@@ -29,6 +30,7 @@ from hardware.emulators.running import run_until_signal
 from hardware.errors import DeviceError
 from hardware.live.live import LiveSession, Shower, WatchPlan, watch
 from hardware.rig.geometry import PlacedObject
+from hardware.ros2.dds import Writer
 from hardware.servo import following
 from hardware.servo.following import steps_round
 from hardware.workcell.build import build_rig
@@ -39,10 +41,12 @@ from twin.camera.capture import expose, record
 from twin.cli import command_line
 from twin.errors import OptionError, TwinError
 from twin.frames import open_recording
+from twin.frames.forms import frame_size
 from twin.frames.images import write_image
 from twin.pins import Pipeline
 from twin.pins.batch import voronoi_map
 from twin.records import open_records
+from twin.records.ros2_messages import decode
 from twin.rig.mounting import Mounting
 from twin.studio.live_page import LivePage, frame_pictures
 from twin.types import Form, Frame
@@ -115,6 +119,60 @@ def test_servo_writes_what_it_says_and_a_session_that_replays(stand_in, tmp_path
     seen = stand_in.pipeline(frames[-1])
     assert seen.valid
     assert np.linalg.norm(seen.graph.nodes_px - stand_in.pipeline.reference.pins_px, axis=1).max() > 4.0
+
+
+@pytest.fixture
+def ros2(monkeypatch):
+    """Messages that this computer alone hears, as they are published; none is dropped for want of readers."""
+    pytest.importorskip("cyclonedds", reason="cyclonedds (the extra ros2) is not installed")
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(random.randrange(1, 230)))
+    sent, write = {}, Writer.write
+
+    def keep(self, message, at_ns):
+        sent.setdefault(self.name, []).append(message)
+        write(self, message, at_ns)
+
+    monkeypatch.setattr(Writer, "write", keep)
+    monkeypatch.setattr(Writer, "heard", True)
+    return sent
+
+
+def test_commands_publish_ros2_topics(stand_in, ros2, tmp_path):
+    run("servo", "--object", "can", "--out", tmp_path / "servo", "--steps", STEPS, "--plain-light", "--ros2", "left/tactip")
+    assert {"/left/tactip/image", "/left/tactip/contact_pose", "/left/tactip/points", "/tf", "/tf_static", "/diagnostics"} <= ros2.keys()
+    moved = [decode("tf2_msgs/TFMessage", data)["transforms"][0] for data in ros2["/tf"]]
+    assert {(each["header"]["frame_id"], each["child_frame_id"]) for each in moved} == {("base", "left_tactip_tool")}
+    assert len({each["transform"]["translation"]["x"] for each in moved}) > 2
+    place = decode("tf2_msgs/TFMessage", ros2["/tf_static"][0])["transforms"][0]
+    assert (place["header"]["frame_id"], place["child_frame_id"]) == ("left_tactip_tool", "left_tactip_sensor")
+    pose = decode("geometry_msgs/PoseWithCovarianceStamped", ros2["/left/tactip/contact_pose"][-1])
+    image = [decode("sensor_msgs/Image", data)["header"]["stamp"] for data in ros2["/left/tactip/image"]]
+    assert pose["header"]["stamp"] in image
+    ros2.clear()
+    folder = tmp_path / "servo" / "frames"
+    folder.mkdir()
+    write_image(folder / "frame_0.png", np.full(frame_size(stand_in.sensor, stand_in.form)[::-1], 90, np.uint8))
+    stand_in.true = None
+    run("live", "--camera", folder, "--headless", "--ros2", "tactip", "--rate", 50)
+    assert {"/tactip/image", "/tactip/pose"} <= ros2.keys() and "/tf" not in ros2
+    assert "expected a namespace" in refused("live", "--camera", folder, "--headless", "--ros2", "a b")
+
+
+def test_a_dds_that_fails_does_not_stop_the_arm(stand_in, ros2, tmp_path, monkeypatch, caplog):
+    def fail(self, frame):
+        time.sleep(0.5)
+        raise DeviceError("/tactip/image: not sent")
+
+    out = tmp_path / "without"
+    begun_s = time.monotonic()
+    run("servo", "--object", "can", "--out", out, "--steps", STEPS, "--plain-light")
+    without_s = time.monotonic() - begun_s
+    monkeypatch.setattr("hardware.workcell.ros2.Ros2Publisher._publish_frame", fail)
+    begun_s = time.monotonic()
+    told = run("servo", "--object", "can", "--out", tmp_path / "with", "--steps", STEPS, "--plain-light", "--ros2", "tactip")
+    assert f"{STEPS} steps" in told and time.monotonic() - begun_s < without_s + 5.0
+    assert len([record for record in caplog.records if "not sent" in record.getMessage()]) == 1
 
 
 def test_a_follow_that_ends_early_is_written_and_is_an_exit_code(stand_in, tmp_path, monkeypatch):

@@ -16,9 +16,10 @@ import pytest
 from made_records import ABOUT, COLOUR, assert_same, made_episode
 
 from scenes import load_sensor
+from twin import errors
 from twin.errors import ExtraError, FrameError, StoreError, TwinError
 from twin.frames import open_recording
-from twin.records import FORMATS, RecordError, Records, convert, open_records, open_writer, record, with_pins
+from twin.records import FORMATS, RecordError, Records, convert, open_records, open_writer, with_pins
 from twin.records.folder import SIDECAR
 
 KILLED = """
@@ -279,8 +280,8 @@ def test_a_missing_library_names_its_remedy(tmp_path):
     def missing(name):
         raise ModuleNotFoundError(name, name=name)
 
-    for to, library in (("lerobot", "pyarrow"), ("mcap", "mcap_ros2")):
-        with patch.object(record, "import_module", missing), pytest.raises(ExtraError, match=f"{library}.*tactip-twin\\[records\\]"):
+    for to, library in (("lerobot", "pyarrow"), ("mcap", "mcap")):
+        with patch.object(errors, "import_module", missing), pytest.raises(ExtraError, match=f"{library}.*tactip-twin\\[records\\]"):
             written(tmp_path / to, to)
         assert not (tmp_path / to).exists()
 

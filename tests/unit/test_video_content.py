@@ -9,7 +9,7 @@ import pytest
 from made_records import COLOUR, made_episode
 from PIL import Image
 
-from hardware.cameras.mjpeg import decode_jpeg
+from hardware.cameras.coded import decode_picture
 from twin.errors import FrameError
 from twin.frames import frames_at, open_recording
 from twin.frames.videos import describe_pauses
@@ -77,7 +77,7 @@ def test_a_pictures_flag_is_said_and_not_applied(tmp_path, name):
     assert alike(next(iter(found)).image, scene(0))
     assert sum("orientation flag (EXIF 6) is not applied" in problem for problem in found.problems) == 1
     if name == "a.jpg":
-        image, note = decode_jpeg(path.read_bytes())  # as a live camera's pictures are decoded
+        image, note = decode_picture(path.read_bytes())  # as a live camera's pictures are decoded
         assert alike(image, scene(0)) and "EXIF 6" in note
         (tmp_path / "frames").mkdir()
         Image.fromarray(scene(1)).save(tmp_path / "frames" / "b.jpg")

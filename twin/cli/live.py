@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 SHIPPED_MODEL = Path("mg400-331")
 Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights are shipped")]
 Camera = Annotated[
-    str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder, a video or mujoco:SCENE")
+    str,
+    typer.Option(
+        "--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., rtsp://..., ros2:/TOPIC, a folder or video, mujoco:SCENE"
+    ),
 ]
 Steps = Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")]
 Record = Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")]
@@ -40,6 +43,9 @@ ArmOption = Annotated[
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, without motion")]
 Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, or a TOML file"), Formerly("limits")]
+Ros2 = Annotated[
+    str | None, typer.Option("--ros2", metavar="NAME", help="publish frames, pins and estimates as ROS 2 topics /NAME/..., such as tactip")
+]
 AtRest = Annotated[
     str,
     typer.Option(
@@ -61,8 +67,10 @@ def live(
     rerun: Annotated[str | None, typer.Option(metavar="T", help="viewer, a new file *.rrd, or a viewer's address rerun+http://...")] = None,
     seconds: Annotated[float | None, typer.Option(min=0, help="stop after this time")] = None,
     count: Annotated[int | None, typer.Option(min=1, help="stop after this number of frames")] = None,
+    rate: Annotated[float | None, typer.Option(min=0.1, help="most frames a second that are used, each time the newest")] = None,
     at_rest: AtRest = NONE,
     also: options.Also = None,
+    ros2: Ros2 = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port of the page; if it is taken, the next free one")] = 8080,
 ) -> "WatchResult":
     """Show a model's estimates on a camera's frames.
@@ -115,6 +123,7 @@ def collect(
     design: Annotated[str, typer.Option(help="random, or even (spread over the ranges)")] = "random",
     plain_light: options.PlainLight = False,
     also: options.Also = None,
+    ros2: Ros2 = None,
     dry_run: DryRun = False,
     *,
     progress: Progress,
@@ -173,6 +182,7 @@ def servo(
     plain_light: options.PlainLight = False,
     at_rest: AtRest = FIRST,
     also: options.Also = None,
+    ros2: Ros2 = None,
     dry_run: DryRun = False,
     *,
     progress: Progress,
@@ -237,6 +247,7 @@ def run_policy(
     known_place: KnownPlace = False,
     plain_light: options.PlainLight = False,
     also: options.Also = None,
+    ros2: Ros2 = None,
     dry_run: DryRun = False,
     *,
     progress: Progress,

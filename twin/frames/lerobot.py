@@ -7,15 +7,13 @@ import json
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from scenes.files import read_regular
-from twin.errors import ErrorsAs, FrameError
+from twin.errors import ErrorsAs, FrameError, library
 from twin.frames.images import picture_of
 from twin.frames.tables import LARGEST_BYTES, called_here
 from twin.frames.videos import open_video
@@ -128,7 +126,7 @@ def open_lerobot(path: Path) -> LeRobotFrames:
         It has another version, is damaged or has no pictures; or pyarrow is missing.
     """
     info = _info(path)
-    _library("pyarrow.parquet")
+    library("pyarrow.parquet")
     problems: list[str] = []
     features: dict[str, dict[str, Any]] = {name: each for name, each in info["features"].items() if isinstance(each, dict)}
     pictured = [name for name, each in features.items() if each.get("dtype") in PICTURES]
@@ -239,17 +237,8 @@ def _columns(feature: str, names: object, cells: list[Any]) -> dict[str, np.ndar
 @contextmanager
 def _parquet(file: Path) -> Iterator[Any]:
     """An open file of tables. If it turns out to be damaged, ``FrameError`` is raised."""
-    parquet, arrow = _library("pyarrow.parquet"), _library("pyarrow")
+    parquet, arrow = library("pyarrow.parquet"), library("pyarrow")
     try:
         yield parquet.ParquetFile(file, page_checksum_verification=True)
     except (OSError, KeyError, ValueError, arrow.ArrowException) as error:
         raise FrameError(f"{file}: damaged ({str(error).splitlines()[0]}); {DAMAGED}") from error
-
-
-def _library(name: str) -> ModuleType:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise FrameError(
-            "a LeRobot data set needs the library pyarrow, which is not installed; pip install 'tactip-twin[records]'"
-        ) from error

@@ -10,7 +10,7 @@ import numpy as np
 
 from scenes import SensorSpec, SpecError, load_sensor
 from scenes.files import LONGEST_PATH, quote
-from twin.errors import FrameError, warn_once
+from twin.errors import FrameError, library, warn_once
 from twin.frames.forms import frame_size, times
 from twin.frames.lerobot import RESTS
 from twin.pins.pipeline import Pipeline, measure_reference
@@ -18,7 +18,7 @@ from twin.progress import Progress, silent, stage
 from twin.records.folder import HELD_STEPS, SIDECAR, FolderWriter, format_of
 from twin.records.huggingface import HuggingFaceWriter, huggingface_records
 from twin.records.lerobot import DATA_MB, INFO, LeRobotWriter, lerobot_records
-from twin.records.record import About, Episode, RecordError, Records, RecordStep, library
+from twin.records.record import About, Episode, RecordError, Records, RecordStep
 from twin.records.recording import RecordingWriter, recording_records
 from twin.records.ros2 import Ros2Writer, ros2_records
 from twin.records.session import is_session, session_records

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 
 from scenes.files import quote, read_regular
-from twin.errors import ErrorsAs, FrameError
+from twin.errors import ErrorsAs, FrameError, library
 from twin.frames.images import png, read_image
 from twin.frames.lerobot import RESTS
-from twin.records.record import About, Episode, RecordError, Records, RecordStep, digest, library
+from twin.records.record import About, Episode, RecordError, Records, RecordStep, digest
 from twin.store import contents, output, write_bytes, write_json
 from twin.types import ImageArray
 

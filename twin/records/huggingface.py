@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from twin.errors import FrameError
+from twin.errors import FrameError, library
 from twin.frames.images import read_image, write_image
 from twin.frames.tables import base_name
 from twin.records.folder import AGAIN, PicturesWriter, read_facts, records_in, require_numbered
-from twin.records.record import CHANNELS, TIME, About, Episode, RecordError, Records, RecordStep, library
+from twin.records.record import CHANNELS, TIME, About, Episode, RecordError, Records, RecordStep
 from twin.store import remove_parts, replace_folder, write_json, write_text, write_with
 from twin.store.atomic import PART
 

@@ -18,12 +18,12 @@ from typing import Any, BinaryIO
 import cv2
 import numpy as np
 
-from twin.errors import ErrorsAs, FrameError
+from twin.errors import ErrorsAs, FrameError, library
 from twin.frames import open_recording
 from twin.frames.lerobot import COUNTERS
 from twin.frames.videos import describe_pauses
 from twin.records.folder import AGAIN, FolderWriter, image_of, png, read_json, read_sidecar, records_in
-from twin.records.record import CHANNELS, IMAGE, TIME, About, Episode, RecordError, Records, RecordStep, library, off_s
+from twin.records.record import CHANNELS, IMAGE, TIME, About, Episode, RecordError, Records, RecordStep, off_s
 from twin.store import write_json, write_text, write_with
 from twin.types import Form
 

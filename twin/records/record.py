@@ -9,14 +9,12 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from importlib import import_module
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter
 
-from twin.errors import TwinError, extras_named
+from twin.errors import TwinError
 from twin.types import Form, ImageArray
 
 POSE_AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -294,15 +292,3 @@ def float32(numbers: object, count: int | None = None) -> np.ndarray:
 def seconds(time_s: float) -> float:
     """A time rounded to the nanosecond, which every format can hold."""
     return round(float(time_s), 9)
-
-
-def library(name: str) -> ModuleType:
-    """An optional library that formats need.
-
-    Raises
-    ------
-    ExtraError
-        The library is not installed.
-    """
-    with extras_named():
-        return import_module(name)

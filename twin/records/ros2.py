@@ -13,46 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from twin.errors import library
+from twin.records import ros2_messages as ros
 from twin.records.folder import AGAIN, VERSION, FolderWriter, image_of, png, read_sidecar, require_numbered, whole_steps
-from twin.records.record import CHANNELS, About, Episode, RecordError, Records, RecordStep, float32, library
+from twin.records.record import CHANNELS, About, Episode, RecordError, Records, RecordStep, float32
 from twin.store import write_with
 
 IMAGE_TOPIC, CONTACT_TOPIC, POSE_TOPIC = "/tactip/image/compressed", "/tactip/contact", "/tactip/pose"
-TF_TOPIC, TF_STATIC_TOPIC = "/tf", "/tf_static"
 TOOL_FRAME, SENSOR_FRAME = "tactip_tool", "tactip_sensor"
 """Child frames; the parent is ``base`` or ``work``. The sensor's z points out of the dome's apex, its x along the picture's x."""
 METADATA, REST = "tactip", "rest.png"
 """Name of a file's own metadata, and of the attached picture without contact."""
-MM_PER_M = 1000.0
-NS_PER_S = 1_000_000_000
 MOST_SAID = 200
 """Most characters of a library's error that a message repeats."""
-TOUCHES_N = 1e-6
-"""Force, N, above which ``/tactip/contact`` is 1."""
-
-_HEADER = "std_msgs/Header header\n"
-_LINE = "=" * 80
-_TIME = f"{_LINE}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-_STAMPED = f"{_LINE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n{_TIME}"
-_VECTOR = f"{_LINE}\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
-_TURN = f"{_LINE}\nMSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
-_DIMENSION = f"{_LINE}\nMSG: std_msgs/MultiArrayDimension\nstring label\nuint32 size\nuint32 stride\n"
-MESSAGES = {
-    "sensor_msgs/msg/CompressedImage": f"{_HEADER}string format\nuint8[] data\n{_STAMPED}",
-    "geometry_msgs/msg/TwistStamped": f"{_HEADER}geometry_msgs/Twist twist\n{_LINE}\nMSG: geometry_msgs/Twist\n"
-    f"geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n{_VECTOR}{_STAMPED}",
-    "geometry_msgs/msg/WrenchStamped": f"{_HEADER}geometry_msgs/Wrench wrench\n{_LINE}\nMSG: geometry_msgs/Wrench\n"
-    f"geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque\n{_VECTOR}{_STAMPED}",
-    "tf2_msgs/msg/TFMessage": f"geometry_msgs/TransformStamped[] transforms\n{_LINE}\nMSG: geometry_msgs/TransformStamped\n{_HEADER}"
-    f"string child_frame_id\ngeometry_msgs/Transform transform\n{_LINE}\nMSG: geometry_msgs/Transform\n"
-    f"geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n{_VECTOR}{_TURN}{_STAMPED}",
-    "std_msgs/msg/Float32MultiArray": f"std_msgs/MultiArrayLayout layout\nfloat32[] data\n{_LINE}\nMSG: std_msgs/MultiArrayLayout\n"
-    f"std_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n{_DIMENSION}",
-    "std_msgs/msg/Int8": "int8 data\n",
-}
-"""Definitions of the messages as in ROS 2."""
 
 
 class Ros2Writer(FolderWriter):
@@ -60,7 +34,7 @@ class Ros2Writer(FolderWriter):
 
     FORMAT = "mcap"
     NAMES = ("episode_*.mcap",)
-    LIBRARIES = ("mcap_ros2.writer",)
+    LIBRARIES = ("mcap.writer",)
 
     def _find(self) -> list[dict[str, Any]]:
         return [_read_description(path)[1] for path in _files(self.folder)]
@@ -75,7 +49,7 @@ class Ros2Writer(FolderWriter):
                 yield [facts]
 
     def _fill(self, file: Any, *, episode: Episode, facts: dict[str, Any]) -> None:
-        bag = _Bag(library("mcap_ros2.writer").Writer(file), self.about, episode)
+        bag = _Bag(library("mcap.writer").Writer(file), self.about, episode)
         for step in episode.steps():
             self._require_fitting(episode, step)
             bag.add(step)
@@ -88,41 +62,36 @@ class _Bag:
 
     def __init__(self, writer: Any, about: About, episode: Episode) -> None:
         self._writer, self._about, self._episode = writer, about, episode
-        self._schemas = {name: writer.register_msgdef(name, text) for name, text in MESSAGES.items()}
+        writer.start(profile="ros2")
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
         self.count = 0
         self._static = episode.T_tool_sensor
-        self._start_ns = round(episode.started_s * NS_PER_S)
+        self._start_ns = round(episode.started_s * ros.NS_PER_S)
 
     def add(self, step: RecordStep) -> None:
         """Write the messages of a step. All have the time of its exposure."""
-        at_ns = self._start_ns + round(step.time_s * NS_PER_S)
+        at_ns = self._start_ns + round(step.time_s * ros.NS_PER_S)
         send = partial(self._send, at_ns=at_ns)
-        header = {"stamp": {"sec": at_ns // NS_PER_S, "nanosec": at_ns % NS_PER_S}, "frame_id": SENSOR_FRAME}
-        based = header | {"frame_id": self._about.frame}
+        header, based = ros.header_of(at_ns, SENSOR_FRAME), ros.header_of(at_ns, self._about.frame)
         if self._static is not None and not self.count:
-            place = _transform(self._static, header | {"frame_id": TOOL_FRAME}, SENSOR_FRAME)
-            send(TF_STATIC_TOPIC, "tf2_msgs/msg/TFMessage", {"transforms": [place]})
-        send(IMAGE_TOPIC, "sensor_msgs/msg/CompressedImage", {"header": header, "format": "png", "data": png(step.image)})
+            send(ros.TF_STATIC_TOPIC, "tf2_msgs/TFMessage", ros.transform(self._static, ros.header_of(at_ns, TOOL_FRAME), SENSOR_FRAME))
+        send(IMAGE_TOPIC, "sensor_msgs/CompressedImage", {"header": header, "format": "png", "data": png(step.image)})
         for name, values in step.values.items():
-            numbers = values.astype(float)
-            topic = CHANNELS[name].topic
+            numbers, topic = values.astype(float), CHANNELS[name].topic
             if self._about.is_plain(name):
-                send(topic, "std_msgs/msg/Float32MultiArray", _array(values, "pin" if name == "pins" else ",".join(self._about.axes(name))))
+                labels = "pin" if name == "pins" else ",".join(self._about.axes(name))
+                send(topic, "std_msgs/Float32MultiArray", ros.number_array(values, labels, "axis"))
             elif name == "wrench":
-                parts = {"force": _vector(numbers[:3]), "torque": _vector(numbers[3:] / MM_PER_M)}
-                send(topic, "geometry_msgs/msg/WrenchStamped", {"header": header, "wrench": parts})
-                send(CONTACT_TOPIC, "std_msgs/msg/Int8", {"data": int(np.linalg.norm(numbers[:3]) > TOUCHES_N)})
+                send(topic, "geometry_msgs/WrenchStamped", {"header": header, "wrench": ros.wrench(numbers[:3], numbers[3:])})
+                send(CONTACT_TOPIC, "std_msgs/Int8", {"data": np.linalg.norm(numbers[:3]) > ros.TOUCHES_N})
             else:
-                send(topic, "geometry_msgs/msg/TwistStamped", {"header": based, "twist": _twist(numbers)})
+                send(topic, "geometry_msgs/TwistStamped", {"header": based, "twist": ros.twist(numbers)})
         if "estimate" in step.values:
             known = dict(zip(self._about.estimates, step.values["estimate"].tolist(), strict=True))
-            six = np.array([known.get(f"pose_{k}", np.nan) for k in range(1, 7)])
-            send(POSE_TOPIC, "geometry_msgs/msg/TwistStamped", {"header": header, "twist": _twist(six)})
+            send(POSE_TOPIC, "geometry_msgs/TwistStamped", {"header": header, "twist": ros.estimated_twist(known)})
         if "pose" in step.values and np.isfinite(step.values["pose"]).all():
-            T = np.eye(4)
-            pose = step.values["pose"].astype(float)
-            T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", pose[3:], degrees=True).as_matrix(), pose[:3]
-            send(TF_TOPIC, "tf2_msgs/msg/TFMessage", {"transforms": [_transform(T, based, TOOL_FRAME)]})
+            send(ros.TF_TOPIC, "tf2_msgs/TFMessage", ros.transform(ros.pose_matrix(step.values["pose"].astype(float)), based, TOOL_FRAME))
         self.count += 1
 
     def finish(self, facts: dict[str, Any]) -> None:
@@ -134,7 +103,11 @@ class _Bag:
         self._writer.finish()
 
     def _send(self, topic: str, kind: str, message: dict[str, Any], *, at_ns: int) -> None:
-        self._writer.write_message(topic, self._schemas[kind], message, at_ns, at_ns, self.count)
+        if kind not in self._schemas:
+            self._schemas[kind] = self._writer.register_schema(ros.full_name(kind), "ros2msg", ros.definition_of(kind).encode())
+        if topic not in self._channels:
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind])
+        self._writer.add_message(self._channels[topic], at_ns, ros.encode(kind, message), at_ns, self.count)
 
 
 def ros2_records(path: Path) -> Records:
@@ -185,68 +158,37 @@ def _read_description(path: Path) -> tuple[About, dict[str, Any], bytes | None]:
 
 def _steps_of(path: Path, about: About) -> Iterator[RecordStep]:
     """The steps of a file. Messages with the same sequence number belong to one step."""
-    reader, decoder = library("mcap.reader"), library("mcap_ros2.decoder").DecoderFactory()
+    reader = library("mcap.reader")
     named = {CHANNELS[name].topic: name for name in about.numbers}
     topics = [IMAGE_TOPIC, *named]
     start_ns: int | None = None
     try:
         with path.open("rb") as file:
-            bag = reader.make_reader(file, validate_crcs=True, decoder_factories=[decoder])
-            decoded = bag.iter_decoded_messages(topics, log_time_order=False)
-            for _, messages in groupby(decoded, key=lambda each: each[2].sequence):
+            found = reader.make_reader(file, validate_crcs=True).iter_messages(topics, log_time_order=False)
+            for _, messages in groupby(found, key=lambda each: each[2].sequence):
                 image, values, at_ns = None, dict[str, np.ndarray](), 0
-                for _, channel, message, ros in messages:
-                    at_ns = message.log_time
+                for schema, channel, message in messages:
+                    at_ns, fields = message.log_time, ros.decode(schema.name.replace("/msg/", "/"), message.data)
                     if channel.topic == IMAGE_TOPIC:
-                        image = image_of(bytes(ros.data), about.gray, str(path))
+                        image = image_of(fields["data"].tobytes(), about.gray, str(path))
                     else:
-                        values[named[channel.topic]] = _numbers(named[channel.topic], ros, about)
+                        values[named[channel.topic]] = _numbers(named[channel.topic], fields, about)
                 start_ns = at_ns if start_ns is None else start_ns
                 if image is not None:
-                    yield RecordStep(image, (at_ns - start_ns) / NS_PER_S, {name: values[name] for name in about.numbers})
+                    yield RecordStep(image, (at_ns - start_ns) / ros.NS_PER_S, {name: values[name] for name in about.numbers})
     except RecordError:
         raise
     except Exception as error:  # the libraries raise exceptions of any type for damaged files
         raise RecordError(f"{path}: damaged ({' '.join(str(error).split())[:MOST_SAID]}); {AGAIN}") from error
 
 
-def _numbers(name: str, ros: Any, about: About) -> np.ndarray:
+def _numbers(name: str, fields: dict[str, Any], about: About) -> np.ndarray:
     """A channel's numbers from its message."""
     if about.is_plain(name):
-        return float32(list(ros.data)).reshape(about.shape(name))
-    if name == "wrench":
-        force, torque = ros.wrench.force, ros.wrench.torque
-        return float32([force.x, force.y, force.z, *(MM_PER_M * t for t in (torque.x, torque.y, torque.z))])
-    linear, angular = ros.twist.linear, ros.twist.angular
-    return float32([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
-
-
-def _twist(six: np.ndarray) -> dict[str, Any]:
-    return {"linear": _vector(six[:3]), "angular": _vector(six[3:])}
-
-
-def _vector(numbers: np.ndarray) -> dict[str, float]:
-    return dict(zip("xyz", numbers.tolist(), strict=True))
-
-
-def _transform(T_mm: np.ndarray, header: dict[str, Any], child: str) -> dict[str, Any]:
-    turn = Rotation.from_matrix(T_mm[:3, :3]).as_quat()
-    rotation = dict(zip("xyzw", turn.tolist(), strict=True))
-    return {
-        "header": header,
-        "child_frame_id": child,
-        "transform": {"translation": _vector(T_mm[:3, 3] / MM_PER_M), "rotation": rotation},
-    }
-
-
-def _array(values: np.ndarray, label: str) -> dict[str, Any]:
-    """Numbers as an array message with named dimensions."""
-    labels = (label, "axis")[: values.ndim]
-    dim = [
-        {"label": each, "size": n, "stride": int(np.prod(values.shape[k:]))}
-        for k, (each, n) in enumerate(zip(labels, values.shape, strict=True))
-    ]
-    return {"layout": {"dim": dim, "data_offset": 0}, "data": values.ravel().tolist()}
+        return np.asarray(fields["data"], np.float32).reshape(about.shape(name))
+    parts, scale = (fields["wrench"], ros.MM_PER_M) if name == "wrench" else (fields["twist"], 1.0)
+    first, second = (list(each.values()) for each in parts.values())
+    return float32([*first, *(scale * each for each in second)])
 
 
 def _files(folder: Path) -> list[Path]:

@@ -38,6 +38,7 @@ bench: setup     ## speed, as ratios to named baselines in the same run
 	@$(SCRIPT) tests/bench/bench_pipeline.py --sensor mg400-127
 	@$(SCRIPT) tests/bench/bench_mechanics.py
 	@$(SCRIPT) tests/bench/bench_environments.py
+	@$(SCRIPT) tests/bench/bench_mujoco.py
 	@$(SCRIPT) tests/bench/bench_render.py
 
 validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, CalculiX, random contacts, Rerun (670 MB)

@@ -220,7 +220,7 @@ def test_frames_of_the_scene_go_through_the_pipeline():
 
 def hold(env, grip_n):
     """Actions that grip with a force, lift, hold and set down."""
-    force, hand = env.grip_n(), env.goal_mm - env.hand_mm
+    force, hand = env.grip_n(), env.goal_mm - env.height_mm()
     if env.part == 2 and env.height_mm() < 0.5:
         return np.array([-1.0, 0.0])
     ready = force > 0.9 * grip_n

@@ -65,7 +65,6 @@ class SurrogateContacts:
         self._before = np.tile(np.eye(4), (count, 1, 1))  # the poses commanded last
         self._known = np.zeros(count, bool)
         self._gap = np.full((count, len(surrogate.node_mm)), np.inf)
-        self._parts = self._found[:, : len(modes)]
         self._domain = surrogate.domain
         self.felt = ContactReading.at_rest(count, self._caps_rest)
 
@@ -147,6 +146,10 @@ class SurrogateContacts:
         if self._network is not None:
             self.felt.caps_mm[row] = self._caps_rest + (self._parts[row] @ self._cap_modes).reshape(-1, 3)
         return self.felt.caps_mm[row]
+
+    @property
+    def _parts(self) -> FloatArray:
+        return self._found[:, : len(self._surrogate.modes)]
 
     @property
     def caps_at_rest_mm(self) -> FloatArray:

@@ -97,7 +97,7 @@ class GraspLift(GripperTask):
 
     def grip_n(self) -> float:
         """The smaller of both fingers' forces along their axes, N."""
-        return float(min(each.force_n[2] for each in self.felt()))
+        return float(min(each.force_n[2] for each in self.readings()))
 
     def _look(self) -> dict[str, FloatArray]:
         state = [(self._fingers - OPEN_MM) / 5.0, self.hand_mm / LIFT_MM, self.goal_mm / LIFT_MM, float(self.part), self._held * PERIOD_S]

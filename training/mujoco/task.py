@@ -66,7 +66,7 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         self.observation_space = cast(spaces.Space[dict[str, FloatArray]], spaces.Dict(box))
         self.action_space = spaces.Box(-1.0, 1.0, self.shape[1:], np.float32)
 
-    def felt(self) -> list[TactileReading]:
+    def readings(self) -> list[TactileReading]:
         """The contacts of both sensors."""
         return [self.scene.read(site) for site in self.scene.sensors]
 
@@ -85,9 +85,9 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         """The observation: ``state`` and touch."""
         seen: dict[str, FloatArray] = {"state": np.array(state)}
         if self.observation == "pins":
-            seen["tactile"] = np.stack([of.pins_px - rest for of, rest in zip(self.felt(), self._rest_px, strict=True)]) / self._spacing
+            seen["tactile"] = np.stack([of.pins_px - rest for of, rest in zip(self.readings(), self._rest_px, strict=True)]) / self._spacing
         elif self.observation == "wrench":
-            seen["tactile"] = np.stack([np.concatenate([of.force_n, of.torque_nmm / 10.0]) for of in self.felt()])
+            seen["tactile"] = np.stack([np.concatenate([of.force_n, of.torque_nmm / 10.0]) for of in self.readings()])
         return {name: np.clip(values, -10.0, 10.0).astype(np.float32) for name, values in seen.items()}
 
     def render(self) -> ImageArray | None:

@@ -39,6 +39,7 @@ bench: setup     ## speed, as ratios to named baselines in the same run
 	@$(SCRIPT) tests/bench/bench_pipeline.py --sensor mg400-127
 	@$(SCRIPT) tests/bench/bench_mechanics.py
 	@$(SCRIPT) tests/bench/bench_environments.py
+	@$(SCRIPT) tests/bench/bench_mujoco.py
 	@$(SCRIPT) tests/bench/bench_render.py
 	@$(SCRIPT) tests/bench/bench_ros2.py
 

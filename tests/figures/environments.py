@@ -6,6 +6,7 @@ from pathlib import Path
 
 import bench_baselines
 import bench_environments
+import bench_geoms
 import bench_surrogate
 import numpy as np
 
@@ -161,3 +162,21 @@ for task in OWN:
     baseline_job(f"{task}.blind", task, 0, " --blind", blind=True)
 for task in BASELINE_SAC:
     baseline_job(f"{task}.sac", task, 0, " --algorithm SAC", algorithm="SAC")
+
+
+@job(
+    "geoms.press",
+    "tests/bench/bench_geoms.py",
+    sensors=("mg400-331",),
+    code=("bench_geoms", "training.mujoco.scene"),
+    shipped=("training/surrogates/mg400-331.safetensors",),
+    minutes=1,
+    beside=DRAWN,
+)
+def geoms(work: Path) -> Measured:
+    """Presses by a robot scene and by the finite elements, by kind of geom."""
+    found = {}
+    for kind, (force, share, off, moved) in bench_geoms.measured().items():
+        found |= {f"{kind}_n": Value(force, "N"), f"{kind}_share": Value(share)}
+        found |= {f"{kind}_mm": Value(off, "mm"), f"{kind}_moved_mm": Value(moved, "mm")}
+    return found

@@ -1,5 +1,6 @@
 """Sensors in a MuJoCo scene: laws of statics and dynamics, agreement with the finite elements, and what is refused."""
 
+import pickle
 from xml.etree import ElementTree
 
 import gymnasium
@@ -7,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from peg_expert import Expert
 
 from hardware.rig.geometry import PlacedObject
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
@@ -220,11 +222,11 @@ def test_frames_of_the_scene_go_through_the_pipeline():
 
 def hold(env, grip_n):
     """Actions that grip with a force, lift, hold and set down."""
-    force, hand = env.grip_n(), env.goal_mm - env.hand_mm
+    force, hand = env.grip_n(), env.goal_mm - env.height_mm()
     if env.part == 2 and env.height_mm() < 0.5:
         return np.array([-1.0, 0.0])
     ready = force > 0.9 * grip_n
-    return np.clip([1.2 * (grip_n - force), ready * hand / 4], [-1, -0.5], [1, 0.5])
+    return np.clip([3.0 * (grip_n - force), ready * hand / 4], [-1, -0.5], [1, 0.5])
 
 
 def play(env, seed, grip_n):
@@ -250,6 +252,46 @@ def test_a_lift_is_repeated_exactly_by_its_seed_and_is_an_environment_for_gymnas
         seen.append([env.step(np.array([1.0, 0.2]))[0]["tactile"] for _ in range(12)][-1])
     assert np.array_equal(*seen) and seen[0].any() and seen[0].shape == (2, 331, 2)
     check_env(env, skip_render_check=True)
+
+
+def test_a_scripted_controller_inserts_pegs_by_what_the_sensors_feel():
+    env = gymnasium.make("tactip/PegInsert-v0", observation="none").unwrapped
+    solved = 0
+    for seed in range(5):
+        _, start = env.reset(seed=seed)
+        assert np.linalg.norm(start["off_mm"]) <= 5 and abs(start["tilt_deg"]) <= 5
+        expert, over, rewards = Expert(env), False, []
+        while not over:
+            _, reward, failed, late, info = env.step(expert.act())
+            rewards.append(reward)
+            over = failed or late
+            assert failed or info["is_success"] or reward == pytest.approx(sum(info["terms"].values()))
+        assert min(rewards[:-1]) >= 0 and max(rewards[:-1]) <= 1
+        solved += info["is_success"]
+    assert solved >= 4
+
+
+def test_a_peg_that_is_pushed_down_without_feeling_often_misses():
+    env = gymnasium.make("tactip/PegInsert-v0", observation="none").unwrapped
+    env.reset(seed=0, options={"off_mm": (5.0, 0.0), "tilt_deg": 5.0})
+    for _ in range(80):
+        *_, failed, _, info = env.step(np.array([0, 0, -0.5, 0]))
+        if failed:
+            break
+    assert not info["is_success"] and info["depth_mm"] < 5
+
+
+@pytest.mark.parametrize("observation", ["pins", "wrench", "none"])
+def test_a_peg_task_is_an_environment_for_gymnasium_that_repeats_and_can_be_stored(observation):
+    env = gymnasium.make("tactip/PegInsert-v0", observation=observation).unwrapped
+    check_env(env, skip_render_check=True)
+    env.reset(seed=5)
+    again = pickle.loads(pickle.dumps(env))
+    seen = []
+    for each in (env, again, env):
+        each.reset(seed=5)
+        seen.append([each.step(np.array([0.2, 0.0, -1.0, 0.1]))[0] for _ in range(8)][-1])
+    assert all(np.array_equal(seen[0][name], other[name]) for other in seen[1:] for name in seen[0])
 
 
 def test_an_arm_carries_a_sensor_through_a_scene_as_through_the_twin():

@@ -250,6 +250,20 @@ def test_what_is_felt_does_not_depend_on_the_poses_in_which_a_way_is_told(surrog
     assert np.linalg.norm(force - parts.felt.force_n[0]) < WAY_BOUND * np.linalg.norm(force)
 
 
+def test_a_few_sensors_in_very_small_steps_feel_what_many_do(surrogate, sensor):
+    """The steps of a physics engine: the way of the other solution, whose bending is evaluated more than once at each pose."""
+    many, few = contacts(surrogate, sensor, "edge"), contacts(surrogate, sensor, "edge", few=True)
+    stops = [pose(-0.5), pose(3.0), pose(3.0, across=(1.5, 0.0)), pose(2.0)]
+    for T in (T for start, stop in pairwise(stops) for T in between(start, stop, 100)):
+        go(many, T)
+        go(few, T)
+    force = many.felt.force_n[0]
+    assert np.linalg.norm(force - few.felt.force_n[0]) < 0.01 * np.linalg.norm(force)
+    assert np.allclose(few.felt.torque_nmm, many.felt.torque_nmm, rtol=0.02, atol=0.1)
+    assert np.abs(few.attitude(0).caps_mm - many.attitude(0).caps_mm).max() < 0.03
+    assert abs(few.felt.area_mm2[0] - many.felt.area_mm2[0]) < 3.0
+
+
 def test_many_contacts_are_those_of_each_alone(surrogate, sensor):
     """They are solved in threads; each has its own object, friction and way."""
     things = [load_object(name) for name in ("plane", "ball-40", "edge", "cylinder")]

@@ -21,7 +21,7 @@ NAMESPACE = "tactip"
 VERSION = 0
 OWN = ("EdgeFollow", "SurfaceFollow", "ContourFollow", "GentlePress", "ObjectRoll", "ObjectPush")
 """Names of this package's tasks."""
-IN_SCENES = {"GraspLift": "training.mujoco.grasp:GraspLift"}
+IN_SCENES = {"GraspLift": "training.mujoco.grasp:GraspLift", "PegInsert": "training.mujoco.peg:PegInsert"}
 """By name: the environments in MuJoCo scenes (extra ``mujoco``)."""
 _PLACES = {
     "Options": "training.environments.batch",

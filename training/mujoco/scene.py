@@ -17,7 +17,7 @@ import numpy as np
 
 from scenes import SensorSpec, load_sensor
 from training.environments.observe import Pictures, SensorView
-from training.mujoco.geoms import MM, solid_of
+from training.mujoco.geoms import MESH_OFF_MM, MM, solid_of
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.model import surrogate_of
 from training.surrogate.solids import distances_to
@@ -25,8 +25,9 @@ from twin.camera.projection import project_in_form
 from twin.compiled import compiled
 from twin.errors import OptionError
 from twin.pins import Pipeline
-from twin.types import BoolArray, FloatArray, Form, Frame, IntArray, Observation, PinState
+from twin.types import FloatArray, Form, Frame, IntArray, Observation, PinState
 
+Arrays = tuple[Any, ...]
 NEAR_MM = 2.0
 """Distance between dome and geom from which the motion towards it is followed."""
 STOP_N_PER_MM = 20.0
@@ -119,16 +120,18 @@ class TactileScene:
         of = [solid_of(model, geom) for geom in geoms]
         self._geom = np.array(geoms, int)
         self._solid, self._pose = [each for each, _ in of], np.array([pose for _, pose in of]).reshape(-1, 4, 4)
-        self._kind = np.array([each.kind for each in self._solid], np.int64)
-        self._sizes = np.zeros((len(of), 4))
+        sizes = np.zeros((len(of), 4))
         for row, each in enumerate(self._solid):
-            self._sizes[row, : len(each.sizes)] = each.sizes
+            sizes[row, : len(each.sizes)] = each.sizes
         fixed = np.where(model.body_weldid > 0, model.body_weldid, -np.arange(model.nbody))  # bodies of the world are no parts of a sensor
-        self._own = fixed[model.geom_bodyid[self._geom]][None] == fixed[self._body][:, None]
+        own, bound = fixed[model.geom_bodyid[self._geom]][None] == fixed[self._body][:, None], model.geom_rbound[self._geom]
+        reach = np.where(bound > 0, MM * bound + MESH_OFF_MM, np.inf)  # a plane has no bound
+        self._solids = np.array([each.kind for each in self._solid], np.int64), sizes, reach, own
         specs = list(dict.fromkeys(self.sensors.values()))
         self._set = np.array([specs.index(each) for each in self.sensors.values()], int)  # of each sensor: number of its contacts
         self._row = np.array([int((self._set[:place] == number).sum()) for place, number in enumerate(self._set)], int)  # row in them
-        self._contacts = [SurrogateContacts(surrogate_of(each), each, int((self._set == k).sum())) for k, each in enumerate(specs)]
+        counts = np.bincount(self._set, minlength=len(specs)).tolist()
+        self._contacts = [SurrogateContacts(surrogate_of(each), each, count, few=True) for each, count in zip(specs, counts, strict=True)]
         self._radius = np.array([self._contacts[number].radius_mm for number in self._set])
         self._views: dict[tuple[str, Form, Pictures], SensorView] = {}
         self.reset()
@@ -158,31 +161,27 @@ class TactileScene:
 
         For an own loop: ``mj_step1``, ``apply``, ``mj_step2``.
         """
-        data = self.data
-        turn, place = data.site_xmat[self._site].reshape(-1, 3, 3), MM * data.site_xpos[self._site]
-        held = data.geom_xmat[self._geom].reshape(-1, 3, 3)
-        solid_turn, solid_place = held @ self._pose[:, :3, :3], MM * data.geom_xpos[self._geom] + (held @ self._pose[:, :3, 3:])[..., 0]
-        normal, before = np.zeros((*self._gap.shape, 3)), self._gap.copy()
-        _gaps(place, turn, solid_place, solid_turn, self._kind, self._sizes, self._own, self._radius, self._gap, normal)
+        data, before, normal = self.data, self._gap.copy(), np.empty((*self._gap.shape, 3))
+        poses = data.site_xpos, data.site_xmat, self._site, data.geom_xpos, data.geom_xmat, self._geom, self._pose
+        _gaps(poses, self._solids, self._radius, self._gap, normal)
         for sensor in range(len(self._site)):
             self._choose(sensor)
-        T = _relative(place, turn, solid_place, solid_turn, self._at)
+        T = _relative(poses, self._at)
         for number, contacts in enumerate(self._contacts):
             mine = np.flatnonzero((self._at >= 0) & (self._set == number))
             if len(mine):
                 rows, felt = self._row[mine], contacts.felt
                 contacts.move(rows, T[mine], np.full(len(mine), data.time))
-                self._lost[mine] = [bool(felt.lost[row]) for row in rows]
-                seen = mine[~self._lost[mine]]
-                depth = -self._gap[seen, self._at[seen]]
-                self._solved[seen] = np.column_stack([felt.force_n[self._row[seen]], felt.torque_nmm[self._row[seen]], depth])
-        loss = self._loss / MM / self.model.opt.timestep
-        self._wrench[:] = _wrenches(turn, self._at, self._gap, before, normal, self._lost, self._solved, loss)
-        bodies = np.stack([self.model.geom_bodyid[self._geom[self._at]], self._body], axis=1)
-        applied = np.zeros_like(self._applied)
-        _push(place, turn, self._wrench, bodies, data.xipos, applied)
-        data.xfrc_applied += applied - self._applied
-        self._applied = applied
+                for sensor, row in zip(mine.tolist(), rows.tolist(), strict=True):
+                    self._lost[sensor] = bool(felt.lost[row])
+                    if not felt.lost[row]:
+                        solved = self._solved[sensor]
+                        solved[:3], solved[3:6], solved[6] = felt.force_n[row], felt.torque_nmm[row], -self._gap[sensor, self._at[sensor]]
+        bodies, state = (self.model.geom_bodyid, self._body, data.xipos), (self._gap, before, normal, self._lost, self._solved)
+        data.xfrc_applied -= self._applied
+        self._applied[:] = 0.0
+        _push(poses, self._at, bodies, state, self._loss / MM / self.model.opt.timestep, self._wrench, self._applied)
+        data.xfrc_applied += self._applied
 
     def _choose(self, sensor: int) -> None:
         """Choose the solid that a sensor touches."""
@@ -205,12 +204,13 @@ class TactileScene:
         contacts, row, at, gap = self._contacts[self._set[sensor]], int(self._row[sensor]), int(self._at[sensor]), self._gap[sensor]
         felt, spec = contacts.felt, self.sensors[site]
         inside = np.flatnonzero(gap < 0)
+        caps = contacts.caps_mm(row).copy()
         return TactileReading(
             self._name(at) if at >= 0 and gap[at] < 0 else "",
             self._wrench[sensor, :3].copy(),
             self._wrench[sensor, 3:].copy(),
-            felt.caps_mm[row].copy(),
-            project_in_form(spec, self.form(site), felt.caps_mm[row]),
+            caps,
+            project_in_form(spec, self.form(site), caps),
             max(float(-gap[at]), 0.0) if at >= 0 else 0.0,
             float(felt.area_mm2[row]),
             float(felt.slip[row]),
@@ -268,92 +268,103 @@ def _touchable(model: mujoco.MjModel) -> list[int]:
 
 
 @compiled()
-def _gaps(
-    place: FloatArray,
-    turn: FloatArray,
-    solid_place: FloatArray,
-    solid_turn: FloatArray,
-    kind: IntArray,
-    sizes: FloatArray,
-    own: BoolArray,
-    radius: FloatArray,
-    gap: FloatArray,
-    normal: FloatArray,
-) -> None:
-    """Write the distances (S, G) of solids from domes, and the solids' outward normals (S, G, 3) there, world frame.
-
-    Sensors (S, 3), (S, 3, 3) and solids (G, 3), (G, 3, 3) are given by place and axes. A solid behind the dome is infinitely far.
-    """
-    point = np.empty((1, 3))
-    for g in range(len(kind)):
-        for s in range(len(place)):
-            if own[s, g]:
-                continue
-            for axis in range(3):
-                point[0, axis] = (solid_turn[g, :, axis] * (place[s] - solid_place[g])).sum()
-            away, outward = distances_to(point, kind[g], sizes[g])
-            ahead = 0.0
-            for axis in range(3):
-                normal[s, g, axis] = (solid_turn[g, axis] * outward[0]).sum()
-                ahead -= normal[s, g, axis] * turn[s, axis, 2]
-            gap[s, g] = away[0] - radius[s] if ahead > 0 else np.inf
+def _pose_of(xpos: FloatArray, xmat: FloatArray, number: int) -> tuple[FloatArray, FloatArray]:
+    """Place (3,), mm, and axes (3, 3) of a site or geom."""
+    return MM * xpos[number], xmat[number].copy().reshape(3, 3)
 
 
 @compiled()
-def _relative(place: FloatArray, turn: FloatArray, solid_place: FloatArray, solid_turn: FloatArray, at: IntArray) -> FloatArray:
+def _solid_at(xpos: FloatArray, xmat: FloatArray, geom: int, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Place and axes of a geom's solid, which has a pose (4, 4) in its frame."""
+    place, held = _pose_of(xpos, xmat, geom)
+    turn = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            place[i] += held[i, j] * pose[j, 3]
+            for k in range(3):
+                turn[i, j] += held[i, k] * pose[k, j]
+    return place, turn
+
+
+@compiled()
+def _gaps(poses: Arrays, solids: Arrays, radius: FloatArray, gap: FloatArray, normal: FloatArray) -> None:
+    """Write the distances (S, G) of solids from domes, and the solids' outward normals (S, G, 3) there, world frame.
+
+    A solid is infinitely far if it is behind the dome, or if the sphere ``bound`` (G,) around it is out of reach.
+    """
+    site_xpos, site_xmat, sites, geom_xpos, geom_xmat, geoms, pose = poses
+    kind, sizes, bound, own = solids
+    point = np.empty((1, 3))
+    for s in range(len(sites)):
+        place, turn = _pose_of(site_xpos, site_xmat, sites[s])
+        for g in range(len(geoms)):
+            gap[s, g] = np.inf
+            off = 0.0
+            for axis in range(3):
+                off += (place[axis] - MM * geom_xpos[geoms[g], axis]) ** 2
+            if own[s, g] or off > (bound[g] + radius[s] + NEAR_MM) ** 2:
+                continue
+            solid_place, solid_turn = _solid_at(geom_xpos, geom_xmat, geoms[g], pose[g])
+            for axis in range(3):
+                point[0, axis] = (solid_turn[:, axis] * (place - solid_place)).sum()
+            away, outward = distances_to(point, kind[g], sizes[g])
+            ahead = 0.0
+            for axis in range(3):
+                normal[s, g, axis] = (solid_turn[axis] * outward[0]).sum()
+                ahead -= normal[s, g, axis] * turn[axis, 2]
+            if ahead > 0:
+                gap[s, g] = away[0] - radius[s]
+
+
+@compiled()
+def _relative(poses: Arrays, at: IntArray) -> FloatArray:
     """Poses (S, 4, 4) of each sensor's solid in its frame; zero where ``at`` is -1."""
+    site_xpos, site_xmat, sites, geom_xpos, geom_xmat, geoms, pose = poses
     T = np.zeros((len(at), 4, 4))
     for s in range(len(at)):
         if at[s] < 0:
             continue
+        place, turn = _pose_of(site_xpos, site_xmat, sites[s])
+        solid_place, solid_turn = _solid_at(geom_xpos, geom_xmat, geoms[at[s]], pose[at[s]])
         T[s, 3, 3] = 1.0
         for i in range(3):
-            T[s, i, 3] = (turn[s, :, i] * (solid_place[at[s]] - place[s])).sum()
+            T[s, i, 3] = (turn[:, i] * (solid_place - place)).sum()
             for j in range(3):
-                T[s, i, j] = (turn[s, :, i] * solid_turn[at[s], :, j]).sum()
+                T[s, i, j] = (turn[:, i] * solid_turn[:, j]).sum()
     return T
 
 
 @compiled()
-def _wrenches(
-    turn: FloatArray,
-    at: IntArray,
-    gap: FloatArray,
-    before: FloatArray,
-    normal: FloatArray,
-    lost: BoolArray,
-    solved: FloatArray,
-    loss: float,
-) -> FloatArray:
-    """The wrenches (S, 6) of the contacts ``solved`` (S, 7), with the loss of skin and gel, and of contacts that can't be computed."""
-    wrench = np.zeros((len(at), 6))
+def _push(poses: Arrays, at: IntArray, bodies: Arrays, contacts: Arrays, loss: float, wrench: FloatArray, applied: FloatArray) -> None:
+    """Write the wrenches (S, 6) of the contacts ``solved`` (S, 7), with the loss of skin and gel, and of contacts that can't be computed.
+
+    Add them to the forces (N) and torques (N m) on solids and sensors, ``applied`` at the bodies' centres of mass.
+    """
+    xpos, xmat, sites, _, _, geoms, _ = poses
+    body_of, body, middle = bodies
+    gap, before, normal, lost, solved = contacts
+    wrench[:] = 0.0
+    force, torque, lever = np.empty(3), np.empty(3), np.empty(3)
     for s in range(len(at)):
         if at[s] < 0:
             continue
+        place, turn = _pose_of(xpos, xmat, sites[s])
         depth = -gap[s, at[s]]
         faster = depth + before[s, at[s]] if before[s, at[s]] <= NEAR_MM else 0.0  # mm in this step; none after a jump
-        if not lost[s]:
-            wrench[s] = solved[s, :6] * min(max(1.0 + loss * faster, 0.0), MOST_GROWTH)
-            continue
-        size = np.sqrt((solved[s, :3] ** 2).sum()) + STOP_N_PER_MM * max(depth - solved[s, 6], 0.0)
+        if lost[s]:
+            size = np.sqrt((solved[s, :3] ** 2).sum()) + STOP_N_PER_MM * max(depth - solved[s, 6], 0.0)
+            for i in range(3):
+                wrench[s, i] = -size * (STOP_RETURNS if faster < 0 else 1.0) * (turn[:, i] * normal[s, at[s]]).sum()
+        else:
+            for i in range(6):
+                wrench[s, i] = solved[s, i] * min(max(1.0 + loss * faster, 0.0), MOST_GROWTH)
         for i in range(3):
-            wrench[s, i] = -size * (STOP_RETURNS if faster < 0 else 1.0) * (turn[s, :, i] * normal[s, at[s]]).sum()
-    return wrench
-
-
-@compiled()
-def _push(place: FloatArray, turn: FloatArray, wrench: FloatArray, bodies: IntArray, middle: FloatArray, applied: FloatArray) -> None:
-    """Add the wrenches on solids and sensors to the forces (N) and torques (N m) on ``bodies`` (S, 2) at their centres of mass."""
-    force, torque, lever = np.empty(3), np.empty(3), np.empty(3)
-    for s in range(len(wrench)):
-        if not wrench[s].any():
-            continue
-        for i in range(3):
-            force[i], torque[i] = (turn[s, i] * wrench[s, :3]).sum(), (turn[s, i] * wrench[s, 3:]).sum()
+            force[i], torque[i] = (turn[i] * wrench[s, :3]).sum(), (turn[i] * wrench[s, 3:]).sum()
         for side in range(2):
-            body, sign = bodies[s, side], 1.0 - 2.0 * side
-            lever[:] = place[s] - MM * middle[body]
+            part, sign = body[s] if side else body_of[geoms[at[s]]], 1.0 - 2.0 * side
+            for i in range(3):
+                lever[i] = place[i] - MM * middle[part, i]
             for i in range(3):
                 j, k = (i + 1) % 3, (i + 2) % 3
-                applied[body, i] += sign * force[i]
-                applied[body, 3 + i] += sign * (torque[i] + lever[j] * force[k] - lever[k] * force[j]) / MM
+                applied[part, i] += sign * force[i]
+                applied[part, 3 + i] += sign * (torque[i] + lever[j] * force[k] - lever[k] * force[j]) / MM

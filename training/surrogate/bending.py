@@ -72,7 +72,7 @@ def unbent(nodes: int) -> tuple[FloatArray, ...]:
 
 
 @compiled(nogil=True, fastmath=LOOSE)
-def _add_product(x: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
+def add_product(x: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
     """Add ``x`` (i,) times a matrix (i, o) to ``out`` (o,)."""
     for k in range(len(x)):
         row, value = matrix[k], x[k]
@@ -81,7 +81,7 @@ def _add_product(x: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
 
 
 @compiled(nogil=True, fastmath=LOOSE)
-def _apply_silu(x: FloatArray) -> None:
+def apply_silu(x: FloatArray) -> None:
     """Apply the activation of the layers to ``x`` (i,)."""
     for k in range(len(x)):
         x[k] = x[k] / (np.float32(1.0) + np.exp(-x[k]))
@@ -111,18 +111,18 @@ def bend(force: FloatArray, bent: FloatArray, moved: FloatArray, network: tuple[
         size += x[k] * x[k]
     gate = np.float32(np.tanh(size / seen / AMPLE))
     one, two, out = a.copy(), b.copy(), c.copy()
-    _add_product(x, first, one)
-    _apply_silu(one)
-    _add_product(one, second, two)
-    _apply_silu(two)
-    _add_product(two, third, out)
+    add_product(x, first, one)
+    apply_silu(one)
+    add_product(one, second, two)
+    apply_silu(two)
+    add_product(two, third, out)
     for o in range(count):
         out[o] *= gate
-    _add_product(x, straight, out)
+    add_product(x, straight, out)
     most = np.float32(0.0)
     for p in range(3):
         whole = np.zeros(bent.shape[1], np.float32)
-        _add_product(out, modes[:, p], whole)
+        add_product(out, modes[:, p], whole)
         for j in range(len(whole)):
             change = np.float32(TAKEN) * (whole[j] - bent[p, j])
             most = max(most, abs(change))

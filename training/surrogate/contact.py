@@ -79,13 +79,25 @@ class Nodes(NamedTuple):
 
 
 class Touching(NamedTuple):
-    """The q nodes near an object, its turn (3, 3), and the places, distances and normals of all nodes in its frame."""
+    """The q nodes near an object, their displacements (q, 3, 3, q) float32 for forces at each other (see ``_solve``), the object's turn
+    (3, 3), and the places, distances and normals of all nodes in its frame."""
 
     near: IntArray
+    among: FloatArray
     turn: FloatArray
     here: FloatArray
     gap: FloatArray
     normal: FloatArray
+
+
+class Kept(NamedTuple):
+    """The near nodes (k, M + 1) of each contact's last load step, -1 behind them, and their ``Touching.among`` (k, 9 M^2) laid flat.
+
+    With many contacts k is 0: they would need too much memory.
+    """
+
+    near: IntArray
+    among: FloatArray
 
 
 class LinearContacts:
@@ -102,6 +114,9 @@ class LinearContacts:
         B.
     bending : tuple of float32 arrays, optional
         Arrays of the network that corrects the linear skin (see ``Bending.kernel``); by default the skin is linear.
+    still_mm : float
+        Change of the bending between two motions up to which one evaluation of it is enough for a load step. With more than 0, a motion in
+        very small steps costs half.
 
     Attributes
     ----------
@@ -131,17 +146,22 @@ class LinearContacts:
         Share of Coulomb's bound that the pressing nodes bear together.
     """
 
-    def __init__(self, node_mm: FloatArray, answer: FloatArray, count: int, *, bending: tuple[FloatArray, ...] | None = None) -> None:
+    def __init__(
+        self, node_mm: FloatArray, answer: FloatArray, count: int, *, bending: tuple[FloatArray, ...] | None = None, still_mm: float = 0.0
+    ) -> None:
         size = len(node_mm)
         self.node_mm, self.answer = node_mm, np.ascontiguousarray(answer.transpose(0, 3, 2, 1), np.float32)
         self.radius_mm = float(np.linalg.norm(node_mm[0]))
-        self.bending = unbent(size) if bending is None else bending
+        self.bending, self.still_mm = unbent(size) if bending is None else bending, still_mm
         self.kind, self.sizes, self.turning = np.zeros(count, np.int64), np.zeros((count, SIZES)), np.zeros((count, 10))
         self.friction, self.compliance_mm_per_n, self.used = np.zeros((3, count))
         self.taken = np.tile(np.eye(4), (count, 1, 1))
         self.force_n, self.moved_mm, self.anchor_mm, self.seen_mm = np.zeros((4, count, size, 3))
         self.bent_mm, self.gap_mm = np.zeros((count, 3, size), np.float32), np.full((count, size), np.inf)
         self.held, self.slides = np.zeros((2, count, size), bool)
+        self._state = tuple(kind(*(getattr(self, name) for name in kind._fields)) for kind in (Laws, Nodes))
+        few = count if count <= ROWS_OF_A_THREAD else 0
+        self._kept = Kept(np.full((few, size + 1), -1), np.empty((few, 9 * size**2), np.float32))
 
     def begin(
         self, row: int, thing: CompiledSolid, friction: float, *, compliance_mm_per_n: float = 0.0, turning: ArmTurning | None = None
@@ -163,12 +183,11 @@ class LinearContacts:
 
     def move(self, rows: IntArray, start: FloatArray, stop: FloatArray) -> None:
         """Move the objects of some rows (R,) from poses ``start`` (R, 4, 4) to ``stop``: in a straight line, with a turn about one axis."""
-        steps = np.maximum(np.ceil(motion_mm(start, stop, self.radius_mm) / STEP_MM), 1).astype(np.int64)
-        laws, nodes = (kind(*(getattr(self, name) for name in kind._fields)) for kind in (Laws, Nodes))
+        skin = self.node_mm, self.answer, self.bending
 
         def follow(which: slice) -> None:
-            given = [np.ascontiguousarray(values[which]) for values in (rows, start, stop, steps)]
-            _follow(*given, self.node_mm, self.answer, self.bending, laws, nodes, self.taken, self.used)
+            given = [np.ascontiguousarray(values[which]) for values in (rows, start, stop)]
+            _follow(*given, *skin, *self._state, self.taken, self.used, self.still_mm, self._kept)
 
         threads = min(len(rows) // ROWS_OF_A_THREAD, MOST_THREADS)
         if threads < 2:
@@ -236,7 +255,6 @@ def _follow(
     rows: IntArray,
     start: FloatArray,
     stop: FloatArray,
-    steps: IntArray,
     node: FloatArray,
     answer: FloatArray,
     bending: tuple[FloatArray, ...],
@@ -244,8 +262,10 @@ def _follow(
     nodes: Nodes,
     taken: FloatArray,
     used: FloatArray,
+    still_mm: float,
+    kept: Kept,
 ) -> None:
-    """Solve each row's motion from ``start`` to ``stop`` (R, 4, 4) in its load steps (R,).
+    """Solve each row's motion from ``start`` to ``stop`` (R, 4, 4) in load steps.
 
     The arrays of all B rows are those of ``LinearContacts``.
     """
@@ -255,19 +275,21 @@ def _follow(
     force, moved, bent, anchor, seen, before, held, slides = nodes
     for r in range(len(rows)):
         row = rows[r]
-        mu, soft, last = laws.friction[row], laws.compliance_mm_per_n[row], steps[r] - 1
-        way = between(start[r], stop[r], steps[r])
+        steps = max(int(np.ceil(moved_mm(start[r], stop[r], node[0, 2]) / STEP_MM)), 1)
+        mu, soft, last = laws.friction[row], laws.compliance_mm_per_n[row], steps - 1
+        way = between(start[r], stop[r], steps)
         mine = Nodes(force[row], moved[row], bent[row], anchor[row], seen[row], before[row], held[row], slides[row])
-        for step in range(steps[r] + MOST_SETTLING):
+        for step in range(steps + MOST_SETTLING):
             T = _deflect_arm(way[min(step, last)], laws.turning[row], mine.force_n)
-            if step > last and _motion(taken[row], T, node[0, 2]) <= SETTLED_MM:
+            if step > last and moved_mm(taken[row], T, node[0, 2]) <= SETTLED_MM:
                 break
             taken[row] = T
             turn, place = T[:3, :3], T[:3, 3]
-            count = 0
+            count, change, off = 0, np.inf, np.inf
             gap = before[row]
+            among = np.empty((0, 3, 3, 0), np.float32)
             for part in range(len(SWEEPS) if step >= last else 1):
-                if part and not count:
+                if part and (not count or (change < still_mm and off < TOLERANCE_N)):
                     break
                 change = bend(mine.force_n, mine.bent_mm, mine.moved_mm, bending)
                 if part > 1 and change < BENT_MM:
@@ -281,11 +303,12 @@ def _follow(
                             count += 1
                             if not held[row, i]:
                                 _anchor(here[i], gap[i], anchor[row, i], seen[row, i], before[row, i])
+                    among = _among(answer, near[:count], row, kept)
                 if count:
-                    _solve(answer, Touching(near[:count], turn, here, gap, normal), mine, shift, mu, soft, part)
+                    off = _solve(answer, Touching(near[:count], among, turn, here, gap, normal), mine, shift, mu, soft, part)
             if count:
                 _to_object_frame(node, mine.moved_mm, turn, place, here)
-                used[row] = _record_friction(Touching(near[:count], turn, here, gap, normal), mine, mu)
+                used[row] = _record_friction(Touching(near[:count], among, turn, here, gap, normal), mine, mu)
             before[row], seen[row] = gap, here
 
 
@@ -318,17 +341,8 @@ def _deflect_arm(T: FloatArray, turning: FloatArray, force: FloatArray) -> Float
 
 
 @compiled()
-def motion_mm(start: FloatArray, stop: FloatArray, radius_mm: float) -> FloatArray:
-    """Upper bound of objects' motion across a dome, (R,) mm, between poses (R, 4, 4)."""
-    found = np.empty(len(start))
-    for r in range(len(start)):
-        found[r] = _motion(start[r], stop[r], radius_mm)
-    return found
-
-
-@compiled()
-def _motion(start: FloatArray, stop: FloatArray, radius_mm: float) -> float:
-    """``motion_mm`` of one pair of poses (4, 4)."""
+def moved_mm(start: FloatArray, stop: FloatArray, radius_mm: float) -> float:
+    """Upper bound of an object's motion across a dome, mm, between two poses (4, 4)."""
     trace, off = 0.0, 0.0
     for p in range(3):
         here = stop[p, 3]
@@ -361,27 +375,43 @@ def _anchor(here: FloatArray, gap: float, anchor: FloatArray, seen: FloatArray, 
         anchor[k] = here[k] if share == 1.0 else seen[k] + share * (here[k] - seen[k])
 
 
-@compiled(fastmath={"reassoc", "contract", "arcp", "nsz"})
-def _solve(answer: FloatArray, at: Touching, nodes: Nodes, shift: FloatArray, friction: float, compliance: float, part: int) -> None:
-    """Solve for the forces (M, 3) of the near nodes (q,) and the displacements (M, 3) of all nodes.
-
-    Distances and normals are linearised at ``here`` (M, 3). The displacements are the linear skin's plus ``bent_mm`` (3, M) float32;
-    ``shift`` (3, M) float32 is working memory.
-    """
-    near, turn, here, gap, normal = at
-    force, moved, bent, anchor, _, _, _, _ = nodes
+@compiled()
+def _among(answer: FloatArray, near: IntArray, row: int, kept: Kept) -> FloatArray:
+    """The displacements (q, 3, 3, q) float32 of a row's near nodes (q,) for forces at each other."""
     count = len(near)
-    n, lag = np.empty((count, 3)), np.empty((count, 3))
-    across, along = np.empty(count), np.empty(count)
-    c, moving = np.empty((count, 3, 3, count), np.float32), np.zeros((3, count), np.float32)
-    sunk = 0.0  # displacement of the compliant object along z
+    if row < len(kept.near):
+        c = kept.among[row, : 9 * count**2].reshape(count, 3, 3, count)
+        if kept.near[row, count] == -1 and (kept.near[row, :count] == near).all():
+            return c
+        kept.near[row, :count] = near
+        kept.near[row, count] = -1
+    else:
+        c = np.empty((count, 3, 3, count), np.float32)
     for a in range(count):
-        i = near[a]
-        rows = answer[i]
+        rows = answer[near[a]]
         for q in range(3):
             for p in range(3):
                 for b in range(count):
                     c[a, q, p, b] = rows[q, p, near[b]]
+    return c
+
+
+@compiled(fastmath={"reassoc", "contract", "arcp", "nsz"})
+def _solve(answer: FloatArray, at: Touching, nodes: Nodes, shift: FloatArray, friction: float, compliance: float, part: int) -> float:
+    """Solve for the forces (M, 3) of the near nodes (q,) and the displacements (M, 3) of all nodes.
+
+    Distances and normals are linearised at ``here`` (M, 3). The displacements are the linear skin's plus ``bent_mm`` (3, M) float32;
+    ``shift`` (3, M) float32 is working memory. Returns the largest change of a force in the last sweep.
+    """
+    near, c, turn, here, gap, normal = at
+    force, moved, bent, anchor, _, _, _, _ = nodes
+    count = len(near)
+    n, lag = np.empty((count, 3)), np.empty((count, 3))
+    across, along = np.empty(count), np.empty(count)
+    moving = np.zeros((3, count), np.float32)
+    sunk = 0.0  # displacement of the compliant object along z
+    for a in range(count):
+        i = near[a]
         for p in range(3):
             n[a, p] = turn[p, 0] * normal[i, 0] + turn[p, 1] * normal[i, 1] + turn[p, 2] * normal[i, 2]
             lag[a, p] = (
@@ -391,11 +421,12 @@ def _solve(answer: FloatArray, at: Touching, nodes: Nodes, shift: FloatArray, fr
             )
         total, trace = compliance * n[a, 2] * n[a, 2], compliance
         for p in range(3):
-            trace += answer[i, p, p, i]
+            trace += c[a, p, p, a]
             for q in range(3):
-                total += n[a, p] * answer[i, q, p, i] * n[a, q]
+                total += n[a, p] * c[a, q, p, a] * n[a, q]
         across[a] = total + YIELDING_MM_PER_N
         along[a] = (trace - total) / 2
+    worst = 0.0
     for _ in range(SWEEPS[part]):
         worst = 0.0
         for a in range(count):
@@ -445,6 +476,7 @@ def _solve(answer: FloatArray, at: Touching, nodes: Nodes, shift: FloatArray, fr
                     shift[p, j] += rows[0, p, j] * e0 + rows[1, p, j] * e1 + rows[2, p, j] * e2
     for j in range(len(moved)):
         moved[j, 0], moved[j, 1], moved[j, 2] = shift[0, j] + bent[0, j], shift[1, j] + bent[1, j], shift[2, j] + bent[2, j] + sunk
+    return worst
 
 
 @compiled()
@@ -453,7 +485,7 @@ def _record_friction(at: Touching, nodes: Nodes, friction: float) -> float:
 
     Returns the ratio of the tangential forces to Coulomb's bound, each summed over the pressing nodes.
     """
-    near, turn, here, _, normal = at
+    near, _, turn, here, _, normal = at
     force, _, _, anchor, _, _, held, slides = nodes
     held[:] = False
     slides[:] = False

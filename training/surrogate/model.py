@@ -19,13 +19,14 @@ import numpy as np
 
 from scenes.base import Section
 from scenes.sensor import SensorSpec
-from training.surrogate.bending import Bending
+from training.surrogate.bending import LOOSE, Bending, add_product, apply_silu
 from training.surrogate.compliance import NODE_RINGS, POLAR_DEG
 from training.surrogate.symmetry import ring_directions, symmetries
+from twin.compiled import compiled
 from twin.errors import ContactError, TwinError
 from twin.geometry.pins import rest_pins
 from twin.store import ArrayFile, Layers, layers_from, layers_to, silu, through_layers
-from twin.types import FloatArray
+from twin.types import FloatArray, IntArray
 
 SHIPPED = Path(__file__).parents[1] / "surrogates"
 SUFFIX = ".safetensors"
@@ -120,6 +121,13 @@ class Surrogate:
         found = through_layers(self.layers, x, silu, by_row) * (self.out_scale * gate(depth_mm)[:, None]).astype(np.float32)
         return linear + found[:, : len(self.modes)], found[:, len(self.modes) :]
 
+    def kernel(self) -> tuple[FloatArray, ...]:
+        """The arrays that ``answer_each`` takes, in its memory layout."""
+        (first, a), (second, b), (third, c) = self.layers
+        seen = self.read.T.reshape(-1, 3, len(self.read))
+        given = seen, self.view.T, self.mean, self.scale, first.T, a, second.T, b, third.T, c, self.out_scale
+        return tuple(np.ascontiguousarray(values, np.float32) for values in given)
+
     def save(self, path: Path) -> int:
         """Write it to a file and return the size in bytes.
 
@@ -146,6 +154,56 @@ class Surrogate:
         return {key: value.astype(np.float32) for key, value in whole.items()} | {
             key: value.astype(np.float16) for key, value in half.items()
         }
+
+
+@compiled(fastmath=LOOSE)
+def answer_each(rows: IntArray, state: tuple[Any, ...], turns: FloatArray, network: tuple[FloatArray, ...], found: FloatArray) -> None:
+    """Write to ``found`` (B, K + BESIDE) float32 what some sensors feel: coefficients of the modes, force, torque, area, sliding share.
+
+    It is ``Surrogate.correct`` without matrices of all rows. ``state`` is of all contacts: the nodes' forces (B, M, 3), whether they press
+    and slide (B, M), friction and used share (B,), distances (B, M). ``turns`` (3 M, 6) are forces and torques by a node's force, and
+    ``network`` is that of ``Surrogate.kernel``.
+    """
+    force_n, held, slides, friction, used, gap_mm = state
+    read, view, mean, scale, first, a, second, b, third, c, out_scale = network
+    count = read.shape[2]
+    for row in rows:
+        gap, mu, x, wrench, deepest = gap_mm[row], friction[row], np.zeros(len(mean), np.float32), np.zeros(6), np.inf
+        pressed, slid = 0, 0
+        for i in range(len(gap)):
+            pressed, slid, deepest = pressed + held[row, i], slid + slides[row, i], min(deepest, gap[i])
+            for q in range(3):
+                force = force_n[row, i, q]
+                if force != 0:
+                    for k in range(count):
+                        x[k] += read[i, q, k] * np.float32(force)
+                    for k in range(6):
+                        wrench[k] += turns[3 * i + q, k] * force
+            if gap[i] < VIEW_MM:
+                for k in range(VIEWS):
+                    x[count + FEATURES + k] += view[i, k] * np.float32(VIEW_MM - gap[i])
+        depth, slip = max(-deepest, 0.0), slid / max(pressed, 1)
+        beside = depth, depth**2 / 5.0, np.log(max(mu, 0.01)), min(mu, 1.5) * depth, pressed / 10.0, slip, used[row]
+        for k in range(7):
+            x[count + k] = beside[k]
+        for k in range(6):
+            x[count + 7 + k] = wrench[k] / WRENCH_SCALE[k]
+        out = found[row]
+        out[:count] = x[:count]
+        for k in range(6):
+            out[count + k] = wrench[k]
+        out[count + 6], out[count + 7] = 0.0, slip
+        for k in range(len(x)):
+            x[k] = (x[k] - mean[k]) / scale[k]
+        one, two, last = a.copy(), b.copy(), c.copy()
+        add_product(x, first, one)
+        apply_silu(one)
+        add_product(one, second, two)
+        apply_silu(two)
+        add_product(two, third, last)
+        share = np.float32(np.tanh(depth / GATE_MM))
+        for k in range(len(out)):
+            out[k] += last[k] * out_scale[k] * share
 
 
 def by_row(x: FloatArray, matrix: FloatArray) -> FloatArray:

@@ -108,7 +108,7 @@ def project(view: ViewSpec, points_mm: FloatArray) -> FloatArray:
     A point's height decides which layers its ray passes. The rays of points behind the window are straight.
     """
     camera = view.camera
-    rho = np.linalg.norm(points_mm[..., :2], axis=-1)
+    rho = np.sqrt(points_mm[..., 0] ** 2 + points_mm[..., 1] ** 2)
     tangent = window_tangent(view, rho, points_mm[..., 2])
     across = points_mm[..., :2] * (tangent / np.maximum(rho, 1e-12))[..., None]
     in_sensor = np.concatenate([across, np.ones_like(across[..., :1])], axis=-1)
@@ -124,10 +124,8 @@ def project_in_form(spec: SensorSpec, form: Form, points_mm: FloatArray) -> Floa
 def window_tangent(view: ViewSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behind_mm: float | None = None) -> FloatArray:
     """Tangent u of the angle in air of the rays from (0, z0) to (rho, z), where z0 is that of the pupil or ``behind_mm``."""
     heights, indices = _layers(view, z_mm, -view.camera.distance_mm if behind_mm is None else behind_mm)
-    rho = np.asarray(rho_mm, float)
-    shape = np.broadcast_shapes(rho.shape, *(np.shape(h) for h in heights))
-    air, window, gel = (np.ravel(np.broadcast_to(np.asarray(h, float), shape)) for h in heights)
-    return _tangents(np.ravel(np.broadcast_to(rho, shape)), air, window, gel, indices[1], indices[2]).reshape(shape)
+    whole = np.broadcast_arrays(np.asarray(rho_mm, float), *heights)
+    return _tangents(*(each.ravel() for each in whole), *indices[1:]).reshape(whole[0].shape)
 
 
 def pixel_rays(view: ViewSpec, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -199,24 +197,27 @@ def lens_disc(view: ViewSpec, housing: HousingSpec) -> Disc:
     return replace(disc, inside=inside.astype(bool))
 
 
-@compiled()
+@compiled(error_model="numpy")
 def _tangents(rho: FloatArray, air: FloatArray, window: FloatArray, gel: FloatArray, n_window: float, n_gel: float) -> FloatArray:
-    """Tangents (k,) of the angle in air of rays that reach rho (k,) through three layers, by Newton's method."""
-    out = np.empty(len(rho))
+    """Tangents (k,) of the angle in air of rays that reach rho (k,) through three layers, by Newton's method.
+
+    The steps of all rays are one loop without branches, which the compiler turns into vector instructions.
+    """
+    u, moves = rho / (air + window / n_window + gel / n_gel), np.ones(len(rho))
     a, b = n_window * n_window, n_gel * n_gel
-    for k in range(len(rho)):
-        u = rho[k] / (air[k] + window[k] / n_window + gel[k] / n_gel)
-        for _ in range(NEWTON_STEPS):
-            p, q = a + (a - 1) * u * u, b + (b - 1) * u * u  # tan(theta) = u / sqrt(p)
+    for _ in range(NEWTON_STEPS):
+        for k in range(len(rho)):
+            p, q = a + (a - 1) * u[k] * u[k], b + (b - 1) * u[k] * u[k]  # tan(theta) = u / sqrt(p)
             root_p, root_q = np.sqrt(p), np.sqrt(q)
-            reach = air[k] * u + window[k] * u / root_p + gel[k] * u / root_q
+            reach = air[k] * u[k] + window[k] * u[k] / root_p + gel[k] * u[k] / root_q
             slope = air[k] + window[k] * a / (p * root_p) + gel[k] * b / (q * root_q)
             step = (rho[k] - reach) / slope
-            u = min(max(u + step, 0.0), GRAZING)
-            if abs(step) <= 1e-15 * (1.0 + u):
-                break
-        out[k] = u
-    return out
+            after = min(max(u[k] + step, 0.0), GRAZING)
+            u[k] = after if moves[k] > 0 else u[k]
+            moves[k] = moves[k] if abs(step) > 1e-15 * (1.0 + after) else 0.0
+        if not moves.any():
+            break
+    return u
 
 
 def _layers(view: ViewSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:

@@ -1,0 +1,105 @@
+"""What the environments in MuJoCo scenes have in common: two sensors on a gripper, kinds of observation, and pictures."""
+
+from typing import Any, ClassVar, Literal, cast, get_args
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium import spaces
+
+from scenes import load_sensor
+from training.mujoco.model import load_scene
+from training.mujoco.scene import TactileReading, TactileScene
+from twin.errors import OptionError
+from twin.types import FloatArray, ImageArray
+
+PERIOD_S = 0.05
+"""Time between two decisions."""
+Touch = Literal["pins", "wrench", "none"]
+TOUCHES: tuple[str, ...] = get_args(Touch)
+
+
+class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
+    """An environment with a gripper and two sensors.
+
+    Parameters
+    ----------
+    sensor : str
+        Name or file.
+    observation : {"pins", "wrench", "none"}
+        Touch: displacements of both sensors' pins in spacings (2, N, 2), the wrenches on the object (2, 6) in N and 10 N mm, or nothing.
+    render_mode : {None, "rgb_array"}
+        ``render`` then shows the scene.
+
+    Raises
+    ------
+    OptionError
+        An option is not valid.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": round(1 / PERIOD_S)}  # type: ignore[misc]
+    world: ClassVar[str]
+    held: ClassVar[str]
+    """The scene, and the geom that the sensors touch."""
+    shape: ClassVar[tuple[int, int]]
+    """Numbers of values of the state and of an action."""
+
+    def __init__(self, sensor: str = "mg400-331", observation: Touch = "pins", render_mode: str | None = None) -> None:
+        if observation not in TOUCHES:
+            raise OptionError(f"observation={observation!r}: expected one of {', '.join(TOUCHES)}")
+        if render_mode not in (None, "rgb_array"):
+            raise OptionError(f"render_mode={render_mode!r}: expected None or rgb_array")
+        self.observation, self.render_mode = observation, render_mode
+        spec, sensors = load_scene(self.world, load_sensor(sensor))
+        self._model = spec.compile()
+        self.scene = TactileScene(self._model, sensors, touchable=[self.held])
+        self._geom = self._model.geom(self.held).id
+        self._object = int(self._model.geom_bodyid[self._geom])
+        self._inertia = self._model.body_inertia[self._object] / self._model.body_mass[self._object]
+        self._rest_px = [self.scene.read(site).pins_px for site in sensors]
+        self._spacing = float(np.median(np.linalg.norm(np.diff(self._rest_px[0], axis=0), axis=1)))
+        self._renderer: mujoco.Renderer | None = None
+        shapes = {"pins": (2, *self._rest_px[0].shape), "wrench": (2, 6)}
+        box: dict[str, spaces.Space[Any]] = {"state": spaces.Box(-10.0, 10.0, self.shape[:1], np.float32)}
+        if observation in shapes:
+            box["tactile"] = spaces.Box(-10.0, 10.0, shapes[observation], np.float32)
+        self.observation_space = cast(spaces.Space[dict[str, FloatArray]], spaces.Dict(box))
+        self.action_space = spaces.Box(-1.0, 1.0, self.shape[1:], np.float32)
+
+    def readings(self) -> list[TactileReading]:
+        """The contacts of both sensors."""
+        return [self.scene.read(site) for site in self.scene.sensors]
+
+    def begin(self, fingers_mm: float) -> None:
+        """Set the model to its start, with the fingers closed so far."""
+        mujoco.mj_resetData(self._model, self.scene.data)
+        for finger in ("left", "right"):
+            self.scene.data.joint(finger).qpos[0] = fingers_mm / 1e3
+        self.scene.data.ctrl[-1] = fingers_mm / 1e3
+
+    def settle(self, seconds: float = PERIOD_S) -> None:
+        """Let time pass."""
+        self.scene.step(round(seconds / self._model.opt.timestep))
+
+    def look(self, state: list[float]) -> dict[str, FloatArray]:
+        """The observation: ``state`` and touch."""
+        seen: dict[str, FloatArray] = {"state": np.array(state)}
+        if self.observation == "pins":
+            seen["tactile"] = np.stack([of.pins_px - rest for of, rest in zip(self.readings(), self._rest_px, strict=True)]) / self._spacing
+        elif self.observation == "wrench":
+            seen["tactile"] = np.stack([np.concatenate([of.force_n, of.torque_nmm / 10.0]) for of in self.readings()])
+        return {name: np.clip(values, -10.0, 10.0).astype(np.float32) for name, values in seen.items()}
+
+    def render(self) -> ImageArray | None:
+        """The scene, (480, 640, 3) uint8, if the render mode is ``rgb_array``; else None."""
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            self._renderer = mujoco.Renderer(self._model, 480, 640)
+        self._renderer.update_scene(self.scene.data)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Close the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()

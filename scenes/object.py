@@ -120,10 +120,7 @@ class MeshShape(Section):
     sha256: str = ""
 
 
-Shape = Annotated[
-    PlaneShape | SphereShape | CylinderShape | EdgeShape | PrismShape | MeshShape,
-    Field(discriminator="kind"),
-]
+Shape = Annotated[PlaneShape | SphereShape | CylinderShape | EdgeShape | PrismShape | MeshShape, Field(discriminator="kind")]
 
 
 class TextureSpec(Section):

@@ -15,11 +15,7 @@ import twin.extend
 
 ROOT = Path(__file__).parents[2]
 STUBS = {ROOT / "twin" / "__init__.pyi": twin, ROOT / "twin" / "extend.pyi": twin.extend}
-WIDER = {
-    "AlsoFormat": "str",
-    "Path": "Path | str",
-    "Form": "Form | str",
-}
+WIDER = {"AlsoFormat": "str", "Path": "Path | str", "Form": "Form | str"}
 """What a function takes in Python, by the type on the command line."""
 SPECIFICATIONS = {"sensor": "SensorSpec", "obj": "ObjectSpec", "experiment": "ExperimentSpec", "servo": "ServoSpec"}
 OTHERWISE = {"target": "str | Sequence[str]", "objects": "str | Sequence[str]", "source": "str | Path", "camera": "str | Path"}

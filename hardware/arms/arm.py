@@ -119,13 +119,7 @@ class Arm(Protocol):
         """Move to joints (J,), deg; otherwise as `move_linear`. Returns the pose that was commanded."""
 
     def wait_settled(
-        self,
-        pose: np.ndarray,
-        *,
-        tolerance_mm: float = 0.1,
-        tolerance_deg: float = 0.1,
-        timeout_s: float = 10.0,
-        at_rest: bool = True,
+        self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0, at_rest: bool = True
     ) -> ArmState:
         """Wait for feedback of the arm at rest at ``pose``, and return this state. Without ``at_rest`` the arm may still move there.
 

@@ -105,12 +105,7 @@ class SimulatedArm(BaseArm):
                 f"{self.name}: newest feedback is {now_s - told_s:.2f} s old (allowed {max_age_s:g} s); stop, then reconnect the arm"
             )
         return ArmState(
-            self.track.pose(told_s),
-            self.track.joints_deg(told_s),
-            told_s,
-            self._enabled,
-            self.track.moving(told_s),
-            self._error(told_s),
+            self.track.pose(told_s), self.track.joints_deg(told_s), told_s, self._enabled, self.track.moving(told_s), self._error(told_s)
         )
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:

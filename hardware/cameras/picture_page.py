@@ -7,7 +7,8 @@ from types import TracebackType
 import cv2
 import numpy as np
 
-from hardware.cameras.mjpeg import CONTENT_TYPE, hold_little, jpeg_of, write_part
+from hardware.cameras.coded import CONTENT_TYPE, jpeg_of, write_part
+from hardware.cameras.mjpeg import hold_little
 from hardware.errors import cannot_listen
 from twin.errors import ErrorsAs
 

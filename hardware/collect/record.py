@@ -58,13 +58,7 @@ class RecordedFrames(ReadableResult):
 
 @writes("init_0.png", "images")
 def record_frames(
-    source: FrameSource,
-    out: Path,
-    *,
-    count: int = COUNT,
-    port: int = 0,
-    say: Callable[[str], object] = print,
-    progress: Progress = silent,
+    source: FrameSource, out: Path, *, count: int = COUNT, port: int = 0, say: Callable[[str], object] = print, progress: Progress = silent
 ) -> RecordedFrames:
     """Record a frame without contact (``init_0.png``), and then contacts while a person presses the sensor.
 

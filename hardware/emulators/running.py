@@ -17,9 +17,7 @@ CHECK_S = 0.1  # interval, s, at which signals and a failure of the emulator are
 
 
 def run_until_signal(
-    device: AbstractContextManager[Any],
-    ready: Callable[[], str],
-    failure: Callable[[], Exception | None] = lambda: None,
+    device: AbstractContextManager[Any], ready: Callable[[], str], failure: Callable[[], Exception | None] = lambda: None
 ) -> None:
     """Run a device until SIGTERM or Ctrl-C, or until it fails. Use it in the main thread only.
 

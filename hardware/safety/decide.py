@@ -242,11 +242,7 @@ _RULES = (
     _ReadingRule("turning_nmm", "hold_torque_nmm", Action.HOLD, DecisionCode.HELD_FORCE, f"{_TURNED} ({_STILL} N mm)"),
     _ReadingRule("slip_begins", "slip_begins", Action.HOLD, DecisionCode.SLIPPING, _SLIDES),
     _ReadingRule(
-        "slip_share",
-        "slip_share",
-        Action.HOLD,
-        DecisionCode.SLIPPING,
-        "{0:.0%} of the contact slides (allowed {1:.0%}); press harder",
+        "slip_share", "slip_share", Action.HOLD, DecisionCode.SLIPPING, "{0:.0%} of the contact slides (allowed {1:.0%}); press harder"
     ),
 )
 

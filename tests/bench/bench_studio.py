@@ -81,12 +81,7 @@ def measure(sensor: str, touched: str, seconds: float, out: Path, *, rate: float
             client.wait(lambda u: "90 % interval" in u.html, 120)
             client.wait(lambda u: "path-traced" in u.html, 120)
             sent: list[tuple[float, float]] = []
-            place, speed, since, ended = (
-                np.array([0.0, 0.0, -1.0]),
-                rng.normal(0, 6, 3),
-                len(client.updates),
-                time.monotonic() + seconds,
-            )
+            place, speed, since, ended = (np.array([0.0, 0.0, -1.0]), rng.normal(0, 6, 3), len(client.updates), time.monotonic() + seconds)
             memory, spent, rests, rest_s = [memory_mb(process)], cpu_s(process), [], time.monotonic() + DRAG_S
             while time.monotonic() < ended:
                 speed += rng.normal(0, 4, 3) - 0.3 * speed - 0.8 * (place - [0, 0, 2.0])

@@ -166,11 +166,7 @@ def test_speed_is_at_most_what_was_asked(ready):
 
 
 @pytest.mark.parametrize(
-    ("spec", "remedy"),
-    [
-        ("mg400:127.0.0.1:1", "twin emulate mg400"),
-        ("magician:/dev/no-such-port", "twin emulate magician"),
-    ],
+    ("spec", "remedy"), [("mg400:127.0.0.1:1", "twin emulate mg400"), ("magician:/dev/no-such-port", "twin emulate magician")]
 )
 def test_what_is_not_there_is_one_clear_error(spec, remedy):
     arm = open_arm(spec)  # opens nothing yet

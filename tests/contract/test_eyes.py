@@ -156,10 +156,7 @@ def test_a_stream_of_thresholded_pictures_is_not_frozen_at_rest():
             made = super()._grab()
             return DevicePicture(np.where(np.indices((360, 360)).sum(axis=0) % 24 < 8, 255, 0).astype(np.uint8), made.time_s)
 
-    with (
-        CameraEmulator(Thresholded(fps=60)) as emulator,
-        MjpegCamera(emulator.url, load_sensor("mg400-331"), Form.PROCESSED) as camera,
-    ):
+    with CameraEmulator(Thresholded(fps=60)) as emulator, MjpegCamera(emulator.url, load_sensor("mg400-331"), Form.PROCESSED) as camera:
         first = camera.read(timeout_s=2.0)
         time.sleep(1.0)
         assert not camera.fault and not camera.blind() and camera.read_latest().time_s > first.time_s + 0.5 and not camera.notes()

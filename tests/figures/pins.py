@@ -87,14 +87,9 @@ def against_recorded(work: Path, *, sensor: str) -> Measured:
 
 for _sensor in SETS:
     _command = f"twin preprocess DIR --sensor {_sensor} --out OUT"
-    job(
-        f"pins.found.{_sensor}",
-        _command,
-        sensors=(_sensor,),
-        code=("twin.pins.batch",),
-        recordings=(SETS[_sensor],),
-        minutes=1,
-    )(partial(found_on, sensor=_sensor))
+    job(f"pins.found.{_sensor}", _command, sensors=(_sensor,), code=("twin.pins.batch",), recordings=(SETS[_sensor],), minutes=1)(
+        partial(found_on, sensor=_sensor)
+    )
 for _sensor in ("mg400-331", "mg400-127"):
     _recording = (SETS[_sensor],)
     job(

@@ -72,8 +72,7 @@ SAMPLES = {
         for sensor in ("mg400-331", "mg400-127", "ur5-331")
     },
     "path-traced": Sample(
-        PICTURES,
-        (("render", "--sensor", "ur5-331", "--object", "edge", "--indent-mm", "2", "--quality", "preview", "--out", "OUT"),),
+        PICTURES, (("render", "--sensor", "ur5-331", "--object", "edge", "--indent-mm", "2", "--quality", "preview", "--out", "OUT"),)
     ),
     **{
         f"pins {name}": Sample((*PINS, *LEARNT, *TWINS, *PICTURES), (("preprocess", f"REAL/{name}", "--sensor", sensor, "--out", "OUT"),))

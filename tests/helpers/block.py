@@ -14,11 +14,7 @@ from twin.mechanics import SkinSolver
 from twin.mechanics.body.elements import PAIRS, Elements
 from twin.mechanics.body.material import law_coefficients
 
-LAWS = {
-    "neo-hookean": {},
-    "mooney-rivlin": {"second_invariant_share": 0.4},
-    "yeoh": {"c20_c10": 0.3, "c30_c10": 0.2},
-}
+LAWS = {"neo-hookean": {}, "mooney-rivlin": {"second_invariant_share": 0.4}, "yeoh": {"c20_c10": 0.3, "c30_c10": 0.2}}
 
 
 def material(law: str = "neo-hookean", *, young_mpa: float = 0.7, poisson: float = 0.47, **extra) -> MaterialSpec:

@@ -56,10 +56,7 @@ def z_scores(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 def reference(mi, spec, surfaces, size_px, spp, seed):
     """Linear light (size, size) on a square film seen by the camera in the air, in a mono variant; mean of ``spp`` samples."""
     lens = spec.lens
-    faces = {
-        "front": (lens.z_mm, spec.gel.refractive_index, lens.refractive_index),
-        "back": (lens.back_mm, lens.refractive_index, 1.0),
-    }
+    faces = {"front": (lens.z_mm, spec.gel.refractive_index, lens.refractive_index), "back": (lens.back_mm, lens.refractive_index, 1.0)}
     extra = {"integrator": {"type": "path", "max_depth": DEPTH, "rr_depth": RR_DEPTH}}
     for name, (z, above, below) in faces.items():
         place = mi.ScalarTransform4f().translate([0, 0, z]).scale([lens.radius_mm, lens.radius_mm, 1])

@@ -378,11 +378,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--object": "nowhere",
         "--design": "best",
     },
-    "convert {session} --out {out}": {
-        "--to": "cooked",
-        "--to mcap --sensor": "nowhere",
-        "--video --to": "recording mcap",
-    },
+    "convert {session} --out {out}": {"--to": "cooked", "--to mcap --sensor": "nowhere", "--video --to": "recording mcap"},
     f"live --model {SENSOR} --camera {{frames}} --headless": {
         "--also": "mcap cooked",
         "--count": "0 -1",
@@ -456,14 +452,7 @@ def _numbers() -> list[Entry]:
                 found.append(Entry("numbers", what, f"{call} {what}", {}, (REFUSED, USAGE), says, sample=what in SAMPLED_NUMBERS))
     for command in EVERY:
         found.append(
-            Entry(
-                "usage",
-                "an unknown option",
-                f"{command} --nonsense",
-                exit=(USAGE,),
-                says=("--nonsense",),
-                sample=command == "doctor",
-            )
+            Entry("usage", "an unknown option", f"{command} --nonsense", exit=(USAGE,), says=("--nonsense",), sample=command == "doctor")
         )
         found.append(Entry("usage", "an argument too many", f"{command} a b c d", exit=(USAGE,)))
     return found
@@ -726,7 +715,7 @@ def _gone_on() -> list[Entry]:
         "moves": lambda path: given.text(lambda t: t.replace(",0", ",1"))(path / MOVES),
     }
     found = [
-        Entry("gone on", "with another mesh", f"{simulate} 2", first=f"{simulate} 1", then={"mesh": given.smaller_ball}, leaves=("*",)),
+        Entry("gone on", "with another mesh", f"{simulate} 2", first=f"{simulate} 1", then={"mesh": given.smaller_ball}, leaves=("*",))
     ]
     for what, change in changes.items():
         then = {"recording": change}

@@ -231,10 +231,7 @@ def _options() -> list[Entry]:
             "servo --object can --steps 1 --out {out} --at-rest {data}",
         ):
             found.append(Entry("a picture without contact", what, call, alone, (REFUSED,), (BAD,)))
-    for command, call in {
-        "audit": f"audit {{data}} {S} --out {{out}}",
-        "evaluate": "evaluate {run} --data {data} --out {out}",
-    }.items():
+    for command, call in {"audit": f"audit {{data}} {S} --out {{out}}", "evaluate": "evaluate {run} --data {data} --out {out}"}.items():
         for what, edit in SAME_TABLE.items():
             found.append(Entry("other tables", what, call, {"data": edited("recording", "targets.csv", edit)}, ANY, same=True))
         for what, (edit, said) in TOLD_TABLE.items():

@@ -122,11 +122,7 @@ def test_the_mirror_images_alone_are_those_of_plain_path_tracing():
 def test_gel_absorbs_as_beer_and_lambert_say():
     """Light of one scattering at the tip: its way from the window and back is known, whatever else happens to it."""
     black = (0.0, 0.0, 0.0)
-    clear = changed(
-        laboratory(24),
-        leds={"size_mm": 0.5},
-        appearance={"skin_albedo": black, "pin_albedo": black, "skin_gloss": 0.0},
-    )
+    clear = changed(laboratory(24), leds={"size_mm": 0.5}, appearance={"skin_albedo": black, "pin_albedo": black, "skin_gloss": 0.0})
     murky = changed(clear, gel={"absorption_per_mm": (ABSORPTION,) * 3})
     light = []
     for spec in (clear, murky):

@@ -12,10 +12,7 @@ from training.estimate.loading import models_by_sensor
 from twin.studio.state import first_state
 from twin.studio.studio import Studio, StudioPlan
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium: apt-get install chromium"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium: apt-get install chromium")]
 pytest.importorskip("playwright", reason="no playwright: pip install 'tactip-twin[browser]'")
 LEAST_LIT = 40  # gray level of the brightest 1 % of a drawn scene
 

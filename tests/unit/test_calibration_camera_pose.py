@@ -15,9 +15,7 @@ DEGENERATE_PX = 0.51  # rms with a wrong polar angle, if the other parameters ar
 
 
 def changed(spec, *, camera=None, pins=None):
-    return spec.model_copy(
-        update={"camera": spec.camera.model_copy(update=camera or {}), "pins": spec.pins.model_copy(update=pins or {})},
-    )
+    return spec.model_copy(update={"camera": spec.camera.model_copy(update=camera or {}), "pins": spec.pins.model_copy(update=pins or {})})
 
 
 def seen(spec, rng, noise_px=NOISE_PX):

@@ -109,9 +109,7 @@ def test_a_layout_that_cannot_be_is_refused_in_words(text, said):
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["\ufeffx;y\n0;0\n1;0\n0;2\n", "# pins of the dome\nx,y\n0,0\n1,0\n0,2\n"],
-    ids=["semicolons", "a comment before the header"],
+    "text", ["\ufeffx;y\n0;0\n1;0\n0;2\n", "# pins of the dome\nx,y\n0,0\n1,0\n0,2\n"], ids=["semicolons", "a comment before the header"]
 )
 def test_positions_come_from_a_file_with_or_without_a_header(tmp_path, text):
     file = tmp_path / "pins.csv"

@@ -115,13 +115,7 @@ def test_newest_library_is_tried_first_and_old_ones_without_a_probe(tmp_path, mo
 
 
 @pytest.mark.parametrize(
-    "library",
-    [
-        "prefix/lib/libLLVM.so.19.1",
-        "prefix/lib/libLLVM.dylib",
-        "prefix/Library/bin/LLVM-C.dll",
-        "programs/LLVM/bin/LLVM-C.dll",
-    ],
+    "library", ["prefix/lib/libLLVM.so.19.1", "prefix/lib/libLLVM.dylib", "prefix/Library/bin/LLVM-C.dll", "programs/LLVM/bin/LLVM-C.dll"]
 )
 def test_the_library_is_found_under_each_systems_name(library, tmp_path, monkeypatch):
     (tmp_path / library).parent.mkdir(parents=True)

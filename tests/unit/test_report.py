@@ -268,17 +268,9 @@ def test_a_table_marks_the_best_and_names_its_units():
     rows = [{"model": "a", "error_mm": 0.2, "share": 0.5}, {"model": "b", "error_mm": 0.1, "share": 0.25}]
     rows.append({"model": "c", "error_mm": None})
     table = make_table(rows, ["model", Column.of("error_mm", best="least"), Column("share", "share", "%", decimals=0, scale=100)])
-    assert [tuple(head.values()) for head in table["heads"]] == [
-        ("model", "", False),
-        ("error", "mm", True),
-        ("share", "%", True),
-    ]
+    assert [tuple(head.values()) for head in table["heads"]] == [("model", "", False), ("error", "mm", True), ("share", "%", True)]
     texts = [[cell["text"] for cell in row] for row in table["body"]]
-    assert texts == [
-        ["a", "0.200", "50"],
-        ["b", "0.100", "25"],
-        ["c", NOTHING, NOTHING],
-    ]
+    assert texts == [["a", "0.200", "50"], ["b", "0.100", "25"], ["c", NOTHING, NOTHING]]
     assert ["best" in row[1]["style"] for row in table["body"]] == [False, True, False]
 
 

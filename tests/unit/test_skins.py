@@ -100,8 +100,7 @@ def test_a_turned_scene_turns_the_pins():
 
 
 @pytest.mark.parametrize(
-    ("name", "size"),
-    [("pad-round", {"outer_radius_mm": 24.0}), ("pad-rectangular", {"width_mm": 48.0, "height_mm": 44.0})],
+    ("name", "size"), [("pad-round", {"outer_radius_mm": 24.0}), ("pad-rectangular", {"width_mm": 48.0, "height_mm": 44.0})]
 )
 def test_a_ball_on_a_pad_of_one_material_meets_hertz(name, size):
     """F = 4/3 E* sqrt(R) d^(3/2) (Hertz 1882), far from the rim of a pad that is large against the contact."""

@@ -37,10 +37,7 @@ NAMES = {
     "shot": "frame",
 }
 # Names that stay for the time being: what files of results contain, and what belongs to other projects. This list may only shrink.
-NAMES_ALLOWED = {
-    ("scenes/sensor.py", "shot_noise"),
-    ("training/surrogate/reading.py", "felt"),
-}
+NAMES_ALLOWED = {("scenes/sensor.py", "shot_noise"), ("training/surrogate/reading.py", "felt")}
 
 # A participle alone is no name of a function, except where it returns its argument changed, as ``sorted`` does.
 PARTICIPLES_ALLOWED = {

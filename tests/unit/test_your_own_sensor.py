@@ -381,8 +381,7 @@ SLOW_FUZZ = ("turned", "16 bits", "masked", "colour")
 
 
 @pytest.mark.parametrize(
-    "change",
-    [pytest.param(change, id=name, marks=[pytest.mark.slow] * (name in SLOW_FUZZ)) for name, change in FUZZ.items()],
+    "change", [pytest.param(change, id=name, marks=[pytest.mark.slow] * (name in SLOW_FUZZ)) for name, change in FUZZ.items()]
 )
 def test_strange_frames_give_a_right_answer_or_an_error_in_words(tmp_path, change):
     images = [change(image) for image in frames_of(rest_of(PINS), 2)]

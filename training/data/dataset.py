@@ -95,12 +95,7 @@ class Dataset:
 
 
 def load_dataset(
-    folder: str | Path,
-    spec: SensorSpec,
-    columns: str | tuple = "surface-2d",
-    *,
-    form: Form | None = None,
-    progress: Step | None = None,
+    folder: str | Path, spec: SensorSpec, columns: str | tuple = "surface-2d", *, form: Form | None = None, progress: Step | None = None
 ) -> Dataset:
     """Read a labelled recording, real or simulated.
 

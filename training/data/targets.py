@@ -33,15 +33,7 @@ PRESETS = {
 CONTACT = "contact"
 # Known properties of a simulated contact besides the arm's pose: name of the label and its unit. Forces act from the skin on the object, in
 # the sensor frame (z out of the tip). The torque is about the sensor's axis. The area is that of the skin at rest.
-CONTACT_UNITS = {
-    "force_x": "N",
-    "force_y": "N",
-    "force_z": "N",
-    "torque_z": "Nmm",
-    "contact_area": "mm2",
-    "slip_share": "",
-    "contact": "",
-}
+CONTACT_UNITS = {"force_x": "N", "force_y": "N", "force_z": "N", "torque_z": "Nmm", "contact_area": "mm2", "slip_share": "", "contact": ""}
 # Least and greatest value that a label can have.
 BOUNDS = {"contact_area": (0.0, np.inf), "slip_share": (0.0, 1.0), "contact": (0.0, 1.0)}
 # Columns of measured forces and torques in recordings (N, N mm), with the names of published recordings.

@@ -46,10 +46,7 @@ DRAWS = "draws.csv"
 # Columns of the table of draws that failed.
 FAILURE_COLUMNS = ("path_id", "attempt", "reason")
 # Files and folders of a data set, except CONFIG and MADE_BY.
-FILES = (
-    *("meta.json", "init_0.png", "images", "frames_bw", RECORDS, TRUTH),
-    *("targets.csv", "move_executed.csv", DRAWS, "failures.csv"),
-)
+FILES = (*("meta.json", "init_0.png", "images", "frames_bw", RECORDS, TRUTH), *("targets.csv", "move_executed.csv", DRAWS, "failures.csv"))
 # Number of rows in a chunk of this group's arrays.
 CHUNK_ROWS = 256
 UNITS = {  # unit and meaning of each array in this group

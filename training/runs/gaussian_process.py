@@ -65,12 +65,7 @@ class Term:
 
 
 SMOOTH_AND_LINEAR = (Term("smooth"), Term("linear"))
-TWO_FIDELITIES = (
-    *SMOOTH_AND_LINEAR,
-    Term("smooth", second=True, reaches=True),
-    Term("linear", second=True),
-    Term("constant", second=True),
-)
+TWO_FIDELITIES = (*SMOOTH_AND_LINEAR, Term("smooth", second=True, reaches=True), Term("linear", second=True), Term("constant", second=True))
 CONSTANT_AND_SMOOTH = (Term("constant"), Term("smooth"))
 
 

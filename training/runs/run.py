@@ -97,13 +97,7 @@ class _Lesson:
 
 @writes(*RUN_FILES, gone_on=(CHECKPOINT,))
 def train_run(
-    config: RunConfig,
-    data: Dataset,
-    out: Path,
-    *,
-    max_minutes: float | None = None,
-    device: str = "cpu",
-    progress: Callable | None = None,
+    config: RunConfig, data: Dataset, out: Path, *, max_minutes: float | None = None, device: str = "cpu", progress: Callable | None = None
 ) -> bool:
     """Train a run, or continue the one in ``out``. The order of the data set's rows does not matter.
 

@@ -319,11 +319,7 @@ def _start_specification(name: str, frame: Frame, pins: PinsSpec, rest: Rest, so
         distance_mm=PINHOLE_MM,
     )
     anywhere = BlobSpec(
-        polarity=polarity,
-        threshold=UNKNOWN_OFFSET,
-        threshold_block_px=UNKNOWN_BLOCK_PX,
-        mask_center_px=(x, y),
-        mask_radius_px=1.1 * radius,
+        polarity=polarity, threshold=UNKNOWN_OFFSET, threshold_block_px=UNKNOWN_BLOCK_PX, mask_center_px=(x, y), mask_radius_px=1.1 * radius
     )
     thresholded = frame.form == Form.PROCESSED
     return SensorSpec(

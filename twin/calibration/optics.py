@@ -183,13 +183,7 @@ def calibrate_optics(
 
 
 def fit_optics(
-    folder: Path,
-    spec: SensorSpec,
-    work: Path,
-    *,
-    limit: int = FRAMES,
-    no_contact: Path | None = None,
-    progress: Progress = silent,
+    folder: Path, spec: SensorSpec, work: Path, *, limit: int = FRAMES, no_contact: Path | None = None, progress: Progress = silent
 ) -> Calibration:
     """Fit a specification to raw frames of a sensor in contact.
 

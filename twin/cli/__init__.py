@@ -103,7 +103,7 @@ def _print_version(asked: bool) -> None:
     "It presses a hyperelastic skin by finite elements, path-traces the camera's frames, finds the pins (markers), and builds their graph: "
     "for rendered, recorded and live frames alike.\n\n"
     "Start with 'twin doctor', then 'twin demo --out out/demo'.\n\n"
-    "Exit codes: 0 done, 1 failed, 2 wrong command line, 3 'twin check' found a failed sensor, 130 ended by Ctrl-C, 143 by SIGTERM.",
+    "Exit codes: 0 done, 1 failed, 2 wrong command line, 3 'twin check' found a failed sensor, 130 ended by Ctrl-C, 143 by SIGTERM."
 )
 def _twin(
     version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_print_version, help="print the version and stop")] = False,

@@ -383,8 +383,7 @@ def robustness(
     pipeline: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="P",
-            help="twin, legacy, adaptive, fixed, simple, log, dog, doh, a file of 'twin tune', or your own as FILE.py:FUNCTION",
+            metavar="P", help="twin, legacy, adaptive, fixed, simple, log, dog, doh, a file of 'twin tune', or your own as FILE.py:FUNCTION"
         ),
     ] = None,
     model: Annotated[list[Path] | None, typer.Option(metavar="RUN", help="folder of a trained model")] = None,

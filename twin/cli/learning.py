@@ -133,8 +133,7 @@ def train(
     batch: Annotated[int | None, typer.Option(help="batch size, instead of the model's own")] = None,
     members: Annotated[int | None, typer.Option(help="networks in the ensemble")] = None,
     kernel: Annotated[
-        bool | None,
-        typer.Option("--kernel/--no-kernel", help="Gaussian process beside the networks; slow for thousands of rows"),
+        bool | None, typer.Option("--kernel/--no-kernel", help="Gaussian process beside the networks; slow for thousands of rows")
     ] = None,
     max_minutes: Annotated[float | None, typer.Option(min=0, callback=finite, help="stop after the epoch that passes this time")] = None,
     threads: options.Threads = None,

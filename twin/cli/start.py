@@ -127,10 +127,7 @@ def render_contact_command(
     tilt_deg: Annotated[options.Pair, typer.Option(metavar="RX RY", help="turn of the object about x, then y")] = (0.0, 0.0),
     shear_mm: Annotated[options.Pair, typer.Option(metavar="X Y", help="drag after the press")] = (0.0, 0.0),
     twist_deg: Annotated[float, typer.Option(metavar="RZ", help="turn about z during the drag")] = 0.0,
-    offset_mm: Annotated[options.Pair, typer.Option(metavar="X Y", help="sideways shift of the object before it approaches")] = (
-        0.0,
-        0.0,
-    ),
+    offset_mm: Annotated[options.Pair, typer.Option(metavar="X Y", help="sideways shift of the object before it approaches")] = (0.0, 0.0),
     form: Annotated[Form, typer.Option(help="the camera's frame, or the cropped and thresholded form of the recordings")] = Form.RAW,
     quality: Annotated[Quality, typer.Option(help=options.QUALITY)] = "standard",
     seed: Annotated[int, typer.Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,

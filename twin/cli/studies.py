@@ -124,14 +124,12 @@ def study_sim_to_real(
     seed: Annotated[int, typer.Option(min=0, max=options.MOST_SEED, help="seed of the choice of frames, the contacts and the weights")] = 0,
     experiment: Annotated[str, typer.Option(metavar="E", help="experiment of the recording")] = "surface-2d",
     contacts: Annotated[
-        str | None,
-        typer.Option(metavar="E", help="experiment to simulate; by default one wider than --experiment"),
+        str | None, typer.Option(metavar="E", help="experiment to simulate; by default one wider than --experiment")
     ] = None,
     draws: Annotated[int, typer.Option(min=1, help="samples of the pins' discrepancy for each contact")] = 2,
     count: Annotated[int, typer.Option(min=10, metavar="N", help="contacts to simulate")] = 500,
     sim: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="DIR", exists=True, file_okay=False, help="existing simulated data set; several are joined"),
+        list[Path] | None, typer.Option(metavar="DIR", exists=True, file_okay=False, help="existing simulated data set; several are joined")
     ] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
     ablate: Annotated[bool, typer.Option("--ablate", help="also train without one ingredient at a time (ablation)")] = False,

@@ -279,11 +279,7 @@ def _open_folder(path: Path, spec: SensorSpec | None, form: Form | None, table: 
     return recording
 
 
-def open_recording(
-    path: str | Path,
-    spec: SensorSpec | None = None,
-    form: Form | None = None,
-) -> Recording:
+def open_recording(path: str | Path, spec: SensorSpec | None = None, form: Form | None = None) -> Recording:
     """Open recorded frames.
 
     Parameters

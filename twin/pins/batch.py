@@ -102,12 +102,7 @@ class Preprocessed(ReadableResult):
 
 @writes("pins.npz", "summary.json", "overlay", to="out_dir")
 def preprocess_recording(
-    path: str | Path,
-    spec: SensorSpec,
-    out_dir: str | Path,
-    form: Form | None = None,
-    overlay: bool = False,
-    progress: Step = unheard,
+    path: str | Path, spec: SensorSpec, out_dir: str | Path, form: Form | None = None, overlay: bool = False, progress: Step = unheard
 ) -> Preprocessed:
     """Observe every frame of a recording and write ``pins.npz``, ``summary.json`` and, with ``overlay``, the pictures ``overlay/``.
 

@@ -101,13 +101,7 @@ class Pipeline:
     """
 
     def __init__(
-        self,
-        spec: SensorSpec,
-        form: Form,
-        reference: Reference | None = None,
-        *,
-        graph: GraphKind = "voronoi",
-        second_look: bool = True,
+        self, spec: SensorSpec, form: Form, reference: Reference | None = None, *, graph: GraphKind = "voronoi", second_look: bool = True
     ) -> None:
         self.spec, self.form, self.graph, self.second_look = spec, form_named(form), graph, second_look
         self.size_px = frame_size(spec, self.form)

@@ -18,11 +18,7 @@ from twin.frames.forms import gray_levels
 from twin.pins.finding.caps import measure_caps
 
 # Fitted quantities in ``[response]``: least value, largest value, and step of the numerical derivatives.
-BOUNDS = {
-    "blur_sigma_px": (0.05, 4.0, 0.03),
-    "sharpening": (0.0, 4.0, 0.05),
-    "sharpening_sigma_px": (0.5, 4.0, 0.05),
-}
+BOUNDS = {"blur_sigma_px": (0.05, 4.0, 0.03), "sharpening": (0.0, 4.0, 0.05), "sharpening_sigma_px": (0.5, 4.0, 0.05)}
 # Further fitted quantities of colour cameras: softness of colour (``[response]``) and fringes (``[camera]``). The numbers are as above.
 CHROMA = {"chroma_sigma_px": (0.05, 4.0, 0.05)}
 FRINGES = {"red_scale": (0.985, 1.015, 0.0003), "blue_scale": (0.985, 1.015, 0.0003)}

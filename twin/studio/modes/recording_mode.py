@@ -226,7 +226,7 @@ class RecordingMode(PageMode):
         looked = self._next_doubt(view) if index < 0 else view.look(index)
         if looked is None:
             return
-        beside = cell_picture(looked.frame, looked.seen, view.reference.area_px2)
+        beside = cell_picture(looked.frame, looked.seen, view.reference.area_px2, view.crop)
         self._show_frame(view, looked, beside)
         if not self._against.value or looked.label is None or self._wanted.overtaken:
             return
@@ -236,10 +236,9 @@ class RecordingMode(PageMode):
             self._show_frame(view, looked, beside, note=f"The twin has no picture of this contact: {error}")
             return
         if light is not None and not self._wanted.overtaken:
-            made = view.twin_frame(light).image
-            self._show_frame(
-                view, looked, made if made.ndim == 3 else np.repeat(made[..., None], 3, axis=2), label="the twin's picture of this contact"
-            )
+            made = view.crop(view.twin_frame(light).image)
+            colour = made if made.ndim == 3 else np.repeat(made[..., None], 3, axis=2)
+            self._show_frame(view, looked, colour, label="the twin's picture of this contact")
 
     def _next_doubt(self, view: RecordingView) -> Looked | None:
         """The next frame with a doubtful label, searched after the shown frame and then from the beginning."""
@@ -271,7 +270,7 @@ class RecordingMode(PageMode):
             paragraph(note, "said"),
             *(paragraph(text, "note") for text in [*view.recording.problems, *view.notes][:4]),
         ]
-        self.put_up((camera, view.crop(beside)), f"recorded frame {looked.frame.name}", numbers, below=label)
+        self.put_up((camera, beside), f"recorded frame {looked.frame.name}", numbers, below=label)
 
 
 def _six(values: np.ndarray) -> str:

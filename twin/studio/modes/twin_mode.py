@@ -47,6 +47,11 @@ MOST_FRICTION = 2.0
 """Largest friction of the slider."""
 
 
+def _as_deep(wish: ObjectPose, before_mm: float, contact: MovingContact) -> ObjectPose:
+    """A wish as deep after the first touch in a contact as one that touched at the depth ``before_mm``."""
+    return replace(wish, depth_mm=wish.depth_mm - before_mm + contact.touch_mm(wish)).within_limits()[0]
+
+
 class TwinMode(PageMode):
     """The mode 'Twin'.
 
@@ -68,6 +73,7 @@ class TwinMode(PageMode):
     """
 
     title = "Twin"
+    has_scene = True
 
     def __init__(self, page: StudioPage, state: StudioState, out: Path, model_of: ModelOf, *, traces: bool = True) -> None:
         super().__init__(page)
@@ -88,7 +94,7 @@ class TwinMode(PageMode):
         self._links = self.newest(self._open_link, "link")
         page.on_address = self._links.give
         self._build_controls()
-        self._forces, self._estimates, self._depths = (
+        self._forces, self._estimates, self._depths = self.charts = tuple(
             LineChart(page, title) for title in ("force on the object, N", "error of the estimates", "indentation, mm")
         )
 
@@ -148,7 +154,9 @@ class TwinMode(PageMode):
 
     def show(self) -> None:
         """Show the twin's newest answer."""
-        if self.worker.newest is not None:
+        if self.worker.newest is None:
+            self._page.show_nothing("The first picture is being made. For a new sensor this takes up to a minute.")
+        else:
             self._publisher.give(self.worker.newest)
 
     @property
@@ -312,25 +320,32 @@ class TwinMode(PageMode):
         self._state = self._state.alter(object=name)
 
         def change() -> None:
+            wish, before = self._wish, self.contact.touch_mm(self._wish)
             self.contact.change(obj=obj)
             with self._showing:
                 self._scene.put_object(obj)
             put(self._friction, self._own_friction())
+            self.ask(_as_deep(wish, before, self.contact), gesture=False)
 
         self.worker.do(change)
-        self.worker.ask(self._wish)
 
     def _change_sensor(self) -> None:
         chosen = self._sensor.value
         with self._rebuilding:
             try:
-                self.open(self.state.alter(sensor=chosen, form=str(Form.RAW)))
+                self.open(self.state.alter(sensor=chosen, form=str(Form.RAW)), as_deep=True)
             except (TwinError, SpecError):
                 put(self._sensor, self._state.sensor, send=True)
                 raise
 
-    def open(self, state: StudioState) -> None:
+    def open(self, state: StudioState, *, as_deep: bool = False) -> None:
         """Show another state. With another sensor everything is built again, which takes some seconds.
+
+        Parameters
+        ----------
+        state : StudioState
+        as_deep : bool
+            Keep the depth relative to the first touch of the sensor that is shown now, instead of the state's depth.
 
         Raises
         ------
@@ -345,7 +360,8 @@ class TwinMode(PageMode):
                 self._tracer.__exit__(None, None, None)
             self._page.gui.set_panel_label(heading(state))
             before, friction = self._choices(), self._own_friction()
-            self._state, self._wish = state, state.object_pose()
+            self._state, wish = state, state.object_pose()
+            self._wish = _as_deep(wish, self.contact.touch_mm(wish), prepared[0]) if as_deep else wish
             self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
             self._model_note = "the model is being loaded"
             self._take_up(*prepared)
@@ -441,9 +457,9 @@ class TwinMode(PageMode):
         across, into = float(np.hypot(*state.force_n[:2])), float(state.force_n[2])
         ends = force_interval(state.force_n.tolist(), self.contact.setup.sensor.skin.stiffness_factor)
         rows = {
-            "force x, y, z": f"{force[0]:+.2f}  {force[1]:+.2f}  {force[2]:+.2f} N",
+            "force x, y, z, N": f"{force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f}",
             "its size, 90 % interval": f"{ends[0]:.2f} to {ends[1]:.2f} N",
-            "lateral force, ratio to normal": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
+            "lateral, share of normal": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
             "torque about z": f"{torque:+.1f} N mm",
             "indentation": f"{answer.indent_mm:+.2f} mm",
             "contact area, slipping": f"{state.area_mm2:.0f} mm2, {100 * state.slip_share:.0f} %",

@@ -10,6 +10,7 @@ from contextlib import contextmanager, redirect_stdout
 from http import HTTPStatus
 from io import StringIO
 from itertools import count
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 from urllib.parse import urlsplit
 
@@ -24,7 +25,8 @@ from websockets.http11 import Request, Response
 from scenes.base import SpecError
 from scenes.files import quote
 from twin.errors import TwinError
-from twin.studio.pictures import STYLE, numbers_html, paragraph
+from twin.studio.pictures import PAGE, numbers_html, paragraph
+from twin.studio.uploads import keep_upload
 from twin.types import ImageArray
 
 if TYPE_CHECKING:
@@ -44,6 +46,8 @@ JPEG_QUALITY = 88
 """Quality of the JPEG pictures in the page."""
 CELLS = "change of the Voronoi cells' areas"
 """Caption of the second picture at the start."""
+ARCHIVES = ".zip,.mp4,.avi,.mkv,.mov"
+"""Kinds of files with frames that can be uploaded."""
 SPAN_S = 20.0
 """Time that the charts show, s."""
 CHART_S = 0.25
@@ -237,6 +241,8 @@ class StudioPage:
         Address on which to listen. If the port is used already, the next free one is taken, see ``url``.
     modes : sequence of str
         Titles of the modes among which the user chooses.
+    saves : Path
+        Folder for uploaded files.
 
     Attributes
     ----------
@@ -249,7 +255,7 @@ class StudioPage:
         The server can't listen on this host and port.
     """
 
-    def __init__(self, title: str, *, host: str, port: int, modes: Sequence[str] = ()) -> None:
+    def __init__(self, title: str, *, host: str, port: int, modes: Sequence[str] = (), saves: Path = Path()) -> None:
         self.on_address: Callable[[str], None] = lambda address: None
         try:
             port = free_port(host, port)
@@ -258,7 +264,7 @@ class StudioPage:
                 self.server = _ViserServer(host=host, port=port, label=title, verbose=False)
         except (OSError, RuntimeError) as error:
             raise TwinError(f"`host` {host} `port` {port}: can't listen there ({error}); give another `host` or `port`") from error
-        self._host = host
+        self._host, self._saves = host, saves
         gui = self.gui = self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         pictures = gui.add_panel(order=0)
@@ -276,7 +282,7 @@ class StudioPage:
         pictures.expand()  # in a narrow window, too
         gui.main_panel.dock_right()
         gui.main_panel.set_width(CONTROLS_PX)
-        self._style = gui.add_html(STYLE)
+        self._style = gui.add_html(PAGE)
         self._said = gui.add_html("", visible=False)
         self._choice = gui.add_dropdown("mode", tuple(modes), initial_value=modes[0]) if modes else None
         self._numbers = gui.add_html(numbers_html())
@@ -314,7 +320,7 @@ class StudioPage:
         if self._choice is not None and self._choice.value != title:
             put(self._choice, title)
         self.server.scene.set_global_visibility(self.mode.has_scene)
-        self._style.content = STYLE if self.mode.has_scene else STYLE + NO_SCENE
+        self._style.content = PAGE if self.mode.has_scene else PAGE + NO_SCENE
         self._panel.set_width(PICTURES_PX if self.mode.has_scene else LARGE_PX)
         self.mode.enter()
 
@@ -372,6 +378,11 @@ class StudioPage:
     def button(self, label: str, action: Callable[[], object], **options: Any) -> None:
         """Add a button that calls an action (see ``guard``)."""
         self.gui.add_button(label, **options).on_click(self.guard(action))
+
+    def upload(self, label: str, kinds: str, take: Callable[[str], object], *, hint: str) -> None:
+        """Add a button for a file of some kinds (".stl,.obj"); ``take`` is called with the path at which it is stored."""
+        button = self.gui.add_upload_button(label, mime_type=kinds, hint=hint)
+        button.on_upload(self.guard(lambda: take(str(keep_upload(self._saves, button.value.name, button.value.content)))))
 
     def say(self, text: str, *, bad: bool = False) -> None:
         """Show a message for some seconds."""

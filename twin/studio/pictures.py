@@ -91,8 +91,10 @@ def number_table(rows: Mapping[str, str]) -> str:
     return "<table>" + "".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in rows.items()) + "</table>"
 
 
-STYLE = files(__package__).joinpath("studio.html").read_text(encoding="utf-8")
-"""The page's stylesheet, and the notice of a lost server."""
+STYLE, DROP = (files(__package__).joinpath(name).read_text(encoding="utf-8") for name in ("studio.html", "drop.js"))
+"""The page's stylesheet with the notice of a lost server, and the program that takes dropped files."""
+PAGE = f'{STYLE}<img hidden src="data:," onerror="{escape(DROP)}">'
+"""Both as HTML. A page runs no script that is added to it later, but it runs that of a picture that can't be loaded."""
 
 
 def numbers_html(*parts: str, kind: str = "") -> str:

@@ -170,13 +170,7 @@ class PinScene:
         server.initial_camera.position = (1.2 * radius_mm, -3.4 * radius_mm, 1.7 * radius_mm)
         server.initial_camera.look_at = (0.0, 0.0, 0.7 * sensor.skin.apex_mm)
         self._skin = self._scene.add_mesh_simple(
-            "/sensor/skin",
-            skin.corners_mm,
-            skin.faces,
-            color=SKIN_RGB,
-            opacity=0.45,
-            side="double",
-            **shadows,
+            "/sensor/skin", skin.corners_mm, skin.faces, color=SKIN_RGB, opacity=0.45, side="double", **shadows
         )
         self._pins = self._scene.add_batched_meshes_simple(
             "/sensor/pins",

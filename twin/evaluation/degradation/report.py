@@ -233,10 +233,7 @@ def _limits_section(page: Page, plan: SweepSettings) -> None:
         ),
     )
     rows = [
-        {
-            "measure": m.title,
-            "limit": f"{'at least' if m.least else 'at most'} {m.limit} {'pitches' if m.in_pitches else m.unit}".strip(),
-        }
+        {"measure": m.title, "limit": f"{'at least' if m.least else 'at most'} {m.limit} {'pitches' if m.in_pitches else m.unit}".strip()}
         for m in (*MEASURES, *(POSE_MEASURES if plan.model_digests else ()))
     ]
     page.table(rows, ["measure", "limit"])

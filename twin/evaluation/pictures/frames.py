@@ -60,14 +60,7 @@ class RealFrames:
 
 
 def read_real(
-    path: Path,
-    spec: SensorSpec,
-    disc: Disc,
-    *,
-    limit: int | None = None,
-    fitted: int = 0,
-    lost: float = 0.0,
-    progress: Step = unheard,
+    path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = None, fitted: int = 0, lost: float = 0.0, progress: Step = unheard
 ) -> RealFrames:
     """Read raw frames. If there are more than ``limit``, a selection that is evenly distributed over the recording is read.
 

@@ -14,7 +14,7 @@ from twin.frames import Recording, frames_at, open_recording
 from twin.pins.pipeline import Pipeline
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
-from twin.studio.page import StudioPage, put
+from twin.studio.page import ARCHIVES, StudioPage, put
 from twin.studio.pictures import CONTROLS, OverlayChoices, badge, camera_picture, cell_picture, number_table, paragraph
 from twin.studio.state import next_path
 
@@ -97,6 +97,9 @@ class NewMode(PageMode):
         gui = page.gui
         with self.folder:
             self._frames = gui.add_text("frames", "", hint="folder, video or recording on the studio's machine")
+            page.upload(
+                "Upload frames (zip or video)", ARCHIVES, self._take_upload, hint="or drop a folder, an archive or a video on the page"
+            )
             self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
             self._layout = gui.add_text("layout", "", hint="empty: identified; or rings:10, hexagon:6, grid:9x7, positions:FILE.csv")
             self._radius = gui.add_text(
@@ -115,6 +118,10 @@ class NewMode(PageMode):
             self._page.show_nothing(self._absent)
         else:
             self._looking.give(int(self._number.value))
+
+    def _take_upload(self, path: str) -> None:
+        put(self._frames, path)
+        self.propose()
 
     def propose(self) -> None:
         """Make a specification from the user's input. This takes some seconds to half a minute.

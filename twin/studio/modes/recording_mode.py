@@ -18,7 +18,7 @@ from twin.studio.camera import dome_part
 from twin.studio.contact import MovingContact, experiment_of
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
-from twin.studio.page import CELLS, StudioPage, put
+from twin.studio.page import ARCHIVES, CELLS, StudioPage, put
 from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
 from twin.types import FloatArray, Form, Frame, Observation
 
@@ -182,6 +182,9 @@ class RecordingMode(PageMode):
         with self.folder:
             self._path = gui.add_text("folder or video", first, hint="any recording that 'twin preprocess' reads, on the studio's machine")
             page.button("Open", lambda: self.open(self._path.value))
+            page.upload(
+                "Upload frames (zip or video)", ARCHIVES, self._take_upload, hint="or drop a folder, an archive or a video on the page"
+            )
             self._number = gui.add_slider("frame number", 0, 1, 1, 0, disabled=True)
             steps = gui.add_button_group("step", ("-10", "-1", "+1", "+10"))
             page.button("Next doubtful label", lambda: self._wanted.give(-1), hint="the next frame whose label is doubtful")
@@ -213,6 +216,10 @@ class RecordingMode(PageMode):
         self._number.max = max(1, len(self._view) - 1)
         self._number.disabled = False
         self._go(0)
+
+    def _take_upload(self, path: str) -> None:
+        put(self._path, path)
+        self.open(path)
 
     def _go(self, index: int) -> None:
         if self._view is not None:

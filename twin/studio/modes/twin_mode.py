@@ -24,7 +24,7 @@ from twin.studio.page import LineChart, StudioPage, put, value_of
 from twin.studio.pictures import OverlayChoices, badge, estimate_table, number_table, paragraph, pins_found
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of
 from twin.studio.scene import FULL_SCALE, PinColour, Scene
-from twin.studio.state import StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
+from twin.studio.state import LAST_STATE, StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
 from twin.studio.tracing import Tracer
 from twin.studio.video import FilmWriter
 from twin.studio.worker import Worker
@@ -79,6 +79,7 @@ class TwinMode(PageMode):
         super().__init__(page)
         self._out, self._model_of, self._traces = out, model_of, traces
         self._state = state
+        self._kept: StudioState | None = None  # as it is in the file of the last state
         self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
         self._wish, self._wished_s = state.object_pose(), 0.0
         self._undo: list[ObjectPose] = []
@@ -230,6 +231,9 @@ class TwinMode(PageMode):
                     (list_sensors, self._state.sensor), (list_objects, self._state.object)))  # fmt: skip
                 self._sensor = gui.add_dropdown("sensor", sensors, initial_value=self._state.sensor)
                 self._object = gui.add_dropdown("object", objects, initial_value=self._state.object)
+                self._page.upload(
+                    "Upload an object (mesh)", ".stl,.obj,.ply", self._touch, hint="lengths in mm; or drop the file on the page"
+                )
                 self._friction = gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction())
                 button("Restart contact", self.restart_contact, hint="clear the friction history and press straight down")
             with gui.add_folder("Show"):
@@ -316,6 +320,7 @@ class TwinMode(PageMode):
         except SpecError:
             put(self._object, self._state.object, send=True)
             raise
+        self._object.options = tuple(sorted({*self._object.options, name}))
         put(self._object, name, send=True)
         self._state = self._state.alter(object=name)
 
@@ -367,7 +372,8 @@ class TwinMode(PageMode):
             self._take_up(*prepared)
             setup = self.contact.setup
             self._form.options = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
-            self._sensor.options = tuple(sorted({*self._sensor.options, state.sensor}))
+            for control, name in ((self._sensor, state.sensor), (self._object, state.object)):
+                control.options = tuple(sorted({*control.options, name}))
             for (control, old), (_, new) in zip(before, self._choices(), strict=True):
                 if control.value == old and new in control.options:  # otherwise the user has just chosen another one; its callback follows
                     put(control, new)
@@ -413,6 +419,9 @@ class TwinMode(PageMode):
             self._show_answer(answer)
         if not self._loading:
             self._load_rest()
+        if answer.arrived and self._kept != self.state:
+            self._kept = self.state
+            self._kept.save(self._out / LAST_STATE)
         for follow in self.followers:
             follow(answer)
 

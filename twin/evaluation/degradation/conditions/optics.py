@@ -101,14 +101,7 @@ def scratched(light: np.ndarray, value: float, view: PictureView, rng: np.random
 _condition = in_family("optics", image_level=True)
 CONDITIONS = (
     _condition("defocus", "camera out of focus", "circle of confusion at the caps", "mm", 4.0, light=defocus),
-    _condition(
-        "focus-rolled",
-        "focus rolled off to one side",
-        "circle of confusion at the far rim",
-        "mm",
-        6.0,
-        light=rolled_focus,
-    ),
+    _condition("focus-rolled", "focus rolled off to one side", "circle of confusion at the far rim", "mm", 6.0, light=rolled_focus),
     _condition("motion-blur", "motion blur", "path of the picture during the exposure", "mm", 5.0, light=motion),
     _condition("lens-dirt", "dirt on the lens", "share of the disc under smudges", "", 0.9, light=dirt),
     _condition("lens-scratches", "scratched lens", "scratches", "", 120.0, light=scratched),

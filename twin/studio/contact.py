@@ -418,26 +418,12 @@ class MovingContact:
         of_frame = self.model is not None and self.model.form is self.setup.form
         seen = pins_in(frame, estimate if of_frame else None, self._pipeline)
         times = {"picture": now - started, "estimate": estimated - now, "pins": time.perf_counter() - estimated}
+        true_px = from_raw(self.setup.sensor.recording, self.setup.form, project(self.setup.sensor.view, state.caps_mm))
+        labels = self.labels(state.T_sensor_object if len(state.contact_mm) else T)
         self._last = ContactAnswer(
-            self.setup,
-            self._count,
-            self._solved,
-            ObjectPose.of(T, self._apex_mm),
-            -self._follower.gap_mm(T),
-            state,
-            light,
-            raw,
-            frame,
-            seen,
-            from_raw(self.setup.sensor.recording, self.setup.form, project(self.setup.sensor.view, state.caps_mm)),
-            estimate,
-            self.labels(state.T_sensor_object if len(state.contact_mm) else T),
-            lit,
-            mesh,
-            arrived,
-            stopped,
-            ms | {name: 1e3 * seconds for name, seconds in times.items()},
-        )
+            self.setup, self._count, self._solved, ObjectPose.of(T, self._apex_mm), -self._follower.gap_mm(T), state, light, raw, frame,
+            seen, true_px, estimate, labels, lit, mesh, arrived, stopped, ms | {name: 1e3 * value for name, value in times.items()},
+        )  # fmt: skip
         return self._last
 
     def labels(self, T: FloatArray) -> dict[str, float]:

@@ -7,6 +7,7 @@ from zipfile import BadZipFile, ZipFile
 
 from twin.errors import TwinError
 from twin.store import writing
+from twin.studio.state import next_path
 
 MOST_UNPACKED = 4_000_000_000
 """Largest size of an archive's content, bytes."""
@@ -21,11 +22,9 @@ def keep_upload(folder: Path, name: str, content: bytes) -> Path:
         The archive is damaged or too large, or nothing can be written.
     """
     safe = re.sub(r"[^\w.-]+", "_", name).lstrip(".") or "file"
-    number = 1
-    while (place := folder / f"upload-{number}").exists():
-        number += 1
+    place = next_path(folder, "upload", "")
     with writing(place):
-        place.mkdir(parents=True)
+        place.mkdir()
         if not safe.lower().endswith(".zip"):
             (place / safe).write_bytes(content)
             return place / safe

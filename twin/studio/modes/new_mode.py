@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.base import SpecError
+from scenes.files import quote
 from scenes.pins import PinsSpec, layout_from
 from scenes.sensor import SensorSpec
 from twin.calibration.new_sensor import NewSensor, new_sensor
@@ -34,28 +35,14 @@ class Wish:
         A frame without contact, "" for none.
     layout : str
         Text for ``layout_from``; "" to have the layout identified.
-    radius : str
-        Radius of the dome, mm; "" for that of a printed TacTip.
+    radius_mm : float or None
+        Radius of the dome; None for that of a printed TacTip.
     """
 
     frames: str
     no_contact: str
     layout: str
-    radius: str
-
-    @property
-    def radius_mm(self) -> float | None:
-        """The radius as a number.
-
-        Raises
-        ------
-        TwinError
-            It is none.
-        """
-        with ErrorsAs(
-            ValueError, lambda error: TwinError(f"`radius_mm` {self.radius}: give a number, or nothing for a printed TacTip's 20")
-        ):
-            return float(self.radius) if self.radius else None
+    radius_mm: float | None
 
 
 def enlarge_layout(pins: PinsSpec, by: int) -> str:
@@ -133,11 +120,14 @@ class NewMode(PageMode):
         """
         if not self._frames.value.strip():
             raise TwinError("give the folder of your sensor's frames first")
-        wish = Wish(*(control.value.strip() for control in (self._frames, self._no_contact, self._layout, self._radius)))
-        wish.radius_mm  # noqa: B018  # raises an error if it is no number
+        controls = self._frames, self._no_contact, self._layout, self._radius
+        frames, no_contact, layout, radius = (control.value.strip() for control in controls)
+        refusal = TwinError(f"`radius_mm` {quote(radius)}: give a number, or nothing for a printed TacTip's 20")
+        with ErrorsAs(ValueError, lambda error: refusal):
+            radius_mm = float(radius) if radius else None
         self._made, self._absent = None, "The frames are being processed."
         self.show()
-        self._making.give(wish)
+        self._making.give(Wish(frames, no_contact, layout, radius_mm))
 
     def correct(self, by: int) -> None:
         """Propose again with a layout that is larger or smaller by ``by``.
@@ -173,9 +163,9 @@ class NewMode(PageMode):
             self._page.say(f"processing the frames: {stage}{share}")
 
         no_contact = Path(wish.no_contact) if wish.no_contact else None
-        layout = layout_from(wish.layout) if wish.layout else None
         out = next_path(self._out, "my-sensor", ".toml")
         try:
+            layout = layout_from(wish.layout) if wish.layout else None
             made = new_sensor(Path(wish.frames), out, layout=layout, radius_mm=wish.radius_mm, no_contact=no_contact, progress=report)
         except (TwinError, SpecError) as error:
             self._absent = f"No specification: {error}"

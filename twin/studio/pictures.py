@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from twin.estimate import Estimate, readable_labels
-from twin.pins.batch import FOUND_RGB, FULL_CHANGE, area_colours, draw_overlay, voronoi_map
+from twin.pins.batch import FOUND_RGB, FULL_CHANGE, GRAY, area_colours, draw_overlay, voronoi_map
 from twin.types import FloatArray, Frame, ImageArray, Observation
 
 ARROW_RGB = (255, 140, 40)
@@ -56,6 +56,7 @@ def cell_picture(
     picture = np.array(crop(voronoi_map(frame.image.shape[:2], seen, rest_px2)), np.uint8)
     height, width = picture.shape[:2]
     low, high, top = width // 4, width - width // 4, height - height // 40 - 3
+    picture[top - 4 :] = GRAY
     picture[top : height - 2, low:high] = area_colours(np.linspace(-1, 1, high - low))
     size = width / 900
     for text, x in ((f"{-100 * FULL_CHANGE:.0f} %", low - 0.15 * width), (f"{100 * FULL_CHANGE:+.0f} %", high + 0.03 * width)):

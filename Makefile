@@ -8,7 +8,7 @@ export TACTIP_REAL ?= ../shared/real
 WORKERS ?= $(shell expr $$(nproc) + 1)
 SCRIPT := PYTHONPATH=$(CURDIR):$(CURDIR)/tests:$(CURDIR)/tests/helpers:$(CURDIR)/tests/bench $(BIN)/python
 
-.PHONY: help setup demo test golden bench figures film gallery tables docs validate lint types wheel clean
+.PHONY: help setup demo test golden bench figures film browser gallery tables docs validate lint types wheel clean
 help:            ## what can be made
 	@sed -n 's/^\([a-z]*\): .*## /\1\t/p' $(MAKEFILE_LIST)
 
@@ -58,6 +58,10 @@ film: setup      ## the studio's film and three pictures, in out/film; needs Deb
 
 gallery: setup   ## the pictures of the gallery, from the code of its page
 	@cd docs && PYTHONPATH=$(CURDIR) $(CURDIR)/$(BIN)/python -m generators.gallery
+
+browser: setup   ## the studio in a real Chromium, wide and narrow; pictures in out/browser; skipped without Debian's chromium
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,browser]'
+	@$(BIN)/python -m pytest -m slow -n 0 -rs tests/browser tests/system/test_studio_browser.py
 
 tables: setup    ## make the documents' tables from figures.json
 	@$(SCRIPT) -m figures --tables

@@ -117,6 +117,7 @@ def check(
     push: str | Sequence[str] | None = ...,
     twist: Path | str | None = ...,
     out: Path | str | None = ...,
+    page: Path | str | None = ...,
     model: Path | str | None = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,

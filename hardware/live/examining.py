@@ -1,21 +1,28 @@
 """Check of a sensor's condition from frames of a camera or of a recording."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import await_frame
 from scenes import SensorSpec
 from twin.calibration.camera_view import register_files
 from twin.errors import FrameError, OptionError
-from twin.frames import evenly_read, open_recording
-from twin.pins import DetectorSpec, Finding, Grade, examine, with_detector
+from twin.frames import evenly_read, open_recording, spread_indices
+from twin.frames.images import write_image
+from twin.pins import DetectorSpec, Finding, Grade, Pipeline, examine, with_detector
+from twin.pins.batch import draw_overlay
 from twin.progress import Progress, silent, stage
-from twin.store import writes_file
+from twin.report.page import Page, PagePicture
+from twin.report.table import Cell
+from twin.store import writes, writes_file
 from twin.types import Form, Frame, ReadableResult
 
 LIMIT = 20  # most frames that are used
+SHOWN = 4  # frames whose pictures are on the page
 MOST_LIVE = 1000  # most frames of a camera that are kept: 6 GB at 1920 x 1080 in colour
 
 
@@ -42,6 +49,7 @@ class Examination(ReadableResult):
 
 
 @writes_file()
+@writes("index.html", "frame-*.png", to="page")
 def examine_sensor(
     source: str,
     sensor: SensorSpec,
@@ -53,6 +61,7 @@ def examine_sensor(
     pushes: Sequence[str] = (),
     twist: Path | None = None,
     out: Path | None = None,
+    page: Path | None = None,
     contacts: Callable[[list[Frame], SensorSpec], Finding | None] | None = None,
     progress: Progress = silent,
 ) -> Examination:
@@ -69,6 +78,8 @@ def examine_sensor(
     no_contact, pushes, twist, out : optional
         As ``rest``, ``pushes``, ``twist`` and ``out`` of ``twin.calibration.camera_view.register_files``: the camera's turn and mirror are
         found, and the frames are compared with the corrected copy of the specification.
+    page : Path, optional
+        Folder for a page with the findings, and pictures of frames with their pins.
     contacts : callable, optional
         Finding whether the contacts in the frames are in the domain of a model of the sensor; for the specification's own detector.
 
@@ -98,7 +109,32 @@ def examine_sensor(
         findings = examine(frames, sensor, detector, progress=step)
     if detector is None and contacts is not None:
         findings += filter(None, [contacts(frames, sensor)])
-    return Examination(findings, views + notes)
+    found = Examination(findings, views + notes)
+    if page is not None:
+        _write_page(page, found, frames, Pipeline(seeing, frames[0].form), source)
+    return found
+
+
+def _write_page(folder: Path, found: Examination, frames: list[Frame], pipeline: Pipeline, source: str) -> None:
+    tones: dict[Grade, Literal["", "good", "bad"]] = {Grade.HEALTHY: "good", Grade.FAILED: "bad"}
+    counts = Counter(str(finding.verdict) for finding in found.findings)
+    lead = f"{len(frames)} frames of {source}. Checks: {', '.join(f'{count} {grade}' for grade, count in counts.items())}."
+    page = Page(f"Health of {pipeline.spec.name}", "twin check", topic="TacTip twin: health", lead=lead)
+    page.notice("What to do", [finding.remedy for finding in found.findings if finding.remedy], tone="bad" if found.failed else "")
+    page.notice("Noted", found.notes)
+    rows = [(each.name, Cell(str(each.verdict), tones.get(each.verdict, "")), each.text) for each in found.findings]
+    columns = ["check", "verdict", "found"]
+    page.table([dict(zip(columns, row, strict=True)) for row in rows], columns)
+    page.section("Pins in the frames", "Green: found. Red: a lost pin's expected place. Yellow: spots that are no pins.")
+    shown = [frames[k] for k in spread_indices(len(frames), SHOWN)]
+    paths = [folder / f"frame-{k + 1}.png" for k in range(len(shown))]
+    for path, frame in zip(paths, shown, strict=True):
+        write_image(path, draw_overlay(frame, pipeline(frame), scale=2))
+    page.figures(
+        *(PagePicture(path, f"Frame {frame.name} with its pins", frame.name) for path, frame in zip(paths, shown, strict=True)),
+        layout="row",
+    )
+    page.write(folder / "index.html")
 
 
 def frames_of(source: str, sensor: SensorSpec | None, form: Form | None, limit: int) -> tuple[list[Frame], list[str]]:

@@ -29,7 +29,7 @@ from twin.studio.live_page import LiveFrame, chart_values, frame_numbers, frame_
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import LineChart, StudioPage, put
-from twin.studio.pictures import badge, paragraph
+from twin.studio.pictures import badge, numbers_html, paragraph
 from twin.studio.studio import LIVE, StudioPlan
 from twin.types import Frame
 
@@ -322,6 +322,7 @@ class LiveMode(PageMode):
         nudges.on_click(page.guard(lambda: self._nudge(nudges.value)))
         gui.add_command("Emergency stop of the arm", hotkey="space", modifier="shift").on_trigger(page.guard(self.emergency_stop))
         self._chart = LineChart(page, "live estimates")
+        self.charts = (self._chart,)
 
     def stop(self) -> None:
         """End, and release camera and arm."""
@@ -330,7 +331,7 @@ class LiveMode(PageMode):
 
     def show(self) -> None:
         """Show the camera. If the command named a camera, it is connected now."""
-        self._page.show_nothing("Give a camera and press 'Connect'.")
+        self._page.show_nothing("Give a camera (a number, /dev/videoN, http://..., a folder or a video) and press 'Connect'.")
         with self._connecting:
             absent = self._feed is None and bool(self._camera.value)
             if absent:
@@ -357,7 +358,8 @@ class LiveMode(PageMode):
             self._pipeline = Pipeline(feed.model.sensor, feed.model.form, feed.model.pipeline.reference)
             self._feed = feed
             feed.start(self._shots.give, self.complain)
-            self._limits.content = "" if feed.robot is None else paragraph(f"{feed.robot.name}: {feed.robot.limits()}", "note")
+            arm = "" if feed.robot is None else f"{feed.robot.name}: {feed.robot.limits()}"
+            self._limits.content = numbers_html(paragraph(arm, "note"))
 
     def disconnect(self) -> None:
         """Release camera and arm."""

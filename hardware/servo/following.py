@@ -30,7 +30,8 @@ from twin.policy import KnownContacts, Policy, PolicyError, PolicyModel, load_po
 from twin.progress import Progress, Step, silent, stage
 from twin.records import KeptAlso
 from twin.records.session import SessionWriter, plain
-from twin.report.charts import save_figure
+from twin.report.charts import save_figure, write_chart
+from twin.report.page import Page, PagePicture
 from twin.report.table import write_rows
 from twin.rig.mounting import Mounting
 from twin.store import write_json, writes
@@ -202,7 +203,8 @@ class Followed:
             *(f"note: {note}" for note in self.notes),
         ]
         if np.isfinite(m.completed):
-            out[0] += f", {m.completed:.0%} of the path, contact lost {m.lost_contacts:g} times"
+            round_mm = np.linalg.norm(np.diff(self.outline_mm, axis=0), axis=1).sum()
+            out[0] += f", {self.path.along_mm.max():.0f} of {round_mm:.0f} mm along the outline, contact lost {m.lost_contacts:g} times"
             entries = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
             out[2:2] = [
                 f"{entries if np.isfinite(m.path_error_mm) else ''}"  # a policy gives no estimate
@@ -213,7 +215,7 @@ class Followed:
         return out + ([in_short(f"ended early: {self.failure}")] if self.failure else [])
 
 
-@writes("trajectory.csv", "trajectory.png", "measures.json", SESSION)
+@writes("index.html", "trajectory.csv", "trajectory*.png", "measures.json", SESSION)
 def follow(
     plan: FollowPlan, model: SensorModel, out: Path, *, about: dict[str, Any] | None = None, progress: Progress = silent
 ) -> Followed | DryRunDone:
@@ -360,7 +362,7 @@ def _results(plan: FollowPlan, rig: Rig, loop: ServoLoop, wanted_mm: float, fail
 
 
 def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, entries: dict[str, Any]) -> list[Path]:
-    figure = trajectory_figure(followed.path, followed.measures, f"{plan.obj.name}, {model.sensor.name}", outline_mm=followed.outline_mm)
+    title, (lead, *lines) = f"{plan.obj.name}, {model.sensor.name}", followed.lines()
     content = {
         **entries,
         "measures": asdict(followed.measures),
@@ -368,8 +370,15 @@ def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, 
         "failure": followed.failure,
         "notes": followed.notes,
     }
-    measures = write_json(out / "measures.json", plain(content))
-    return [write_csv(out / "trajectory.csv", followed.path), save_figure(out / "trajectory.png", figure), measures]
+    files = [write_csv(out / "trajectory.csv", followed.path), write_json(out / "measures.json", plain(content))]
+    draw = partial(trajectory_figure, followed.path, followed.measures, title, outline_mm=followed.outline_mm)
+    picture = write_chart(out / "trajectory.png", draw)
+    page = Page(f"Following: {title}", "twin servo", topic="TacTip twin: servoing", lead=f"{lead}.")
+    page.items(lines)
+    page.figures(PagePicture(picture, "The tool's path around the object, depth and angle at each step", width_px=1000))
+    for path in files:
+        page.download(path)
+    return [page.write(out / "index.html"), *files, picture]
 
 
 @dataclass(frozen=True)

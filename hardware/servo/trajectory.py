@@ -223,34 +223,46 @@ def write_csv(path: Path, trajectory: Trajectory) -> Path:
     return write_table(path, [{"step": k} | {name: float(values[k]) for name, values in columns.items()} for k in steps])
 
 
-def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outline_mm: np.ndarray | None = None) -> Figure:
-    """Four panels. With an outline (N, 2) in the base frame they also show the true surface."""
-    figure, (whole, zoom, depth, angle) = new_figure(2, 2, panel_inch=4.6)
-    figure.suptitle(
-        f"{title}: S = {measures.smoothness:.3f}, path error {measures.path_error_mm:.2f} mm, "
-        f"{measures.completed:.0%} of the path, contact lost {measures.lost_contacts:g} times"
-    )
-    for ax in (whole, zoom):
-        if outline_mm is not None:
-            ax.plot(*outline_mm.T, color=muted_colour(), lw=3, alpha=0.5, label="object")
-        ax.plot(*path.tool_mm.T, color=TOOL, lw=1, label="tool")
-        ax.plot(*path.surface_mm.T, ".", color=FELT, ms=3, label="estimated surface")
-        ax.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
-    whole.set_title("trajectory")
-    whole.legend(loc="best", fontsize=8)
+def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outline_mm: np.ndarray) -> Figure:
+    """Panels: the trajectory, its roughest part if there are enough steps for one, and depth and angle if they are known.
+
+    The outline (N, 2) is in the base frame.
+    """
     slopes = local_slopes(path.tool_mm)
-    if len(slopes) and np.isfinite(slopes).any():
+    rough = bool(np.isfinite(slopes).any())
+    courses = [
+        (estimated, true, name)
+        for estimated, true, name in (
+            (path.depth_mm, path.true_depth_mm, "depth, mm"),
+            (path.angle_deg, path.true_angle_deg, "angle from the normal, deg"),
+        )
+        if np.isfinite([estimated, true]).any()
+    ]
+    panels = 1 + rough + len(courses)
+    figure, axes = new_figure(min(panels, 2), -(-panels // 2), panel_inch=4.6)
+    figure.suptitle(title)
+    for ax in axes[panels:]:
+        ax.axis("off")
+    for ax in axes[: 1 + rough]:
+        ax.plot(*outline_mm.T, color=muted_colour(), lw=3, alpha=0.5, label="object")
+        ax.plot(*path.tool_mm.T, color=TOOL, lw=1, label="tool")
+        if np.isfinite(path.surface_mm).any():
+            ax.plot(*path.surface_mm.T, ".", color=FELT, ms=3, label="estimated surface")
+        ax.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
+    axes[0].set_title("trajectory")
+    axes[0].legend(loc="best", fontsize=8)
+    if rough:
         worst = int(np.nanargmax(slopes))
         x, y = path.tool_mm[worst + LOCAL_N // 2]
-        zoom.set(xlim=(x - ZOOM_MM, x + ZOOM_MM), ylim=(y - ZOOM_MM, y + ZOOM_MM))
-        zoom.set_title(f"roughest: local S {slopes[worst]:.3f} (mean {measures.local_smoothness:.3f})")
-    steps = np.arange(len(path.depth_mm))
-    for ax, estimated, true, name in (
-        (depth, path.depth_mm, path.true_depth_mm, "depth, mm"),
-        (angle, path.angle_deg, path.true_angle_deg, "angle from the normal, deg"),
-    ):
-        ax.plot(steps, true, color=muted_colour(), lw=2, label="true")
-        ax.plot(steps, estimated, color=FELT, lw=0.8, label="estimated")
+        axes[1].set(xlim=(x - ZOOM_MM, x + ZOOM_MM), ylim=(y - ZOOM_MM, y + ZOOM_MM))
+        axes[1].set_title(f"roughest: local S {slopes[worst]:.3f} (mean {measures.local_smoothness:.3f})")
+    for ax, (estimated, true, name) in zip(axes[1 + rough :], courses, strict=False):
+        for values, style in (
+            (true, {"color": muted_colour(), "lw": 2, "label": "true"}),
+            (estimated, {"color": FELT, "label": "estimated"}),
+        ):
+            if np.isfinite(values).any():
+                ax.plot(np.arange(len(values)), values, **style)
         ax.set(xlabel="step", ylabel=name)
         ax.legend(fontsize=8)
     return figure

@@ -61,7 +61,7 @@ def test_the_page_is_drawn_and_moved_by_keys_alone(studio):
 
 def test_a_typed_number_moves_the_object(studio):
     with open_page(studio.page.url) as (page, messages):
-        field = page.locator("xpath=//*[normalize-space(text())='depth, mm']/following::input[not(@type='hidden')]").first
+        field = page.locator("xpath=//label[normalize-space(text())='depth, mm']/following::input[not(@type='hidden')]").first
         field.fill("1.5")
         field.press("Enter")
         await_depth(page, 1.5)
@@ -88,6 +88,5 @@ def test_a_narrow_window_has_the_controls(studio):
         page.wait_for_timeout(2000)
         assert np.percentile(shown(page), 99) > LEAST_LIT
         assert page.locator("[data-depth]").count() == 1
-        page.locator("text=Camera >> visible=true").first.click()  # the pictures' section is closed at first
         page.locator("img >> visible=true").first.wait_for(timeout=10_000)
         assert not messages

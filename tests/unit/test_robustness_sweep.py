@@ -16,7 +16,7 @@ from training.studies import degradation
 from twin.errors import TwinError
 from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.conditions import CONDITIONS
-from twin.evaluation.degradation.envelope import Envelope, crossing, curves_of, envelopes_of, shares_of
+from twin.evaluation.degradation.envelope import NEAR, Envelope, crossing, curves_of, envelopes_of, evaluate_sweep, shares_of
 from twin.evaluation.degradation.measures import MEASURES, measure_frame
 from twin.evaluation.degradation.plan import ConditionPlan, SweepPlan, load_plan
 from twin.evaluation.degradation.report import _share_row, compare
@@ -112,6 +112,19 @@ def test_curves_envelopes_and_their_comparison():
     assert (band.low <= band.mean + 1e-12).all() and (band.mean <= band.high + 1e-12).all()
 
 
+def test_between_held_and_failed_it_is_bisected_until_they_are_near(spec, frames, monkeypatch, tmp_path):
+    def rows(plan, *_, **__):
+        row = {"frame": "x", "pipeline": "a", **dict.fromkeys(("valid", "precision", "edges"), 1.0), "centroid_px": 0.1, "swaps": 0.0}
+        row["area_error"] = 0.0
+        return [row | {"case": c.case.name, "severity": c.severity, "recall": 1.0 if c.severity < 0.31 else 0.5} for c in cells_of(plan)]
+
+    monkeypatch.setattr("twin.evaluation.degradation.envelope.run_sweep", rows)
+    plan = real_plan(spec, frames)
+    (envelope,) = (e for e in evaluate_sweep(plan, tmp_path, jobs=1, progress=lambda *_: None).envelopes if e.case is plan.cases[0])
+    assert envelope.held < 0.31 <= envelope.failed and envelope.failed - envelope.held <= NEAR * envelope.failed
+    assert envelope.held <= envelope.severity <= envelope.failed and envelope.label.startswith("held at ")
+
+
 def answer(value, half=0.1, valid=True):
     low, high = ([v + sign * half for v in value] for sign in (-1, 1))
     return {"value": value, "low": low, "high": high, "range": [5.0, 60.0], "units": ["mm", "deg"], "valid": valid}
@@ -182,10 +195,13 @@ def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path
     page = read_sound_page(written[0].read_text(encoding="utf-8"), tmp_path)
     assert all(case.title in page.text for case in plan.cases)
     assert "Narrower in" in page.text or "narrower in none" in page.text
-    assert counts[0] == (0, 7) and counts[-1] == (7, 7)  # severity 0 is one cell for all
+    assert counts[0] == (0, 7) and (7, 7) in counts  # severity 0 is one cell for all
+    assert counts[-1][0] == counts[-1][1] > 7  # between what is held and what fails, severities were added
     assert all(e.severity > 0 for e in envelopes if e.pipeline == "twin")
+    assert all(e.middle is None for e in envelopes)
     assert all(e.reached for e in envelopes if e.case.name in ("wrong-crop", "noise+jpeg"))
-    cells = sorted((tmp_path / "cells").iterdir())
+    whole = {cell.file for cell in cells_of(plan)}
+    cells = sorted(path for path in (tmp_path / "cells").iterdir() if path.stem in whole)
     kept = cells[0].stat().st_mtime_ns
     cells[1].write_text("{ torn")
     counts.clear()
@@ -287,8 +303,8 @@ def test_an_envelope_ends_at_the_severest_step(tmp_path):
         for s in (0.0, 0.35)
     ]
     (found,) = envelopes_of(curves_of(rows, (case,), pitch_px=10.0), (case,))
-    assert not found.reached and found.width == 0.35 and found.label == "> 0.14"
-    assert replace(found, severity=0.0, measure="recall").label == "fails undegraded"
+    assert not found.reached and found.width == 0.35 and found.label == "held at 0.14, the last step"
+    assert replace(found, severity=0.0, failed=0.0, measure="recall").label == "fails undegraded"
 
 
 def test_shares_tell_the_bad_side():

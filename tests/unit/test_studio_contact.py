@@ -1,7 +1,7 @@
 """What the studio's page shows, without the page: where the object may go, what an answer belongs to, and the two meshes."""
 
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -50,6 +50,13 @@ def test_limits_are_kept_and_named():
     assert "x is limited to 20 mm" in why and "tilt x is limited to -60 deg" in why
     with pytest.raises(ContactError, match="depth_mm: nan is not a finite number"):
         ObjectPose(depth_mm=float("nan")).within_limits()
+
+
+def test_the_first_touch_is_where_the_gap_closes_also_beside_the_axis_and_tilted(contact):
+    for pose in (ObjectPose(), ObjectPose(x_mm=5.0), ObjectPose(x_mm=5.0, tilt_y_deg=20.0)):
+        touch = replace(pose, depth_mm=contact.touch_mm(pose)).matrix(SENSOR.skin.apex_mm)
+        assert abs(contact._follower.gap_mm(touch)) < 0.02
+    assert contact.touch_mm(ObjectPose(x_mm=5.0)) > contact.touch_mm(ObjectPose()) + 0.2
 
 
 def test_a_straight_way_has_no_bend():

@@ -5,7 +5,9 @@ import socket
 import threading
 import time
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -14,8 +16,9 @@ from twin.errors import ContactError, TwinError
 from twin.studio.contact import Light, SolvedMesh
 from twin.studio.page import PORTS_TRIED, StudioPage, free_port
 from twin.studio.pose import NAMES, ObjectPose
-from twin.studio.state import MOST_BYTES, StudioState, first_state, read_trajectory, save_trajectory, tap_and_shear
+from twin.studio.state import LAST_STATE, MOST_BYTES, StudioState, first_state, read_trajectory, save_trajectory, tap_and_shear
 from twin.studio.tracing import Failed, Traced
+from twin.studio.uploads import keep_upload
 from twin.studio.video import RATE_HZ, FilmWriter
 from twin.studio.worker import Newest, Worker
 
@@ -189,6 +192,35 @@ def test_a_state_opens_again(tmp_path):
     state = first_state(None, "mg400-331", "sphere").model_copy(update={"friction": 0.3, "pose": {"x_mm": 1.0, "depth_mm": 2.0}})
     again = first_state(state.save(tmp_path / "state.json"), "ignored", "ignored")
     assert again == state and again.object_pose() == ObjectPose(x_mm=1.0, depth_mm=2.0)
+
+
+def test_the_last_state_is_shown_again_unless_another_is_asked_for(tmp_path):
+    assert first_state(None, None, None, tmp_path) == first_state(None, "mg400-331", "sphere")
+    kept = first_state("?sensor=mg400-127&object=edge&depth_mm=1.5", None, None)
+    kept.save(tmp_path / LAST_STATE)
+    assert first_state(None, None, None, tmp_path) == kept
+    assert first_state(None, "mg400-331", None, tmp_path).object == "sphere"
+    (tmp_path / LAST_STATE).write_text("{ torn")
+    assert first_state(None, None, None, tmp_path).sensor == "mg400-331"
+
+
+def archive(**files):
+    held = BytesIO()
+    with ZipFile(held, "w") as written:
+        for name, content in files.items():
+            written.writestr(name, content)
+    return held.getvalue()
+
+
+def test_uploads_stay_in_their_own_folder(tmp_path):
+    folder = tmp_path / "saves"
+    assert keep_upload(folder, "../../a part.stl", b"solid").relative_to(folder).parts[1:] == ("_.._a_part.stl",)
+    frames = keep_upload(folder, "mine.zip", archive(**{"mine/a.png": b"1", "mine/b.png": b"2"}))
+    assert frames.name == "mine" and sorted(path.name for path in frames.iterdir()) == ["a.png", "b.png"]
+    keep_upload(folder, "evil.zip", archive(**{"../../../out.txt": b"", "/abs.txt": b""}))
+    assert [path.name for path in tmp_path.iterdir()] == ["saves"]
+    with pytest.raises(TwinError, match="no readable archive"):
+        keep_upload(folder, "torn.zip", b"PK\x03\x04")
 
 
 @pytest.mark.parametrize(

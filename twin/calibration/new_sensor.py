@@ -579,8 +579,6 @@ def _write_page(path: Path, made: NewSensor, pictures: list[Path]) -> None:
     page = Page(f"New sensor {made.sensor.name}", "twin new", topic="TacTip twin: a new sensor", lead=" ".join(made.health.lines()[:1]))
     page.notice("Unsure", list(made.identified.doubts), tone="bad")
     page.notice("Noted", [*made.odd, *made.health.lines()[1:]])
-    page.section("Pins in the frames", "Green: found. Red: a lost pin's expected place. Yellow: spots that are no pins.")
-    page.figures(*(PagePicture(path, f"Frame with its pins, {path.stem}", "", kind="frame") for path in pictures))
     page.section("What is known")
     page.items(made.known)
     page.section("What is assumed")
@@ -599,6 +597,8 @@ def _write_page(path: Path, made: NewSensor, pictures: list[Path]) -> None:
     )
     page.section("How to find out more")
     page.items(made.next_steps)
+    page.section("Pins in the frames", "Green: found. Red: a lost pin's expected place. Yellow: spots that are no pins.")
+    page.figures(*(PagePicture(path, f"Frame with its pins, {path.stem}", "", kind="photo") for path in pictures), layout="row")
     page.section("Layouts that were considered")
     page.table(
         [

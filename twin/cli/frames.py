@@ -172,6 +172,7 @@ def check(
         Path | None, typer.Option(metavar="FRAME", help="contact whose object was turned from x to y, instead of a second push")
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="copy of the specification with the view of --push")] = None,
+    page: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for a page with the findings and pictures")] = None,
     model: Annotated[
         Path | None, typer.Option(metavar="RUN", help="run that must know the contacts; by default the sensor's weights")
     ] = None,
@@ -194,7 +195,7 @@ def check(
 
     \b
     Example:
-      twin check recordings/today --sensor ur5-331
+      twin check recordings/today --sensor ur5-331 --page out/health
       twin check 0 --sensor mine.toml
       twin check today --sensor mine.toml --no-contact rest.png \\
           --push x:right.png --push y:down.png --out turned.toml

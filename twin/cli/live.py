@@ -213,6 +213,7 @@ def servo(
 
     \b
     Writes to --out:
+      index.html      the trajectory and its measures
       trajectory.csv, trajectory.png
       measures.json   smoothness S as the Tac-VGNN paper defines it, path, depth
                       and angle errors, jerk, share of the path, lost contacts;

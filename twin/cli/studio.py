@@ -17,8 +17,12 @@ if TYPE_CHECKING:
 
 @app.command("studio")
 def studio(
-    sensor: Annotated[str, typer.Option(metavar="S", help="sensor name ('twin sensors') or specification file")] = "mg400-331",
-    obj: Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")] = "sphere",
+    sensor: Annotated[
+        str | None, typer.Option(metavar="S", help="sensor name ('twin sensors') or specification file (mg400-331 if not given)")
+    ] = None,
+    obj: Annotated[
+        str | None, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file (sphere)")
+    ] = None,
     state: Annotated[
         str | None, typer.Option(metavar="FILE", help="a state saved by the page, or its link, instead of sensor and object")
     ] = None,
@@ -46,6 +50,8 @@ def studio(
     Live (camera and arm), Your own sensor (a specification from a folder of frames, as 'twin new' makes it, with the layout over the
     frames).
 
+    Without --sensor, --object and --state it shows what it showed last, from last-state.json in the folder --saves.
+
     The page's folder 'Save' shows a link that opens the complete state again, in a browser while the studio runs, or with --state.
 
     Only this machine can open the page, and the page loads nothing from other servers. All browsers show the same state. Ctrl-C ends it.
@@ -62,7 +68,7 @@ def studio(
     from twin.studio.state import first_state
     from twin.studio.studio import StudioPlan, run_studio
 
-    first = first_state(state, sensor, obj)
+    first = first_state(state, sensor, obj, saves)
     shown = load_sensor(first.sensor)
     require_feed(camera, arm, recording, shown)
     plan = StudioPlan(first, saves, host=host, port=port, traces=not plain, recording=recording, camera=camera, arm=arm, seconds=seconds)

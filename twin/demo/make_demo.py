@@ -326,8 +326,11 @@ def add_tables(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> None:
         "Against real recordings: displacement by depth",
         "Mean displacement of all pins on a flat plate, in pixels of the uncropped camera frame. Measured: the Tac-VGNN release's "
         "recordings, pure presses in 1 mm bins. Simulated: true cap positions at the middle of each bin, with nominal stiffness; the "
-        "hexagonal sensor's camera distance and pin spacing were chosen with these figures in view. The differences are those of a skin "
-        "that is not calibrated: 'twin calibrate contact' fits skin and arm to a recording, and docs/results says how small they are then.",
+        "hexagonal sensor's camera distance and pin spacing were chosen with these figures in view.",
+        "The columns differ because they are not the same contacts. A bin of the recordings has presses tilted by up to 20 deg, at every "
+        "depth of the bin, and its depths count from the arm's zero. The simulated contact is one straight press, at the nominal zero. "
+        "'twin validate' simulates each recorded frame instead, with its own depth and tilt and the zero that was fitted to the arm. Then "
+        "a pin is less than half a pixel from the recorded one on average (docs/results/pins.md).",
     )
     columns = [
         Column("indent_mm", "indentation", "mm", decimals=1),

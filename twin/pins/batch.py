@@ -34,6 +34,8 @@ GRAY = (28, 32, 38)
 """Background of a cell map."""
 FULL_CHANGE = 0.3
 """Relative change of a cell's area at both ends of the colour scale."""
+AREA_STOPS = ((5, 48, 97), (67, 147, 195), (247, 247, 247), (214, 96, 77), (103, 0, 31))
+"""RGB colours of areas from smaller to larger, evenly spaced: those of matplotlib's RdBu_r, which the charts of reports have."""
 NO_REFERENCE = (
     "no frame without contact was used: the pins at rest are those of the specification, which makes errors of a pose up to four times "
     "larger; record one frame without contact (init_0.png beside the frames, or `no_contact` FRAME)"
@@ -215,9 +217,10 @@ def recording_reference(spec: SensorSpec, recording: Recording, problems: list[s
 
 def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> np.ndarray:
     """Picture (H, W, 3) uint8 RGB: frame, graph, found pins (green), predicted places of lost pins (red), rejected blobs (yellow)."""
-    gray = cv2.resize(gray_levels(frame.image), None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
-    light = HALF / max(float(np.percentile(gray, BRIGHTEST)), DARKEST)  # a dark frame is shown lighter
-    canvas = cv2.cvtColor(np.minimum(gray * light, HALF).astype(np.uint8), cv2.COLOR_GRAY2RGB)
+    image = cv2.resize(frame.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+    light = HALF / max(float(np.percentile(gray_levels(image), BRIGHTEST)), DARKEST)  # a dark frame is shown lighter
+    canvas = np.minimum(image.reshape(*image.shape[:2], -1) * light, HALF).astype(np.uint8)
+    canvas = np.repeat(canvas, 3, axis=2) if canvas.shape[2] == 1 else canvas
 
     def place(px: np.ndarray) -> list[list[int]]:
         px = px[np.isfinite(px).all(axis=1)]
@@ -248,14 +251,18 @@ def voronoi_map(shape: tuple[int, int], seen: Observation, rest_area_px2: np.nda
     if seen.graph is None or rest_area_px2 is None or not seen.graph.cells:
         return canvas
     change = np.clip((seen.graph.area_px2 / rest_area_px2 - 1) / FULL_CHANGE, -1, 1)
-    levels = np.nan_to_num(127.5 * (1 + change), nan=127.5).astype(np.uint8)
-    colors = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_JET)[:, 0, ::-1]
-    for cell, color in zip(seen.graph.cells, colors, strict=True):
+    for cell, color in zip(seen.graph.cells, area_colours(np.nan_to_num(change)), strict=True):
         if len(cell) > 2:
             corners = np.round(np.asarray(cell)).astype(np.int32)
             cv2.fillPoly(canvas, [corners], color.tolist(), cv2.LINE_AA)
             cv2.polylines(canvas, [corners], True, GRAY, 1, cv2.LINE_AA)
     return canvas
+
+
+def area_colours(change: np.ndarray) -> np.ndarray:
+    """RGB colours (n, 3) of changes of area (n,) from -1 to 1, in units of ``FULL_CHANGE``."""
+    stops = np.array(AREA_STOPS, float)
+    return np.stack([np.interp(change, np.linspace(-1, 1, len(stops)), channel) for channel in stops.T], axis=1)
 
 
 def overlay_name(frame_name: str, taken: set[str]) -> str:

@@ -95,12 +95,15 @@ def enlargement(rest_px: np.ndarray, pins_px: np.ndarray) -> float:
     return max((factor for factor in ENLARGEMENTS if factor * longest <= apart), default=ENLARGEMENTS[0])
 
 
-def draw_area_surface(ax: Axes3D, nodes_px: np.ndarray, value: np.ndarray, title: str) -> None:
-    """Draw a value of each pin as a smooth surface over the image plane (cubic interpolation; 3D axes)."""
+def draw_area_surface(ax: Axes3D, nodes_px: np.ndarray, value: np.ndarray, title: str, *, change: bool = False) -> None:
+    """Draw a value of each pin as a smooth surface over the image plane (cubic interpolation; 3D axes). A ``change`` has two signs."""
     low, high = nodes_px.min(axis=0), nodes_px.max(axis=0)
     grid_x, grid_y = np.meshgrid(*[np.linspace(a, b, SURFACE_GRID) for a, b in zip(low, high, strict=True)])
     surface = CloughTocher2DInterpolator(nodes_px, value)(grid_x, grid_y)
-    ax.plot_surface(grid_x, grid_y, surface, cmap=sequential(), rcount=SURFACE_GRID, ccount=SURFACE_GRID, linewidth=0)
+    largest = float(np.nanmax(np.abs(value)))
+    colours = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest} if change else {"cmap": sequential()}
+    drawn = ax.plot_surface(grid_x, grid_y, surface, rcount=SURFACE_GRID, ccount=SURFACE_GRID, linewidth=0, **colours)
+    ax.figure.colorbar(drawn, ax=ax, shrink=0.5, pad=0.12, label="px²")
     ax.set(xlabel="x, px", ylabel="y, px")
     ax.set_title(title, loc="center", y=0.97)
     ax.invert_yaxis()
@@ -109,9 +112,9 @@ def draw_area_surface(ax: Axes3D, nodes_px: np.ndarray, value: np.ndarray, title
 def area_surface_figure(rest: PinGraph, contact: PinGraph) -> Figure:
     """The three surfaces of the paper's figure 4: no contact, contact, and their difference (px^2)."""
     figure, axes = new_figure(3, projection="3d")
-    draw_area_surface(axes[0], rest.nodes_px, rest.area_px2, "no contact: cell area, px²")
-    draw_area_surface(axes[1], contact.nodes_px, contact.area_px2, "contact: cell area, px²")
-    draw_area_surface(axes[2], contact.nodes_px, contact.area_px2 - rest.area_px2, "difference, px²")
+    draw_area_surface(axes[0], rest.nodes_px, rest.area_px2, "no contact: cell area")
+    draw_area_surface(axes[1], contact.nodes_px, contact.area_px2, "contact: cell area")
+    draw_area_surface(axes[2], contact.nodes_px, contact.area_px2 - rest.area_px2, "change of cell area", change=True)
     return figure
 
 

@@ -167,7 +167,7 @@ def _draw_with_pyvista(folder: Path, path: str) -> None:
         ambient=0.2,
         smooth_shading=True,
         scalar_bar_args={
-            "title": "skin displacement, mm",
+            "title": "skin displacement, mm\n",  # the line keeps it off the numbers
             "color": "white",
             "fmt": "%.1f",
             "n_labels": 4,

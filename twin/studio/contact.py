@@ -39,6 +39,8 @@ MOST_LIFT_MM = 60.0
 """Largest distance, mm, by which an object in an impossible place is lifted along the sensor's z."""
 HALVINGS = 14
 """Number of bisections by which this lift is found. They give it to 4 um."""
+FAR_MM, TOUCH_MM = 80.0, 0.01
+"""Height and depth, mm, between which an object is moved to find where it first touches, and the gap that counts as touching."""
 SHELL_MM = 1.0
 """Distance, mm, of the shells inside the gel that are searched for objects that are too deep. Thinner objects are not noticed."""
 SHELL_POINTS = 800
@@ -272,6 +274,19 @@ class MovingContact:
             low, high = (low, lift) if not self.refusal(_lift(T, lift)) else (lift, high)
         return _lift(T, high), "; ".join(part for part in (reason, f"the object stops here: {why}") if part)
 
+    def touch_mm(self, pose: ObjectPose) -> float:
+        """Depth, mm, at which the object first touches the skin if it approaches along the sensor's z, otherwise posed as ``pose``.
+
+        It is that of a straight approach if the object passes the skin.
+        """
+        depth_mm = -FAR_MM
+        while depth_mm < FAR_MM:  # by the gap, the object moves as far as nothing can touch
+            gap_mm = self._follower.gap_mm(replace(pose, depth_mm=depth_mm).matrix(self._apex_mm))
+            if gap_mm < TOUCH_MM:
+                return depth_mm
+            depth_mm += gap_mm
+        return 0.0
+
     def _is_there(self, goal: FloatArray) -> bool:
         near = (T for T in (self._T, self._blocked) if T is not None)
         return any(np.abs(T - goal).max() < SAME_MM for T in near)
@@ -403,26 +418,12 @@ class MovingContact:
         of_frame = self.model is not None and self.model.form is self.setup.form
         seen = pins_in(frame, estimate if of_frame else None, self._pipeline)
         times = {"picture": now - started, "estimate": estimated - now, "pins": time.perf_counter() - estimated}
+        true_px = from_raw(self.setup.sensor.recording, self.setup.form, project(self.setup.sensor.view, state.caps_mm))
+        labels = self.labels(state.T_sensor_object if len(state.contact_mm) else T)
         self._last = ContactAnswer(
-            self.setup,
-            self._count,
-            self._solved,
-            ObjectPose.of(T, self._apex_mm),
-            -self._follower.gap_mm(T),
-            state,
-            light,
-            raw,
-            frame,
-            seen,
-            from_raw(self.setup.sensor.recording, self.setup.form, project(self.setup.sensor.view, state.caps_mm)),
-            estimate,
-            self.labels(state.T_sensor_object if len(state.contact_mm) else T),
-            lit,
-            mesh,
-            arrived,
-            stopped,
-            ms | {name: 1e3 * seconds for name, seconds in times.items()},
-        )
+            self.setup, self._count, self._solved, ObjectPose.of(T, self._apex_mm), -self._follower.gap_mm(T), state, light, raw, frame,
+            seen, true_px, estimate, labels, lit, mesh, arrived, stopped, ms | {name: 1e3 * value for name, value in times.items()},
+        )  # fmt: skip
         return self._last
 
     def labels(self, T: FloatArray) -> dict[str, float]:

@@ -31,9 +31,11 @@ def frame_pictures(
     sensor: SensorSpec, reference: Reference, frame: Frame, seen: Observation, drawn: OverlayChoices = OverlayChoices.GRAPH
 ) -> tuple[ImageArray, ImageArray]:
     """The dome's part of a frame with its overlay, and its Voronoi cells by their change of area; (h, w, 3) uint8 RGB each."""
-    pictures = camera_picture(frame, seen, reference.pins_px, drawn), cell_picture(frame, seen, reference.area_px2)
-    camera, cells = (dome_part(sensor, picture, frame.form) for picture in pictures)
-    return camera, cells
+
+    def crop(image: ImageArray) -> ImageArray:
+        return dome_part(sensor, image, frame.form)
+
+    return crop(camera_picture(frame, seen, reference.pins_px, drawn)), cell_picture(frame, seen, reference.area_px2, crop)
 
 
 def frame_numbers(live: LiveFrame, seen: Observation) -> list[str]:

@@ -10,6 +10,7 @@ from contextlib import contextmanager, redirect_stdout
 from http import HTTPStatus
 from io import StringIO
 from itertools import count
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 from urllib.parse import urlsplit
 
@@ -24,7 +25,8 @@ from websockets.http11 import Request, Response
 from scenes.base import SpecError
 from scenes.files import quote
 from twin.errors import TwinError
-from twin.studio.pictures import numbers_html, paragraph
+from twin.studio.pictures import PAGE, numbers_html, paragraph
+from twin.studio.uploads import keep_upload
 from twin.types import ImageArray
 
 if TYPE_CHECKING:
@@ -36,24 +38,26 @@ LOCAL = ("127.0.0.1", "localhost", "::1")
 """Hosts that only this machine reaches."""
 PORTS_TRIED, MOST_PORT = 100, 65535
 """Number of consecutive ports that are tried, and the largest port."""
-PICTURES_PX, CONTROLS_PX = 330, 350
-"""Widths, px, of the panels with the pictures and with the controls."""
+PICTURES_PX, LARGE_PX, CONTROLS_PX = 330, 620, 350
+"""Widths, px, of the panel with the pictures beside the scene and without the scene, and of the panel with the controls."""
+NO_SCENE = "<style>@media (max-width: 36em) { .mantine-Paper-root:has(.studio) { height: 100%; max-height: 100% !important; } }</style>"
+"""Style without a scene: in a narrow window the pictures and controls have its place."""
 JPEG_QUALITY = 88
 """Quality of the JPEG pictures in the page."""
-CELLS = "Voronoi cells: blue smaller, red larger"
+CELLS = "change of the Voronoi cells' areas"
 """Caption of the second picture at the start."""
+ARCHIVES = ".zip,.mp4,.avi,.mkv,.mov"
+"""Kinds of files with frames that can be uploaded."""
 SPAN_S = 20.0
 """Time that the charts show, s."""
 CHART_S = 0.25
 """Shortest interval in s between two drawings of the charts."""
-CHART_PX = 165
+CHART_PX = 170
 """Height of a chart, px."""
 LINES = ("#4dabf7", "#ff922b", "#51cf66", "#f06595", "#ffd43b", "#845ef7")
 """Colours of a chart's lines."""
 CHANGE_S = 10.0
 """Longest wait, s, for changes of the page."""
-SAID_S = 12.0
-"""Time, s, for which a message is shown."""
 
 
 def value_of(control: viser.GuiInputHandle[str], kind: Callable[[str], Value], now: str) -> Value:
@@ -175,7 +179,7 @@ class LineChart:
 
     def __init__(self, page: "StudioPage", title: str) -> None:
         self._page, self._title = page, title
-        self._order = page.next_chart()
+        self._order, self._visible = page.next_chart(), True
         self._plot: viser.GuiUplotHandle | None = None
         self._names: tuple[str, ...] = ()
         self._points: deque[tuple[float, ...]] = deque()
@@ -198,23 +202,32 @@ class LineChart:
             times, *lines = np.array(self._points).T
             self._plot.data = (times - now, *lines)
 
+    def show(self, visible: bool) -> None:
+        """Show or hide the chart. It goes on to collect values."""
+        self._visible = visible
+        if self._plot is not None:
+            self._plot.visible = visible
+
     def _draw_anew(self) -> None:
         if self._plot is not None:
             self._plot.remove()
         lines: list[uplot.Series] = [
             {"label": name, "stroke": colour, "width": 2} for name, colour in zip(self._names, LINES, strict=False)
         ]
-        axis: uplot.Axis = {"stroke": "#8a93a3", "size": 34, "grid": {"stroke": "#8a93a333", "width": 1}}
+        faint: uplot.Axis_Grid = {"stroke": "#8a93a333", "width": 1}
+        axis: uplot.Axis = {"stroke": "#8a93a3", "size": 50, "grid": faint, "ticks": {**faint, "size": 4}}
         with self._page.charts_tab:
             self._plot = self._page.gui.add_uplot(
                 (np.zeros(1),) * (len(lines) + 1),
                 ({"label": "s"}, *lines),
                 title=self._title,
                 height=CHART_PX,
-                axes=({**axis, "size": 26}, axis),
+                axes=({**axis, "size": 24}, axis),
                 scales={"x": {"time": False, "range": (-SPAN_S, 0.0)}},
-                legend={"show": True},
+                legend={"show": True, "live": False},
+                padding=(12, 16, 0, 0),
                 order=self._order,
+                visible=self._visible,
             )
 
 
@@ -226,6 +239,10 @@ class StudioPage:
     title : str
     host, port : str, int
         Address on which to listen. If the port is used already, the next free one is taken, see ``url``.
+    modes : sequence of str
+        Titles of the modes among which the user chooses.
+    saves : Path
+        Folder for uploaded files.
 
     Attributes
     ----------
@@ -238,7 +255,7 @@ class StudioPage:
         The server can't listen on this host and port.
     """
 
-    def __init__(self, title: str, *, host: str, port: int) -> None:
+    def __init__(self, title: str, *, host: str, port: int, modes: Sequence[str] = (), saves: Path = Path()) -> None:
         self.on_address: Callable[[str], None] = lambda address: None
         try:
             port = free_port(host, port)
@@ -247,26 +264,31 @@ class StudioPage:
                 self.server = _ViserServer(host=host, port=port, label=title, verbose=False)
         except (OSError, RuntimeError) as error:
             raise TwinError(f"`host` {host} `port` {port}: can't listen there ({error}); give another `host` or `port`") from error
-        self._host = host
+        self._host, self._saves = host, saves
         gui = self.gui = self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         pictures = gui.add_panel(order=0)
         with pictures.add_tab("Camera"):
+            self._absent = gui.add_html("")
             empty = np.zeros((8, 8, 3), np.uint8)
-            self._camera = gui.add_image(empty, label="camera", format="jpeg", jpeg_quality=JPEG_QUALITY)
-            self._cells = gui.add_image(empty, label=CELLS, format="jpeg", jpeg_quality=JPEG_QUALITY)
+            self._camera, self._cells = (
+                gui.add_image(empty, label="", format="jpeg", jpeg_quality=JPEG_QUALITY, visible=False) for _ in range(2)
+            )
         self.charts_tab = pictures.add_tab("Charts")
         self.next_chart = count().__next__
+        self._panel = pictures
         pictures.dock_left()
-        pictures.set_width(PICTURES_PX)
+        pictures.set_width(LARGE_PX)
+        pictures.expand()  # in a narrow window, too
         gui.main_panel.dock_right()
         gui.main_panel.set_width(CONTROLS_PX)
-        self._numbers = gui.add_html(numbers_html())
+        self._style = gui.add_html(PAGE)
         self._said = gui.add_html("", visible=False)
-        self._forget_s = 0.0
+        self._choice = gui.add_dropdown("mode", tuple(modes), initial_value=modes[0]) if modes else None
+        self._numbers = gui.add_html(numbers_html())
+        self._said_count = 0
         self._modes: dict[str, PageMode] = {}
         self._mode: str = ""
-        self._choice: viser.GuiDropdownHandle[str] | None = None
 
     @property
     def url(self) -> str:
@@ -283,13 +305,8 @@ class StudioPage:
         """Offer these modes, and enter the first one."""
         self._modes = {mode.title: mode for mode in modes}
         if self._choice is not None:
-            self._choice.options = tuple(self._modes)
             self._choice.on_update(lambda event: self.choose(event.target.value))
         self.choose(modes[0].title)
-
-    def add_mode_choice(self, titles: Sequence[str]) -> None:
-        """Create the control in which the user chooses a mode."""
-        self._choice = self.gui.add_dropdown("mode", tuple(titles), initial_value=titles[0])
 
     def choose(self, title: str) -> None:
         """Enter a mode."""
@@ -302,24 +319,26 @@ class StudioPage:
             mode.folder.visible = name == title
         if self._choice is not None and self._choice.value != title:
             put(self._choice, title)
+        self.server.scene.set_global_visibility(self.mode.has_scene)
+        self._style.content = PAGE if self.mode.has_scene else PAGE + NO_SCENE
+        self._panel.set_width(PICTURES_PX if self.mode.has_scene else LARGE_PX)
         self.mode.enter()
 
     def show_pictures(self, camera: ImageArray, below: ImageArray, label: str, label_below: str = CELLS) -> None:
         """Show two pictures (h, w, 3) RGB with their captions."""
-        self._camera.label, self._cells.label = label, label_below
-        self._camera.image, self._cells.image = camera, below
+        self._absent.content = ""
+        for shown, image, caption in ((self._camera, camera, label), (self._cells, below, label_below)):
+            shown.image, shown.label, shown.visible = image, caption, True
 
     def show_nothing(self, why: str) -> None:
-        """Remove pictures and numbers of another mode, and show the reason or what will follow."""
-        empty = np.zeros((8, 8, 3), np.uint8)
-        self.show_pictures(empty, empty, "no picture yet", "")
-        self.show_numbers(paragraph(why, "note"))
+        """Remove pictures and numbers of another mode, and show at their place what to do or what will follow."""
+        self._camera.visible = self._cells.visible = False
+        self._absent.content = numbers_html(paragraph(why, "absent"))
+        self.show_numbers()
 
     def show_numbers(self, *parts: str) -> None:
-        """Show parts of HTML above the controls."""
-        self._numbers.content = numbers_html(*parts)
-        if self._said.visible and time.monotonic() > self._forget_s:
-            self._said.visible = False
+        """Show parts of HTML above the controls, in a box of a fixed height so that the controls keep their places."""
+        self._numbers.content = numbers_html(*parts, kind="numbers") if parts else ""
 
     def together(self, change: Callable[[], None]) -> None:
         """Make changes that all browsers get at once, and wait until they are made.
@@ -360,11 +379,16 @@ class StudioPage:
         """Add a button that calls an action (see ``guard``)."""
         self.gui.add_button(label, **options).on_click(self.guard(action))
 
+    def upload(self, label: str, kinds: str, take: Callable[[str], object], *, hint: str) -> None:
+        """Add a button for a file of some kinds (".stl,.obj"); ``take`` is called with the path at which it is stored."""
+        button = self.gui.add_upload_button(label, mime_type=kinds, hint=hint)
+        button.on_upload(self.guard(lambda: take(str(keep_upload(self._saves, button.value.name, button.value.content)))))
+
     def say(self, text: str, *, bad: bool = False) -> None:
         """Show a message for some seconds."""
-        self._said.content = numbers_html(paragraph(text, "stop" if bad else "said"))
+        self._said_count += 1  # so that the same message begins anew
+        self._said.content = numbers_html(paragraph(text, "stop" if bad else "said"), kind=f"message n{self._said_count}")
         self._said.visible = True
-        self._forget_s = time.monotonic() + SAID_S
 
     def hush(self) -> None:
         """Hide the message: the user does something else."""

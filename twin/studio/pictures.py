@@ -1,20 +1,26 @@
 """Makes the pictures and numbers of the page, without a browser."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from enum import StrEnum
 from html import escape
+from importlib.resources import files
 
 import cv2
 import numpy as np
 
 from twin.estimate import Estimate, readable_labels
-from twin.pins.batch import FOUND_RGB, draw_overlay, voronoi_map
+from twin.pins.batch import FOUND_RGB, FULL_CHANGE, GRAY, area_colours, draw_overlay, voronoi_map
 from twin.types import FloatArray, Frame, ImageArray, Observation
 
 ARROW_RGB = (255, 140, 40)
 """Colour of the arrows of the pins' displacements."""
 TOLD_APART_PX = 0.7
 """Length, px, below which displacements of pins are not drawn."""
+
+
+CONTROLS = {"no_contact": "no-contact frame", "radius_mm": "dome radius, mm"}
+"""Labels of the controls for arguments with another name."""
 
 
 class OverlayChoices(StrEnum):
@@ -43,9 +49,19 @@ def camera_picture(frame: Frame, seen: Observation, rest_px: FloatArray, drawn: 
     return canvas
 
 
-def cell_picture(frame: Frame, seen: Observation, rest_px2: FloatArray) -> ImageArray:
-    """(H, W, 3) uint8 RGB: the Voronoi cells by their change of area."""
-    return np.asarray(voronoi_map(frame.image.shape[:2], seen, rest_px2), np.uint8)
+def cell_picture(
+    frame: Frame, seen: Observation, rest_px2: FloatArray, crop: Callable[[ImageArray], ImageArray] = lambda image: image
+) -> ImageArray:
+    """(h, w, 3) uint8 RGB: the cropped Voronoi cells by their change of area, with a scale below."""
+    picture = np.array(crop(voronoi_map(frame.image.shape[:2], seen, rest_px2)), np.uint8)
+    height, width = picture.shape[:2]
+    low, high, top = width // 4, width - width // 4, height - height // 40 - 3
+    picture[top - 4 :] = GRAY
+    picture[top : height - 2, low:high] = area_colours(np.linspace(-1, 1, high - low))
+    size = width / 900
+    for text, x in ((f"{-100 * FULL_CHANGE:.0f} %", low - 0.15 * width), (f"{100 * FULL_CHANGE:+.0f} %", high + 0.03 * width)):
+        cv2.putText(picture, text, (int(x), height - 3), cv2.FONT_HERSHEY_SIMPLEX, size, (255, 255, 255), 1, cv2.LINE_AA)
+    return picture
 
 
 def pins_found(seen: Observation) -> str:
@@ -76,25 +92,15 @@ def number_table(rows: Mapping[str, str]) -> str:
     return "<table>" + "".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in rows.items()) + "</table>"
 
 
-STYLE = """<style>
-.studio{font:13px/1.35 system-ui,sans-serif;padding:2px 6px}
-.studio table{width:100%;border-collapse:collapse;font-variant-numeric:tabular-nums;margin:2px 0}
-.studio td,.studio th{padding:1px 4px;text-align:right;font-weight:400}
-.studio td:first-child,.studio th:first-child{text-align:left;color:#8a93a3}
-.studio th{color:#8a93a3;border-bottom:1px solid #8a93a344}
-.studio .badge{display:inline-block;border-radius:4px;padding:0 6px;margin:0 4px 2px 0;background:#8a93a333}
-.studio .still{background:#2f9e4455}.studio .moving{background:#f08c0055}
-.studio .good{color:#2f9e44}.studio .bad{color:#e03131}
-.studio .note{color:#8a93a3;margin:2px 0}
-.studio .stop{background:#e0313122;border-left:3px solid #e03131;padding:2px 6px;margin:3px 0}
-.studio .said{border-left:3px solid #1c7ed6;padding:2px 6px;margin:3px 0}
-</style>"""
-"""CSS of the numbers, for light and dark pages."""
+STYLE, DROP = (files(__package__).joinpath(name).read_text(encoding="utf-8") for name in ("studio.html", "drop.js"))
+"""The page's stylesheet with the notice of a lost server, and the program that takes dropped files."""
+PAGE = f'{STYLE}<img hidden src="data:," onerror="{escape(DROP)}">'
+"""Both as HTML. A page runs no script that is added to it later, but it runs that of a picture that can't be loaded."""
 
 
-def numbers_html(*parts: str) -> str:
-    """HTML of the page's numbers."""
-    return f"{STYLE}<div class='studio'>{''.join(parts)}</div>"
+def numbers_html(*parts: str, kind: str = "") -> str:
+    """HTML of parts in the page's style; ``kind`` is one more class of it."""
+    return f"<div class='studio {kind}'>{''.join(parts)}</div>"
 
 
 def badge(text: str, kind: str = "") -> str:
@@ -103,5 +109,6 @@ def badge(text: str, kind: str = "") -> str:
 
 
 def paragraph(text: str, kind: str) -> str:
-    """HTML of a line; empty for an empty text."""
-    return f"<p class='{kind}'>{escape(text)}</p>" if text else ""
+    """HTML of a line; empty for an empty text. Arguments that the text names in backquotes become the names of the page's controls."""
+    named = re.sub(r"`(\w+)`", lambda found: f"'{CONTROLS.get(found[1], found[1])}'", text)
+    return f"<p class='{kind}'>{escape(named)}</p>" if text else ""

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 import cv2
 import numpy as np
@@ -161,6 +162,7 @@ class PinScene:
 
     def __init__(self, server: viser.ViserServer, sensor: SensorSpec, skin: TriangleMesh, rest: PinState) -> None:
         radius_mm, pin = max(sensor.skin.half_size_mm), pin_shape(sensor.pins)
+        shadows: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
         self._scene = server.scene
         self._scene.configure_environment_map(None)
         self._scene.configure_default_lights(enabled=True, cast_shadow=False)
@@ -168,14 +170,7 @@ class PinScene:
         server.initial_camera.position = (1.2 * radius_mm, -3.4 * radius_mm, 1.7 * radius_mm)
         server.initial_camera.look_at = (0.0, 0.0, 0.7 * sensor.skin.apex_mm)
         self._skin = self._scene.add_mesh_simple(
-            "/sensor/skin",
-            skin.corners_mm,
-            skin.faces,
-            color=SKIN_RGB,
-            opacity=0.45,
-            side="double",
-            cast_shadow=False,
-            receive_shadow=False,
+            "/sensor/skin", skin.corners_mm, skin.faces, color=SKIN_RGB, opacity=0.45, side="double", **shadows
         )
         self._pins = self._scene.add_batched_meshes_simple(
             "/sensor/pins",
@@ -186,18 +181,14 @@ class PinScene:
             batched_colors=colours(np.zeros(len(rest.caps_mm)), PinColour.DISPLACEMENT),
             lod="off",
             side="double",
-            cast_shadow=False,
-            receive_shadow=False,
+            **shadows,
         )
-        self._scene.add_cylinder(
-            "/sensor/holder",
-            radius=1.02 * radius_mm,
-            height=HOLDER_MM,
-            color=HOLDER_RGB,
-            position=(0.0, 0.0, sensor.skin.rim_z_mm - HOLDER_MM / 2 - 0.05),
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        place = {"color": HOLDER_RGB, "position": (0.0, 0.0, sensor.skin.rim_z_mm - HOLDER_MM / 2 - 0.05)} | shadows
+        if sensor.skin.shape == "rectangular-pad":
+            across, along = (2.04 * half for half in sensor.skin.half_size_mm)
+            self._scene.add_box("/sensor/holder", dimensions=(across, along, HOLDER_MM), **place)
+        else:
+            self._scene.add_cylinder("/sensor/holder", radius=1.02 * radius_mm, height=HOLDER_MM, **place)
         self._scene.add_frame("/sensor/axes", axes_length=6.0, axes_radius=0.15, position=(-1.6 * radius_mm, 0.0, 0.0))
         self._force = self._scene.add_arrows(
             "/force", np.zeros((1, 2, 3)), FORCE_RGB, shaft_radius=0.35, head_radius=0.9, head_length=1.8, visible=False

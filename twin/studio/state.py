@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from urllib.parse import parse_qsl, urlencode, urlsplit
@@ -11,7 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from scenes import load_object, load_sensor
-from scenes.base import NonNegative, Section
+from scenes.base import NonNegative, Section, SpecError
 from scenes.files import read_regular
 from twin.errors import ErrorsAs, TwinError
 from twin.store import text_file, write_json, writing
@@ -20,6 +21,8 @@ from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.scene import PinColour
 from twin.types import Form
 
+SENSOR, OBJECT = "mg400-331", "sphere"
+"""Sensor and object at first."""
 MOST_BYTES = 4_000_000
 """Largest size of a file, bytes. The studio writes no larger ones."""
 MOST_SHOWN = 80
@@ -28,6 +31,8 @@ MOST_ROWS = 20_000
 """Most poses of a path."""
 FIRST_DEPTH_MM = 2.0
 """Depth of the object at first, mm, so that a contact is visible."""
+LAST_STATE = "last-state.json"
+"""Name of the file with the state that was shown last."""
 COLUMNS = ("time_s", *NAMES)
 """Columns of a path's file."""
 
@@ -121,16 +126,19 @@ class StudioState(Section):
         return write_json(path, self.model_dump(mode="json"))
 
 
-def first_state(saved: str | Path | None, sensor: str, touched: str) -> StudioState:
-    """The state of a file or link, else that of a sensor with a small indentation.
+def first_state(saved: str | Path | None, sensor: str | None, touched: str | None, saves: Path | None = None) -> StudioState:
+    """The state of a file or link, else that of a sensor with a small indentation. If nothing is given, the last one of the ``saves``.
 
     Raises
     ------
     TwinError, SpecError
         The file or link holds no state, or there is no such sensor or object.
     """
+    if saved is None and not sensor and not touched and saves is not None and (saves / LAST_STATE).exists():
+        with suppress(TwinError, SpecError):  # a damaged file, or one of a sensor that is gone
+            return first_state(saves / LAST_STATE, None, None)
     if saved is None:
-        state = StudioState(sensor=sensor, object=touched, pose={"depth_mm": FIRST_DEPTH_MM})
+        state = StudioState(sensor=sensor or SENSOR, object=touched or OBJECT, pose={"depth_mm": FIRST_DEPTH_MM})
     else:
         state = StudioState.of_link(str(saved)) if "?" in str(saved) else StudioState.load(Path(saved))
     load_sensor(state.sensor), load_object(state.object)

@@ -79,8 +79,8 @@ class Studio:
     """
 
     def __init__(self, plan: StudioPlan, model_of: ModelOf, live_mode: ModeMaker) -> None:
-        self.page = StudioPage(heading(plan.state), host=plan.host, port=plan.port)
-        self.page.add_mode_choice([mode.title for mode in (TwinMode, DegradeMode, RecordingMode)] + [LIVE, NewMode.title])
+        titles = [TwinMode.title, DegradeMode.title, RecordingMode.title, LIVE, NewMode.title]
+        self.page = StudioPage(heading(plan.state), host=plan.host, port=plan.port, modes=titles, saves=plan.out)
         self.twin = TwinMode(self.page, plan.state, plan.out, model_of, traces=plan.traces)
         degrade = DegradeMode(self.page, self.twin)
         self.twin.followers.append(degrade.follow)

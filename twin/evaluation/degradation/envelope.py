@@ -1,7 +1,7 @@
 """Curves and envelopes of a finished sweep: the severity of a condition at which a measure crosses its limit."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,8 @@ BAND = (5, 95)
 """Percentiles of these samples at the ends of the band: a 90 % interval."""
 WIDEST = 1 / 3
 """Width of an interval, relative to the trained range, from which on it says nothing."""
+NEAR = 0.1
+"""Largest distance of the severities that are held and failed, as a share of the latter, that is not bisected."""
 SHORT = 0.75
 """Share of the margin of rendered frames below which a real sensor counts as having lost margin. Chosen."""
 
@@ -59,6 +61,8 @@ class Envelope:
         Severity at which the first measure crosses its limit; inf if none does up to the last step.
     measure : str
         Name of that measure; "" if none.
+    held, failed : float
+        The last severity that is held, and the first that fails; inf if none does.
     looked : float
         Severity of the last step.
     interval : (2,) float
@@ -69,6 +73,8 @@ class Envelope:
     pipeline: str
     severity: float
     measure: str
+    held: float = 0.0
+    failed: float = np.inf
     looked: float = 1.0
     interval: tuple[float, float] = (np.inf, np.inf)
 
@@ -84,10 +90,16 @@ class Envelope:
 
     @property
     def label(self) -> str:
-        """The severity as text, in the parameter's unit."""
+        """The severities that are held and failed as text, in the parameter's unit."""
         if not self.reached:
-            return f"> {self.case.label(self.looked)}"
-        return self.case.label(self.severity) if self.severity > 0 else "fails undegraded"
+            return f"held at {self.case.label(self.looked)}, the last step"
+        return f"held at {self.case.label(self.held)}, failed at {self.case.label(self.failed)}" if self.failed > 0 else "fails undegraded"
+
+    @property
+    def middle(self) -> float | None:
+        """The severity between those that are held and failed; None if they are within ``NEAR`` of each other, or none fails."""
+        middle = round((self.held + self.failed) / 2, 3)
+        return middle if self.held < middle < self.failed < np.inf and self.failed - self.held > NEAR * self.failed else None
 
 
 @dataclass(frozen=True)
@@ -130,23 +142,38 @@ class SweepEvaluation:
 
 
 def evaluate_sweep(plan: SweepSettings, folder: Path, *, jobs: int, progress: Callable[[int, int], None]) -> SweepEvaluation:
-    """Run or continue a sweep, and compute its curves and envelopes."""
-    rows = run_sweep(plan, folder, jobs=jobs, progress=progress)
+    """Run or continue a sweep, and compute its curves and envelopes. Between the severities that are held and failed it is refined."""
     pitch_px = float(np.mean(nominal_reference(plan.source.spec, plan.source.form).spacing_px))
-    curves = curves_of(rows, plan.cases, pitch_px)
-    return SweepEvaluation(plan, rows, curves, envelopes_of(curves, plan.cases))
+    while True:
+        rows = run_sweep(plan, folder, jobs=jobs, progress=progress)
+        curves = curves_of(rows, plan.cases, pitch_px)
+        envelopes = envelopes_of(curves, plan.cases)
+        further = {name: set(plan.between.get(name, ())) for name in (case.name for case in plan.cases)}
+        for envelope in envelopes:
+            if envelope.middle is not None:
+                further[envelope.case.name].add(envelope.middle)
+        if all(further[name] <= plan.between.get(name, set()) for name in further):
+            return SweepEvaluation(plan, rows, curves, envelopes)
+        plan = replace(plan, between=further)
 
 
 def crossing(measure: Measure, limit: float, severity: np.ndarray, mean: np.ndarray) -> float:
     """Severity at which a mean first crosses its limit, by linear interpolation between steps; inf if it does not."""
-    known = np.isfinite(mean)
-    severity, mean = severity[known], mean[known]
-    for k, value in enumerate(mean):
-        if measure.exceeds(value, limit):
-            if k == 0:
-                return 0.0
-            return float(severity[k - 1] + (severity[k] - severity[k - 1]) * (limit - mean[k - 1]) / (value - mean[k - 1]))
-    return np.inf
+    held, failed = bracket(measure, limit, severity, mean)
+    if 0 < failed < np.inf:
+        before, after = (float(mean[severity == at][0]) for at in (held, failed))
+        return held + (failed - held) * (limit - before) / (after - before)
+    return failed
+
+
+def bracket(measure: Measure, limit: float, severity: np.ndarray, mean: np.ndarray) -> tuple[float, float]:
+    """The last severity before a mean first crosses its limit, and the first after it: 0 and 0 if it always does, inf if it does not."""
+    known = severity[np.isfinite(mean)]
+    fails = [measure.exceeds(value, limit) for value in mean[np.isfinite(mean)]]
+    if True not in fails:
+        return float(known[-1]) if len(known) else 0.0, np.inf
+    k = fails.index(True)
+    return (float(known[k - 1]), float(known[k])) if k else (0.0, 0.0)
 
 
 def curves_of(rows: list[dict], cases: tuple[DegradedCase, ...], pitch_px: float) -> list[Curve]:
@@ -171,8 +198,9 @@ def envelopes_of(curves: list[Curve], cases: tuple[DegradedCase, ...]) -> list[E
             first = min((c for c in curves if c.case == case.name and c.pipeline == pipeline), key=lambda c: c.crossing)
             reached = np.isfinite(first.crossing)
             sooner, later = sorted(crossing(first.measure, first.limit, first.severity, edge) for edge in (first.low, first.high))
-            looked = float(first.severity.max())
-            found.append(Envelope(case, pipeline, first.crossing, first.measure.name if reached else "", looked, (sooner, later)))
+            held, failed = bracket(first.measure, first.limit, first.severity, first.mean)
+            name, looked = first.measure.name if reached else "", float(first.severity.max())
+            found.append(Envelope(case, pipeline, first.crossing, name, held, failed, looked, (sooner, later)))
     return found
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from twin.evaluation.degradation.condition import DegradedCase
-from twin.evaluation.degradation.envelope import SHORT, Curve, Envelope, Share, SweepEvaluation, shares_of
+from twin.evaluation.degradation.envelope import NEAR, SHORT, Curve, Envelope, Share, SweepEvaluation, shares_of
 from twin.evaluation.degradation.measures import MEASURES, POSE_MEASURES
 from twin.evaluation.degradation.sweep import SweepCell, SweepSettings, cells_of
 from twin.pins import DetectorSpec
@@ -132,7 +132,7 @@ def shares_figure(shares: Sequence[Share]) -> Figure:
     ax.set_yticks(range(len(shares)), [share.real.case.title for share in reversed(shares)], fontsize=8)
     ax.grid(axis="y", visible=False)
     ax.set_xlim(0, 1.03)
-    ax.set_xlabel("severity at the first failure. Bar: rendered frames; dot: real ones; arrow: no failure within the range", fontsize=8)
+    ax.set_xlabel("severity between held and failed. Bar: rendered frames; dot: real ones; arrow: no failure within the range", fontsize=8)
     return figure
 
 
@@ -212,8 +212,8 @@ def _shares_section(page: Page, out: Path, plan: SweepSettings, shares: list[Sha
         [
             "condition",
             "parameter",
-            Column("real", "real frames fail at"),
-            Column("rendered", "rendered frames fail at"),
+            Column("real", "real frames"),
+            Column("rendered", "rendered frames"),
             Column("share", "share", decimals=2),
         ],
     )
@@ -243,8 +243,9 @@ def _envelope_section(page: Page, plan: SweepSettings, entries: list[_Entry]) ->
     pipelines = [*(d.name for d in plan.detectors), *plan.model_digests]
     page.section(
         "Envelope, least margin first",
-        f"The parameter's value at which {pipelines[0]} and the others fail, and which measure fails first, linear between two steps: "
-        "where a measure jumps, the step in which it does is what counts. The bar is the part of the range that is survived.",
+        f"The parameter's last value that {pipelines[0]} and the others hold, the first at which they fail, and which measure fails first. "
+        f"Between two steps the range was bisected until both values were within {100 * NEAR:.0f} %. The bar is the part of the range "
+        "that is held.",
     )
     rows = [
         {"condition": Shown(e.case.title, href=link_to(e.case.name)), "parameter": _parameters(e.case)}
@@ -297,11 +298,11 @@ def _worst(out: Path, cells: list[SweepCell], case: DegradedCase, envelope: Enve
 
 def _row(e: Envelope) -> dict:
     single = len(e.case.conditions) == 1
-    value = e.case.conditions[0].value(e.width) if single else None
-    unit = e.case.conditions[0].unit if single else ""
+    ends = (e.width, e.held, e.failed if e.reached else None)
+    value, held, failed = (e.case.conditions[0].value(end) if single and end is not None else None for end in ends)
     return {
         "condition": e.case.name, "pipeline": e.pipeline, "severity": round(e.width, 4), "reached": bool(e.reached), "measure": e.measure,
-        "value": value, "unit": unit,
+        "value": value, "held": held, "failed": failed, "unit": e.case.conditions[0].unit if single else "",
     }  # fmt: skip
 
 

@@ -102,10 +102,11 @@ class DegradeMode(PageMode):
     """
 
     title = "Degrade"
+    has_scene = True
 
     def __init__(self, page: StudioPage, twin: TwinMode) -> None:
         super().__init__(page)
-        self._twin = twin
+        self._twin, self.charts = twin, twin.charts
         self._judge: FrameEvaluator | None = None
         self._edge, self._finding = "", False
         self._pose: ObjectPose | None = None

@@ -70,6 +70,7 @@ class EpisodeMode(PageMode):
     """
 
     title = "Episode"
+    has_scene = True
 
     def __init__(self, page: StudioPage, sensor: SensorSpec, form: Form) -> None:
         super().__init__(page)
@@ -81,7 +82,7 @@ class EpisodeMode(PageMode):
         self._middle_mm = np.zeros(3)  # of the part of the object that is shown
         self._last: EpisodeStep | None = None
         self._steps = self.newest(self._show, "episode")
-        self._rewards, self._forces = LineChart(page, "reward of a step"), LineChart(page, "force on the object, N")
+        self._rewards, self._forces = self.charts = LineChart(page, "reward of a step"), LineChart(page, "force on the object, N")
 
     def give(self, step: EpisodeStep) -> None:
         """Give the next step to show. Returns at once."""

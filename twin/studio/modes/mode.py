@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
-from twin.studio.page import CELLS, StudioPage
+from twin.studio.page import CELLS, LineChart, StudioPage
 from twin.studio.worker import Newest
 from twin.types import ImageArray
 
@@ -22,16 +22,22 @@ class PageMode(ABC):
     ----------
     title : str
         Name by which the user chooses the mode.
+    has_scene : bool
+        Whether the scene belongs to the mode. Otherwise it is hidden while the mode is chosen.
     folder : viser.GuiFolderHandle
         The mode's controls, visible only while it is chosen.
+    charts : tuple of LineChart
+        The mode's charts, visible only while it is chosen.
     """
 
     title: ClassVar[str]
+    has_scene: ClassVar[bool] = False
 
     def __init__(self, page: StudioPage) -> None:
         self._page, self._active = page, False
         self.folder = page.gui.add_folder(self.title, visible=False)
         self._threads: list[Newest[Any]] = []
+        self.charts: tuple[LineChart, ...] = ()
 
     def newest(self, take: Callable[[T], None], name: str) -> Newest[T]:
         """A thread ``studio-NAME`` that starts and stops with the mode. Errors of ``take`` are shown on the page."""
@@ -52,11 +58,15 @@ class PageMode(ABC):
     def enter(self) -> None:
         """The user has chosen the mode. From now on the pictures are those of this mode."""
         self._active = True
+        for chart in self.charts:
+            chart.show(True)
         self.show()
 
     def leave(self) -> None:
         """The user has chosen another mode. Work in progress continues, but is not shown."""
         self._active = False
+        for chart in self.charts:
+            chart.show(False)
 
     @abstractmethod
     def show(self) -> None:

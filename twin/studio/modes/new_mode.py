@@ -5,16 +5,18 @@ from pathlib import Path
 
 import numpy as np
 
+from scenes.base import SpecError
+from scenes.files import quote
 from scenes.pins import PinsSpec, layout_from
 from scenes.sensor import SensorSpec
 from twin.calibration.new_sensor import NewSensor, new_sensor
-from twin.errors import TwinError
+from twin.errors import ErrorsAs, TwinError
 from twin.frames import Recording, frames_at, open_recording
 from twin.pins.pipeline import Pipeline
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
-from twin.studio.page import StudioPage, put
-from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, number_table, paragraph
+from twin.studio.page import ARCHIVES, StudioPage, put
+from twin.studio.pictures import CONTROLS, OverlayChoices, badge, camera_picture, cell_picture, number_table, paragraph
 from twin.studio.state import next_path
 
 LARGER, SMALLER = "one larger", "one smaller"
@@ -33,11 +35,14 @@ class Wish:
         A frame without contact, "" for none.
     layout : str
         Text for ``layout_from``; "" to have the layout identified.
+    radius_mm : float or None
+        Radius of the dome; None for that of a printed TacTip.
     """
 
     frames: str
     no_contact: str
     layout: str
+    radius_mm: float | None
 
 
 def enlarge_layout(pins: PinsSpec, by: int) -> str:
@@ -71,6 +76,7 @@ class NewMode(PageMode):
         super().__init__(page)
         self._twin, self._out = twin, out
         self._made: NewSensor | None = None
+        self._absent = "Give the folder of your sensor's frames, in contact or not, and press 'Propose a specification'."
         self._recording: Recording | None = None
         self._pipeline: Pipeline | None = None
         self._making = self.newest(self._make, "new")
@@ -78,8 +84,14 @@ class NewMode(PageMode):
         gui = page.gui
         with self.folder:
             self._frames = gui.add_text("frames", "", hint="folder, video or recording on the studio's machine")
+            page.upload(
+                "Upload frames (zip or video)", ARCHIVES, self._take_upload, hint="or drop a folder, an archive or a video on the page"
+            )
             self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
             self._layout = gui.add_text("layout", "", hint="empty: identified; or rings:10, hexagon:6, grid:9x7, positions:FILE.csv")
+            self._radius = gui.add_text(
+                CONTROLS["radius_mm"], "", hint="empty: 20, that of a printed TacTip; all lengths are in proportion to it"
+            )
             page.button("Propose a specification", self.propose)
             correct = gui.add_button_group("correct the layout", (SMALLER, LARGER))
             self._number = gui.add_slider("frame shown", 0, 1, 1, 0, disabled=True)
@@ -90,9 +102,13 @@ class NewMode(PageMode):
     def show(self) -> None:
         """Show the newest proposal."""
         if self._made is None:
-            self._page.show_nothing("Give the folder of your sensor's frames, in contact or not, and press 'Propose a specification'.")
+            self._page.show_nothing(self._absent)
         else:
             self._looking.give(int(self._number.value))
+
+    def _take_upload(self, path: str) -> None:
+        put(self._frames, path)
+        self.propose()
 
     def propose(self) -> None:
         """Make a specification from the user's input. This takes some seconds to half a minute.
@@ -100,11 +116,18 @@ class NewMode(PageMode):
         Raises
         ------
         TwinError
-            No frames are given.
+            No frames are given, or the radius is no number.
         """
         if not self._frames.value.strip():
             raise TwinError("give the folder of your sensor's frames first")
-        self._making.give(Wish(self._frames.value.strip(), self._no_contact.value.strip(), self._layout.value.strip()))
+        controls = self._frames, self._no_contact, self._layout, self._radius
+        frames, no_contact, layout, radius = (control.value.strip() for control in controls)
+        refusal = TwinError(f"`radius_mm` {quote(radius)}: give a number, or nothing for a printed TacTip's 20")
+        with ErrorsAs(ValueError, lambda error: refusal):
+            radius_mm = float(radius) if radius else None
+        self._made, self._absent = None, "The frames are being processed."
+        self.show()
+        self._making.give(Wish(frames, no_contact, layout, radius_mm))
 
     def correct(self, by: int) -> None:
         """Propose again with a layout that is larger or smaller by ``by``.
@@ -140,9 +163,16 @@ class NewMode(PageMode):
             self._page.say(f"processing the frames: {stage}{share}")
 
         no_contact = Path(wish.no_contact) if wish.no_contact else None
-        layout = layout_from(wish.layout) if wish.layout else None
         out = next_path(self._out, "my-sensor", ".toml")
-        made = new_sensor(Path(wish.frames), out, layout=layout, no_contact=no_contact, progress=report)
+        try:
+            layout = layout_from(wish.layout) if wish.layout else None
+            made = new_sensor(Path(wish.frames), out, layout=layout, radius_mm=wish.radius_mm, no_contact=no_contact, progress=report)
+        except (TwinError, SpecError) as error:
+            self._absent = f"No specification: {error}"
+            self._page.hush()
+            if self._active:
+                self.show()
+            return
         recording = open_recording(frames_at(Path(wish.frames), None, no_contact), made.sensor)
         self._made, self._recording = made, recording
         self._pipeline = Pipeline(made.sensor, recording.form)

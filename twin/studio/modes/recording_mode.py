@@ -18,7 +18,7 @@ from twin.studio.camera import dome_part
 from twin.studio.contact import MovingContact, experiment_of
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
-from twin.studio.page import CELLS, StudioPage, put
+from twin.studio.page import ARCHIVES, CELLS, StudioPage, put
 from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
 from twin.types import FloatArray, Form, Frame, Observation
 
@@ -182,6 +182,9 @@ class RecordingMode(PageMode):
         with self.folder:
             self._path = gui.add_text("folder or video", first, hint="any recording that 'twin preprocess' reads, on the studio's machine")
             page.button("Open", lambda: self.open(self._path.value))
+            page.upload(
+                "Upload frames (zip or video)", ARCHIVES, self._take_upload, hint="or drop a folder, an archive or a video on the page"
+            )
             self._number = gui.add_slider("frame number", 0, 1, 1, 0, disabled=True)
             steps = gui.add_button_group("step", ("-10", "-1", "+1", "+10"))
             page.button("Next doubtful label", lambda: self._wanted.give(-1), hint="the next frame whose label is doubtful")
@@ -214,6 +217,10 @@ class RecordingMode(PageMode):
         self._number.disabled = False
         self._go(0)
 
+    def _take_upload(self, path: str) -> None:
+        put(self._path, path)
+        self.open(path)
+
     def _go(self, index: int) -> None:
         if self._view is not None:
             put(self._number, int(np.clip(index, 0, len(self._view) - 1)))
@@ -226,7 +233,7 @@ class RecordingMode(PageMode):
         looked = self._next_doubt(view) if index < 0 else view.look(index)
         if looked is None:
             return
-        beside = cell_picture(looked.frame, looked.seen, view.reference.area_px2)
+        beside = cell_picture(looked.frame, looked.seen, view.reference.area_px2, view.crop)
         self._show_frame(view, looked, beside)
         if not self._against.value or looked.label is None or self._wanted.overtaken:
             return
@@ -236,10 +243,9 @@ class RecordingMode(PageMode):
             self._show_frame(view, looked, beside, note=f"The twin has no picture of this contact: {error}")
             return
         if light is not None and not self._wanted.overtaken:
-            made = view.twin_frame(light).image
-            self._show_frame(
-                view, looked, made if made.ndim == 3 else np.repeat(made[..., None], 3, axis=2), label="the twin's picture of this contact"
-            )
+            made = view.crop(view.twin_frame(light).image)
+            colour = made if made.ndim == 3 else np.repeat(made[..., None], 3, axis=2)
+            self._show_frame(view, looked, colour, label="the twin's picture of this contact")
 
     def _next_doubt(self, view: RecordingView) -> Looked | None:
         """The next frame with a doubtful label, searched after the shown frame and then from the beginning."""
@@ -271,7 +277,7 @@ class RecordingMode(PageMode):
             paragraph(note, "said"),
             *(paragraph(text, "note") for text in [*view.recording.problems, *view.notes][:4]),
         ]
-        self.put_up((camera, view.crop(beside)), f"recorded frame {looked.frame.name}", numbers, below=label)
+        self.put_up((camera, beside), f"recorded frame {looked.frame.name}", numbers, below=label)
 
 
 def _six(values: np.ndarray) -> str:

@@ -24,7 +24,7 @@ from twin.studio.page import LineChart, StudioPage, put, value_of
 from twin.studio.pictures import OverlayChoices, badge, estimate_table, number_table, paragraph, pins_found
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of
 from twin.studio.scene import FULL_SCALE, PinColour, Scene
-from twin.studio.state import StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
+from twin.studio.state import LAST_STATE, StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
 from twin.studio.tracing import Tracer
 from twin.studio.video import FilmWriter
 from twin.studio.worker import Worker
@@ -45,6 +45,11 @@ MOST_UNDO = 100
 """Most gestures that can be taken back."""
 MOST_FRICTION = 2.0
 """Largest friction of the slider."""
+
+
+def _as_deep(wish: ObjectPose, before_mm: float, contact: MovingContact) -> ObjectPose:
+    """A wish as deep after the first touch in a contact as one that touched at the depth ``before_mm``."""
+    return replace(wish, depth_mm=wish.depth_mm - before_mm + contact.touch_mm(wish)).within_limits()[0]
 
 
 class TwinMode(PageMode):
@@ -68,11 +73,13 @@ class TwinMode(PageMode):
     """
 
     title = "Twin"
+    has_scene = True
 
     def __init__(self, page: StudioPage, state: StudioState, out: Path, model_of: ModelOf, *, traces: bool = True) -> None:
         super().__init__(page)
         self._out, self._model_of, self._traces = out, model_of, traces
         self._state = state
+        self._kept: StudioState | None = None  # as it is in the file of the last state
         self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
         self._wish, self._wished_s = state.object_pose(), 0.0
         self._undo: list[ObjectPose] = []
@@ -88,7 +95,7 @@ class TwinMode(PageMode):
         self._links = self.newest(self._open_link, "link")
         page.on_address = self._links.give
         self._build_controls()
-        self._forces, self._estimates, self._depths = (
+        self._forces, self._estimates, self._depths = self.charts = tuple(
             LineChart(page, title) for title in ("force on the object, N", "error of the estimates", "indentation, mm")
         )
 
@@ -148,7 +155,9 @@ class TwinMode(PageMode):
 
     def show(self) -> None:
         """Show the twin's newest answer."""
-        if self.worker.newest is not None:
+        if self.worker.newest is None:
+            self._page.show_nothing("The first picture is being made. For a new sensor this takes up to a minute.")
+        else:
             self._publisher.give(self.worker.newest)
 
     @property
@@ -222,6 +231,9 @@ class TwinMode(PageMode):
                     (list_sensors, self._state.sensor), (list_objects, self._state.object)))  # fmt: skip
                 self._sensor = gui.add_dropdown("sensor", sensors, initial_value=self._state.sensor)
                 self._object = gui.add_dropdown("object", objects, initial_value=self._state.object)
+                self._page.upload(
+                    "Upload an object (mesh)", ".stl,.obj,.ply", self._touch, hint="lengths in mm; or drop the file on the page"
+                )
                 self._friction = gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction())
                 button("Restart contact", self.restart_contact, hint="clear the friction history and press straight down")
             with gui.add_folder("Show"):
@@ -308,29 +320,37 @@ class TwinMode(PageMode):
         except SpecError:
             put(self._object, self._state.object, send=True)
             raise
+        self._object.options = tuple(sorted({*self._object.options, name}))
         put(self._object, name, send=True)
         self._state = self._state.alter(object=name)
 
         def change() -> None:
+            wish, before = self._wish, self.contact.touch_mm(self._wish)
             self.contact.change(obj=obj)
             with self._showing:
                 self._scene.put_object(obj)
             put(self._friction, self._own_friction())
+            self.ask(_as_deep(wish, before, self.contact), gesture=False)
 
         self.worker.do(change)
-        self.worker.ask(self._wish)
 
     def _change_sensor(self) -> None:
         chosen = self._sensor.value
         with self._rebuilding:
             try:
-                self.open(self.state.alter(sensor=chosen, form=str(Form.RAW)))
+                self.open(self.state.alter(sensor=chosen, form=str(Form.RAW)), as_deep=True)
             except (TwinError, SpecError):
                 put(self._sensor, self._state.sensor, send=True)
                 raise
 
-    def open(self, state: StudioState) -> None:
+    def open(self, state: StudioState, *, as_deep: bool = False) -> None:
         """Show another state. With another sensor everything is built again, which takes some seconds.
+
+        Parameters
+        ----------
+        state : StudioState
+        as_deep : bool
+            Keep the depth relative to the first touch of the sensor that is shown now, instead of the state's depth.
 
         Raises
         ------
@@ -345,13 +365,15 @@ class TwinMode(PageMode):
                 self._tracer.__exit__(None, None, None)
             self._page.gui.set_panel_label(heading(state))
             before, friction = self._choices(), self._own_friction()
-            self._state, self._wish = state, state.object_pose()
+            self._state, wish = state, state.object_pose()
+            self._wish = _as_deep(wish, self.contact.touch_mm(wish), prepared[0]) if as_deep else wish
             self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
             self._model_note = "the model is being loaded"
             self._take_up(*prepared)
             setup = self.contact.setup
             self._form.options = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
-            self._sensor.options = tuple(sorted({*self._sensor.options, state.sensor}))
+            for control, name in ((self._sensor, state.sensor), (self._object, state.object)):
+                control.options = tuple(sorted({*control.options, name}))
             for (control, old), (_, new) in zip(before, self._choices(), strict=True):
                 if control.value == old and new in control.options:  # otherwise the user has just chosen another one; its callback follows
                     put(control, new)
@@ -397,6 +419,9 @@ class TwinMode(PageMode):
             self._show_answer(answer)
         if not self._loading:
             self._load_rest()
+        if answer.arrived and self._kept != self.state:
+            self._kept = self.state
+            self._kept.save(self._out / LAST_STATE)
         for follow in self.followers:
             follow(answer)
 
@@ -441,9 +466,9 @@ class TwinMode(PageMode):
         across, into = float(np.hypot(*state.force_n[:2])), float(state.force_n[2])
         ends = force_interval(state.force_n.tolist(), self.contact.setup.sensor.skin.stiffness_factor)
         rows = {
-            "force x, y, z": f"{force[0]:+.2f}  {force[1]:+.2f}  {force[2]:+.2f} N",
+            "force x, y, z, N": f"{force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f}",
             "its size, 90 % interval": f"{ends[0]:.2f} to {ends[1]:.2f} N",
-            "lateral force, ratio to normal": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
+            "lateral, share of normal": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
             "torque about z": f"{torque:+.1f} N mm",
             "indentation": f"{answer.indent_mm:+.2f} mm",
             "contact area, slipping": f"{state.area_mm2:.0f} mm2, {100 * state.slip_share:.0f} %",

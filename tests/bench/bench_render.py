@@ -13,9 +13,9 @@ from functools import partial
 from time import perf_counter
 
 import numpy as np
-from film import scaled
 from image_error import Truth, memory_mb, timed_ms
 from plain_path import PlainPath
+from scaled_sensor import scaled
 
 from scenes import load_object, load_sensor
 from scenes.sensor import SensorSpec

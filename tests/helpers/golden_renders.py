@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from film import scaled
+from scaled_sensor import scaled
 from scipy import stats
 
 from scenes import load_sensor

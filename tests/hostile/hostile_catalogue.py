@@ -401,6 +401,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--arm mg400:127.0.0.1:1 --port": "-1 70000",
         "--arm mg400:127.0.0.1:1 --fault": "nonsense",
     },
+    "record --out {out}": {"--camera": "99 nowhere", "--camera 0 --count": "0 -1", "--camera 0 --port": "-1 70000"},
     f"study servo --model {SENSOR} --out {{out}}": {
         "--steps": "0 -1",
         "--seed": "-1",

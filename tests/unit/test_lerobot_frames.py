@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from made_records import ABOUT, COLOUR, made_episode
 
-from twin.errors import FrameError
+from twin.errors import FrameError, TwinError
 from twin.frames import frames_at, open_recording
 from twin.records import open_writer
 
@@ -48,7 +48,7 @@ def test_pictures_in_videos_are_read_too(tmp_path):
 
 def test_what_cannot_be_read_says_so(tmp_path):
     folder, _ = written(tmp_path / "set")
-    with patch.dict("sys.modules", {"pyarrow": None, "pyarrow.parquet": None}), pytest.raises(FrameError, match="pip install"):
+    with patch.dict("sys.modules", {"pyarrow": None, "pyarrow.parquet": None}), pytest.raises(TwinError, match="pip install"):
         open_recording(folder)
     other = tmp_path / "labels.csv"
     other.write_text("image_name,pose_1\na.png,1\n")

@@ -61,7 +61,7 @@ def test_area_pictures_take_any_graph():
     figure, (ax,) = new_figure(1)
     draw_area_change(ax, moved, rest.area_px2, "change")
     assert len(ax.collections[0].get_paths()) == 40
-    assert len(area_surface_figure(rest, moved).axes) == 3
+    assert len(area_surface_figure(rest, moved).axes) == 6  # three surfaces, each with its scale
 
 
 def test_enlarged_arrows_stay_between_their_pins_and_say_so():

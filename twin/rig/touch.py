@@ -96,7 +96,7 @@ class SmoothSurface:
         gap_mm = distance_mm - self.raised_mm
         inward = -np.einsum("mij,mj->mi", turn, outward)  # in the sensor frame
         azimuth = np.radians(mounting.image_turn_deg)
-        across, axial = inward[:, :2] @ [np.cos(azimuth), np.sin(azimuth)], inward[:, 2]
+        across, axial = inward[:, 0] * np.cos(azimuth) + inward[:, 1] * np.sin(azimuth), inward[:, 2]  # a product of BLAS depends on M
         along_mm, lateral_mm = mounting.centre_mm @ mounting.axis, mounting.centre_mm @ mounting.across
         return TrueTouch(
             mounting.skin_apex_mm + along_mm - (gap_mm + along_mm * axial + lateral_mm * across),

@@ -59,7 +59,7 @@ EXTRA_COST = 0.05
 hundreds of such blobs."""
 REMASK_PX = 2.0
 """Least displacement of the whole view, px, with which the mask is displaced, if a pin is close to the mask's edge."""
-MASK_MARGIN, MASK_MARGIN_PX = 0.5, 2.0
+MASK_MARGIN, MASK_MARGIN_PX = 0.5, 1.0
 """Distance from the mask's edge below which a lost pin may be cut off, in spacings, and below which a found pin's cap is, px."""
 PLAUSIBLE = 0.5
 """Least share of labelled pins for a labelling to be improved by further steps."""

@@ -46,7 +46,7 @@ print(json.dumps([name for name, job in JOBS.items() if is_kept(job)]))
 """
 CLOCKS = ("ms", "seconds", "time")
 """Beginnings and ends of the names of columns that hold times."""
-CHARTS = ("panel.png", "errors.png")
+CHARTS = ("panel.png", "errors.png", "skin.png")
 """Pictures that are drawn to be looked at. No figure is measured on them."""
 
 

@@ -1,7 +1,8 @@
 """How late and how often the streamed loop decides on the emulated rig, against an older version of this program in the same run.
 
 Run ``python tests/bench/bench_servo_timing.py [--baseline FOLDER]`` with the project on the path; FOLDER is a checkout of the version to
-compare with, such as ``git worktree add /tmp/before 1266b7c``, the last one before arms were watched while the loop works. Both emulators
+compare with, such as ``git worktree add /tmp/before 1266b7c``, the last one before arms were watched while the loop works. With --ros2
+frames and estimates are published as ROS 2 topics, and another process reads all of them (set ROS_LOCALHOST_ONLY=1). Both emulators
 are in processes of their own. The estimator answers at once, so what is measured is the loop, the drivers and the two streams. The two
 versions take turns, so that other work on the machine meets both.
 """
@@ -11,6 +12,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -35,8 +37,21 @@ with CameraEmulator(NoisyCamera(fps={CAMERA_HZ}, color=True)) as camera:
     sys.stdin.read()
 """
 
+READER = """
+from threading import Thread
+from hardware.ros2.dds import Participant
+from hardware.workcell.ros2 import SENSOR_TOPICS, TOPICS
+participant = Participant()
+def read(reader):
+    while True:
+        reader.take()
+for topic, kind in (SENSOR_TOPICS | TOPICS).items():
+    Thread(target=read, args=(participant.reader(topic if topic[0] == "/" else f"/bench/{topic}", kind),)).start()
+print("reading", flush=True)
+"""
 
-def once() -> dict[str, float]:
+
+def once(ros2: bool = False) -> dict[str, float]:
     """Run the loop of the version that is on the path."""
     from hardware.arms.mg400 import MG400, Mg400Ports
     from hardware.cameras.mjpeg import MjpegCamera
@@ -44,9 +59,10 @@ def once() -> dict[str, float]:
     from hardware.safety.decide import load_limits
     from hardware.safety.safe_arm import SafeArm
     from hardware.servo.loop import ServoLoop
-    from hardware.servo.step import LoopSettings
+    from hardware.servo.step import LoopHooks, LoopSettings
     from hardware.workcell.build import Rig
     from scenes import load_experiment, load_object, load_sensor, load_servo
+    from twin.pins import Pipeline
     from twin.rig.mounting import Mounting
     from twin.types import Form
 
@@ -57,17 +73,23 @@ def once() -> dict[str, float]:
     names = (mounting.depth_label, mounting.angle_label)
 
     def estimator(frame: object) -> SimpleNamespace:
-        return SimpleNamespace(names=names, value=value, low=value, high=value, valid=True, reason="")
+        return SimpleNamespace(names=names, value=value, low=value, high=value, units=("mm", "deg"), valid=True, reason="", seen=None)
 
-    children = [subprocess.Popen([sys.executable, "-c", code], stdin=-1, stdout=-1, text=True) for code in (ARM, CAMERA)]
+    codes = (ARM, CAMERA, READER) if ros2 else (ARM, CAMERA)
+    children = [subprocess.Popen([sys.executable, "-c", code], stdin=-1, stdout=-1, text=True) for code in codes]
     try:
-        ports, url = (child.stdout.readline().split() for child in children)
+        ports, url, *_ = (child.stdout.readline().split() for child in children)
         dashboard, motion, *feedback = map(int, ports)
         arm = SafeArm(MG400("127.0.0.1", ports=Mg400Ports(dashboard, motion, tuple(feedback))), load_limits("mg400"))
         with Rig(MjpegCamera(url[0], None, Form.RAW), arm, placed, True) as rig:
             rig.source.read(timeout_s=10.0)
             settings = LoopSettings(STEPS, blocking=False, period_s=1.0 / RATE_HZ)
-            timing = ServoLoop(rig, servo, estimator, settings).run(placed.start_pose(servo.indent_mm))
+            loop = ServoLoop(rig, servo, estimator, settings)
+            with ExitStack() as opened:
+                if ros2:
+                    publish = opened.enter_context(rig.publishing("bench", Pipeline(load_sensor("mg400-331"), Form.RAW)))
+                    loop.hooks = LoopHooks(on_estimate=publish)
+                timing = loop.run(placed.start_pose(servo.indent_mm))
     finally:
         for child in children:
             child.kill()
@@ -76,10 +98,10 @@ def once() -> dict[str, float]:
     return {"median_ms": 1e3 * late.p50, "p95_ms": 1e3 * late.p95, "age_ms": 1e3 * age.p50, "decided_hz": timing.decided_hz}
 
 
-def run_of(folder: Path) -> dict[str, float]:
+def run_of(folder: Path, *more: str) -> dict[str, float]:
     """``once`` with the version in a folder."""
     path = os.pathsep.join(str(folder / part) for part in ("", "tests", "tests/helpers"))
-    command = [sys.executable, str(Path(__file__).resolve()), "--once"]
+    command = [sys.executable, str(Path(__file__).resolve()), "--once", *more]
     done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False, cwd=folder)
     if done.returncode:
         raise SystemExit(f"{folder}: {done.stderr[-2000:]}")
@@ -91,15 +113,16 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--baseline", type=Path, help="checkout of the version to compare with")
     options.add_argument("--once", action="store_true", help="one run of the version on the path, as JSON")
+    options.add_argument("--ros2", action="store_true", help="publish ROS 2 topics, which another process reads")
     given = options.parse_args()
     if given.once:
-        print(json.dumps(once()))
+        print(json.dumps(once(given.ros2)))
         return
     versions = {"now": ROOT} | ({"baseline": given.baseline} if given.baseline else {})
     runs: dict[str, list[dict[str, float]]] = {name: [] for name in versions}
     for _ in range(TURNS):
         for name, folder in versions.items():
-            runs[name].append(run_of(folder))
+            runs[name].append(run_of(folder, *(["--ros2"] if given.ros2 and folder == ROOT else [])))
     found = {name: {key: float(np.median([run[key] for run in each])) for key in each[0]} for name, each in runs.items()}
     print(f"{STEPS} steps asked for at {RATE_HZ:g} Hz, camera {CAMERA_HZ:g} Hz; medians of {TURNS} runs each, taking turns")
     for name, each in found.items():

@@ -23,7 +23,7 @@ from scipy.stats.qmc import Sobol
 from hardware.arms.arm import ArmState
 from hardware.cameras.mjpeg import without_secrets
 from hardware.errors import DeviceError
-from hardware.rig.geometry import PlacedObject, matrix_of, pose_of
+from hardware.rig.geometry import PlacedObject
 from hardware.workcell.build import Rig, build_rig, check_plan
 from hardware.workcell.mover import Mover
 from scenes import ObjectSpec, SensorSpec, ServoSpec
@@ -35,6 +35,7 @@ from twin.frames.images import write_image
 from twin.pins import Pipeline, measure_reference
 from twin.progress import Progress, Step, silent, stage
 from twin.records import KeptAlso
+from twin.rig.arm_pose import matrix_of, pose_of
 from twin.store import contents, made_by, output, write_json, write_text, writes
 from twin.types import Form, Frame
 
@@ -216,9 +217,8 @@ class WorkFrame:
 
     def base_pose(self, label: np.ndarray, near: np.ndarray, *, away_mm: float = 0.0) -> np.ndarray:
         """The arm's pose (6,) at work coordinates (6,), ``away_mm`` back along the approach. ``near`` (6,) selects the turn about z."""
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_euler("xyz", label[3:], degrees=True).as_matrix()
-        T[:3, 3] = label[:3] - away_mm * self._toward
+        T = matrix_of(label)
+        T[:3, 3] -= away_mm * self._toward
         return pose_of(self._T @ T, near)
 
     def label(self, base_pose: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 from hardware.cameras.picture_page import PicturePage
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
+from twin.frames.forms import gray_levels
 from twin.frames.images import write_image
 from twin.progress import Progress, silent, stage
 from twin.store import writes
@@ -126,7 +127,7 @@ class _Chosen:
 
     def consider(self, image: np.ndarray, time_s: float) -> str:
         """Keep a frame, or say what to do first; "" if it was kept."""
-        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        gray = gray_levels(image)
         small = cv2.resize(gray, None, fx=1 / SHRINK, fy=1 / SHRINK, interpolation=cv2.INTER_AREA).astype(np.float32)
         before, self._before = self._before, small
         if before is None or before.shape != small.shape:

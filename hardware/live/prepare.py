@@ -11,7 +11,7 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.pins import Pipeline, node_features
-from twin.progress import Progress, report_each, silent, stage
+from twin.progress import Progress, silent, stage
 from twin.simulator import Simulator
 from twin.workers import in_processes
 
@@ -24,9 +24,8 @@ def compile_ahead(*, progress: Progress = silent) -> None:
     """Compile each part. This takes about half a minute of each of two cores the first time, and some seconds later."""
     parts = [_press, _look]
     with stage(progress, "compiling") as step:
-        done = in_processes(_begin, (), parts, processes=min(len(parts), os.cpu_count() or 1))
-        for _ in report_each([None] * len(parts), step):
-            next(done)
+        for done, _ in enumerate(in_processes(_begin, (), parts, processes=min(len(parts), os.cpu_count() or 1)), 1):
+            step(done, len(parts))
 
 
 def _begin() -> Callable[[Callable[[], None]], None]:

@@ -3,7 +3,8 @@
 import numpy as np
 
 from hardware.errors import DeviceError
-from hardware.rig.geometry import PlacedObject, distance_to_axis, matrix_of, pose_of
+from hardware.rig.geometry import PlacedObject, distance_to_axis
+from twin.rig.arm_pose import matrix_of, pose_of
 
 # Distance between the dome and the circle around the object, in mm.
 MARGIN_MM = 10.0

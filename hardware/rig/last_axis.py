@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hardware.arms.kinematics import Kinematics, LinkageKinematics
-from hardware.rig.geometry import PlacedObject, matrix_of, pose_of
+from hardware.rig.geometry import PlacedObject
+from twin.rig.arm_pose import matrix_of, pose_of
 
 # Angle beyond the end of the range, deg, above which an orientation needs a turn back. It is larger than the noise of an estimated angle.
 # Otherwise the axis would turn back and forth.

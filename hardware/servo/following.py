@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.cameras.mjpeg import without_secrets
 from hardware.errors import DeviceError, in_short
-from hardware.rig.geometry import PlacedObject, matrix_of, pose_of, shift_in_tool
+from hardware.rig.geometry import PlacedObject, shift_in_tool
 from hardware.rig.last_axis import LastAxis, poses_along, turns_back_mm
 from hardware.servo.loop import ServoLoop, require_labels
 from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
@@ -33,6 +33,7 @@ from twin.records.session import SessionWriter, plain
 from twin.report.charts import save_figure, write_chart
 from twin.report.page import Page, PagePicture
 from twin.report.table import write_rows
+from twin.rig.arm_pose import matrix_of, pose_of
 from twin.rig.mounting import Mounting
 from twin.store import write_json, writes
 from twin.types import FIRST, Frame, ReadableResult

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hardware.rig.geometry import matrix_of, pose_of
 from scenes.servo import ServoSpec
+from twin.rig.arm_pose import matrix_of, pose_of
 from twin.rig.mounting import Mounting
 
 

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from hardware.rig.geometry import PlacedObject, matrix_of
+from hardware.rig.geometry import PlacedObject
 from hardware.servo.law import Reading, tangent_of
 from hardware.servo.step import StepRecord
 from twin.report.charts import muted_colour, new_figure
 from twin.report.table import write_table
 from twin.report.themes import BLUE, RED
+from twin.rig.arm_pose import matrix_of
 from twin.rig.mounting import Mounting
 
 # Number of points in a window of the local smoothness.

@@ -24,7 +24,7 @@ from hardware.cameras.source import FrameSource, await_frame
 from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
 from hardware.errors import DeviceError, leave
 from hardware.rig.approach import path_around
-from hardware.rig.geometry import PlacedObject, matrix_of
+from hardware.rig.geometry import PlacedObject
 from hardware.safety.decide import Action, decide, load_limits
 from hardware.safety.eyes import NEAR_MM, ArmWatch
 from hardware.safety.safe_arm import RETREAT_SHARES, SafeArm
@@ -38,6 +38,7 @@ from twin.frames import open_recording
 from twin.optics.preview import Preview
 from twin.optics.render import traced_shading
 from twin.pins import Pipeline
+from twin.rig.arm_pose import matrix_of
 from twin.rig.mounting import Mounting
 from twin.types import FIRST, NONE, Form, Frame
 

@@ -15,12 +15,13 @@ from hardware.arms.arm import ArmState
 from hardware.arms.motion import turn_between_deg
 from hardware.errors import DeviceError
 from hardware.rig.approach import path_around
-from hardware.rig.geometry import matrix_of, shift_in_tool
+from hardware.rig.geometry import shift_in_tool
 from hardware.rig.last_axis import HOLD_DEG, LastAxis
 from hardware.safety.decide import Sensed
 from hardware.safety.eyes import ArmWatch, FreshFrames
 from hardware.safety.safe_arm import NoWayBackError, SafeArm, try_each
 from hardware.workcell.build import Rig
+from twin.rig.arm_pose import matrix_of
 from twin.types import Frame
 
 LOG = logging.getLogger(__name__)

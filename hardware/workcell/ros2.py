@@ -28,6 +28,7 @@ from twin.frames.forms import recording_to_raw
 from twin.geometry.pins import rest_pins
 from twin.pins import Pipeline
 from twin.records import ros2_messages as ros
+from twin.rig.arm_pose import matrix_of
 from twin.types import Form, Frame
 
 LOG = logging.getLogger(__name__)
@@ -205,7 +206,7 @@ class Ros2Publisher:
         if state is not None and state is not self._state:  # tf2 warns of a stamp that comes twice
             self._state = state
             based = ros.header_of(arm_ns := self._at_ns(state.time_s), "base")
-            self._send(ros.TF_TOPIC, arm_ns, lambda: ros.transform(ros.pose_matrix(state.pose), based, self.tool_frame))
+            self._send(ros.TF_TOPIC, arm_ns, lambda: ros.transform(matrix_of(state.pose), based, self.tool_frame))
         if not self._estimates:
             self._publish_pins(at_ns, frame, None)
 
@@ -314,6 +315,6 @@ def _contact_pose(header: dict[str, Any], names: tuple[str, ...], numbers: np.nd
             k = _POSE[name]
             pose[k], unit = value, 1 / ros.MM_PER_M if k < 3 else np.radians(1.0)
             variance[k] = ((high - low) * unit / SD_90) ** 2
-    place = ros.transform(ros.pose_matrix(pose), header, "")["transforms"][0]["transform"]
+    place = ros.transform(matrix_of(pose), header, "")["transforms"][0]["transform"]
     found = {"position": place["translation"], "orientation": place["rotation"]}
     return {"header": header, "pose": {"pose": found, "covariance": np.diag(variance).ravel()}}

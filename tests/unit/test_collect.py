@@ -11,11 +11,12 @@ from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.reader import DevicePicture, LiveSource
 from hardware.collect.collect import COLUMNS, META, Collection, WorkFrame, collect, draw_contact
 from hardware.errors import DeviceError
-from hardware.rig.geometry import PlacedObject, matrix_of
+from hardware.rig.geometry import PlacedObject
 from hardware.workcell.build import Rig
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from training.data.design import nearest_to_even
 from twin.frames import open_recording, read_image
+from twin.rig.arm_pose import matrix_of
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
 

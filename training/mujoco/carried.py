@@ -15,6 +15,7 @@ from training.mujoco.geoms import MM
 from training.mujoco.model import scene_file
 from training.mujoco.scene import TactileScene
 from twin.errors import ContactError
+from twin.rig.arm_pose import matrix_of
 from twin.types import PinState
 
 CARRIED = "carried_tactip"
@@ -48,9 +49,8 @@ class CarriedSensor:
         ContactError
             The contact can't be computed.
         """
-        T, data, dt = np.eye(4), self.scene.data, self.scene.model.opt.timestep
-        T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", pose[3:], degrees=True).as_matrix(), pose[:3]
-        T = T @ self.T_tool_sensor
+        data, dt = self.scene.data, self.scene.model.opt.timestep
+        T = matrix_of(pose) @ self.T_tool_sensor
         before, before_s = self._last or (T, time_s)
         steps = max(round(min(time_s - before_s, LONGEST_S) / dt), 1)
         turns = Slerp([0.0, 1.0], Rotation.from_matrix([before[:3, :3], T[:3, :3]]))

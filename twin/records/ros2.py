@@ -18,6 +18,7 @@ from twin.errors import library
 from twin.records import ros2_messages as ros
 from twin.records.folder import AGAIN, VERSION, FolderWriter, image_of, png, read_sidecar, require_numbered, whole_steps
 from twin.records.record import CHANNELS, About, Episode, RecordError, Records, RecordStep, float32
+from twin.rig.arm_pose import matrix_of
 from twin.store import write_with
 
 IMAGE_TOPIC, CONTACT_TOPIC, POSE_TOPIC = "/tactip/image/compressed", "/tactip/contact", "/tactip/pose"
@@ -91,7 +92,7 @@ class _Bag:
             known = dict(zip(self._about.estimates, step.values["estimate"].tolist(), strict=True))
             send(POSE_TOPIC, "geometry_msgs/TwistStamped", {"header": header, "twist": ros.estimated_twist(known)})
         if "pose" in step.values and np.isfinite(step.values["pose"]).all():
-            send(ros.TF_TOPIC, "tf2_msgs/TFMessage", ros.transform(ros.pose_matrix(step.values["pose"].astype(float)), based, TOOL_FRAME))
+            send(ros.TF_TOPIC, "tf2_msgs/TFMessage", ros.transform(matrix_of(step.values["pose"].astype(float)), based, TOOL_FRAME))
         self.count += 1
 
     def finish(self, facts: dict[str, Any]) -> None:

@@ -179,13 +179,6 @@ def wrench(force_n: np.ndarray, torque_nmm: np.ndarray) -> dict[str, Any]:
     return {"force": vector(force_n), "torque": vector(np.asarray(torque_nmm) / MM_PER_M)}
 
 
-def pose_matrix(pose: np.ndarray) -> np.ndarray:
-    """The matrix (4, 4) of a pose (6,), mm and deg."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", pose[3:], degrees=True).as_matrix(), pose[:3]
-    return T
-
-
 def transform(T_mm: np.ndarray, header: Mapping[str, Any], child: str) -> dict[str, Any]:
     """A pose (4, 4) of a frame as a ``/tf`` message, in m."""
     parts = {"translation": vector(T_mm[:3, 3] / MM_PER_M), "rotation": vector(Rotation.from_matrix(T_mm[:3, :3]).as_quat())}

@@ -322,7 +322,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     },
     "evaluate {run} --data {recording} --out {out}": {"--rows": "some", "--label-kind": "both"},
     f"preprocess {{frames}} {S} --out {{out}}": {"--form": "cooked raw"},
-    f"check {{frames}} {S}": {"--max-frames": "0 -1 1e3", "--pipeline": "nowhere.toml"},
+    f"check {{frames}} {S}": {"--max-frames": "0 -1 1e3", "--pipeline": "nowhere.toml", "--page": "/proc/nowhere/page"},
     f"graph {{frames}} {S} --out {{out}}": {"--kind": "star", "--form": "cooked raw"},
     f"tune {S} --frames {{frames}} --out {{out}}/mine.toml": {"--max-frames": "0 -1", "--method": "magic"},
     f"render {S} --object plane --out {{out}} --quality preview": {
@@ -586,7 +586,7 @@ OVERWRITTEN = {  # files of the user's own in --out that a command of the same n
     "live": ("session.json", "steps.jsonl"),
     "convert": ("tactip.json", "README.md"),
     "demo": ("index.html",),
-    "study servo": ("study.csv",),
+    "study servo": ("study.csv", "index.html"),
     "study objects": ("objects.csv", "index.html"),
     "study sim-to-real": ("study.csv", "index.html"),
     "study tac-vgnn": ("index.html", "models.csv"),

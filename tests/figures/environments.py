@@ -1,12 +1,15 @@
 """The errors that the shipped surrogates state, how fast the environments step, and what is trained from scratch."""
 
 import json
+from collections.abc import Callable
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import bench_baselines
 import bench_environments
 import bench_geoms
+import bench_grasp
 import bench_surrogate
 import numpy as np
 
@@ -180,3 +183,46 @@ def geoms(work: Path) -> Measured:
         found |= {f"{kind}_n": Value(force, "N"), f"{kind}_share": Value(share)}
         found |= {f"{kind}_mm": Value(off, "mm"), f"{kind}_moved_mm": Value(moved, "mm")}
     return found
+
+
+GRASP_SEEDS, GRASP_MINUTES = (0, 1), 25
+
+
+def grasp_job(name: str, options: str, measure: Callable[[Path], Measured], minutes: float) -> None:
+    """Register what one run of the bench of grippers measures."""
+    job(
+        f"grasp.{name}",
+        f"tests/bench/bench_grasp.py {options}",
+        sensors=("mg400-331",),
+        code=("bench_grasp", "training.mujoco.scene", "training.mujoco.task", "training.mujoco.grasp", "training.mujoco.peg"),
+        shipped=("training/surrogates/mg400-331.safetensors", "training/mujoco/scenes"),
+        minutes=minutes,
+        beside=DRAWN,
+    )(measure)
+
+
+def grasp_constant(work: Path) -> Measured:
+    """The best constant grip."""
+    shares = {grip_n: bench_grasp.constant(grip_n) for grip_n in bench_grasp.GRIPS_N}
+    best = max(shares, key=lambda grip_n: shares[grip_n])
+    return {"success": Value(shares[best]), "grip_n": Value(best, "N")}
+
+
+def grasp_scripted(work: Path, *, way: str) -> Measured:
+    """A scripted controller."""
+    task, controller = bench_grasp.SCRIPTED[way]
+    return {"success": Value(bench_grasp.solved(task, controller, observation="none"))}
+
+
+def grasp_learnt(work: Path, *, observation: str, seed: int) -> Measured:
+    """What PPO learns."""
+    share, steps, used_s = bench_grasp.learnt(observation, seed, out=work / "policy.zip")
+    return {"success": Value(share), "steps": Value(steps), "core_minutes": Value(used_s / 60, "min")}
+
+
+grasp_job("constant", "--way constant", grasp_constant, 5)
+for way in bench_grasp.SCRIPTED:
+    grasp_job(way, f"--way {way}", partial(grasp_scripted, way=way), 3)
+for observation, seed in product(("none", "wrench", "pins"), GRASP_SEEDS):
+    options = f"--observation {observation} --seed {seed}"
+    grasp_job(f"{observation}.seed{seed}", options, partial(grasp_learnt, observation=observation, seed=seed), GRASP_MINUTES)

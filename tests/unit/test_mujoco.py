@@ -15,6 +15,7 @@ from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from training.mujoco import TactileScene
 from training.mujoco.carried import CARRIED, open_world
 from training.mujoco.geoms import FILLET_MM, solid_of
+from training.mujoco.grasp import BONUS, CRUSH, FRICTION, MASS_KG, WANTED
 from training.mujoco.model import attach_sensor, load_scene, sensor_part, write_urdf
 from training.surrogate.solids import Drum, Ellipsoid, SweptBox, distances_to
 from twin.errors import ContactError, OptionError
@@ -220,28 +221,52 @@ def test_frames_of_the_scene_go_through_the_pipeline():
     assert np.nanmean(np.linalg.norm(seen.pins_px - scene.read("tip").pins_px, axis=1)) < 1.0
 
 
-def hold(env, grip_n):
-    """Actions that grip with a force, lift, hold and set down."""
-    force, hand = env.grip_n(), env.goal_mm - env.height_mm()
-    if env.part == 2 and env.height_mm() < 0.5:
-        return np.array([-1.0, 0.0])
-    ready = force > 0.9 * grip_n
-    return np.clip([3.0 * (grip_n - force), ready * hand / 4], [-1, -0.5], [1, 0.5])
-
-
-def play(env, seed, grip_n):
-    """Whether an episode is solved with a grip that may depend on what the object needs."""
+def play(seed, grip_n):
+    """Play an episode of GraspLift with a grip that may depend on what the object needs; rewards, and what the last step says."""
+    env = gymnasium.make("tactip/GraspLift-v0", observation="none").unwrapped
     env.reset(seed=seed)
-    while True:
-        *_, failed, late, info = env.step(hold(env, grip_n(env)))
-        if failed or late:
-            return info["is_success"]
+    rewards, over = [], False
+    while not over:
+        _, reward, over, _, info = env.step(np.clip([(grip_n(env) - env.grip_n()) / 0.15], -1, 1))
+        rewards.append(reward)
+        assert reward == pytest.approx(sum(info["terms"].values()))
+    assert min(rewards) >= 0 and max(rewards[:-1]) <= 1
+    return rewards, info
 
 
 def test_a_lift_needs_the_right_grip_for_each_object():
+    for seed in range(2):
+        rewards, info = play(seed, lambda env: WANTED * env.least_n)
+        assert info["is_success"] and rewards[-1] > BONUS
+        for share, why in ((0.8, "dropped"), (1.1 * CRUSH, "crushed")):
+            rewards, info = play(seed, lambda env, share=share: share * env.least_n)
+            assert info[why] and not info["is_success"] and rewards[-1] == 0
+
+
+def test_most_objects_of_a_lift_break_or_fall_with_any_constant_grip():
+    env = gymnasium.make("tactip/GraspLift-v0", observation="none").unwrapped
+    least, seen = [], []
+    for seed in range(300):
+        _, drawn = env.reset(seed=seed)
+        least.append(env.least_n)
+        seen.append((drawn["mass_kg"], drawn["friction"]))
+    (lightest, slippery), (heaviest, rough) = np.min(seen, axis=0), np.max(seen, axis=0)
+    assert (
+        MASS_KG[0] <= lightest < 0.06 and 0.25 < heaviest <= MASS_KG[1] and FRICTION[0] <= slippery < 0.35 and 0.75 < rough <= FRICTION[1]
+    )
+    grips, least = np.arange(0.3, 4.5, 0.05)[:, None], np.array(least)
+    assert ((least <= grips) & (CRUSH * least >= grips)).mean(axis=1).max() <= 0.5
+
+
+def test_the_load_that_both_sensors_feel_is_the_weight_while_the_hand_moves_evenly():
     env = gymnasium.make("tactip/GraspLift-v0", observation="wrench").unwrapped
-    assert all(play(env, seed, lambda env: 1.35 * env.least_n) for seed in range(3))
-    assert sum(play(env, seed, lambda env: 1.2) for seed in range(3)) < 3
+    env.reset(seed=1, options={"mass_kg": 0.15, "friction": 0.6})
+    loads = []
+    for _ in range(50):
+        seen, *_ = env.step(np.clip([(WANTED * env.least_n - env.grip_n()) / 0.15], -1, 1))
+        left, right = seen["tactile"][0, :, 0]
+        loads.append(right - left)
+    assert np.mean(loads[25:]) == pytest.approx(0.15 * 9.81, rel=0.03)
 
 
 def test_a_lift_is_repeated_exactly_by_its_seed_and_is_an_environment_for_gymnasium():
@@ -249,8 +274,8 @@ def test_a_lift_is_repeated_exactly_by_its_seed_and_is_an_environment_for_gymnas
     seen = []
     for _ in range(2):
         env.reset(seed=5)
-        seen.append([env.step(np.array([1.0, 0.2]))[0]["tactile"] for _ in range(12)][-1])
-    assert np.array_equal(*seen) and seen[0].any() and seen[0].shape == (2, 331, 2)
+        seen.append([env.step(np.array([0.5]))[0]["tactile"] for _ in range(12)][-1])
+    assert np.array_equal(*seen) and seen[0].any() and seen[0].shape == (2, 2, 331, 2)
     check_env(env, skip_render_check=True)
 
 

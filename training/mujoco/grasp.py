@@ -1,7 +1,8 @@
-"""``tactip/GraspLift-v0``: lift an object of unknown mass and friction with a parallel gripper and two TacTips, hold it, and set it down.
+"""``tactip/GraspLift-v0``: hold an object of unknown mass and friction in a parallel gripper with two TacTips.
 
-The object breaks above a force that is ``CRUSH`` times the least grip that holds it. So no constant grip serves: the agent has to feel the
-load and the beginning slip. An episode has three parts: lift the object by ``LIFT_MM``, hold it for ``HOLD_S``, and set it down.
+The hand moves by itself: it waits for ``GRIP_S`` with the fingers lightly closed, lifts the object, holds it, and sets it down. The agent
+commands the grip. The object breaks above a force that is ``CRUSH`` times the least grip that holds it. So no constant grip serves: the
+agent has to feel the load and the beginning slip.
 """
 
 from typing import Any
@@ -13,41 +14,51 @@ from training.mujoco.geoms import MM
 from training.mujoco.task import PERIOD_S, GripperTask
 from twin.types import FloatArray
 
-STEPS = 160
+GRIP_S, LIFT_S, HOLD_S, LOWER_S = 0.5, 2.5, 2.0, 1.0
+STEPS = round((GRIP_S + LIFT_S + HOLD_S + LOWER_S) / PERIOD_S)
 """Number of decisions of an episode."""
-MASS_KG, FRICTION, MOST_GRIP_N = (0.05, 0.3), (0.3, 0.8), 2.3
-"""Ranges of mass and friction. Objects that need more than ``MOST_GRIP_N`` at each finger are drawn again: the skin is too
-soft for them."""
-CRUSH = 1.8
-LIFT_MM, NEAR_MM, HOLD_S = 50.0, 5.0, 2.0
-GRIP_MM, LIFT_STEP_MM = 0.2, 4.0
-"""Motion of the fingers and of the hand by an action of 1."""
-OPEN_MM, MOST_CLOSED_MM = 18.0, 25.5
-"""Travel of each finger at the start, just clear of the object, and its largest travel."""
+LIFT_MM = 50.0
+MASS_KG, FRICTION = (0.05, 0.3), (0.3, 0.8)
+"""Ranges of mass and friction."""
+LEAST_N = 0.32, 2.0
+"""Range of the least grip. The skin is too soft for more."""
+CRUSH, WANTED = 2.0, 1.4
+"""Multiples of the least grip: at which the object breaks, and which earns most."""
+GRIP_MM = 0.3
+"""Motion of each finger by an action of 1."""
+TOUCHING_MM, MOST_CLOSED_MM = 19.0, 26.0
+"""Travel of each finger at the start, and its largest travel."""
 FALLEN_MM = 12.0
 """Distance by which the object may sink in the grip. The skin alone gives way by up to 6 mm."""
+STANDS_MM = 1.0
+"""Height below which the object counts as set down."""
+BONUS = 20.0
+"""Reward for an object that was set down."""
+TIMESTEP_S = 0.005
 
 
 class GraspLift(GripperTask):
-    """Lift, hold and set down. Actions: closing motion of the fingers and motion of the hand, -1 to 1. See ``GripperTask``."""
+    """Hold while the hand lifts and lowers. Action: closing motion of the fingers, -1 to 1. See ``GripperTask``."""
 
-    world, held, shape = "gripper", "block", (5, 2)
+    world, held, shape = "gripper", "block", (3, 1)
+    timestep_s = TIMESTEP_S
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, FloatArray], dict[str, Any]]:
-        """Begin an episode; ``options`` can give ``mass_kg`` and ``friction``."""
+        """Begin an episode; ``options`` can give ``mass_kg`` and ``friction``.
+
+        All ratios of least grips are equally probable; mass and friction are drawn from those that need the drawn grip.
+        """
         super().reset(seed=seed)
-        given = options or {}
-        while True:
-            mass, friction = (float(self.np_random.uniform(*of)) for of in (MASS_KG, FRICTION))
-            mass, friction = float(given.get("mass_kg", mass)), float(given.get("friction", friction))
-            self.least_n = mass * 9.81 / (2 * friction)
-            if self.least_n <= MOST_GRIP_N or given:
-                break
+        least_n = float(np.exp(self.np_random.uniform(*np.log(LEAST_N))))
+        friction = self.np_random.uniform(*np.clip(np.array(MASS_KG) * 9.81 / (2 * least_n), *FRICTION))
+        drawn = {"mass_kg": 2 * friction * least_n / 9.81, "friction": friction} | (options or {})
+        mass, friction = float(drawn["mass_kg"]), float(drawn["friction"])
+        self.least_n = mass * 9.81 / (2 * friction)
         model, data = self._model, self.scene.data
         model.body_mass[self._object], model.body_inertia[self._object] = mass, mass * self._inertia
         model.geom_friction[self._geom, 0] = friction
-        self._fingers, self.hand_mm, self.part, self._held, self._done = OPEN_MM, 0.0, 0, 0, 0
-        self.begin(OPEN_MM)
+        self._fingers, self.hand_mm, self._done = TOUCHING_MM, 0.0, 0
+        self.begin(TOUCHING_MM)
         mujoco.mj_forward(model, data)
         self.scene.reset()
         self.settle()
@@ -56,40 +67,20 @@ class GraspLift(GripperTask):
 
     def step(self, action: FloatArray) -> tuple[dict[str, FloatArray], float, bool, bool, dict[str, Any]]:
         """Move fingers and hand; see gymnasium. The reward of a step is at most 1, and 0 where the episode fails."""
-        fingers, hand = np.clip(np.asarray(action, float), -1.0, 1.0)
-        self._fingers = float(np.clip(self._fingers + GRIP_MM * fingers, 0.0, MOST_CLOSED_MM))
-        self.hand_mm = float(np.clip(self.hand_mm + LIFT_STEP_MM * hand, -5.0, 120.0))
-        self.scene.data.ctrl[:] = self.hand_mm / MM, self._fingers / MM
-        self.settle()
         self._done += 1
-        grip_n = self.grip_n()
-        height = self.height_mm()
-        off_mm = abs(height - self.goal_mm)
-        if self.part < 2 and off_mm < NEAR_MM:
-            self.part, self._held = 1, self._held + 1
-            if self._held * PERIOD_S >= HOLD_S:
-                self.part = 2
-        crushed = grip_n > CRUSH * self.least_n
-        dropped = self.part > 0 and (self.hand_mm - height > FALLEN_MM or (self.part == 1 and off_mm > 2 * NEAR_MM))
-        solved = self.part == 2 and height < 1.0 and grip_n < 0.05
-        failed = bool(crushed or dropped)
-        held = min(grip_n / self.least_n, 1.0) if self.part < 2 else 1.0
-        terms = {"part": self.part / 3.0, "grip": held / 6.0, "height": 1.0 / (1.0 + off_mm / 10.0) / 6.0}
-        reward = 0.0 if failed else sum(terms.values())
-        info = {
-            "is_success": solved,
-            "grip_n": grip_n,
-            "height_mm": height,
-            "crushed": bool(crushed),
-            "dropped": bool(dropped),
-            "terms": terms,
-        }
-        return self._look(), reward + (STEPS - self._done) * float(solved), failed or solved, self._done >= STEPS, info
-
-    @property
-    def goal_mm(self) -> float:
-        """Height, mm, that the present part of the episode asks for."""
-        return 0.0 if self.part == 2 else LIFT_MM
+        self._fingers = float(np.clip(self._fingers + GRIP_MM * np.clip(np.ravel(action)[0], -1, 1), 0.0, MOST_CLOSED_MM))
+        lifted = GRIP_S, GRIP_S + LIFT_S, GRIP_S + LIFT_S + HOLD_S, STEPS * PERIOD_S
+        share = float(np.interp(self._done * PERIOD_S, lifted, [0.0, 1.0, 1.0, 0.0]))
+        self.hand_mm = LIFT_MM * (1 - float(np.cos(np.pi * share))) / 2
+        self.settle(targets=(self.hand_mm / MM, self._fingers / MM))
+        seen, grip_n, height = self._look(), self.grip_n(), self.height_mm()
+        crushed, dropped = grip_n > CRUSH * self.least_n, self.hand_mm - height > FALLEN_MM
+        over, failed = self._done == STEPS, crushed or dropped
+        solved = over and not failed and height < STANDS_MM
+        ratio = max(grip_n, 1e-3) / (WANTED * self.least_n)
+        terms = {"grip": 0.0 if failed else min(ratio, 1 / ratio), "set_down": BONUS * solved}
+        info = {"is_success": solved, "grip_n": grip_n, "height_mm": height, "crushed": crushed, "dropped": dropped, "terms": terms}
+        return seen, sum(terms.values()), failed or over, False, info
 
     def height_mm(self) -> float:
         """Height of the object above its place at the start."""
@@ -97,8 +88,7 @@ class GraspLift(GripperTask):
 
     def grip_n(self) -> float:
         """The smaller of both fingers' forces along their axes, N."""
-        return float(min(each.force_n[2] for each in self.readings()))
+        return float(min(each.force_n[2] for each in self.felt))
 
     def _look(self) -> dict[str, FloatArray]:
-        state = [(self._fingers - OPEN_MM) / 5.0, self.hand_mm / LIFT_MM, self.goal_mm / LIFT_MM, float(self.part), self._held * PERIOD_S]
-        return self.look(state)
+        return self.look([(self._fingers - TOUCHING_MM) / 5.0, self.hand_mm / LIFT_MM, self._done / STEPS])

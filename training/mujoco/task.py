@@ -1,5 +1,6 @@
 """What the environments in MuJoCo scenes have in common: two sensors on a gripper, kinds of observation, and pictures."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, cast, get_args
 
 import gymnasium
@@ -9,12 +10,14 @@ from gymnasium import spaces
 
 from scenes import load_sensor
 from training.mujoco.model import load_scene
-from training.mujoco.scene import TactileReading, TactileScene
+from training.mujoco.scene import TactileScene
 from twin.errors import OptionError
 from twin.types import FloatArray, ImageArray
 
 PERIOD_S = 0.05
 """Time between two decisions."""
+CHANGES = 10.0
+"""Factor by which changes of touch are observed."""
 Touch = Literal["pins", "wrench", "none"]
 TOUCHES: tuple[str, ...] = get_args(Touch)
 
@@ -27,7 +30,8 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
     sensor : str
         Name or file.
     observation : {"pins", "wrench", "none"}
-        Touch: displacements of both sensors' pins in spacings (2, N, 2), the wrenches on the object (2, 6) in N and 10 N mm, or nothing.
+        Touch: displacements of both sensors' pins in spacings (2, 2, N, 2), the wrenches on the object (2, 2, 6) in N and 10 N mm, or
+        nothing. The second half is ``CHANGES`` times their change since the last decision.
     render_mode : {None, "rgb_array"}
         ``render`` then shows the scene.
 
@@ -43,6 +47,7 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
     """The scene, and the geom that the sensors touch."""
     shape: ClassVar[tuple[int, int]]
     """Numbers of values of the state and of an action."""
+    timestep_s: ClassVar[float] = 0.002
 
     def __init__(self, sensor: str = "mg400-331", observation: Touch = "pins", render_mode: str | None = None) -> None:
         if observation not in TOUCHES:
@@ -52,6 +57,7 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         self.observation, self.render_mode = observation, render_mode
         spec, sensors = load_scene(self.world, load_sensor(sensor))
         self._model = spec.compile()
+        self._model.opt.timestep = self.timestep_s
         self.scene = TactileScene(self._model, sensors, touchable=[self.held])
         self._geom = self._model.geom(self.held).id
         self._object = int(self._model.geom_bodyid[self._geom])
@@ -59,35 +65,40 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         self._rest_px = [self.scene.read(site).pins_px for site in sensors]
         self._spacing = float(np.median(np.linalg.norm(np.diff(self._rest_px[0], axis=0), axis=1)))
         self._renderer: mujoco.Renderer | None = None
-        shapes = {"pins": (2, *self._rest_px[0].shape), "wrench": (2, 6)}
+        shapes = {"pins": (2, 2, *self._rest_px[0].shape), "wrench": (2, 2, 6)}
         box: dict[str, spaces.Space[Any]] = {"state": spaces.Box(-10.0, 10.0, self.shape[:1], np.float32)}
         if observation in shapes:
             box["tactile"] = spaces.Box(-10.0, 10.0, shapes[observation], np.float32)
         self.observation_space = cast(spaces.Space[dict[str, FloatArray]], spaces.Dict(box))
         self.action_space = spaces.Box(-1.0, 1.0, self.shape[1:], np.float32)
 
-    def readings(self) -> list[TactileReading]:
-        """The contacts of both sensors."""
-        return [self.scene.read(site) for site in self.scene.sensors]
-
     def begin(self, fingers_mm: float) -> None:
         """Set the model to its start, with the fingers closed so far."""
         mujoco.mj_resetData(self._model, self.scene.data)
+        self._touch: FloatArray | None = None
         for finger in ("left", "right"):
             self.scene.data.joint(finger).qpos[0] = fingers_mm / 1e3
         self.scene.data.ctrl[-1] = fingers_mm / 1e3
 
-    def settle(self, seconds: float = PERIOD_S) -> None:
-        """Let time pass."""
-        self.scene.step(round(seconds / self._model.opt.timestep))
+    def settle(self, seconds: float = PERIOD_S, targets: Sequence[float] | None = None) -> None:
+        """Let time pass, in which the actuators' targets change evenly to new ones, and feel."""
+        ctrl, steps = self.scene.data.ctrl, round(seconds / self._model.opt.timestep)
+        for row in np.linspace(ctrl, ctrl if targets is None else targets, steps + 1)[1:]:
+            ctrl[:] = row
+            self.scene.step()
+        self.felt = [self.scene.read(site) for site in self.scene.sensors]
+        if self.observation == "pins":
+            touch = np.stack([of.pins_px - rest for of, rest in zip(self.felt, self._rest_px, strict=True)]) / self._spacing
+        else:
+            touch = np.stack([np.concatenate([of.force_n, of.torque_nmm / 10.0]) for of in self.felt])
+        before = touch if self._touch is None else self._touch[0]
+        self._touch = np.stack([touch, CHANGES * (touch - before)])
 
     def look(self, state: list[float]) -> dict[str, FloatArray]:
         """The observation: ``state`` and touch."""
         seen: dict[str, FloatArray] = {"state": np.array(state)}
-        if self.observation == "pins":
-            seen["tactile"] = np.stack([of.pins_px - rest for of, rest in zip(self.readings(), self._rest_px, strict=True)]) / self._spacing
-        elif self.observation == "wrench":
-            seen["tactile"] = np.stack([np.concatenate([of.force_n, of.torque_nmm / 10.0]) for of in self.readings()])
+        if self.observation != "none" and self._touch is not None:
+            seen["tactile"] = self._touch
         return {name: np.clip(values, -10.0, 10.0).astype(np.float32) for name, values in seen.items()}
 
     def render(self) -> ImageArray | None:

@@ -84,7 +84,7 @@ class UrKinematics(StageKinematics):
             q6 = np.arctan2(-side @ T[:3, 1] / np.sin(q5), side @ T[:3, 0] / np.sin(q5))
         T_14 = np.linalg.inv(_link(q1, d1, 0, TWISTS[0])) @ T @ np.linalg.inv(_link(q5, d5, 0, TWISTS[4]) @ _link(q6, d6, 0, 0.0))
         x, y = (T_14 @ [0.0, -d4, 0.0, 1.0])[:2]
-        q3 = np.copysign(self._arccos((x**2 + y**2 - a2**2 - a3**2) / (2 * a2 * a3), pose), near[2])
+        q3 = np.copysign(self._arccos((x**2 + y**2 - a2**2 - a3**2) / (2 * a2 * a3), pose), np.sin(near[2]))
         q2 = np.arctan2(y, x) - np.arctan2(a3 * np.sin(q3), a2 + a3 * np.cos(q3))
         q4 = np.arctan2(T_14[1, 0], T_14[0, 0]) - q2 - q3
         joints = np.degrees(near + _turn(np.array([q1, q2, q3, q4, q5, q6]) - near))

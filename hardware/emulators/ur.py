@@ -14,7 +14,6 @@ import struct
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from threading import Event, Lock, Thread
 from typing import Any
 
@@ -59,7 +58,6 @@ FAULTS = {
     "emergency-stop": Fault("the emergency stop is pressed, this many seconds after the start", 0.0, SECONDS),
     "protective-stop": Fault("each move ends in a protective stop after this share of its time", 0.5, SHARE),
     "slider": Fault("the speed slider is at this share", 0.1, SHARE),
-    "stall": Fault("each move stops after this share of its time, without an error", 0.5, SHARE),
     "ignore-moves": Fault("moves are accepted and not executed"),
 }
 
@@ -71,6 +69,8 @@ class UrController:
     ----------
     inputs, outputs : dict of str to float
         The registers of RTDE.
+    watchdog_hz : float
+        Least rate of inputs, below which the control script ends; 0 if none is set.
     written_s : float
         ``time.monotonic()`` of the newest input.
     """
@@ -87,13 +87,13 @@ class UrController:
         self.robot_mode, self.safety_mode, self.runtime_state = RUNNING, NORMAL, STOPPED
         self._started_s = self._cycled_s = self.written_s = time.monotonic()
         self._program: Iterator[None] | None = None
-        self._watchdog_hz = self._locked_until_s = 0.0
-        self._ends: tuple[float, Callable[[], None]] = (np.inf, self.end_program)  # when and how a fault ends the present move
+        self.watchdog_hz = self._locked_until_s = 0.0
+        self._collides_s = np.inf  # when a fault ends the present move
 
     @property
     def enabled(self) -> bool:
         """Whether the control script runs under its watchdog."""
-        return self.runtime_state == PLAYING and self._watchdog_hz > 0
+        return self.runtime_state == PLAYING and self.watchdog_hz > 0
 
     def busy(self) -> bool:
         """Whether the arm moves."""
@@ -103,11 +103,11 @@ class UrController:
         """Go on to the present time; returns the values of RTDE's variables, of which those that are missing are 0."""
         with self.lock:
             now_s = time.monotonic()
-            if now_s >= self._ends[0]:
-                self._ends[1]()
-                self._ends = (np.inf, self.end_program)
+            if now_s >= self._collides_s:
+                self._collides_s = np.inf
+                self.protective_stop()
             if self.runtime_state == PLAYING and self._program is not None:
-                starves = self.enabled and now_s - self.written_s > 1 / self._watchdog_hz
+                starves = self.enabled and now_s - self.written_s > 1 / self.watchdog_hz
                 if starves or next(self._program, self) is self:
                     self.end_program()
             joints = self.track.joints_deg(now_s)
@@ -131,7 +131,7 @@ class UrController:
     def end_program(self) -> None:
         """End the script; the arm stops."""
         self.track.stop(time.monotonic())
-        self.runtime_state, self._program, self._watchdog_hz = STOPPED, None, 0.0
+        self.runtime_state, self._program, self.watchdog_hz = STOPPED, None, 0.0
 
     def press_emergency_stop(self) -> None:
         """Press the emergency stop, which cuts the power."""
@@ -198,15 +198,7 @@ class UrController:
         if isinstance(piece, Violation):
             self.end_program()
             return
-        for fault, act in (("stall", lambda: self.track.stop(time.monotonic())), ("protective-stop", self.protective_stop)):
-            if (share := self.faults.value(fault)) is not None:
-                self._ends = (now_s + share * piece.duration_s, act)
-
-    def _set_watchdog(self) -> None:
-        self._watchdog_hz = self.inputs["input_double_register_0"]
-
-    def _stop(self) -> None:
-        self.track.stop(time.monotonic())
+        self._collides_s = now_s + (self.faults.value("protective-stop") or np.inf) * max(piece.duration_s, CYCLE_S)
 
 
 # The commands of the control script by their numbers: moveJ, moveL, triggerProtectiveStop, stopL, stopJ and setWatchdog.
@@ -214,39 +206,14 @@ COMMANDS: dict[int, Callable[[UrController], None]] = {
     1: lambda arm: arm._move(linear=False),
     3: lambda arm: arm._move(linear=True),
     31: UrController.protective_stop,
-    33: UrController._stop,
-    34: UrController._stop,
-    35: UrController._set_watchdog,
+    **dict.fromkeys((33, 34), lambda arm: arm.track.stop(time.monotonic())),
+    35: lambda arm: setattr(arm, "watchdog_hz", arm.inputs["input_double_register_0"]),
 }
 
 
 def type_of(name: str) -> str:
     """The type of an RTDE variable; NOT_FOUND if there is none of this name."""
     return next((kind for kind, names in NAMES.items() if re.fullmatch(names, name)), "NOT_FOUND")
-
-
-@dataclass(eq=False)
-class RtdeClient:
-    """A client on RTDE's port.
-
-    Attributes
-    ----------
-    outputs : list of str
-        Variables of a packet.
-    inputs : list of list of str
-        Registers of the packets that it sends, which are numbered from 1.
-    streams : bool
-        Whether it gets packets.
-    """
-
-    connection: socket.socket
-    outputs: list[str] = field(default_factory=list)
-    inputs: list[list[str]] = field(default_factory=list)
-    streams: bool = False
-
-    def send(self, kind: bytes, content: bytes) -> None:
-        """Send a package of a kind."""
-        self.connection.sendall(struct.pack(">H", 3 + len(content)) + kind + content)
 
 
 class UrEmulator(Emulator):
@@ -269,7 +236,8 @@ class UrEmulator(Emulator):
         self.arm = UrController(self.faults, time_scale)
         self.host = host or f"127.{random.randrange(1, 255)}.{random.randrange(256)}.{random.randrange(1, 255)}"
         self._servers: list[socketserver.ThreadingTCPServer] = []
-        self._clients: set[RtdeClient] = set()
+        self._streams: dict[socket.socket, list[str]] = {}  # the variables that each client gets
+        self._owner: socket.socket | None = None  # the client whose inputs the registers take
         self._connections: set[socket.socket] = set()
         self._ended = Event()
 
@@ -330,14 +298,12 @@ class UrEmulator(Emulator):
             due_s = max(due_s + CYCLE_S, time.monotonic())
             present = self.arm.cycle()
             values = values if "frozen-feedback" in self.faults else present
-            for client in self._clients.copy() if "silent" not in self.faults else ():
+            for connection, names in self._streams.copy().items() if "silent" not in self.faults else ():
                 content = b"\1"
-                for name in client.outputs if client.streams else ():
-                    layout = ">" + TYPES[type_of(name)]
+                for layout, name in ((">" + TYPES[type_of(name)], name) for name in names):
                     content += struct.pack(layout, *np.broadcast_to(values.get(name, 0), int(layout[1:-1] or 1)).tolist())
-                if client.streams:
-                    with contextlib.suppress(OSError):
-                        client.send(b"U", content)
+                with contextlib.suppress(OSError):
+                    _send(connection, b"U", content)
 
     def _serve_dashboard(self, connection: socket.socket) -> None:
         connection.sendall(b"Connected: Universal Robots Dashboard Server\n")
@@ -355,39 +321,48 @@ class UrEmulator(Emulator):
                     self.arm.run_script(script[1])
 
     def _serve_rtde(self, connection: socket.socket) -> None:
-        client, stream = RtdeClient(connection), connection.makefile("rb")
-        self._clients.add(client)
+        stream, outputs, recipes = connection.makefile("rb"), [""], [[""]]
         try:
             while header := stream.read(3):
                 size, kind = struct.unpack(">Hc", header)
                 content = stream.read(size - 3)
-                if "silent" not in self.faults:
-                    self._answer(client, kind, content)
+                if "silent" in self.faults:
+                    continue
+                answer = b"\1"  # to the protocol's version, start and pause
+                if kind == b"U":
+                    self._take(recipes[content[0]], content[1:])
+                    continue
+                if kind == b"v":
+                    answer = struct.pack(">4I", *VERSION)
+                elif kind in b"OI":
+                    names = content[8 if kind == b"O" else 0 :].decode().rstrip(",").split(",")
+                    types = [type_of(name) for name in names]
+                    if kind == b"O":
+                        outputs = names
+                    elif self._owner in (None, connection):
+                        self._owner = connection
+                        recipes.append(names)
+                    else:
+                        types = ["IN_USE"] * len(names)
+                    answer = bytes([len(recipes) - 1 or 1]) + ",".join(types).encode()
+                _send(connection, kind, answer)
+                if kind == b"S":
+                    self._streams[connection] = outputs
+                elif kind == b"P":
+                    self._streams.pop(connection, None)
         finally:
-            self._clients.discard(client)
+            self._streams.pop(connection, None)
+            self._owner = None if self._owner is connection else self._owner
 
-    def _answer(self, client: RtdeClient, kind: bytes, content: bytes) -> None:
-        if kind == b"U":
-            names = client.inputs[content[0] - 1]
-            layout = ">" + "".join(TYPES[type_of(name)] for name in names)
-            with self.arm.lock:
-                self.arm.inputs.update(zip(names, struct.unpack(layout, content[1:]), strict=False))
-                self.arm.written_s = time.monotonic()
-        elif kind == b"v":
-            client.send(kind, struct.pack(">4I", *VERSION))
-        elif kind in b"OI":
-            names = content[8 if kind == b"O" else 0 :].decode().rstrip(",").split(",")
-            types = [type_of(name) for name in names]
-            if kind == b"O":
-                client.outputs = names
-            elif any("input_int_register_0" in one for other in self._clients - {client} for one in other.inputs):
-                types = ["IN_USE"] * len(names)  # by another program
-            else:
-                client.inputs.append(names)
-            client.send(kind, bytes([len(client.inputs) or 1]) + ",".join(types).encode())
-        else:  # the protocol's version, start and pause
-            client.streams = kind == b"S"
-            client.send(kind, b"\1")
+    def _take(self, names: list[str], content: bytes) -> None:
+        numbers = struct.unpack(">" + "".join(TYPES[type_of(name)] for name in names), content)
+        with self.arm.lock:
+            self.arm.inputs.update(zip(names, numbers, strict=False))
+            self.arm.written_s = time.monotonic()
+
+
+def _send(connection: socket.socket, kind: bytes, content: bytes) -> None:
+    connection.sendall(struct.pack(">H", 3 + len(content)) + kind + content)
 
 
 class _Server(socketserver.ThreadingTCPServer):

@@ -6,6 +6,7 @@ watchdog does that. The program imports the standard library and ``ur_rtde`` onl
 """
 
 import contextlib
+import faulthandler
 import json
 import os
 import queue
@@ -49,10 +50,7 @@ class ClientProcess:
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
         self._process = subprocess.Popen([sys.executable, "-P", __file__, host, str(os.getpid())], **pipes)  # type: ignore[call-overload]
         threading.Thread(target=self._read, name="ur client", daemon=True).start()
-        try:
-            self._answer(CONNECT_S)
-        except RuntimeError as error:
-            raise ConnectionError(str(error)) from error
+        self._answer(CONNECT_S)
 
     @property
     def is_alive(self) -> bool:
@@ -117,34 +115,28 @@ def run_clients(host: str, program: int) -> None:
     def read() -> None:
         for line in sys.stdin:
             requests.put(json.loads(line))
-        requests.put([])
+        requests.put([None])
 
-    try:
-        receive = import_module("rtde_receive").RTDEReceiveInterface(host, FEEDBACK_HZ)
-        dashboard = import_module("dashboard_client").DashboardClient(host)
-        dashboard.connect()
-    except Exception as error:
-        return send(str(error))
+    receive = import_module("rtde_receive").RTDEReceiveInterface(host, FEEDBACK_HZ)
+    dashboard = import_module("dashboard_client").DashboardClient(host)
+    dashboard.connect()
     send([None])
     threading.Thread(target=read, daemon=True).start()
     threading.Thread(target=_send_feedback, args=(receive, send), daemon=True).start()
     while receive.isConnected() and os.getppid() == program:  # the input does not end with a program that has forked
         try:
-            request = requests.get(timeout=KICK_S)
-        except queue.Empty:
-            if control is not None:
-                control.kickWatchdog()
-            continue
-        if not request:
-            break
-        method, *arguments = request
-        try:
+            method, *arguments = requests.get(timeout=KICK_S)
+            if method is None:  # the end of the input
+                break
             if method == "enable":
                 control = _run_control_program(host, control)
             send([method == "enable" or (getattr(control, method, None) or getattr(dashboard, method))(*arguments)])
+        except queue.Empty:
+            if control is not None:
+                control.kickWatchdog()
         except Exception as error:
             send(str(error))
-    if control is not None:
+    if control is not None and receive.isConnected():
         control.stopScript()
 
 
@@ -161,8 +153,7 @@ def _send_feedback(client: Any, send: Callable[[object], None]) -> None:
 
 def _run_control_program(host: str, control: Any) -> Any:
     """The client of the control program, which runs when this returns."""
-    if hasattr(signal, "alarm"):
-        signal.alarm(CONNECT_S)  # with a silent arm the constructor never returns, and perhaps nobody is left to end this process
+    faulthandler.dump_traceback_later(CONNECT_S, exit=True)  # with a silent arm it never returns, and perhaps nobody is left to end it
     if control is None:
         control = import_module("rtde_control").RTDEControlInterface(host)
     else:
@@ -171,8 +162,7 @@ def _run_control_program(host: str, control: Any) -> Any:
             time.sleep(LOOK_S)
     if not control.setWatchdog(WATCHDOG_HZ):
         raise RuntimeError("its control program does not answer")
-    if hasattr(signal, "alarm"):
-        signal.alarm(0)
+    faulthandler.cancel_dump_traceback_later()
     return control
 
 

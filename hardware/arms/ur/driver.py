@@ -28,10 +28,8 @@ SAFETY = {
     PROTECTIVE: "protective stop; free the arm and look for the cause, then call clear_error() and enable()",
     4: "recovery mode; leave it at the teach pendant",
     5: "safeguard stop; close the safeguard",
-    6: "emergency stop of the system; release it",
-    EMERGENCY: "emergency stop; release it at the robot",
-    8: "safety violation; restart the robot",
-    9: "fault; restart the robot",
+    **dict.fromkeys((6, EMERGENCY), "emergency stop; release it at the robot"),
+    **dict.fromkeys((8, 9), "safety violation or fault; restart the robot"),
 }
 ENDED = "its control program was ended by its watchdog, by a limit, at the teach pendant or by another program; call enable()"
 # Longest waits, s: for power and brakes; for the release of a protective stop, which is possible after 5 s; for a reply; for the reply to
@@ -62,7 +60,7 @@ class UR(BaseArm):
     def __init__(self, host: str) -> None:
         self.name, self._host = f"UR at {host}", host
         self.kinematics = UrKinematics()
-        self._client: ClientProcess | None = None  # from connect to disconnect, even if the connection is lost in between
+        self._client: Any = None  # a ``ClientProcess`` from connect to disconnect, even if the connection is lost in between
         self._speeds, self._slider = SPEEDS, 1.0
         self._enabled = self._under_way = False  # whether this driver has enabled it, and has sent a move since it stood
 
@@ -75,7 +73,7 @@ class UR(BaseArm):
         if importlib.util.find_spec("rtde_control") is None:
             raise ExtraError("this needs ur_rtde, which is not installed: pip install 'tactip-twin[ur]'")
         self._close()  # remains of a lost connection
-        remedy = "check the address and the cable, or start 'twin emulate ur'"
+        remedy = "check the address, the cable, and that RTDE and dashboard are switched on, or start 'twin emulate ur'"
         with ErrorsAs(ConnectionError, lambda error: DeviceNotConnectedError(f"{self.name}: can't connect ({error}); {remedy}")):
             self._client = ClientProcess(self._host)
         try:
@@ -112,7 +110,7 @@ class UR(BaseArm):
 
     def disable(self) -> None:
         self._require_in_use()
-        if self._enabled and (not self.is_connected or self._newest()["RuntimeState"] in (PLAYING, PAUSED)):
+        if self._enabled and self._client.feedback["RuntimeState"] != STOPPED:
             self._halt("stop", lambda packet: packet["RuntimeState"] == STOPPED and not _moves(packet))
         self._enabled = False
 
@@ -200,20 +198,17 @@ class UR(BaseArm):
         self._unstopped = self._under_way = False
 
     def _ask(self, method: str, *arguments: Any, timeout_s: float = REPLY_S) -> Any:
-        assert self._client is not None
-        with (
-            ErrorsAs(ConnectionError, lambda error: DeviceNotConnectedError(f"{self.name}: {method}: {error}; call connect()")),
-            ErrorsAs(RuntimeError, lambda error: DeviceError(f"{self.name}: {method}: {error}")),
-        ):
+        lost = lambda error: DeviceNotConnectedError(f"{self.name}: {method}: {error}; call connect()")  # noqa: E731
+        with ErrorsAs(ConnectionError, lost), ErrorsAs(RuntimeError, lambda error: DeviceError(f"{self.name}: {method}: {error}")):
             return self._client.ask(method, *arguments, timeout_s=timeout_s)
 
     def _newest(self, max_age_s: float = FEEDBACK_AGE_S) -> dict[str, Any]:
         asked_s = time.monotonic()
         while True:
             self._require_connected()
-            packet = self._client.feedback if self._client is not None else {}
-            if (age_s := (now_s := time.monotonic()) - packet["time_s"]) <= max_age_s:
-                return packet
+            packet, now_s = self._client.feedback, time.monotonic()
+            if (age_s := now_s - packet["time_s"]) <= max_age_s:
+                return dict(packet)
             if now_s - asked_s > READ_S:
                 raise StaleDataError(f"{self.name}: newest feedback is {age_s:.2f} s old (allowed {max_age_s:g} s); connect() again")
             time.sleep(POLL_S)
@@ -222,7 +217,7 @@ class UR(BaseArm):
         """Whether feedback newer than this call shows something in time."""
         asked_s = time.monotonic()
         while self.is_connected and time.monotonic() - asked_s < within_s:
-            packet = self._client.feedback if self._client is not None else {}
+            packet = self._client.feedback
             if packet.get("time_s", 0.0) > asked_s and obeyed(packet):
                 return True
             time.sleep(POLL_S)

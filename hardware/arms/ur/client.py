@@ -47,7 +47,7 @@ class ClientProcess:
         self.feedback: dict[str, Any] = {}
         self._answers: queue.Queue[Any] = queue.Queue()
         self._lock = threading.Lock()
-        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "start_new_session": True}
         self._process = subprocess.Popen([sys.executable, "-P", __file__, host, str(os.getpid())], **pipes)  # type: ignore[call-overload]
         threading.Thread(target=self._read, name="ur client", daemon=True).start()
         self._answer(CONNECT_S)

@@ -71,7 +71,7 @@ class UR(BaseArm):
     def connect(self) -> None:
         self._require_disconnected()
         if importlib.util.find_spec("rtde_control") is None:
-            raise ExtraError("this needs ur_rtde, which is not installed: pip install 'tactip-twin[ur]'")
+            raise ExtraError("this needs ur_rtde, which is not installed: pip install 'tactip-twin[ur]', or ur_rtde alone")
         self._close()  # remains of a lost connection
         remedy = "check the address, the cable, and that RTDE and dashboard are switched on, or start 'twin emulate ur'"
         with ErrorsAs(ConnectionError, lambda error: DeviceNotConnectedError(f"{self.name}: can't connect ({error}); {remedy}")):

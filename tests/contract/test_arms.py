@@ -1,4 +1,4 @@
-"""One contract for every arm: simulated, MG400 over TCP, Magician over a pseudo-terminal."""
+"""One contract for every arm: simulated, MG400 over TCP, Magician over a pseudo-terminal, UR through its client package."""
 
 import time
 
@@ -48,6 +48,10 @@ class TestMg400WithOldFirmware(OfBench):
 
 class TestMagician(OfBench):
     kind = "magician"
+
+
+class TestUr(OfBench):
+    kind = "ur"
 
 
 @pytest.fixture(params=ARMS)

@@ -8,10 +8,12 @@ import numpy as np
 from hardware.arms.magician import Magician
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.simulated import SimulatedArm
+from hardware.arms.ur.driver import UR
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
+from hardware.emulators.ur import UrEmulator
 
-ARMS = ("simulated-6", "simulated-4", "mg400", "mg400-old", "magician")
+ARMS = ("simulated-6", "simulated-4", "mg400", "mg400-old", "magician", "ur")
 
 
 @dataclass
@@ -41,6 +43,10 @@ def bench(kind: str, *, faults: tuple[str, ...] = (), time_scale: float = 4.0):
             emulator = stack.enter_context(Mg400Emulator(port_offset=None, faults=faults, firmware=firmware, time_scale=time_scale))
             arm = mg400_of(emulator)
             yield Bench(arm, np.array([300.0, 0, 0, 0, 0, 10]), emulator, emulator.pose)
+        elif kind == "ur":
+            emulator = stack.enter_context(UrEmulator(host=None, faults=faults, time_scale=time_scale))
+            arm = UR(emulator.host)
+            yield Bench(arm, np.array([100.0, -500, 200, 0, 0, -160]), emulator, emulator.pose)
         else:
             emulator = stack.enter_context(MagicianEmulator(faults=faults, time_scale=time_scale))
             arm = Magician(emulator.device)

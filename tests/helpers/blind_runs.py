@@ -23,12 +23,14 @@ from true_estimator import TrueEstimator
 
 from hardware.arms.magician import Magician
 from hardware.arms.mg400 import MG400, Mg400Ports
+from hardware.arms.ur.driver import UR
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import DevicePicture
 from hardware.collect.collect import Collection, collect
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
+from hardware.emulators.ur import UrEmulator
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, shift_in_tool
 from hardware.safety.decide import SafetyLimits
@@ -56,7 +58,8 @@ ARM_FAULTS = {
 }
 # A Magician sends nothing unasked, so that its feedback and its replies are the same, and a reply that comes 2 s late is lost.
 SERIAL_FAULTS = {"feedback dead": ("mute",), "feedback garbled": ("wrong-checksum=1",)}
-KINDS = {"mg400": ("surface", ARM_FAULTS), "magician": ("magician", SERIAL_FAULTS)}
+UR_FAULTS = {"feedback dead": ("silent",), "feedback frozen": ("frozen-feedback",), "replies lost": ("no-replies",), "link lost": ()}
+KINDS = {"mg400": ("surface", ARM_FAULTS), "magician": ("magician", SERIAL_FAULTS), "ur": ("ur5", UR_FAULTS)}
 KILLED, HEALTHY = "program killed", "healthy"
 FAULTS = (*CAMERA_FAULTS, *ARM_FAULTS, KILLED)
 PHASES = ("standing", "approach", "near", "contact")
@@ -158,7 +161,10 @@ def program(
 ) -> Callable[[], None]:
     """What runs the command with an arm at its ports or at its serial line."""
     placed, servo = placed_can(kind), load_servo(KINDS[kind][0]).model_copy(update={"clear_mm": CLEAR_MM})
-    device = Magician(place) if kind == "magician" else MG400("127.0.0.1", ports=Mg400Ports(place[0], place[1], tuple(place[2:])))
+    if kind == "mg400":
+        device = MG400("127.0.0.1", ports=Mg400Ports(place[0], place[1], tuple(place[2:])))
+    else:
+        device = UR(place) if kind == "ur" else Magician(place)
     arm = SafeArm(device, SafetyLimits(box_mm=((-2000, 2000),) * 3))
     source = MjpegCamera(url, load_sensor("mg400-331"), Form.RAW)
 
@@ -193,11 +199,15 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
     start = placed.start_pose(-CLEAR_MM - 10.0)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        emulator = stack.enter_context(MagicianEmulator() if kind == "magician" else Mg400Emulator(port_offset=None))
+        makes = {"magician": MagicianEmulator, "mg400": partial(Mg400Emulator, port_offset=None), "ur": partial(UrEmulator, host=None)}
+        emulator = stack.enter_context(makes[kind]())
         kinematics = emulator.arm.kinematics
         emulator.arm.track.__init__(kinematics, kinematics.inverse(kinematics.nearest_pose(start)))
         camera = stack.enter_context(CameraEmulator(DomeCamera()))
-        place = emulator.device if kind == "magician" else tuple(emulator.ports[port] for port in (29999, 30003, 30004, 30005))
+        if kind == "mg400":
+            place = tuple(emulator.ports[port] for port in (29999, 30003, 30004, 30005))
+        else:
+            place = emulator.host if kind == "ur" else emulator.device
         stops: list[float] = []
         stop = emulator.arm.track.stop
 
@@ -236,7 +246,7 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
         elif fault != HEALTHY:
             kinds = (CAMERA_FAULTS | KINDS[kind][1])[fault]
             device = camera if fault in CAMERA_FAULTS else emulator
-            device.faults.add(kinds[rng.randrange(len(kinds))])
+            device.faults.add(kinds[rng.randrange(len(kinds))]) if kinds else emulator.unplug()
         fault_s = time.monotonic()
         done.wait(30.0)
         time.sleep(1.2 if process is not None else 0.1)
@@ -299,7 +309,7 @@ def _judged(emulator, placed, fault_s: float, stops: list[float]) -> tuple[float
 def table(runs: list[Run]) -> str:
     """The worst of each fault and phase, in Markdown."""
     lines = ["| fault | phase | runs | detected, s | stands, s | towards, mm | pressed, mm | wrong |", "| --- " * 8 + "|"]
-    for fault in FAULTS:
+    for fault in dict.fromkeys((*FAULTS, *(run.fault for run in runs))):
         for phase in PHASES:
             some = [run for run in runs if (run.fault, run.phase) == (fault, phase)]
             if some:

@@ -395,6 +395,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--time-scale": "0 -1 nan inf",
     },
     "emulate magician": {"--link": "{frames}/f_0.png /proc/nowhere", "--fault": "nonsense", "--time-scale": "0 -1 nan inf"},
+    "emulate ur": {"--host": "999.1.1.1 nowhere.invalid", "--fault": "nonsense", "--time-scale": "0 -1 nan inf"},
     f"emulate camera {S} --object plane": {
         "--arm": "nowhere mg400:127.0.0.1:1",
         "--arm mg400:127.0.0.1:1 --fps": "0 nan",
@@ -461,7 +462,20 @@ def _numbers() -> list[Entry]:
 
 EVERY = (
     *("audit", "calibrate contact", "calibrate optics", "check", "collect", "convert", "dataset", "demo", "doctor", "emulate camera"),
-    *("emulate magician", "emulate mg400", "evaluate", "experiments", "graph", "live", "new", "objects", "pack", "predict", "preprocess"),
+    *(
+        "emulate magician",
+        "emulate mg400",
+        "emulate ur",
+        "evaluate",
+        "experiments",
+        "graph",
+        "live",
+        "new",
+        "objects",
+        "pack",
+        "predict",
+        "preprocess",
+    ),
     *(
         "randomisations",
         "realism",

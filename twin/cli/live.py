@@ -39,10 +39,11 @@ Record = Annotated[bool, typer.Option("--record", help="keep every frame and ste
 NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")]
 KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stands exactly at --servo: measure errors against it")]
 ArmOption = Annotated[
-    str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT")
+    str,
+    typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT, ur:ADDRESS"),
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, without motion")]
-Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, or a TOML file"), Formerly("limits")]
+Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, ur, or a TOML file"), Formerly("limits")]
 Ros2 = Annotated[
     str | None, typer.Option("--ros2", metavar="NAME", help="publish frames, pins and estimates as ROS 2 topics /NAME/..., such as tactip")
 ]
@@ -347,6 +348,29 @@ def magician(
     from hardware.emulators.running import emulate_magician
 
     call(emulate_magician, locals(), faults=faults_of(fault, FAULTS))
+
+
+@emulate.command("ur")
+def ur(
+    host: Annotated[
+        str, typer.Option(help="address to listen on; a second emulated UR needs another one, such as 127.0.0.2")
+    ] = "127.0.0.1",
+    fault: FaultOption = None,
+    time_scale: TimeScale = 1.0,
+) -> None:
+    """Emulate a Universal Robots UR5, as far as ur_rtde uses it.
+
+    The ports are 29999 (dashboard), 30003 (script) and 30004 (RTDE).
+
+    In Python: open_arm("ur:127.0.0.1").
+
+    \b
+    Example:
+      twin emulate ur
+    """
+    from hardware.emulators.ur import FAULTS, emulate_ur
+
+    call(emulate_ur, locals(), faults=faults_of(fault, FAULTS))
 
 
 @emulate.command("camera")

@@ -292,8 +292,7 @@ class PoseEstimator:
         return RestSeeker(self) if self.counts_from_rest else self
 
     def with_intervals(self, intervals: Mapping[str, np.ndarray]) -> "PoseEstimator":
-        """The same model with other interval quantiles, as ``training.studies.judging.intervals_on`` finds them for one kind of its
-        frames."""
+        """The same model with other interval quantiles: those of one kind of its frames."""
         found = copy(self)
         found.ensemble = copy(self.ensemble)
         for name, values in intervals.items():

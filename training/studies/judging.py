@@ -21,7 +21,6 @@ from training.data.targets import ANGLE, DEPTH, TURN, Targets, limits_of
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
-from training.runs.assemble import conformal_quantile
 from training.runs.identity import rows_named
 from twin.estimate import readable_labels
 from twin.frames import open_recording
@@ -101,20 +100,6 @@ def measure_errors(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
     known = np.isfinite(targets.executed) & np.isfinite(made.executed) & (np.abs(targets.move).max(axis=1) > LARGE_MOVE)
     if known.any():
         found["executed_agreement"] = float(((made.executed > 0.5) == (targets.executed > 0.5))[known].mean())
-    return found
-
-
-def intervals_on(run: Path, data: Dataset, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Interval quantiles of a finished run, by their names in ``weights.pt``, that contain 90 % of the labels of some rows.
-
-    Give rows from which the run did not learn. ``widen_intervals`` stores the quantiles.
-    """
-    estimator = PoseEstimator.load(run)
-    made, targets = estimator.predict_rows(data, rows), data.targets.rows(rows)
-    found = {}
-    for name, key, half_width in (("quantile", estimator.config["labels"], made.half_width), ("raw_quantile", "raw", made.half_width_raw)):
-        ratio = np.abs(label_error(made.mean, getattr(targets, key), targets.units)) / half_width
-        found[name] = getattr(estimator.ensemble, name) * conformal_quantile(ratio)
     return found
 
 

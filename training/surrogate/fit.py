@@ -192,24 +192,16 @@ def require_dome(sensor: SensorSpec) -> None:
         raise OptionError(f"{sensor.name}: its gel is sealed, which a surrogate does not model; use backend='fem'")
 
 
-def fit(
-    sensor: SensorSpec,
-    solved: Sequence[SolvedPath],
-    *,
-    extra: Sequence[SolvedPath] = (),
-    start: Surrogate | None = None,
-    progress: Any = lambda *_: None,
-) -> Surrogate:
+def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], *, start: Surrogate | None = None, progress: Any = lambda *_: None) -> Surrogate:
     """Fit a surrogate to solved paths of the sensor's lattice.
 
-    Every fifth path of ``solved`` is used only to measure the errors; all paths of ``extra`` are trained on. ``start`` is a surrogate of a
-    sensor whose pins are the lattice. If it is given, its modes are used and the training continues from its networks: the corrections of
-    sensors of one family are similar.
+    Every fifth path of ``solved`` is used only to measure the errors. ``start`` is a surrogate of a sensor whose pins are the lattice. If it
+    is given, its modes are used and the training continues from its networks: the corrections of sensors of one family are similar.
     """
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    solved, extra = ([cut(path, sensor.skin.outer_radius_mm) for path in paths] for paths in (solved, extra))
-    seen = [path for number, path in enumerate(solved) if number % JUDGED] + list(extra)
+    solved = [cut(path, sensor.skin.outer_radius_mm) for path in solved]
+    seen = [path for number, path in enumerate(solved) if number % JUDGED]
     kept = [path for number, path in enumerate(solved) if not number % JUDGED]
     skin = compliance_of(lattice_sensor(sensor))
     answer = average_compliance(skin.nodes, sensor.pins.phase_deg)
@@ -267,22 +259,12 @@ def fit(
         "sensor": sensor.name,
         "mechanics": mechanics_of(sensor),
         "domain": {"depth_mm": DEEPEST_TAKEN_MM, "polar_deg": POLAR_DEG, "friction": STICKING},
-        "paths": len(solved) + len(extra),
-        "states": int(sum(len(path.T) for path in (*solved, *extra))),
+        "paths": len(solved),
+        "states": int(sum(len(path.T) for path in solved)),
     }
-    made = Surrogate(
-        about,
-        skin.node_mm,
-        answer.astype(np.float32),
-        on_pins.astype(np.float32),
-        read.astype(np.float32),
-        view,
-        bending,
-        mean,
-        scale,
-        layers,
-        out_scale,
-    ).as_kept()  # so that the errors are those of the file, which rounds the arrays
+    single = (values.astype(np.float32) for values in (answer, on_pins, read))
+    made = Surrogate(about, skin.node_mm, *single, view, bending, mean, scale, layers, out_scale)
+    made = made.as_kept()  # so that the errors are those of the file, which rounds the arrays
     about["errors"] = measure_errors(made, sensor, kept)
     return made
 

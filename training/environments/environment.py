@@ -135,26 +135,11 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
             print(f"open {self._page.url} in a browser: it shows the episode", file=sys.stderr, flush=True)
         T = batch.tool.object_poses(batch.T_work, batch.T_object)[0]
         place_mm, felt = batch.touch().place_mm[0], batch.backend.felt
-        shown = {
-            "goal": ", ".join(
-                _in_units(name, value) for name, value in zip(batch.task.goal_names, batch.goals_for_agents()[0].tolist(), strict=True)
-            ),
-            "contact area, slipping": f"{felt.area_mm2[0]:.0f} mm2, {100 * felt.slip[0]:.0f} %",
-            "not computed": felt.lost[0],
-        }
-        self._page.show(
-            EpisodeStep(
-                int(batch.steps_done[0]),
-                frame,
-                batch.backend.attitude(0),
-                contact.obj,
-                T,
-                felt.force_n[0].copy(),
-                T[:3, :3] @ place_mm + T[:3, 3],
-                reward,
-                {name: text for name, text in shown.items() if text},
-            )
-        )
+        goal = ", ".join(map(_in_units, batch.task.goal_names, batch.goals_for_agents()[0].tolist()))
+        area = f"{felt.area_mm2[0]:.0f} mm2, {100 * felt.slip[0]:.0f} %"
+        shown = {"goal": goal, "contact area, slipping": area, "not computed": felt.lost[0]}
+        seen = int(batch.steps_done[0]), frame, batch.backend.attitude(0), contact.obj, T, felt.force_n[0].copy()
+        self._page.show(EpisodeStep(*seen, T[:3, :3] @ place_mm + T[:3, 3], reward, {name: text for name, text in shown.items() if text}))
         time.sleep(max(0.0, self._shown_s + 1 / RENDER_FPS - time.monotonic()))
         self._shown_s = time.monotonic()
 

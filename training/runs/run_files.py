@@ -51,9 +51,8 @@ KERNELS = "kernels"  # the arrays of the Gaussian processes of the modes, one fo
 KERNEL_LABELS = "kernel_labels"  # the labels that these processes estimate
 BESIDE = "beside"  # the arrays of the Gaussian process that is averaged with the networks, in ``weights.pt``
 SHA256 = "weights_sha256"  # digest of the small copy's weights, in its configuration; older shipped copies have none
-RECORDINGS = (
-    "recordings"  # names of the folders from which the run learnt, in the small copy's configuration; ``rows`` has the number of frames
-)
+# Names of the folders from which the run learnt, in the small copy's configuration. ``rows`` has the number of frames.
+RECORDINGS = "recordings"
 NOT_PACKED = (KERNELS, KERNEL_LABELS, "parameters", "learnt_from")  # entries of ``weights.pt`` that are left out or packed in another form
 
 

@@ -142,10 +142,6 @@ class _Truths:
         pins = np.stack([g.move_vectors(pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
         return _Truths(g.move_vectors(self.moved, NODE_RINGS), g.move_vectors(self.force, NODE_RINGS), pins.reshape(len(pins), -1))
 
-    def some(self, first: int, every: int) -> "_Truths":
-        """Every ``every``-th state, from ``first`` on."""
-        return _Truths(self.moved[first::every], self.force[first::every], self.pins[first::every])
-
 
 @writes_file("out")
 def distil(
@@ -195,8 +191,8 @@ def require_dome(sensor: SensorSpec) -> None:
 def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], *, start: Surrogate | None = None, progress: Any = lambda *_: None) -> Surrogate:
     """Fit a surrogate to solved paths of the sensor's lattice.
 
-    Every fifth path of ``solved`` is used only to measure the errors. ``start`` is a surrogate of a sensor whose pins are the lattice. If it
-    is given, its modes are used and the training continues from its networks: the corrections of sensors of one family are similar.
+    Every fifth path of ``solved`` is used only to measure the errors. ``start`` is a surrogate of a sensor whose pins are the lattice. If
+    it is given, its modes are used and the training continues from its networks: the corrections of sensors of one family are similar.
     """
     torch.manual_seed(0)
     torch.set_num_threads(1)
@@ -215,9 +211,9 @@ def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], *, start: Surrogate | 
     answer, flat = softness * answer, softness * flat
     turned = [truths.turn(g) for g in group]
     if start is None:
-        some = [part.some(number, max(len(truths.force) * len(group) // MODE_STATES, 1)) for number, part in enumerate(turned)]
-        pins = np.concatenate([part.pins for part in some])
-        forces = np.concatenate([part.force.reshape(len(part.force), -1) for part in some])
+        every = max(len(truths.force) * len(group) // MODE_STATES, 1)
+        pins = np.concatenate([part.pins[first::every] for first, part in enumerate(turned)])
+        forces = np.concatenate([part.force[first::every] for first, part in enumerate(turned)]).reshape(len(pins), -1)
         modes = _main(np.concatenate([pins, 3 * (pins - forces @ flat.T)]), MODES)
     else:
         modes = _carry_modes(start, sensor, weights)
@@ -237,7 +233,7 @@ def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], *, start: Surrogate | 
         part = _turn_states(rows, g)
         seen_by = [part.force.reshape(len(part.force), -1) @ read.T, part.beside, part.within @ view.T]
         inputs.append(np.concatenate(seen_by, axis=1).astype(np.float32))
-        lacks = _pins_and_rest(part, flat)[1] @ modes.T
+        lacks = (part.pins.reshape(len(part.pins), -1) - part.force.reshape(len(part.force), -1) @ flat.T) @ modes.T
         others = np.column_stack([part.area / 100.0, part.slip])
         outputs.append(np.concatenate([lacks, part.wrench - part.linear, others], axis=1).astype(np.float32))
     x, y = np.concatenate(inputs), np.concatenate(outputs)
@@ -262,8 +258,8 @@ def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], *, start: Surrogate | 
         "paths": len(solved),
         "states": int(sum(len(path.T) for path in solved)),
     }
-    single = (values.astype(np.float32) for values in (answer, on_pins, read))
-    made = Surrogate(about, skin.node_mm, *single, view, bending, mean, scale, layers, out_scale)
+    answer, on_pins, read = (values.astype(np.float32) for values in (answer, on_pins, read))
+    made = Surrogate(about, skin.node_mm, answer, on_pins, read, view, bending, mean, scale, layers, out_scale)
     made = made.as_kept()  # so that the errors are those of the file, which rounds the arrays
     about["errors"] = measure_errors(made, sensor, kept)
     return made
@@ -343,12 +339,6 @@ def _carry_modes(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> F
     turn = about_z(np.radians(sensor.pins.phase_deg - start.phase_deg)).astype(np.float32)
     modes = (start.modes @ turn.T).transpose(0, 2, 1, 3) * weights
     return np.ascontiguousarray(modes.reshape(len(modes), -1))
-
-
-def _pins_and_rest(rows: _Samples, flat: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The pins' motion (S, 6 P), and its part that the linear skin's compliance (6 P, 3 M) does not explain."""
-    truth = rows.pins.reshape(len(rows.pins), -1)
-    return truth, truth - rows.force.reshape(len(rows.force), -1) @ flat.T
 
 
 def _truths(sensor: SensorSpec, solved: Sequence[SolvedPath], weights: FloatArray) -> _Truths:

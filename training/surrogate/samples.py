@@ -83,9 +83,9 @@ def solve_path(solver: SkinSolver, nodes: AtNodes, drawn: DrawnPath, *, step_mm:
             return None
     pins = (np.array([getattr(s, name) for s in states], np.float32) for name in ("base_mm", "axis"))
     wrench = (np.array([getattr(s, name) for s in states]) for name in ("force_n", "torque_nmm"))
-    rest = [(s.point_area_mm2.sum(), s.slip_share, nodes.moved_mm(s), nodes.force_n(s)) for s in states]
+    others = [(s.point_area_mm2.sum(), s.slip_share, nodes.moved_mm(s), nodes.force_n(s)) for s in states]
     T = np.array([s.T_sensor_object for s in states])
-    return SolvedPath(drawn.shape, drawn.friction, T, *pins, *wrench, *map(np.array, zip(*rest, strict=True)))
+    return SolvedPath(drawn.shape, drawn.friction, T, *pins, *wrench, *map(np.array, zip(*others, strict=True)))
 
 
 def solve_paths(sensor: SensorSpec, numbers: Sequence[int], *, processes: int, progress: Step) -> list[SolvedPath]:

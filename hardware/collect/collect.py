@@ -445,19 +445,8 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
         The frame without contact shows a contact, or not this sensor.
     """
     kept = KeptAlso(out, plan.also, plan.sensor)
-    rig = build_rig(
-        plan.sensor,
-        plan.obj,
-        plan.servo.placement,
-        plan.experiment,
-        camera=plan.camera,
-        arm=plan.arm,
-        form=plan.form,
-        limits=plan.limits,
-        seed=plan.sampling_seed,
-        plain_light=plan.plain_light,
-        at_once=True,
-    )
+    devices = {key: getattr(plan, key) for key in ("camera", "arm", "form", "limits", "plain_light")}
+    rig = build_rig(plan.sensor, plan.obj, plan.servo.placement, plan.experiment, **devices, seed=plan.sampling_seed, at_once=True)
     collection = Collection(out, _about(plan, rig), rig.source.form)
     before = collection.count
 
@@ -506,19 +495,11 @@ def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
 def _about(plan: CollectPlan, rig: Rig) -> dict[str, Any]:
     """Everything that the frames depend on. A collection is continued only if all of this is the same."""
     low, high = zip(*plan.experiment.ranges().values(), strict=True)
-    return {
-        "comments": f"collected: {plan.experiment.name}, {plan.sensor.name}, {plan.obj.name}",
-        "camera": without_secrets(plan.camera),
-        "arm": plan.arm,
-        "sensor": plan.sensor.name,
-        "form": str(rig.source.form),
-        "seed": plan.sampling_seed,
-        "experiment": plan.experiment.model_dump(mode="json"),
-        "placement": plan.servo.placement.model_dump(mode="json"),
-        "tap_move": plan.experiment.tap,
-        "poses_rng": [high[:6], low[:6]],
-        "moves_rng": [high[6:], low[6:]],
-        "linear_speed": plan.servo.linear_mm_s,
-        "angular_speed": plan.servo.angular_deg_s,
-        **({} if plan.design == "random" else {"design": plan.design}),  # left out for "random", so that older collections can be continued
-    }
+    about: dict[str, Any] = {"comments": f"collected: {plan.experiment.name}, {plan.sensor.name}, {plan.obj.name}"}
+    about |= {"camera": without_secrets(plan.camera), "arm": plan.arm, "sensor": plan.sensor.name, "form": str(rig.source.form)}
+    about |= {"seed": plan.sampling_seed, "experiment": plan.experiment.model_dump(mode="json")}
+    about |= {"placement": plan.servo.placement.model_dump(mode="json"), "tap_move": plan.experiment.tap}
+    about |= {"poses_rng": [high[:6], low[:6]], "moves_rng": [high[6:], low[6:]]}
+    about |= {"linear_speed": plan.servo.linear_mm_s, "angular_speed": plan.servo.angular_deg_s}
+    # left out for "random", so that older collections can be continued
+    return about | ({} if plan.design == "random" else {"design": plan.design})

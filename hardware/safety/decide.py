@@ -4,6 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -353,12 +354,7 @@ def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwr
     return (start + min(shares) * way, True) if shares else (target.copy(), False)
 
 
-def _refuse(code: DecisionCode, reason: str) -> Decision:
-    return Decision(Action.REFUSE, code, reason)
-
-
-def _hold(code: DecisionCode, reason: str) -> Decision:
-    return Decision(Action.HOLD, code, reason)
+_refuse, _hold = partial(Decision, Action.REFUSE), partial(Decision, Action.HOLD)
 
 
 def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed | None) -> Decision | None:

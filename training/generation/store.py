@@ -175,16 +175,9 @@ class Store:
         """Content of ``meta.json``, with the keys that recordings have."""
         experiment, recording = self.config.experiment, self.config.sensor.recording
         low, high = np.array(list(experiment.ranges().values())).T.tolist()
-        meta = {
-            "image_dir": self.config.image_folder,
-            "target_df_file": "targets.csv",
-            "tap_move": list(experiment.tap),
-            "poses_rng": [high[:6], low[:6]],
-            "moves_rng": [high[6:], low[6:]],
-            "num_poses": count,
-            "num_frames": 1,
-            "comments": f"simulated: {experiment.name}, {self.config.sensor.name}, {self.config.object.name}",
-        }
+        meta: dict[str, Any] = {"image_dir": self.config.image_folder, "target_df_file": "targets.csv", "tap_move": list(experiment.tap)}
+        meta |= {"poses_rng": [high[:6], low[:6]], "moves_rng": [high[6:], low[6:]], "num_poses": count, "num_frames": 1}
+        meta |= {"comments": f"simulated: {experiment.name}, {self.config.sensor.name}, {self.config.object.name}"}
         if recording and self.config.images == "processed":
             meta["threshold"] = [recording.threshold_block_px, recording.threshold_offset]
             meta["crop"] = list(recording.crop_px)

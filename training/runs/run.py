@@ -189,29 +189,16 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
     """The whole configuration as in ``config.json``; ``data`` are in order, and ``train`` (m,) are the training rows."""
     pins = data.pins
     kept_out = np.setdiff1d(np.arange(len(data)), train)
-    return {
-        "model": config.model,
-        "recipe": asdict(config.recipe),
-        "labels": config.labels,
-        "columns": list(data.targets.names),
-        "units": list(data.targets.units),
-        "helpers": list(config.helpers),
-        "seed": config.seed,
-        "split": config.split,
-        "size": config.size,
-        "rows": {"usable": len(data), "train": len(train)}
-        | identity_of(data, model_named(config.model))
-        | {"kept_out": list(dict.fromkeys(pins.image_name[kept_out].tolist()))},
-        "sensor": pins.sensor.model_dump(mode="json"),
-        "pipeline": {
-            "form": str(pins.form),
-            "graph": "voronoi",
-            "detection": blob_spec(pins.sensor.pipeline, pins.form).model_dump(mode="json"),
-        },
-        "data": ", ".join(map(str, data.folders)),
-        "problems": data.problems,
-        "code": fingerprint(__name__),
-    } | ({"labelled": dict(config.labelled)} if config.labelled else {})
+    rows = {"usable": len(data), "train": len(train)} | identity_of(data, model_named(config.model))
+    rows |= {"kept_out": list(dict.fromkeys(pins.image_name[kept_out].tolist()))}
+    detection = blob_spec(pins.sensor.pipeline, pins.form).model_dump(mode="json")
+    found: dict = {"model": config.model, "recipe": asdict(config.recipe), "labels": config.labels}
+    found |= {"columns": list(data.targets.names), "units": list(data.targets.units), "helpers": list(config.helpers)}
+    found |= {"seed": config.seed, "split": config.split, "size": config.size, "rows": rows}
+    found |= {"sensor": pins.sensor.model_dump(mode="json")}
+    found |= {"pipeline": {"form": str(pins.form), "graph": "voronoi", "detection": detection}}
+    found |= {"data": ", ".join(map(str, data.folders)), "problems": data.problems, "code": fingerprint(__name__)}
+    return found | ({"labelled": dict(config.labelled)} if config.labelled else {})
 
 
 def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: LabelCode) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:

@@ -113,17 +113,12 @@ def summary_of(audit: Audit, data: Dataset) -> dict:
     """The findings as numbers and lists of frame names."""
     names = data.pins.image_name
     lost = data.pins.lost.any(axis=1)
-    return {
-        "frames": len(data),
-        **({"not_told": audit.not_assessed} if audit.not_assessed else _moves(audit, data)),
-        "no_contact": names[audit.no_contact].tolist(),
-        "wrong_sign": names[audit.wrong_sign].tolist(),
-        "fit_no_story": names[audit.odd].tolist(),
-        "same_pins_as_an_earlier_frame": names[audit.duplicates != np.arange(len(names))].tolist(),
-        "frames_with_lost_pins": int(lost.sum()),
-        **({} if audit.not_assessed else {"depth_mm_per_mm_of_move_not_executed": audit.depth_per_move, "drift": audit.drift}),
-        "reader": data.problems,
-    }
+    listed = zip(LISTS, (audit.no_contact, audit.wrong_sign, audit.odd, audit.duplicates != np.arange(len(names))), strict=True)
+    found: dict[str, Any] = {"frames": len(data)} | ({"not_told": audit.not_assessed} if audit.not_assessed else _moves(audit, data))
+    found |= {key: names[those].tolist() for key, those in listed} | {"frames_with_lost_pins": int(lost.sum())}
+    if not audit.not_assessed:
+        found |= {"depth_mm_per_mm_of_move_not_executed": audit.depth_per_move, "drift": audit.drift}
+    return found | {"reader": data.problems}
 
 
 def _moves(audit: Audit, data: Dataset) -> dict:

@@ -189,7 +189,7 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
     """The whole configuration as in ``config.json``; ``data`` are in order, and ``train`` (m,) are the training rows."""
     pins = data.pins
     kept_out = np.setdiff1d(np.arange(len(data)), train)
-    rows = {"usable": len(data), "train": len(train)} | identity_of(data, model_named(config.model))
+    rows: dict = {"usable": len(data), "train": len(train)} | identity_of(data, model_named(config.model))
     rows |= {"kept_out": list(dict.fromkeys(pins.image_name[kept_out].tolist()))}
     detection = blob_spec(pins.sensor.pipeline, pins.form).model_dump(mode="json")
     found: dict = {"model": config.model, "recipe": asdict(config.recipe), "labels": config.labels}

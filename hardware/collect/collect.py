@@ -477,18 +477,13 @@ def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
     """Check the plan and report it. Of the contacts the next ``CHECKED_CONTACTS`` are checked."""
     work, near = WorkFrame(plan.experiment, rig.placed), rig.arm.state().pose
     pressed = np.array(plan.experiment.clear) + np.array(plan.experiment.tap)
-    contacts = [
-        draw_contact(plan.experiment, plan.sampling_seed, n, plan.design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))
-    ]
+    numbers = range(made, min(plan.count, made + CHECKED_CONTACTS))
+    contacts = [draw_contact(plan.experiment, plan.sampling_seed, number, plan.design) for number in numbers]
     planned = [work.base_pose(one.pose + pressed, near) for one in contacts]
     clear = work.base_pose(np.zeros(6), near, away_mm=CLEAR_MM)
     spent_s = (plan.count - made) * CONTACT_S
-    form = rig.source.form
-    at_rest = partial(measure_reference, plan.sensor, form)
-    lines = check_plan(
-        rig, Pipeline(plan.sensor, form), clear, planned, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s, at_rest=at_rest
-    )
-    for line in lines:
+    pipeline, at_rest = Pipeline(plan.sensor, rig.source.form), partial(measure_reference, plan.sensor, rig.source.form)
+    for line in check_plan(rig, pipeline, clear, planned, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s, at_rest=at_rest):
         LOGGER.warning("%s", line)
 
 

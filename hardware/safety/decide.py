@@ -286,11 +286,8 @@ def decide(
         return refused
     if kinematics is not None and (refused := _joints(pose, state.pose, limits, kinematics)):
         return refused
-    if shortened:
-        return Decision(
-            Action.MOVE, DecisionCode.STEP_SHORTENED, f"shortened to a step of {limits.step_mm} mm, {limits.step_deg} deg", pose
-        )
-    return Decision(Action.MOVE, DecisionCode.OK, "", pose)
+    why = f"shortened to a step of {limits.step_mm} mm, {limits.step_deg} deg" if shortened else ""
+    return Decision(Action.MOVE, DecisionCode.STEP_SHORTENED if shortened else DecisionCode.OK, why, pose)
 
 
 def clip(target: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics: Kinematics | None = None) -> np.ndarray:

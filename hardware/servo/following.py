@@ -329,7 +329,7 @@ def _say_turns(rig: Rig, servo: ServoSpec, wanted_mm: float) -> None:
 
 def _note_step(session: SessionWriter | None, step: Step, steps: int, record: StepRecord, frame: Frame, estimate: Estimate) -> None:
     if session is not None:
-        session.append(frame, record.plain())
+        session.append(frame, asdict(record))
     step(record.index + 1, steps)
 
 

@@ -89,9 +89,8 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         if self._state == "new":
             raise OptionError("step() before reset(); call reset() first")
         done = self.batch.step(self.batch.as_numbers(action, (len(self.batch.axes),))[None], np.zeros(1, int))
-        info = {
-            name: value.item() if isinstance(value, np.generic) else value for name, value in _row(done.info).items() if value is not None
-        }
+        known = {key: value for key, value in _row(done.info).items() if value is not None}
+        info = {key: value.item() if isinstance(value, np.generic) else value for key, value in known.items()}
         self._show(float(done.reward[0]))
         return _row(self.batch.observation()), float(done.reward[0]), bool(done.terminated[0]), bool(done.truncated[0]), info
 

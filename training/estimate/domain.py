@@ -557,9 +557,8 @@ def _fit_changes(flat: np.ndarray, labelled: np.ndarray, motions: np.ndarray, rn
     dim = np.sort(rng.permutation(np.concatenate([np.flatnonzero(~labelled), np.arange(len(flat), len(every))]))[: KNOWN // 2])
     known = np.concatenate([a[rows, :lead], a[dim, :lead], (-mean @ components.T / deviation)[None, :lead]])
     none = np.zeros(0)
-    return Domain(
-        motions, mean, components, deviation, weight, whiten, usual, known, np.ones(11), none, none, none, none, len(dim) + 1, 0.0, 0.0
-    )
+    given = motions, mean, components, deviation, weight, whiten, usual, known, np.ones(11)
+    return Domain(*given, none, none, none, none, len(dim) + 1, 0.0, 0.0)
 
 
 def _places(reference: Reference) -> FloatArray:

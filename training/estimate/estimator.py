@@ -400,6 +400,7 @@ class PoseEstimator:
         lost: float = 0.0,
         verdict: DomainVerdict = USUAL_FRAME,
     ) -> PoseEstimate:
+        labels = self.names, self.units
         excess: np.ndarray = np.zeros(len(self._bounds[0]))
         if isinstance(made, Prediction) and self.domain is not None:
             reason = verdict.reason
@@ -410,17 +411,13 @@ class PoseEstimator:
             if self._tracker is not None:
                 self._tracker.forget()
             none = np.full(len(self.names), np.nan)
-            return PoseEstimate(
-                self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched, seen=made.seen
-            )
+            return PoseEstimate(*labels, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched, seen=made.seen)
         value, half, executed = made.mean[0], made.half_width[0], float(made.executed[0])
         low, high, notes = self._widening(value, half, lost, verdict, excess)
         value, low, high = (np.clip(each, *self._bounds) for each in (value, low, high))
         if slip is not None:
             value, low, high = (np.concatenate(pair) for pair in zip((value, low, high), slip.values, strict=True))
-        return PoseEstimate(
-            self.names, self.units, value, low, high, executed, True, "", _ms(started), contact, made.touched, notes, made.seen
-        )
+        return PoseEstimate(*labels, value, low, high, executed, True, "", _ms(started), contact, made.touched, notes, made.seen)
 
     def pins_in(self, frame: Frame) -> OneFrame | Unseen:
         """The pins of one frame, or the reason why they can't be used; raises as a call does."""

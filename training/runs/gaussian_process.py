@@ -393,9 +393,8 @@ def sample_rows(count: int, seed: int) -> np.ndarray:
 def _fit_processes(
     start: Kernel, points: Points, labels: np.ndarray, rows: np.ndarray, group: np.ndarray | None
 ) -> tuple[Processes, np.ndarray]:
-    return _join_posteriors(
-        [Posterior(climb_likelihood(start, points.rows(rows), label[rows]), points, label, group) for label in labels.T]
-    )
+    kernels = [climb_likelihood(start, points.rows(rows), label[rows]) for label in labels.T]
+    return _join_posteriors([Posterior(kernel, points, label, group) for kernel, label in zip(kernels, labels.T, strict=True)])
 
 
 def _join_posteriors(found: list[Posterior]) -> tuple[Processes, np.ndarray]:

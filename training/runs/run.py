@@ -228,11 +228,8 @@ def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | Non
 
 def _collect_weights(loop: Loop) -> dict:
     network = loop.result()
-    return {
-        "weights": {key: value.cpu().clone() for key, value in network.state_dict().items()},
-        "held": loop.rows.held,
-        "curves": loop.curves,
-    }
+    weights = {key: value.cpu().clone() for key, value in network.state_dict().items()}
+    return {"weights": weights, "held": loop.rows.held, "curves": loop.curves}
 
 
 def _open_checkpoint(out: Path, resolved: dict) -> dict | None:

@@ -210,11 +210,8 @@ def pack(run: Path, out: Path) -> int:
     if rows:
         kept |= {KERNELS: content[KERNELS], KERNEL_LABELS: torch.tensor(content[KERNEL_LABELS])}
     arrays = _flat(kept)
-    whole = {
-        key
-        for key, value in arrays.items()
-        if value.size <= LARGE or value.dtype == np.int64 or key.startswith((f"{BESIDE}.", f"{KERNELS}."))
-    }
+    of_processes = (f"{BESIDE}.", f"{KERNELS}.")
+    whole = {key for key, value in arrays.items() if value.size <= LARGE or value.dtype == np.int64 or key.startswith(of_processes)}
     small = {key: value if key in whole else value.astype(np.float16) for key, value in arrays.items()}
     small["reference_px"] = content["reference_px"].numpy()  # in full precision, because the graph is made from it
     weights = save({key: np.ascontiguousarray(value) for key, value in small.items()})

@@ -141,12 +141,9 @@ def leak_check(mean: np.ndarray, targets: Targets) -> Leak:
 def _bins(error: np.ndarray, targets: Targets) -> dict[str, list[dict]]:
     """MAE of each label by depth, angle and shear, as ``{by: [{from, to, frames, label: mae, ...}]}``."""
     found: dict[str, list[dict]] = {}
+    known = dict(zip(targets.names, targets.corrected.T, strict=True))
     axes = {"depth_mm": (DEPTH, DEPTH_EDGES_MM, False), "angle_deg": (ANGLE, ANGLE_EDGES_DEG, True)}
-    values = {
-        key: (targets.corrected[:, targets.names.index(name)], edges, size)
-        for key, (name, edges, size) in axes.items()
-        if name in targets.names
-    }
+    values = {key: (known[name], edges, size) for key, (name, edges, size) in axes.items() if name in known}
     if np.isfinite(targets.move).all():
         done = np.where(np.isnan(targets.executed), 1.0, targets.executed)
         values["shear_mm"] = (done * targets.move[:, 0], SHEAR_EDGES_MM, True)

@@ -163,9 +163,8 @@ class Vgnn(nn.Module):
     def prepare(self, x: torch.Tensor) -> None:
         """Set the scales of the features and the principal components from training features (M, N, F) of frames without lost pins."""
         self.scale.copy_(x.flatten(0, 1).std(dim=0).clamp(min=1e-6))
-        for flat, mean, components in zip(
-            self._modal(x), (self.mode_mean, self.area_mean), (self.components, self.area_components), strict=True
-        ):
+        learnt = (self.mode_mean, self.components), (self.area_mean, self.area_components)
+        for flat, (mean, components) in zip(self._modal(x), learnt, strict=True):
             if components.shape[1]:
                 mean.copy_(flat.mean(dim=0))
                 components.copy_(mode_components(flat - mean, components.shape[1]))

@@ -261,12 +261,10 @@ def stands_and_moves(labels: Sequence[ArmLabel]) -> np.ndarray:
     return np.hstack(poses_and_moves(labels))
 
 
-def with_missing(
-    simulated: Dataset, labels: list[ArmLabel], discrepancy: Discrepancy, seed: int, *, progress: Step | None = None
-) -> Dataset:
-    """A simulated data set with a discrepancy, sampled for each contact, added to its pins; ``labels`` are its ``arm_labels``."""
+def with_missing(simulated: Dataset, labels: list[ArmLabel], missing: Discrepancy, seed: int, *, progress: Step | None = None) -> Dataset:
+    """A simulated data set with what is missing, sampled for each contact, added to its pins; ``labels`` are its ``arm_labels``."""
     pins = simulated.pins
-    missing_px = discrepancy.draw_px(labels, pins.nodes_px - pins.reference.pins_px, contact_of(simulated), seed)
+    missing_px = missing.draw_px(labels, pins.nodes_px - pins.reference.pins_px, contact_of(simulated), seed)
     nodes_px = pins.nodes_px + missing_px
     return replace(simulated, pins=replace(pins, nodes_px=nodes_px, area_px2=voronoi_areas(nodes_px, pins.reference, progress=progress)))
 

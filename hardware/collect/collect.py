@@ -316,14 +316,9 @@ def _collect_one(stops: "_Stops", experiment: ExperimentSpec, collection: Collec
     confirmed = stops.go(contact.pose + clear + tap)
     frame = stops.frame_after(confirmed)
     after = stops.mover.arm.state()
-    log = {
-        "asked": [*contact.pose.tolist(), *contact.move.tolist()],
-        "confirmed_pose": confirmed.pose.tolist(),
-        "confirmed_s": confirmed.time_s,
-        "frame_s": frame.time_s,
-        "sequence": frame.sequence,
-        "moved_meanwhile_mm": float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3])),
-    }
+    moved_mm = float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3]))
+    log = {"asked": [*contact.pose.tolist(), *contact.move.tolist()], "confirmed_pose": confirmed.pose.tolist()}
+    log |= {"confirmed_s": confirmed.time_s, "frame_s": frame.time_s, "sequence": frame.sequence, "moved_meanwhile_mm": moved_mm}
     collection.keep(index, frame, stops.work.label(confirmed.pose), contact.move, log)
     stops.frame_after(stops.go(contact.pose + clear + tap, LIFT_MM))
 

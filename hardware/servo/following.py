@@ -406,11 +406,8 @@ class ServoStudy(ReadableResult):
     @property
     def rows(self) -> list[dict[str, Any]]:
         """``model``, ``object``, every measure and ``failure`` of each run that made a step."""
-        return [
-            {"model": model, "object": name, **asdict(run.measures), "failure": run.failure}
-            for (model, name), run in self.found.items()
-            if isinstance(run, Followed)
-        ]
+        runs = [(key, run) for key, run in self.found.items() if isinstance(run, Followed)]
+        return [{"model": model, "object": name, **asdict(run.measures), "failure": run.failure} for (model, name), run in runs]
 
     def lines(self) -> list[str]:
         """The comparison as a table in plain text."""

@@ -119,13 +119,8 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
             if progress:
                 progress(frame.sequence + 1, len(recording))
         notes += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
-        arrays = {
-            "nodes_px": np.reshape(nodes, (-1, n, 2)),
-            "area_px2": np.reshape(areas, (-1, n)),
-            "lost": np.reshape(lost, (-1, n)).astype(bool),
-            "valid": np.array(valid, bool),
-            "light": np.reshape(light, (-1, n)),
-        }
+        arrays = {"nodes_px": np.reshape(nodes, (-1, n, 2)), "area_px2": np.reshape(areas, (-1, n)), "light": np.reshape(light, (-1, n))}
+        arrays |= {"lost": np.reshape(lost, (-1, n)).astype(bool), "valid": np.array(valid, bool)}
         about = {"rest_px": reference.pins_px, "measured": np.array(named != UNMEASURED), "notes": np.array(notes, str)}
         return {"image_name": np.array(names, str)} | about | arrays
 

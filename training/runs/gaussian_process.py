@@ -286,11 +286,8 @@ class Processes:
 
     def __call__(self, wanted: Points) -> np.ndarray:
         """(B, K) expected labels of other rows."""
-        found = [
-            kernel.between(kernel.divide_by_lengths(wanted), placed) @ weight
-            for kernel, placed, weight in zip(self.kernels, self._placed, self.weight.T, strict=True)
-        ]
-        return np.stack(found, axis=1)
+        each = zip(self.kernels, self._placed, self.weight.T, strict=True)
+        return np.stack([kernel.between(kernel.divide_by_lengths(wanted), placed) @ weight for kernel, placed, weight in each], axis=1)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays that ``of_arrays`` needs; the terms are not among them."""

@@ -68,13 +68,8 @@ class _Lesson:
         executed = torch.from_numpy(data.targets.executed.astype(np.float32)).repeat(views)
         learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # held-out frames are used in view 0 only
         rows = [torch.from_numpy(each) for each in (learnt, held)]
-        return Loop(
-            network,
-            config.recipe,
-            TrainingRows(self.prepared.inputs, self.scaled.repeat(views, 1), weight, executed, *rows),
-            seed,
-            model.penalty,
-        )
+        taught = TrainingRows(self.prepared.inputs, self.scaled.repeat(views, 1), weight, executed, *rows)
+        return Loop(network, config.recipe, taught, seed, model.penalty)
 
     def keep(self, done: list, loop: Loop | None) -> None:
         """Write the checkpoint and the curves."""

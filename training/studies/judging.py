@@ -85,15 +85,10 @@ def measure_errors(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
         error = np.abs(label_error(np.clip(made.mean, *limits_of(targets.names)), truth, targets.units))
         half_width = made.half_width_raw if kind == "raw" else made.half_width
         inside = np.abs(label_error(made.mean, truth, targets.units)) <= half_width
-        found[kind] = {
-            name: {
-                "mae": float(error[:, k].mean()),
-                "median": float(np.median(error[:, k])),
-                "coverage_90": float(inside[:, k].mean()),
-                "half_width_90": float(half_width[:, k].mean()),
-            }
-            for k, name in enumerate(targets.names)
-        }
+        found[kind] = {}
+        for name, off, covered, wide in zip(targets.names, error.T, inside.T, half_width.T, strict=True):
+            means = {"mae": off.mean(), "median": np.median(off), "coverage_90": covered.mean(), "half_width_90": wide.mean()}
+            found[kind][name] = {key: float(value) for key, value in means.items()}
         found[kind]["bins"] = _bins(error, targets)
     leak = leak_check(made.mean, targets)
     found["leak_slope"], found["leak_not_checked"] = leak.slope, leak.reason

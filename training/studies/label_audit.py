@@ -169,11 +169,8 @@ def _write_evidence(out: Path, audit: Audit, data: Dataset, page: Page) -> list[
     """Write the corrected labels and the picture, and show the picture on the page."""
     labels = _correct_moves(data, audit.executed.round(), audit.depth_per_move)
     chart = write_chart(out / "audit.png", lambda: _evidence_figure(audit, data, labels))
-    page.figures(
-        PagePicture(
-            chart, "Evidence for the findings: which hypothesis fits each frame, corrections of the angle, moves along the table, drift"
-        )
-    )
+    shown = "Evidence for the findings: which hypothesis fits each frame, corrections of the angle, moves along the table, drift"
+    page.figures(PagePicture(chart, shown))
     return [write_table(out / "labels_corrected.csv", _label_rows(audit, data, labels)), chart]
 
 

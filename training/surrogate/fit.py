@@ -251,13 +251,9 @@ def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], *, start: Surrogate | 
     layers = _train_network(*given, start.layers if start else (), WIDTH, progress)
     onto = _interpolation(sensor)
     on_pins = np.einsum("np,kcpi->knci", onto, modes.reshape(MODES, 2, -1, 3) / weights[None], optimize=True)
-    about = {
-        "sensor": sensor.name,
-        "mechanics": mechanics_of(sensor),
-        "domain": {"depth_mm": DEEPEST_TAKEN_MM, "polar_deg": POLAR_DEG, "friction": STICKING},
-        "paths": len(solved),
-        "states": int(sum(len(path.T) for path in solved)),
-    }
+    domain = {"depth_mm": DEEPEST_TAKEN_MM, "polar_deg": POLAR_DEG, "friction": STICKING}
+    about = {"sensor": sensor.name, "mechanics": mechanics_of(sensor), "domain": domain, "paths": len(solved)}
+    about |= {"states": int(sum(len(path.T) for path in solved))}
     answer, on_pins, read = (values.astype(np.float32) for values in (answer, on_pins, read))
     made = Surrogate(about, skin.node_mm, answer, on_pins, read, view, bending, mean, scale, layers, out_scale)
     made = made.as_kept()  # so that the errors are those of the file, which rounds the arrays
@@ -450,16 +446,10 @@ def _train_network(x: FloatArray, y: FloatArray, gates: FloatArray, counts: Floa
 
     ``counts`` (S,) are the states' weights in the loss. Training starts from the weights and offsets of ``start``, if there are any.
     """
-    net = torch.nn.Sequential(
-        torch.nn.Linear(x.shape[1], width),
-        torch.nn.SiLU(),
-        torch.nn.Linear(width, width),
-        torch.nn.SiLU(),
-        torch.nn.Linear(width, y.shape[1]),
-    )
+    linear = [torch.nn.Linear(*sizes) for sizes in pairwise((x.shape[1], width, width, y.shape[1]))]
+    net = torch.nn.Sequential(linear[0], torch.nn.SiLU(), linear[1], torch.nn.SiLU(), linear[2])
     inputs, wanted, share, count = (torch.from_numpy(np.ascontiguousarray(values)) for values in (x, y, gates[:, None], counts))
     batches = max(len(x) // BATCH, 1)
-    linear = [layer for layer in net if isinstance(layer, torch.nn.Linear)]
     with torch.no_grad():
         for layer, (weight, offset) in zip(linear, start, strict=False):
             layer.weight.copy_(torch.from_numpy(weight))

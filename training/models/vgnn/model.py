@@ -82,17 +82,9 @@ def fill_lost(
     return nodes_px, area_px2
 
 
-def seated_inputs(
-    registration: Registration,
-    nodes_px: np.ndarray,
-    area_px2: np.ndarray,
-    lost: np.ndarray,
-    reference: Reference,
-    *,
-    together: bool = False,
-) -> PinInputs:
-    """Inputs of frames (see ``fill_lost``) without the camera's displacement; ``together`` as in ``Registration``."""
-    nodes, area, _, share = registration(nodes_px, area_px2, together=together)
+def seat_inputs(registration: Registration, filled: tuple, lost: np.ndarray, reference: Reference, *, together: bool = False) -> PinInputs:
+    """Inputs of frames, ``filled`` as by ``fill_lost``, without the camera's displacement; ``together`` as in ``Registration``."""
+    nodes, area, _, share = registration(*filled, together=together)
     return PinInputs(pin_features(nodes, area, reference), lost, share)
 
 
@@ -309,8 +301,8 @@ class VgnnModel(PinModel):
         In view 1 the whole difference of each frame from the expected camera is removed, as for a camera at another place.
         """
         registration, left = fit_registration(pins.nodes_px[train], pins.reference.pins_px)
-        nodes_px, area_px2 = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
-        seated = seated_inputs(registration, nodes_px, area_px2, pins.lost, pins.reference)
+        nodes_px, area_px2 = filled = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
+        seated = seat_inputs(registration, filled, pins.lost, pins.reference)
         taken = registration.difference(nodes_px)
         taken[train] = left
         displaced = pin_features(*registration.take_out(nodes_px, area_px2, taken), pins.reference)
@@ -322,10 +314,10 @@ class VgnnModel(PinModel):
         """See ``PinModel``. If a frame without contact shows the camera's place, no displacement of the camera is estimated."""
         registration = Registration(**learnt["registration"])
         pins = pins.relative_to(reference) if pins.measured else pins
-        nodes_px, area_px2 = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, reference)
+        filled = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, reference)
         if pins.measured:
-            return PinInputs(pin_features(nodes_px, area_px2, reference), pins.lost)
-        return seated_inputs(registration, nodes_px, area_px2, pins.lost, reference, together=together)
+            return PinInputs(pin_features(*filled, reference), pins.lost)
+        return seat_inputs(registration, filled, pins.lost, reference, together=together)
 
     def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
         """See ``Model``. Sets the scales of the features and the pin modes."""

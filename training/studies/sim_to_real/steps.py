@@ -107,17 +107,9 @@ class Twin:
 
     def config(self, obj: ObjectSpec, seed: int) -> GenerationConfig:
         """Configuration of the twin's contacts, without pictures."""
-        return GenerationConfig(
-            sensor=self.sensor,
-            object=obj,
-            experiment=self.experiment,
-            randomisation=self.randomisation,
-            friction=rig_of(self.sensor).friction,
-            seed=seed,
-            images="none",
-            states="all",
-            across=self.across,
-        )
+        how: dict[str, Any] = {"randomisation": self.randomisation, "images": "none", "states": "all", "across": self.across}
+        friction = rig_of(self.sensor).friction
+        return GenerationConfig(sensor=self.sensor, object=obj, experiment=self.experiment, friction=friction, seed=seed, **how)
 
     def simulated_sets(
         self, plan: SimToRealPlan, out: Path, sensor: SensorSpec, form: Form, given: Sequence[Path], progress: Progress

@@ -313,11 +313,8 @@ def run(plan: TacVgnnPlan, out: Path, *, progress: Progress = silent) -> TacVgnn
     graphs = compare_graphs(data.pins)
     spent = train_all(runs, data, folder, max_minutes=plan.max_minutes, device=device, progress=progress)
     rows = [table_row(each, data, folder, spent.get(each.folder)) for each in runs]
-    written = [
-        write_table(out / "models.csv", rows),
-        write_table(out / "graphs.csv", graphs),
-        write_chart(out / "curves.png", lambda: curves_figure(runs, folder)),
-    ]
+    written = [write_table(out / "models.csv", rows), write_table(out / "graphs.csv", graphs)]
+    written.append(write_chart(out / "curves.png", lambda: curves_figure(runs, folder)))
     efficiency = _efficiency(plan, runs, data, device, progress)
     if efficiency:
         chart = write_chart(out / "efficiency.png", lambda: efficiency_figure(efficiency))

@@ -24,6 +24,7 @@ from training.generation.make import REST, Outcome, make_contact
 from twin import store
 from twin.errors import ErrorsAs, StoreError
 from twin.frames.truth import TRUTH, image_name
+from twin.store import write_text
 
 # Largest size of a JSON file of a data set, bytes. A sensor's measured tables are its largest part.
 LARGEST_RECORD = 100_000_000
@@ -140,9 +141,9 @@ class Store:
                 truth.append(arrays)
                 self._add_rows(tables, index, arrays, notes)
             truth.close({"sensor": self.config.sensor.name, "form": str(self.config.form)})
-            store.write_text(self.folder / "meta.json", json.dumps(self._meta(count)))
+            write_text(self.folder / "meta.json", json.dumps(self._meta(count)))
             for name, rows in tables.items():
-                store.write_text(self.folder / name, _csv(rows, FAILURE_COLUMNS if name == "failures.csv" else None))
+                write_text(self.folder / name, _csv(rows, FAILURE_COLUMNS if name == "failures.csv" else None))
             store.replace_folder(truth.path, self.folder / TRUTH)
         except StoreError as error:
             raise self._unfinished_error(error) from error
@@ -184,7 +185,7 @@ class Store:
             store.require_same_code(self.folder, make_contact, begun=True)
             return
         store.require_same_code(self.folder, make_contact, begun=False)
-        store.write_text(path, text)  # written last, so that a folder with a configuration also states what code made it
+        write_text(path, text)  # written last, so that a folder with a configuration also states what code made it
 
     def _unfinished_error(self, error: StoreError) -> DatasetError:
         done = len(self.list_finished() - {REST})

@@ -158,7 +158,7 @@ class RestSeeker:
 
     Parameters
     ----------
-    model : RestingModel
+    model : PoseEstimator
 
     Attributes
     ----------

@@ -4,11 +4,10 @@ A recording is the camera's frame cropped, thresholded and resized at capture. W
 size (w, h), and pixel centres at integers, ``x_rec = (x_raw - x0 + 0.5) w / (x1 - x0) - 0.5``; likewise for y.
 """
 
-from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from statistics import mode
 
 import cv2
 import numpy as np
@@ -39,8 +38,6 @@ BLACK_BELOW, WHITE_ABOVE = 16, 239
 COLOURLESS_BELOW = 4.0
 # Number of frames by which the size and form of a recording are recognised.
 VOTES = 25
-
-Thing = TypeVar("Thing", bound=Hashable)
 
 
 def raw_to_recording(recording: RecordingSpec | None, raw_px: np.ndarray) -> np.ndarray:
@@ -249,9 +246,9 @@ def common_kind(files: list[Path], spec: SensorSpec | None, form: Form | None) -
     if not votes:
         raise FrameError(f"no usable frame among {len(files)}; the first: {reasons[0]}")
     kinds = [votes[k] for k in sorted(votes)]
-    size = _most([kind.size_px for kind in kinds])
+    size = mode(kind.size_px for kind in kinds)
     kinds = [kind for kind in kinds if kind.size_px == size]
-    return FrameKind(_most([kind.form for kind in kinds]), size, max(kind.bits for kind in kinds))
+    return FrameKind(mode(kind.form for kind in kinds), size, max(kind.bits for kind in kinds))
 
 
 def _corner_and_scale(recording: RecordingSpec | None) -> tuple[np.ndarray, np.ndarray]:
@@ -265,8 +262,3 @@ def _corner_and_scale(recording: RecordingSpec | None) -> tuple[np.ndarray, np.n
 def _size_px(image: np.ndarray) -> tuple[int, int]:
     """(width, height) of an image."""
     return image.shape[1], image.shape[0]
-
-
-def _most(things: list[Thing]) -> Thing:
-    """The most frequent thing; of equally frequent things the first."""
-    return Counter(things).most_common(1)[0][0]

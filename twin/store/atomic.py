@@ -114,9 +114,15 @@ def text_file(path: Path) -> Iterator[io.StringIO]:
     write_text(path, text.getvalue())
 
 
-def write_json(path: Path, content: object, *, default: Callable[[object], object] | None = None) -> Path:
-    """Write JSON with indented lines; ``default`` as in ``json.dumps``; raises as ``write_with``."""
-    return write_text(path, json.dumps(content, indent=1, default=default) + "\n")
+def write_json(path: Path, content: object) -> Path:
+    """Write JSON with indented lines; numbers of NumPy are written as numbers; raises as ``write_with``."""
+    return write_text(path, json.dumps(content, indent=1, default=_plain_number) + "\n")
+
+
+def _plain_number(value: object) -> object:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"expected a number, got {type(value).__name__}")
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool = False) -> Path:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypedDict
+from typing import Any, Literal
 
 import numpy as np
 
@@ -76,15 +76,6 @@ FAIR_RATE = 0.5
 Rate = tuple[float, float]
 
 
-class RateRow(TypedDict):
-    """A setting that was tried, and its result."""
-
-    block_px: int
-    threshold: float
-    exact_rate: float
-    found_share: float
-
-
 @dataclass(frozen=True)
 class Tuned:
     """The result of a tuning.
@@ -92,8 +83,6 @@ class Tuned:
     Attributes
     ----------
     detector : DetectorSpec
-    rates : list of RateRow
-        All settings that were tried.
     notes : list of str
         Reasons to doubt the result, and what to do.
     rest : Rest
@@ -101,7 +90,6 @@ class Tuned:
     """
 
     detector: DetectorSpec
-    rates: list[RateRow]
     notes: list[str]
     rest: Rest
 
@@ -176,13 +164,9 @@ def tune(
     evidence = _evidence(tried, rates, best, judged, reference, start)
     if doubts:
         evidence = evidence.model_copy(update={"sure": "unsure"})
-    table: list[RateRow] = [
-        {"block_px": _block(d), "threshold": _threshold(d), "exact_rate": exact, "found_share": share}
-        for d, (exact, share) in zip(tried, rates, strict=True)
-    ]
     seen = sum(one.explained >= SHOWN for one in layout.seen)
     found = _at_rest(tried[best].model_copy(update={"evidence": evidence}), sensor.pins, rest, layout)
-    return Tuned(found, table, doubts + _notes(tried[best], evidence, seen, len(frames)), rest)
+    return Tuned(found, doubts + _notes(tried[best], evidence, seen, len(frames)), rest)
 
 
 def _at_rest(detector: DetectorSpec, pins: PinsSpec, rest: Rest, layout: Candidate) -> DetectorSpec:

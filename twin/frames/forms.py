@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from scenes.sensor import BlobSpec, PipelineSpec, Polarity, RecordingSpec, SensorSpec
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.frames.images import bits_used, decode, to_eight_bits
 from twin.types import Form
 
@@ -71,10 +71,8 @@ def form_named(name: str) -> Form:
     FrameError
         There is no such form.
     """
-    try:
+    with ErrorsAs(ValueError, lambda error: FrameError(f"no form is called {name!r}; there are: {', '.join(Form)}")):
         return Form(name)
-    except ValueError:
-        raise FrameError(f"no form is called {name!r}; there are: {', '.join(Form)}") from None
 
 
 def frame_size(spec: SensorSpec, form: Form) -> tuple[int, int]:
@@ -208,10 +206,8 @@ def form_of(image: np.ndarray, name: str, spec: SensorSpec | None, form: Form | 
         form = form_named(form)
     if spec is None:
         return form or (Form.PROCESSED if is_two_level(image) else Form.RAW)
-    try:
+    with ErrorsAs(FrameError, lambda error: FrameError(f"{name}: {error}")):
         told = recognise_form(spec, image)
-    except FrameError as error:
-        raise FrameError(f"{name}: {error}") from None
     if form is None:
         return told
     expected = known_sizes(spec).get(form)

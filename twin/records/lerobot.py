@@ -10,7 +10,6 @@ import json
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -23,7 +22,7 @@ from twin.errors import ErrorsAs, FrameError, library
 from twin.frames import open_recording
 from twin.frames.lerobot import COUNTERS
 from twin.frames.videos import describe_pauses
-from twin.records.folder import AGAIN, FolderWriter, image_of, png, read_json, read_sidecar, records_in
+from twin.records.folder import AGAIN, FolderWriter, image_of, png, read_json, read_sidecar, reading_tables, records_in
 from twin.records.record import CHANNELS, IMAGE, TIME, About, Episode, RecordError, Records, RecordStep, off_s
 from twin.store import write_json, write_text, write_with
 from twin.types import Form
@@ -193,6 +192,7 @@ class LeRobotWriter(FolderWriter):
         """Columns of the data files: their Arrow types, and in the metadata their description for Hugging Face's library."""
         columns: list[tuple[str, Any]] = []
         described: dict[str, Any] = {}
+        said: dict[str, Any]
         for name, feature in self._features().items():
             dtype, shape = feature["dtype"], feature["shape"]
             if dtype == "video":
@@ -375,7 +375,7 @@ def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Recor
     path, number = folder / DATA_PATH.format(**{key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}), row["episode_index"]
     video = f"videos/{IMAGE}/from_timestamp" in row
     pictures = _film_pictures(folder, row, about) if video else iter(())
-    with _reading(path) as parquet:
+    with reading_tables(path) as parquet:
         file = parquet.ParquetFile(path, page_checksum_verification=True)
         leaf = next(k for k in range(len(file.schema)) if file.schema.column(k).path == "episode_index")
         for group in range(file.num_row_groups):
@@ -387,15 +387,6 @@ def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Recor
                     image = next(pictures) if video else image_of(line[IMAGE]["bytes"], about.gray, str(path))
                     found = {name: np.asarray(line[CHANNELS[name].column], np.float32) for name in about.numbers}
                     yield RecordStep(image, float(line[TIME]), {name: value.reshape(about.shape(name)) for name, value in found.items()})
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[Any]:
-    """The library that reads tables. If the path turns out to be damaged, ``RecordError`` is raised."""
-    try:
-        yield library("pyarrow.parquet")
-    except (OSError, KeyError, ValueError, TypeError, StopIteration, library("pyarrow").ArrowException) as error:
-        raise RecordError(f"{path}: damaged ({error}); {AGAIN}") from error
 
 
 def _film_pictures(folder: Path, row: dict[str, Any], about: About) -> Iterator[np.ndarray]:
@@ -417,7 +408,7 @@ def _episode_rows(folder: Path) -> list[dict[str, Any]]:
         return []
     total = read_json(folder / INFO).get("total_episodes")
     rows: list[dict[str, Any]] = []
-    with _reading(folder / "meta/episodes") as parquet:
+    with reading_tables(folder / "meta/episodes") as parquet:
         for path in sorted(folder.glob("meta/episodes/chunk-*/file-*.parquet")):
             names = [name for name in parquet.read_schema(path).names if not name.startswith("stats/")]
             rows += parquet.read_table(path, columns=names, page_checksum_verification=True).to_pylist()
@@ -437,7 +428,7 @@ def _facts_of(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tasks(folder: Path) -> list[str]:
-    with _reading(folder / TASKS) as parquet:
+    with reading_tables(folder / TASKS) as parquet:
         return [str(task) for task in parquet.read_table(folder / TASKS)["__index_level_0__"].to_pylist()]
 
 

@@ -151,11 +151,9 @@ def collect(
           --experiment surface-2d --count 5000 --out data/real
     """
     from hardware.collect.collect import CollectPlan, collect_frames
-    from scenes import load_experiment, load_object, load_sensor, load_servo
+    from scenes import load_experiment, load_object
 
-    asked = load_experiment(experiment)
-    things = {"sensor": load_sensor(sensor), "obj": load_object(obj or asked.object), "servo": load_servo(servo)}
-    plan = call(CollectPlan, locals(), experiment=asked, **things)
+    plan = call(CollectPlan, locals(), obj=load_object(obj or load_experiment(experiment).object))
     with signals_as_ctrl_c():
         return collect_frames(plan, out, progress=progress)
 
@@ -224,11 +222,10 @@ def servo(
     The exit code is 1 if it ended early.
     """
     from hardware.servo.following import FollowPlan, follow
-    from scenes import load_object, load_servo
     from training.estimate.loading import load_with_history
 
     stream_hz = rate if stream else None
-    plan = call(FollowPlan, locals(), obj=load_object(obj), servo=load_servo(servo))
+    plan = call(FollowPlan, locals())
     with signals_as_ctrl_c():
         followed = follow(plan, load_with_history(model), out, about={"model": str(model)}, progress=progress)
     return followed  # type: ignore[return-value]  # a dry run has nothing but its lines
@@ -269,10 +266,9 @@ def run_policy(
           --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1
     """
     from hardware.servo.following import FollowPlan, follow, load_for_outlines
-    from scenes import load_object, load_servo
     from training.environments.policy_domain import contacts_of
 
-    plan = call(FollowPlan, locals(), obj=load_object(obj), servo=load_servo(servo))
+    plan = call(FollowPlan, locals())
     with signals_as_ctrl_c():
         followed = follow(plan, load_for_outlines(policy, contacts_of), out, about={"policy": str(policy)}, progress=progress)
     return followed  # type: ignore[return-value]  # a dry run has nothing but its lines
@@ -398,7 +394,5 @@ def camera(
     """
     from hardware.emulators.camera import FAULTS
     from hardware.emulators.twin_camera import emulate_camera
-    from scenes import load_object, load_sensor, load_servo
 
-    faults, spec = faults_of(fault, FAULTS), load_sensor(sensor)
-    call(emulate_camera, locals(), sensor=spec, obj=load_object(obj), servo=load_servo(servo))
+    call(emulate_camera, locals(), faults=faults_of(fault, FAULTS))

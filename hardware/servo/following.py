@@ -30,9 +30,9 @@ from twin.policy import KnownContacts, Policy, PolicyError, PolicyModel, load_po
 from twin.progress import Progress, Step, silent, stage
 from twin.records import KeptAlso
 from twin.records.session import SessionWriter, plain
-from twin.report.charts import save_figure, write_chart
+from twin.report.charts import write_chart
 from twin.report.page import Page, PagePicture
-from twin.report.table import write_rows
+from twin.report.table import Cell, Column, write_rows
 from twin.rig.arm_pose import matrix_of, pose_of
 from twin.rig.mounting import Mounting
 from twin.store import write_json, writes
@@ -440,12 +440,12 @@ class ServoStudy(ReadableResult):
         return lines
 
 
-@writes("study.csv", "study.png")
+@writes("index.html", "study.csv", "study*.png")
 def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent) -> ServoStudy:
     """Follow each object with each model in the twin, and write each run and the comparison to ``out``.
 
-    It writes a folder for each model and object as ``follow`` does, ``study.csv`` and ``study.png``. A run that can't make a single step
-    is also a result of the study.
+    It writes a folder for each model and object as ``follow`` does, ``index.html``, ``study.csv`` and ``study.png``. A run that
+    can't make a single step is also a result of the study.
 
     Raises
     ------
@@ -475,8 +475,29 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
     made.written.append(write_rows(out / "study.csv", made.rows))
     pictures = [(*key, run.path, run.outline_mm) for key, run in found.items() if isinstance(run, Followed)]
     if pictures:
-        made.written.append(save_figure(out / "study.png", comparison_figure(pictures)))
+        made.written.append(write_chart(out / "study.png", partial(comparison_figure, pictures)))
+    made.written.insert(0, _write_study(out, made))
     return made
+
+
+def _write_study(out: Path, study: ServoStudy) -> Path:
+    """Write the study's page, whose rows lead to the pages of the runs, and return its path."""
+    page = Page("Following outlines", "twin study servo", topic="TacTip twin: study")
+    page.lead = "Each model follows the outline of each object once in the twin."
+    units = ("", "", "mm", "mm", "deg", "%", "")
+    columns = [Column(key, title.removesuffix(f" {unit}"), unit) for (key, title), unit in zip(SHOWN.items(), units, strict=True)]
+    rows = [
+        {"model": model, "object": Cell(name, href=f"{folder_name(model)}/{name}/index.html"), "end": run.failure or "all steps made"}
+        | {key: value * (100 if key == "completed" else 1) for key, value in asdict(run.measures).items()}
+        if isinstance(run, Followed)
+        else {"model": model, "object": name, "end": run}
+        for (model, name), run in study.found.items()
+    ]
+    page.table(rows, ["model", "object", *columns, "end"], caption="S is the paper's smoothness; local S does not depend on the axes.")
+    if (out / "study.png") in study.written:
+        page.figures(PagePicture(out / "study.png", "The tool's path (thin) around each object (wide), for each model", width_px=1000))
+    page.download(out / "study.csv", "all measures")
+    return page.write(out / "index.html")
 
 
 def folder_name(label: str) -> str:

@@ -1,4 +1,4 @@
-"""One contract for every arm: simulated, MG400 over TCP, Magician over a pseudo-terminal, any arm over ROS 2."""
+"""One contract for every arm: simulated, MG400 over TCP, Magician over a pseudo-terminal, UR through its client, any over ROS 2."""
 
 import time
 
@@ -56,6 +56,10 @@ class TestRos2ArmOfTwists(OfBench):
 
 class TestRos2ArmOfPoses(OfBench):
     kind = "ros2-pose"
+
+
+class TestUr(OfBench):
+    kind = "ur"
 
 
 @pytest.fixture(params=ARMS)

@@ -11,11 +11,13 @@ from hardware.arms.magician import Magician
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.ros2 import Ros2Arm
 from hardware.arms.simulated import SimulatedArm
+from hardware.arms.ur.driver import UR
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.ros2 import Ros2Emulator
+from hardware.emulators.ur import UrEmulator
 
-ARMS = ("simulated-6", "simulated-4", "mg400", "mg400-old", "magician", "ros2-twist", "ros2-pose")
+ARMS = ("simulated-6", "simulated-4", "mg400", "mg400-old", "magician", "ros2-twist", "ros2-pose", "ur")
 NUMBERS = count()
 
 
@@ -56,6 +58,10 @@ def bench(kind: str, *, faults: tuple[str, ...] = (), time_scale: float = 4.0):
             emulator = stack.enter_context(Ros2Emulator(form, namespace=namespace, faults=faults))
             arm = Ros2Arm(form, namespace=namespace)
             yield Bench(arm, np.array([300.0, 0, 0, 0, 0, 0]), emulator, emulator.pose)
+        elif kind == "ur":
+            emulator = stack.enter_context(UrEmulator(host=None, faults=faults, time_scale=time_scale))
+            arm = UR(emulator.host)
+            yield Bench(arm, np.array([100.0, -500, 200, 0, 0, -160]), emulator, emulator.pose)
         else:
             emulator = stack.enter_context(MagicianEmulator(faults=faults, time_scale=time_scale))
             arm = Magician(emulator.device)

@@ -25,6 +25,7 @@ from true_estimator import TrueEstimator
 from hardware.arms.magician import Magician
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.ros2 import Ros2Arm
+from hardware.arms.ur.driver import UR
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import DevicePicture
 from hardware.collect.collect import Collection, collect
@@ -32,6 +33,7 @@ from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.ros2 import Ros2Emulator
+from hardware.emulators.ur import UrEmulator
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, shift_in_tool
 from hardware.safety.decide import SafetyLimits
@@ -59,6 +61,7 @@ ARM_FAULTS = {
 }
 # A Magician sends nothing unasked, so that its feedback and its replies are the same, and a reply that comes 2 s late is lost.
 SERIAL_FAULTS = {"feedback dead": ("mute",), "feedback garbled": ("wrong-checksum=1",)}
+UR_FAULTS = {"feedback dead": ("silent",), "feedback frozen": ("frozen-feedback",), "replies lost": ("no-replies",), "link lost": ()}
 # No reply belongs to a command of ROS 2, so that lost commands are what lost replies are elsewhere.
 TOPIC_FAULTS = {
     "feedback dead": ("silent-feedback",),
@@ -69,6 +72,7 @@ TOPIC_FAULTS = {
 KINDS = {
     "mg400": ("surface", ARM_FAULTS),
     "magician": ("magician", SERIAL_FAULTS),
+    "ur": ("ur5", UR_FAULTS),
     "ros2-twist": ("surface", TOPIC_FAULTS),
     "ros2-pose": ("surface", TOPIC_FAULTS),
 }
@@ -176,9 +180,11 @@ def program(
     if kind.startswith("ros2"):
         device = Ros2Arm(kind[5:], namespace=place)
         hold = device._hold
-        device._hold = lambda: (stops is not None and stops.append(time.monotonic()), hold())
+        device._hold = lambda *why, **how: (stops is not None and stops.append(time.monotonic()), hold(*why, **how))
+    elif kind == "mg400":
+        device = MG400("127.0.0.1", ports=Mg400Ports(place[0], place[1], tuple(place[2:])))
     else:
-        device = Magician(place) if kind == "magician" else MG400("127.0.0.1", ports=Mg400Ports(place[0], place[1], tuple(place[2:])))
+        device = UR(place) if kind == "ur" else Magician(place)
     arm = SafeArm(device, SafetyLimits(box_mm=((-2000, 2000),) * 3))
     source = MjpegCamera(url, load_sensor("mg400-331"), Form.RAW)
 
@@ -218,8 +224,12 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
             place = f"t{os.getpid()}/run{seed}"
             emulator = stack.enter_context(Ros2Emulator(kind[5:], namespace=place, pose=start))
         else:
-            emulator = stack.enter_context(MagicianEmulator() if kind == "magician" else Mg400Emulator(port_offset=None))
-            place = emulator.device if kind == "magician" else tuple(emulator.ports[port] for port in (29999, 30003, 30004, 30005))
+            makes = {"magician": MagicianEmulator, "mg400": partial(Mg400Emulator, port_offset=None), "ur": partial(UrEmulator, host=None)}
+            emulator = stack.enter_context(makes[kind]())
+            if kind == "mg400":
+                place = tuple(emulator.ports[port] for port in (29999, 30003, 30004, 30005))
+            else:
+                place = emulator.host if kind == "ur" else emulator.device
             _start_at(emulator, start, stops)
         camera = stack.enter_context(CameraEmulator(DomeCamera()))
         done = threading.Event()
@@ -252,7 +262,7 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
         elif fault != HEALTHY:
             kinds = (CAMERA_FAULTS | KINDS[kind][1])[fault]
             device = camera if fault in CAMERA_FAULTS else emulator
-            device.faults.add(kinds[rng.randrange(len(kinds))])
+            device.faults.add(kinds[rng.randrange(len(kinds))]) if kinds else emulator.unplug()
         fault_s = time.monotonic()
         done.wait(30.0)
         time.sleep(1.2 if process is not None else 0.1)
@@ -271,7 +281,7 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
 
 
 def _start_at(emulator, start: np.ndarray, stops: list[float]) -> None:
-    """Put an emulated Dobot at a pose, and note when it is stopped."""
+    """Put an emulated arm at a pose, and note when it is stopped."""
     kinematics, track = emulator.arm.kinematics, emulator.arm.track
     track.__init__(kinematics, kinematics.inverse(kinematics.nearest_pose(start)))
     stop = track.stop
@@ -335,7 +345,7 @@ def _judged(emulator, placed, fault_s: float, stops: list[float]) -> tuple[float
 def table(runs: list[Run]) -> str:
     """The worst of each fault and phase, in Markdown."""
     lines = ["| fault | phase | runs | detected, s | stands, s | towards, mm | pressed, mm | wrong |", "| --- " * 8 + "|"]
-    for fault in FAULTS:
+    for fault in dict.fromkeys((*FAULTS, *(run.fault for run in runs))):
         for phase in PHASES:
             some = [run for run in runs if (run.fault, run.phase) == (fault, phase)]
             if some:

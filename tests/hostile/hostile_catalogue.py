@@ -322,7 +322,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     },
     "evaluate {run} --data {recording} --out {out}": {"--rows": "some", "--label-kind": "both"},
     f"preprocess {{frames}} {S} --out {{out}}": {"--form": "cooked raw"},
-    f"check {{frames}} {S}": {"--max-frames": "0 -1 1e3", "--pipeline": "nowhere.toml"},
+    f"check {{frames}} {S}": {"--max-frames": "0 -1 1e3", "--pipeline": "nowhere.toml", "--page": "/proc/nowhere/page"},
     f"graph {{frames}} {S} --out {{out}}": {"--kind": "star", "--form": "cooked raw"},
     f"tune {S} --frames {{frames}} --out {{out}}/mine.toml": {"--max-frames": "0 -1", "--method": "magic"},
     f"render {S} --object plane --out {{out}} --quality preview": {
@@ -396,6 +396,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     },
     "emulate magician": {"--link": "{frames}/f_0.png /proc/nowhere", "--fault": "nonsense", "--time-scale": "0 -1 nan inf"},
     "emulate ros2": {"--form": "nonsense", "--namespace": "1a a//b", "--fault": "nonsense"},
+    "emulate ur": {"--host": "999.1.1.1 nowhere.invalid", "--fault": "nonsense", "--time-scale": "0 -1 nan inf"},
     f"emulate camera {S} --object plane": {
         "--arm": "nowhere mg400:127.0.0.1:1",
         "--arm mg400:127.0.0.1:1 --fps": "0 nan",
@@ -462,7 +463,7 @@ def _numbers() -> list[Entry]:
 
 EVERY = (
     *("audit", "calibrate contact", "calibrate optics", "check", "collect", "convert", "dataset", "demo", "doctor", "emulate camera"),
-    *("emulate magician", "emulate mg400", "emulate ros2"),
+    *("emulate magician", "emulate mg400", "emulate ros2", "emulate ur"),
     *("evaluate", "experiments", "graph", "live", "new", "objects", "pack", "predict", "preprocess"),
     *(
         "randomisations",
@@ -588,7 +589,7 @@ OVERWRITTEN = {  # files of the user's own in --out that a command of the same n
     "live": ("session.json", "steps.jsonl"),
     "convert": ("tactip.json", "README.md"),
     "demo": ("index.html",),
-    "study servo": ("study.csv",),
+    "study servo": ("study.csv", "index.html"),
     "study objects": ("objects.csv", "index.html"),
     "study sim-to-real": ("study.csv", "index.html"),
     "study tac-vgnn": ("index.html", "models.csv"),

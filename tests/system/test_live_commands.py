@@ -224,6 +224,7 @@ def test_a_model_that_fails_is_a_result_of_the_study(stand_in, tmp_path, monkeyp
         (row,) = csv.DictReader(file)
     assert row["model"] == "one" and row["object"] == "can" and row["steps"] == "3"
     assert (tmp_path / "one" / "can" / "trajectory.csv").is_file() and (tmp_path / "study.png").is_file()
+    assert 'href="one/can/index.html"' in (tmp_path / "index.html").read_text()
 
 
 def test_collect_in_the_twin_makes_a_recording_that_is_gone_on_with(tmp_path):

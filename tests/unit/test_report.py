@@ -78,6 +78,12 @@ def test_hostile_names_stay_text(tmp_path):
     assert {f"{HOSTILE}.png", f"{HOSTILE}-dark.png", f"{HOSTILE}.csv", f"#{HOSTILE}"} <= set(addresses)
 
 
+def test_words_in_backquotes_are_names(tmp_path):
+    page = Page("Title", "twin new")
+    page.items(["give its radius (`radius_mm`), not `<b>`"])
+    assert "(<code>radius_mm</code>), not <code>&lt;b&gt;</code>" in page.html(tmp_path)
+
+
 def test_an_unsound_page_is_refused():
     for html, word in (
         ("<p>", "never closed"),

@@ -318,7 +318,7 @@ class Domain:
     def _why(self, found: Strangeness, moved: FloatArray, lost: BoolArray, reference: Reference) -> str:
         """The most probable cause of a strange frame, in words."""
         straight = self(_remove_similarity(moved, reference), lost)  # exactly, because the motions are those of small turns
-        again = "take a new frame without contact with the present view (init_0.png beside the frames, --no-contact, --at-rest)"
+        again = "take a new frame without contact with the present view (init_0.png beside recorded frames)"
         if any((each.parts[:4] <= REFUSED).all() for each in (found, straight)):
             scale, turn, *shift = align(reference.pins_px[None] + moved * reference.spacing_px.mean(), reference.pins_px)[1][0]
             return (

@@ -43,11 +43,11 @@ ArmOption = Annotated[
     typer.Option(
         "--arm",
         metavar="A",
-        help="simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT, ros2:twist, ros2:pose[,pose=TOPIC...]",
+        help="simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT, ros2:twist, ros2:pose, ur:ADDRESS",
     ),
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, without motion")]
-Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, ros2, or a TOML file"), Formerly("limits")]
+Limits = Annotated[str | None, typer.Option("--safety", help="limits: mg400, magician, ros2, ur, or a TOML file"), Formerly("limits")]
 Ros2 = Annotated[
     str | None, typer.Option("--ros2", metavar="NAME", help="publish frames, pins and estimates as ROS 2 topics /NAME/..., such as tactip")
 ]
@@ -374,6 +374,29 @@ def ros2_arm(
     from hardware.emulators.ros2 import FAULTS, emulate_ros2
 
     call(emulate_ros2, locals(), faults=faults_of(fault, FAULTS))
+
+
+@emulate.command("ur")
+def ur(
+    host: Annotated[
+        str, typer.Option(help="address to listen on; a second emulated UR needs another one, such as 127.0.0.2")
+    ] = "127.0.0.1",
+    fault: FaultOption = None,
+    time_scale: TimeScale = 1.0,
+) -> None:
+    """Emulate a Universal Robots UR5, as far as ur_rtde uses it.
+
+    The ports are 29999 (dashboard), 30003 (script) and 30004 (RTDE).
+
+    In Python: open_arm("ur:127.0.0.1").
+
+    \b
+    Example:
+      twin emulate ur
+    """
+    from hardware.emulators.ur import FAULTS, emulate_ur
+
+    call(emulate_ur, locals(), faults=faults_of(fault, FAULTS))
 
 
 @emulate.command("camera")

@@ -48,7 +48,7 @@ def study_servo_command(
     Example:
       twin study servo --model out/gnn --model out/tac-vgnn --out out/study
 
-    Writes to --out: a folder for each model and object as 'twin servo' writes it, study.csv, study.png.
+    Writes to --out: a folder for each model and object as 'twin servo' writes it, index.html, study.csv, study.png.
     """
     from hardware.servo.following import ServoStudyPlan, study_servo
     from scenes import load_object, load_servo

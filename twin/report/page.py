@@ -1,7 +1,8 @@
 """Pages of results: a builder that all commands use, and templates that give all pages the same look.
 
 A page is one HTML file that needs no network. Its pictures are files beside it, or are embedded in it (``embed``). All text is escaped;
-emphasis is made by `strong`, `code`, `good` and `bad`, which escape their argument.
+emphasis is made by `strong`, `code`, `good` and `bad`, which escape their argument. Words in backquotes are names,
+in the font for code.
 """
 
 import base64
@@ -16,7 +17,7 @@ from typing import Any, Literal
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from twin.report.table import Column, Row, make_table
 from twin.report.themes import dark_of, stylesheet
@@ -132,6 +133,7 @@ class Page:
         environment = Environment(
             loader=PackageLoader("twin.report", "."), undefined=StrictUndefined, autoescape=True, trim_blocks=True, lstrip_blocks=True
         )
+        environment.filters["names"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
         return environment.get_template("page.html.j2").render(
             stylesheet=stylesheet(),
             title=self.title,

@@ -47,6 +47,8 @@ NEAR, SETTLE_S = 0.01, 1.0
 """Distance, mm or deg, from the end of the path at which a move has ended, and the longest time, s, until then."""
 REST, REST_S = 0.05, 0.06
 """An arm that changed its place by less than this, mm or deg, in this time stands."""
+DRIFT = 1e-3
+"""Largest share by which the clock of the stamps may be slower than this machine's."""
 STOPS_S = 1.0
 """Longest time, s, that an arm may take to stand after a stop."""
 ACCELERATION = 500.0
@@ -269,7 +271,8 @@ class Ros2Arm(BaseArm):
         stamp_s = stamp["sec"] + stamp["nanosec"] / ros.NS_PER_S
         if 0.0 < stamp_s <= self._stamp_s:  # repeated, or overtaken
             return
-        self._stamp_s, self._behind_s = stamp_s, min(self._behind_s, now_s - stamp_s)  # clocks may differ, but no message gains time
+        risen_s = self._behind_s + DRIFT * (stamp_s - self._stamp_s)
+        self._stamp_s, self._behind_s = stamp_s, min(risen_s, now_s - stamp_s)  # clocks may differ, but no message gains time
         time_s, pose = stamp_s + self._behind_s if stamp_s else now_s, pose_of(ros.matrix_in(message["pose"]), self._pose)
         way = measure_way(pose, self._pose)
         if self._enabled and not self._fault and not (way <= JUMP + FASTEST * (time_s - self._pose_s)).all():

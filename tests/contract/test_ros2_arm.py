@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from threading import Event, Thread
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -232,3 +233,13 @@ def test_clocks_may_differ_and_a_stamp_may_be_missing(shift_s, monkeypatch):
         assert abs(arm.state().time_s - time.monotonic()) < SILENCE_S
         arm.enable()
         arm.move_linear(HOME + [0, 5, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize("ppm", [-200, 200])
+def test_a_clock_that_drifts_for_hours_makes_no_pose_late(ppm, monkeypatch):
+    arm, clock = Ros2Arm("twist"), SimpleNamespace(monotonic=lambda: now_s)
+    monkeypatch.setattr("hardware.arms.ros2.time", clock)
+    for now_s in np.arange(1000.0, 15_400.0, 10.0):
+        stamp = ros.header_of(round((1 + 1e-6 * ppm) * now_s * ros.NS_PER_S), "base_link")
+        arm._take_pose({"header": stamp, "pose": ros.place(np.eye(4))})
+        assert abs(arm._pose_s - now_s) < 0.1 * SILENCE_S

@@ -53,6 +53,12 @@ def test_a_fault_in_a_phase_stops_a_magician(seed):
     assert not found.wrong(), found
 
 
+@pytest.mark.parametrize("seed", range(0, 4 * len(FAULTS), 7))
+def test_a_fault_in_a_phase_stops_an_arm_behind_ros_2(seed):
+    found = measure(seed, kind=("ros2-twist", "ros2-pose")[seed % 2])
+    assert not found.wrong(), found
+
+
 @pytest.mark.parametrize("seed", range(2, 4 * len(faults_of("ur")), 7))
 def test_a_fault_in_a_phase_stops_a_ur(seed):
     found = measure(seed, kind="ur")

@@ -209,7 +209,7 @@ def test_nothing_takes_the_command_line_for_a_library():
 
 def test_a_command_that_a_group_does_not_have_is_told_with_those_it_has():
     told = CliRunner().invoke(command_line(), ["emulate", "ur5"])
-    assert told.exit_code == 2 and "There are mg400, magician, ur, camera." in told.output
+    assert told.exit_code == 2 and "There are mg400, magician, ros2, ur, camera." in told.output
 
 
 def commands_below(command, words=()):

@@ -40,10 +40,14 @@ NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="seed of the twin'
 KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stands exactly at --servo: measure errors against it")]
 ArmOption = Annotated[
     str,
-    typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT, ur:ADDRESS"),
+    typer.Option(
+        "--arm",
+        metavar="A",
+        help="simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT, ros2:twist, ros2:pose, ur:ADDRESS",
+    ),
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, without motion")]
-Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, ur, or a TOML file"), Formerly("limits")]
+Limits = Annotated[str | None, typer.Option("--safety", help="limits: mg400, magician, ros2, ur, or a TOML file"), Formerly("limits")]
 Ros2 = Annotated[
     str | None, typer.Option("--ros2", metavar="NAME", help="publish frames, pins and estimates as ROS 2 topics /NAME/..., such as tactip")
 ]
@@ -344,6 +348,28 @@ def magician(
     from hardware.emulators.running import emulate_magician
 
     call(emulate_magician, locals(), faults=faults_of(fault, FAULTS))
+
+
+@emulate.command("ros2")
+def ros2_arm(
+    form: Annotated[str, typer.Option(help="commands: twist, as for MoveIt Servo, or pose, as for a cartesian controller")] = "twist",
+    namespace: Annotated[str, typer.Option(help="namespace of its topics")] = "",
+    fault: FaultOption = None,
+) -> None:
+    """Emulate an arm behind ROS 2.
+
+    It publishes current_pose and joint_states, and obeys servo_node/delta_twist_cmds or target_pose.
+
+    In Python: open_arm("ros2:twist").
+
+    \b
+    Example:
+      twin emulate ros2 --namespace left
+      twin servo --object can --arm ros2:twist,namespace=left --out out/servo
+    """
+    from hardware.emulators.ros2 import FAULTS, emulate_ros2
+
+    call(emulate_ros2, locals(), faults=faults_of(fault, FAULTS))
 
 
 @emulate.command("ur")
